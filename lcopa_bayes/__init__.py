@@ -1,0 +1,1 @@
+"""Posteriors for systems with memory, delay and coupled axes, and what the data cannot say."""

@@ -1,0 +1,156 @@
+"""The device on the virtual bench: paths with delay from every drive to every response."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from math import inf, isfinite
+from typing import final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lcopa_bayes.arrays import Array, Matrix, frozen
+from lcopa_bayes.bench.command import Command
+from lcopa_bayes.bench.inversion import Compliance
+from lcopa_bayes.bench.superposition import superposed
+from lcopa_bayes.problems import InputError
+from lcopa_bayes.record import Axis
+from lcopa_bayes.stated import PAPER, StatedPath
+
+ACCURACY = 1e-9
+"""Error of a response [-], of the steady deflection per unit drive and per unit jump."""
+
+
+@final
+@dataclass(frozen=True)
+class TransferPath:
+    """``gain exp(-delay s) / (sum_i eta_i s^order_i + stiffness)`` (Ta et al. 2026, Eq. 31).
+
+    Raises InputError for a gain that is not finite, a delay that is negative or not finite, and as
+    `Compliance` does. A gain of 0 is a path that does nothing.
+    """
+
+    gain: float
+    """b [response unit per drive unit]; the steady deflection per unit of drive is ``gain / stiffness``."""
+    delay: float
+    """tau [ms]; not negative."""
+    etas: tuple[float, ...]
+    """Viscosities [ms^order], one per order."""
+    orders: tuple[float, ...]
+    """Fractional orders [-]; positive and distinct."""
+    stiffness: float
+    """k [-]; positive."""
+
+    def __post_init__(self) -> None:
+        problems = []
+        if not isfinite(self.gain):
+            problems.append(f"a gain must be finite; got {self.gain}")
+        if not 0 <= self.delay < inf:
+            problems.append(f"a delay must be at least 0 and finite; got {self.delay}")
+        try:
+            Compliance(self.etas, self.orders, self.stiffness)
+        except InputError as error:
+            problems.extend(error.problems)
+        if problems:
+            raise InputError(problems)
+
+    @cached_property
+    def compliance(self) -> Compliance:
+        """The path without gain and delay."""
+        return Compliance(self.etas, self.orders, self.stiffness)
+
+    @property
+    def steady(self) -> float:
+        """Deflection under a unit drive held for ever [response unit per drive unit]."""
+        return self.gain / self.stiffness
+
+    def step_response(self, time: ArrayLike) -> Array:
+        """Deflection [response unit per drive unit] at `time` [ms] after a unit step, in its shape."""
+        return self.gain * self.compliance.step_response(np.asarray(time, dtype=float) - self.delay)
+
+
+@final
+@dataclass(frozen=True)
+class Device:
+    """Responses that are sums over paths from all drives, each about a resting offset.
+
+    Raises InputError unless `paths` has one row per response axis and one column per drive axis and
+    there is one finite offset per response axis.
+    """
+
+    paths: tuple[tuple[TransferPath, ...], ...]
+    """``paths[i][j]`` leads from drive j to response i."""
+    drive_axes: tuple[Axis, ...]
+    response_axes: tuple[Axis, ...]
+    offsets: tuple[float, ...]
+    """Response without any drive [response unit], one per response axis."""
+    time_unit: str = "ms"
+    """Unit of delays, of viscosities and of every time given to this device."""
+
+    def __post_init__(self) -> None:
+        rows, columns = len(self.response_axes), len(self.drive_axes)
+        problems = []
+        if not (rows and columns and [len(row) for row in self.paths] == [columns] * rows):
+            problems.append(f"a device needs {rows} x {columns} paths, one per response and drive axis")
+        if len(self.offsets) != rows or not all(isfinite(offset) for offset in self.offsets):
+            problems.append(f"one finite offset per response axis is needed; got {self.offsets}")
+        if problems:
+            raise InputError(problems)
+
+    def response(self, command: Command, time: ArrayLike, *, exposure: float = 0.0) -> Matrix:
+        """Responses to `command` at `time` [ms], (n, n_responses) [response unit].
+
+        ``offset_i + sum_j steady_ij rest_j + sum_jc jump_jc step_ij(time - time_c)``: rest under the
+        command's resting drive, then one step response per change. With an `exposure` > 0 [ms] each
+        value is the mean over the exposure that ends at its time, taken exactly by the integral of the
+        step response. Accuracy: `ACCURACY`, plus rounding 1e-13 time/exposure when there is an exposure.
+        Raises InputError for a command with another number of axes or a negative exposure.
+        """
+        time = frozen(time, name="time")
+        problems = []
+        if command.rest.size != len(self.drive_axes):
+            problems.append(
+                f"the device has {len(self.drive_axes)} drive axes; the command {command.rest.size}"
+            )
+        if not 0 <= exposure < inf:
+            problems.append(f"an exposure must be at least 0 and finite; got {exposure}")
+        if problems:
+            raise InputError(problems)
+        out = np.tile(np.array(self.offsets), (time.size, 1))
+        jumps = command.jumps
+        for i, row in enumerate(self.paths):
+            for j, path in enumerate(row):
+                out[:, i] += path.steady * command.rest[j]
+                moved = jumps[:, j] != 0
+                if path.gain == 0 or not moved.any():
+                    continue
+                changes, sizes = command.times[moved] + path.delay, path.gain * jumps[moved, j]
+                compliance, tolerance = path.compliance, ACCURACY / path.stiffness
+                if exposure == 0:
+                    out[:, i] += superposed(
+                        compliance.step_response, time, changes, sizes, tolerance=tolerance
+                    )
+                else:
+                    end, start = (
+                        superposed(
+                            compliance.ramp_response, edge, changes, sizes, tolerance=tolerance * exposure
+                        )
+                        for edge in (time, time - exposure)
+                    )
+                    out[:, i] += (end - start) / exposure
+        return out
+
+
+def _stated(path: StatedPath) -> TransferPath:
+    return TransferPath(path.gain, path.delay, path.etas, path.orders, path.stiffness)
+
+
+_PLANT = PAPER.plant
+PAPER_DEVICE = Device(
+    paths=((_stated(_PLANT.xx), _stated(_PLANT.xy)), (_stated(_PLANT.yx), _stated(_PLANT.yy))),
+    drive_axes=(Axis("x", "rad"), Axis("y", "rad")),
+    response_axes=(Axis("x", "rad"), Axis("y", "rad")),
+    offsets=(0.0, 0.0),
+)
+"""The identified 2 x 2 model of Ta et al. 2026, Eq. 65."""

@@ -1,0 +1,64 @@
+"""Observed samples of a set of records, arranged for the likelihood."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.arrays import Index, Matrix, Vector
+from lcopa_bayes.record import Record
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """Samples of one response axis in one record."""
+
+    index: Index
+    """Position of each sample among the record's sample times."""
+    values: Vector
+    """[response unit]."""
+    gaps: Vector
+    """Time since the previous sample, in sampling periods; 1 for the first."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """All samples of one record."""
+
+    record: Record
+    times: Vector
+    """Times at which any axis was sampled [time unit]."""
+    axes: tuple[Observed, ...]
+    """One per response axis."""
+
+    @classmethod
+    def of(cls, record: Record, period: float) -> Samples:
+        """Samples of a record; gaps are counted in `period` [time unit]."""
+        taken = ~np.isnan(record.response)
+        rows = np.flatnonzero(taken.any(axis=1))
+        times = record.time[rows]
+        axes = []
+        for axis in range(record.response.shape[1]):
+            index = np.flatnonzero(taken[rows, axis])
+            at = times[index]
+            gaps = np.concatenate(([1.0], np.diff(at) / period))[: at.size]
+            axes.append(Observed(index, record.response[rows[index], axis], gaps))
+        return cls(record, times, tuple(axes))
+
+    def matrix(self) -> Matrix:
+        """Responses at `times`, (samples, axes), NaN where missing [response unit]."""
+        out = np.full((self.times.size, len(self.axes)), np.nan)
+        for axis, observed in enumerate(self.axes):
+            out[observed.index, axis] = observed.values
+        return out
+
+
+def sampling_period(records: Sequence[Record]) -> float:
+    """Median time between samples over the records [time unit]; the unit in which noise correlates."""
+    steps = [np.diff(record.time[~np.isnan(record.response).all(axis=1)]) for record in records]
+    return float(np.median(np.concatenate(steps)))

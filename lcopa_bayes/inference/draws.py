@@ -1,0 +1,98 @@
+"""Posterior draws with names, units, log densities and a grade."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.arrays import Array, Matrix, Vector
+from lcopa_bayes.estimate import Estimate
+from lcopa_bayes.inference.grade import Grade, Quality, overall, qualities
+from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.sampler import Run, sampled_qualities
+
+_MEASURED = 12_000
+"""Draws on which the convergence of the linear parameters is measured."""
+_PER_ENSEMBLE = 500
+"""Draws delivered per ensemble."""
+_CHUNK = 128
+"""Draws completed at a time."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """Draws of every row of the parameter table."""
+
+    table: ParameterTable
+    values: Array
+    """Canonical table values, (ensembles, draws, rows), each in its row's unit."""
+    log_density: Matrix
+    """Log posterior density of the sampled coordinates, (ensembles, draws) [nat]."""
+    qualities: tuple[Quality, ...]
+    """Of every free parameter, in table order."""
+    target_ess: float
+    """Effective sample size asked for [draws]."""
+
+    @cached_property
+    def grade(self) -> Grade:
+        """Grade of the whole run."""
+        return overall(self.qualities, self.target_ess)
+
+    @property
+    def flat(self) -> Matrix:
+        """All draws, (ensembles * draws, rows)."""
+        return self.values.reshape(-1, self.values.shape[-1])
+
+    @property
+    def ess(self) -> float:
+        """Smallest effective sample size [draws]."""
+        return min(quality.ess for quality in self.qualities)
+
+    def thinned(self, count: int) -> Matrix:
+        """About `count` draws spread evenly over all of them, (count, rows)."""
+        flat = self.flat
+        return flat[np.linspace(0, flat.shape[0] - 1, min(count, flat.shape[0])).astype(int)]
+
+    def column(self, name: str) -> Vector:
+        """All draws of one parameter."""
+        return self.flat[:, self.table.names.index(name)]
+
+    def estimates(self) -> tuple[Estimate, ...]:
+        """Median, interval and grade of every free parameter."""
+        return tuple(
+            Estimate.of(
+                quality.name,
+                self.table.rows[self.table.names.index(quality.name)].unit,
+                self.column(quality.name),
+                ess=quality.ess,
+                grade=quality.grade(self.target_ess).level,
+            )
+            for quality in self.qualities
+        )
+
+
+def gather(posterior: Posterior, run: Run) -> Draws:
+    """Draws of a run: the kept half, thinned evenly, with the linear parameters drawn exactly."""
+    coordinates, log_density = run.kept()
+    ensembles, walkers, count, _ = coordinates.shape
+    stride = max(1, -(-ensembles * walkers * count // _MEASURED))
+    coordinates, log_density = coordinates[:, :, ::-1][:, :, ::stride], log_density[:, :, ::-1][:, :, ::stride]
+    rng = np.random.default_rng(np.random.SeedSequence(run.plan.seed, spawn_key=(1_000,)))
+    flat = coordinates.reshape(-1, coordinates.shape[-1])
+    chunks = np.array_split(flat, max(1, flat.shape[0] // _CHUNK))
+    values = np.concatenate([posterior.complete(chunk, rng) for chunk in chunks])
+    values = values.reshape(*coordinates.shape[:3], -1)
+    found = {quality.name: quality for quality in sampled_qualities(posterior, run)}
+    if posterior.linear:
+        names = [posterior.table.names[k] for k in posterior.linear]
+        found |= {q.name: q for q in qualities(names, values[..., posterior.linear])}
+    ordered = tuple(found[name] for name in posterior.table.names if name in found)
+    by_draw = values.swapaxes(1, 2).reshape(ensembles, -1, values.shape[-1])
+    densities = log_density.swapaxes(1, 2).reshape(ensembles, -1)
+    picked = np.linspace(0, by_draw.shape[1] - 1, min(_PER_ENSEMBLE, by_draw.shape[1])).astype(int)
+    return Draws(posterior.table, by_draw[:, picked], densities[:, picked], ordered, run.plan.target_ess)

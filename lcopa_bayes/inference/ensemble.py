@@ -1,0 +1,85 @@
+"""One emcee ensemble as a value that can be advanced, stored and taken up again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, final
+
+import emcee
+import numpy as np
+
+from lcopa_bayes.arrays import Array, Matrix, Vector
+from lcopa_bayes.inference.posterior import Posterior
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Ensemble:
+    """Kept draws of one ensemble and all it needs to go on."""
+
+    chain: Array
+    """Sampled coordinates, (draws, walkers, dimension)."""
+    log_density: Matrix
+    """(draws, walkers)."""
+    position: Matrix
+    """Where the walkers stand, (walkers, dimension)."""
+    position_log_density: Vector
+    """(walkers,)."""
+    accepted: Vector
+    """Kept draws at which each walker had just moved: emcee counts moves only where it keeps a draw."""
+    steps: int
+    """Steps taken."""
+    random: tuple[Any, ...]
+    """State of the legacy generator that emcee draws from."""
+
+    @classmethod
+    def at(cls, posterior: Posterior, position: Matrix, seed: np.random.SeedSequence) -> Ensemble:
+        """A new ensemble; emcee needs a legacy generator, seeded here and nowhere else."""
+        walkers, dimension = position.shape
+        state = np.random.RandomState(np.random.MT19937(seed)).get_state()  # noqa: NPY002
+        return cls(
+            np.empty((0, walkers, dimension)),
+            np.empty((0, walkers)),
+            position,
+            posterior.log_density(position),
+            np.zeros(walkers),
+            0,
+            tuple(state),
+        )
+
+    @property
+    def acceptance(self) -> float:
+        """Share of accepted moves."""
+        return float(self.accepted.mean() / max(1, self.chain.shape[0]))
+
+
+def moves() -> list[tuple[emcee.moves.Move, float]]:
+    """Differential evolution along the ensemble's own differences, some of it long enough to change
+    hills, with snooker and stretch moves against degenerate directions."""
+    return [
+        (emcee.moves.DEMove(), 0.55),
+        (emcee.moves.DEMove(gamma0=1.0), 0.1),
+        (emcee.moves.DESnookerMove(), 0.1),
+        (emcee.moves.StretchMove(), 0.25),
+    ]
+
+
+def advance(posterior: Posterior, ensemble: Ensemble, draws: int, thin: int) -> Ensemble:
+    """The ensemble after ``draws * thin`` more steps, every `thin`-th of them kept.
+
+    Deterministic: the same ensemble advanced twice gives the same draws, in whatever process.
+    """
+    walkers, dimension = ensemble.position.shape
+    sampler = emcee.EnsembleSampler(walkers, dimension, posterior.log_density, moves=moves(), vectorize=True)
+    sampler.random_state = ensemble.random
+    state = emcee.State(ensemble.position, log_prob=ensemble.position_log_density)
+    last = sampler.run_mcmc(state, draws, thin_by=thin, skip_initial_state_check=True)
+    return Ensemble(
+        np.concatenate([ensemble.chain, sampler.get_chain()]),
+        np.concatenate([ensemble.log_density, sampler.get_log_prob()]),
+        np.array(last.coords),
+        np.array(last.log_prob),
+        ensemble.accepted + sampler.backend.accepted,
+        ensemble.steps + draws * thin,
+        tuple(sampler.random_state),
+    )

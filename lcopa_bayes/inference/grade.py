@@ -1,0 +1,108 @@
+"""How far draws can be trusted, in numbers and in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, final
+
+import numpy as np
+from arviz_stats.base import array_stats
+
+from lcopa_bayes.arrays import Array
+
+Level = Literal["reliable", "tentative", "unusable"]
+
+RELIABLE_RHAT = 1.02
+"""Nested R-hat of independent ensembles [-] (Margossian et al. 2024, Bayesian Analysis 19)."""
+TENTATIVE_RHAT = 1.1
+"""Above it the ensembles tell different stories."""
+TENTATIVE_ESS = 100.0
+"""Below it not even a mean is known well [draws]."""
+_RANK: dict[Level, int] = {"reliable": 0, "tentative": 1, "unusable": 2}
+
+
+@final
+@dataclass(frozen=True)
+class Quality:
+    """Convergence of one parameter's draws."""
+
+    name: str
+    ess_bulk: float
+    """Effective sample size for the centre of the distribution [draws]."""
+    ess_tail: float
+    """Effective sample size for the 5 and 95 % quantiles [draws]."""
+    rhat: float
+    """Nested rank R-hat between ensembles [-]."""
+
+    @property
+    def ess(self) -> float:
+        """The smaller of the two effective sample sizes [draws]."""
+        return min(self.ess_bulk, self.ess_tail)
+
+    def grade(self, target_ess: float) -> Grade:
+        """Grade of this parameter against a wanted effective sample size."""
+        if not (self.rhat <= TENTATIVE_RHAT and self.ess >= TENTATIVE_ESS):
+            level: Level = "unusable"
+        elif self.rhat <= RELIABLE_RHAT and self.ess >= target_ess:
+            level = "reliable"
+        else:
+            level = "tentative"
+        return Grade(level, f"{self.name}: R-hat {self.rhat:.3f}, effective sample size {self.ess:.0f}")
+
+
+@final
+@dataclass(frozen=True)
+class Grade:
+    """A grade with the reason for it."""
+
+    level: Level
+    reason: str
+
+    @staticmethod
+    def worst(grades: Sequence[Grade]) -> Grade:
+        """The lowest of several grades."""
+        return max(grades, key=lambda grade: _RANK[grade.level])
+
+
+def qualities(names: Sequence[str], values: Array) -> tuple[Quality, ...]:
+    """Quality of each parameter from draws (ensembles, walkers, draws, parameters).
+
+    A parameter that does not vary has no R-hat: its entries are NaN and it grades as unusable, so
+    leave fixed parameters out.
+    """
+    ensembles, walkers = values.shape[:2]
+    owner = np.repeat(np.arange(ensembles), walkers)
+    out = []
+    for k, name in enumerate(names):
+        chains = values[..., k].reshape(ensembles * walkers, -1)
+        out.append(
+            Quality(
+                name,
+                float(array_stats.ess(chains, method="bulk")),
+                float(array_stats.ess(chains, method="tail", prob=(0.05, 0.95))),
+                float(array_stats.rhat_nested(chains, owner)),
+            )
+        )
+    return tuple(out)
+
+
+def overall(found: Sequence[Quality], target_ess: float) -> Grade:
+    """Grade of a run: the worst parameter's, with the remedy when it is not reliable."""
+    worst = max(found, key=lambda quality: (_RANK[quality.grade(target_ess).level], -quality.ess))
+    grade = worst.grade(target_ess)
+    weak = [quality.name for quality in found if quality.grade(target_ess).level == grade.level]
+    if grade.level == "reliable":
+        return Grade(
+            "reliable",
+            f"independent ensembles agree (largest R-hat {max(q.rhat for q in found):.3f}) and the smallest "
+            f"effective sample size is {min(q.ess for q in found):.0f} ({worst.name})",
+        )
+    remedy = (
+        "the ensembles disagree: the posterior has several hills or a long ridge; sample more steps, "
+        "fix or narrow what the record cannot tell"
+        if worst.rhat > RELIABLE_RHAT
+        else "too few effective draws; sample more steps"
+    )
+    others = f" (also {', '.join(n for n in weak if n != worst.name)})" if len(weak) > 1 else ""
+    return Grade(grade.level, f"{grade.reason}{others}; {remedy}")

@@ -1,0 +1,342 @@
+"""The parameter table: every number of the model with its name, unit, prior and transform."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from math import inf, lgamma, log
+from typing import NamedTuple, final
+
+import numpy as np
+
+from lcopa_bayes.arrays import Array, Flags, Index, Matrix, Vector
+from lcopa_bayes.inference.defaults import Scales
+from lcopa_bayes.inference.noise import NOISES
+from lcopa_bayes.inference.priors import Prior
+from lcopa_bayes.plant.forward import Dynamics
+from lcopa_bayes.plant.layout import Layout
+from lcopa_bayes.problems import InputError, nearest
+from lcopa_bayes.settings import ModelSettings, PriorSettings
+
+_DOMAIN = {
+    "gain": (-inf, inf),
+    "time": (0.0, inf),
+    "order": (0.0, 2.0),
+    "delay": (0.0, inf),
+    "offset": (-inf, inf),
+    "sigma": (0.0, inf),
+    "rho": (0.0, 1.0),
+    "nu": (0.0, inf),
+}
+"""Where each kind of parameter must lie."""
+_LOG_KINDS = frozenset({"time", "sigma", "nu"})
+"""Kinds sampled by their logarithm."""
+_ORDERED_DRAWS = 200_000
+"""Prior draws that measure how much mass an unexchangeable prior puts on decreasing orders."""
+
+
+class Place(NamedTuple):
+    """Where a parameter enters: (response, drive) for gains, (element, term) for times and orders,
+    (slot, 0) for delays, (response, record or -1 for all) for offsets, (response, 0) for noise."""
+
+    first: int
+    second: int
+
+
+@final
+@dataclass(frozen=True)
+class Parameter:
+    """One number of the model."""
+
+    name: str
+    unit: str
+    kind: str
+    place: Place
+    prior: Prior | None
+    """None when fixed."""
+    value: float = np.nan
+    """Fixed value, in `unit`."""
+    default: bool = True
+    """Whether the prior is the default one."""
+
+    @property
+    def free(self) -> bool:
+        """Whether the parameter is inferred."""
+        return self.prior is not None
+
+    @property
+    def log_scale(self) -> bool:
+        """Whether it is sampled by its logarithm."""
+        return self.kind in _LOG_KINDS or (self.prior is not None and self.prior.dist == "loguniform")
+
+    @property
+    def logit_scale(self) -> bool:
+        """Whether it is sampled by its logit: near 1 a noise correlation and the logarithm of the noise
+        scale then trade off along a straight line."""
+        return self.kind == "rho"
+
+    @property
+    def domain(self) -> tuple[float, float]:
+        """Interval on which the posterior can be positive: the prior's support within the kind's."""
+        low, high = _DOMAIN[self.kind]
+        support = (low, high) if self.prior is None else self.prior.support
+        return max(low, support[0]), min(high, support[1])
+
+    def log_prior(self, x: Vector) -> Vector:
+        """Log density of the prior, restricted to the domain and normalised there."""
+        assert self.prior is not None
+        density = self.prior.log_density(x)
+        low, high = _DOMAIN[self.kind]
+        if self.prior.support[0] >= low and self.prior.support[1] <= high:
+            return density
+        return np.where((x > low) & (x <= high), density - self._log_mass, -np.inf)
+
+    @cached_property
+    def _log_mass(self) -> float:
+        assert self.prior is not None
+        return log(_mass(self.prior, self.kind))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class ParameterTable:
+    """All parameters of a posterior; arrays of values have one column per row of the table."""
+
+    layout: Layout
+    rows: tuple[Parameter, ...]
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names, in table order."""
+        return tuple(row.name for row in self.rows)
+
+    def of_kind(self, kind: str) -> list[int]:
+        """Positions of the parameters of a kind."""
+        return [k for k, row in enumerate(self.rows) if row.kind == kind]
+
+    def at(self, kind: str, first: int, second: int = 0) -> int:
+        """Position of the parameter of a kind at a place."""
+        return self._positions[kind, first, second]
+
+    @cached_property
+    def _positions(self) -> dict[tuple[str, int, int], int]:
+        return {(row.kind, *row.place): k for k, row in enumerate(self.rows)}
+
+    @cached_property
+    def _columns(self) -> list[tuple[list[int], list[int]]]:
+        """Columns of times and orders of each element."""
+        return [
+            (
+                [self.at("time", e, k) for k in range(slot.terms)],
+                [self.at("order", e, k) for k in range(slot.terms)],
+            )
+            for e, slot in enumerate(self.layout.elements)
+        ]
+
+    @cached_property
+    def exchangeable(self) -> tuple[bool, ...]:
+        """Per element: whether its terms have equal priors, so that they are sampled in any order."""
+        out = []
+        for times, orders in self._columns:
+            priors = [(self.rows[t].prior, self.rows[o].prior) for t, o in zip(times, orders, strict=True)]
+            free = all(t is not None and o is not None for t, o in priors)
+            alike = all(str(pair) == str(priors[0]) and pair == priors[0] for pair in priors)
+            out.append(len(priors) > 1 and free and alike)
+        return tuple(out)
+
+    @cached_property
+    def log_ordering(self) -> float:
+        """Log of 1 / (prior mass on decreasing orders), summed over elements."""
+        total = 0.0
+        for (_, orders), exchangeable in zip(self._columns, self.exchangeable, strict=True):
+            if exchangeable:
+                total += lgamma(len(orders) + 1)
+            elif len(orders) > 1:
+                total -= log(self._ordered_share(orders))
+        return total
+
+    @cached_property
+    def log_permutations(self) -> float:
+        """Log of the number of term orders in which the same plant is sampled."""
+        terms = (slot.terms for slot in self.layout.elements)
+        return sum(lgamma(n + 1) for n, same in zip(terms, self.exchangeable, strict=True) if same)
+
+    def _ordered_share(self, orders: list[int]) -> float:
+        rng = np.random.default_rng(0)
+        drawn = [_draw(self.rows[k], _ORDERED_DRAWS, rng) for k in orders]
+        share = float(np.mean(np.all(np.diff(drawn, axis=0) < 0, axis=0)))
+        if share == 0.0:
+            names = ", ".join(self.rows[k].name for k in orders)
+            raise InputError(
+                f"[priors] {names}: the priors have no mass where the orders decrease "
+                f"({' > '.join(self.rows[k].name for k in orders)}); let them overlap or swap them"
+            )
+        return share
+
+    def canonical(self, values: Matrix) -> Matrix:
+        """The same plants with the terms of exchangeable elements by decreasing order."""
+        return self.sorted_with_source(values)[0] if any(self.exchangeable) else values
+
+    def sorted_with_source(self, values: Matrix) -> tuple[Matrix, Index]:
+        """Canonical values, and where each given value went: ``canonical[b, source[b, k]] = values[b, k]``."""
+        out = values.copy()
+        source = np.tile(np.arange(len(self.rows)), (values.shape[0], 1))
+        for (times, orders), exchangeable in zip(self._columns, self.exchangeable, strict=True):
+            if not exchangeable:
+                continue
+            rank = np.argsort(-values[:, orders], axis=1, kind="stable")
+            back = np.argsort(rank, axis=1)
+            for columns in (times, orders):
+                out[:, columns] = np.take_along_axis(values[:, columns], rank, axis=1)
+                source[:, columns] = np.array(columns)[back]
+        return out, source
+
+    def dynamics(self, values: Matrix) -> Dynamics:
+        """What the forward model needs, from canonical values (batch, rows)."""
+        delays = [self.at("delay", k) for k in range(len(self.layout.delays))]
+        return Dynamics(
+            tuple(values[:, times] for times, _ in self._columns),
+            tuple(values[:, orders] for _, orders in self._columns),
+            values[:, delays],
+        )
+
+    def gains(self, values: Matrix) -> Array:
+        """Gains, (batch, responses, drives) [response unit per drive unit]."""
+        shape = (len(self.layout.responses), len(self.layout.drives))
+        return values[:, self.of_kind("gain")].reshape(-1, *shape)
+
+    def offset(self, values: Matrix, response: int, record: int) -> Vector:
+        """Offset of a response axis on a fit record, (batch,) [response unit]; 0 when the model has none."""
+        for second in (-1, record):
+            if ("offset", response, second) in self._positions:
+                return values[:, self.at("offset", response, second)]
+        return np.zeros(values.shape[0])
+
+    def ordered(self, values: Matrix) -> Flags:
+        """Whether the orders of every element decrease, (batch,)."""
+        out = np.ones(values.shape[0], dtype=bool)
+        for _, orders in self._columns:
+            out &= np.all(np.diff(values[:, orders], axis=1) <= 0, axis=1)
+        return out
+
+    def draw(self, size: int, rng: np.random.Generator) -> Matrix:
+        """Canonical values from the prior, (size, rows)."""
+        out = np.empty((0, len(self.rows)))
+        while out.shape[0] < size:
+            values = np.stack([_draw(row, size, rng) for row in self.rows], axis=1)
+            values = self.canonical(values)
+            out = np.concatenate([out, values[self.ordered(values)]])
+        return out[:size]
+
+
+def parameter_table(
+    layout: Layout,
+    scales: Scales,
+    records: Sequence[str],
+    *,
+    time_unit: str,
+    model: ModelSettings,
+    noise: str,
+    priors: Mapping[str, PriorSettings],
+) -> ParameterTable:
+    """Table of a study; InputError when a prior names no parameter or has no mass in its domain."""
+    rows: list[Parameter] = []
+
+    def add(kind: str, place: tuple[int, int], suffix: str, unit: str, prior: Prior) -> None:
+        name = f"{kind}_{suffix}" if suffix else kind
+        rows.append(Parameter(name, unit, kind, Place(*place), prior))
+
+    for i, response in enumerate(layout.responses):
+        for j, drive in enumerate(layout.drives):
+            unit = f"{response.unit}/{drive.unit}"
+            add("gain", (i, j), layout.path_name(i, j), unit, scales.gain(i, j))
+    for e, slot in enumerate(layout.elements):
+        for k in range(slot.terms):
+            suffix = f"{k + 1}_{slot.name}" if slot.name else f"{k + 1}"
+            add("time", (e, k), suffix, time_unit, scales.time())
+            add("order", (e, k), suffix, "-", scales.order())
+    for d, name in enumerate(layout.delays):
+        add("delay", (d, 0), name, time_unit, scales.delay())
+    for i, response in enumerate(layout.responses):
+        axis = layout.response_name(i)
+        if model.offset == "record":
+            for r, record in enumerate(records):
+                suffix = "_".join(filter(None, (axis, record if len(records) > 1 else "")))
+                add("offset", (i, r), suffix, response.unit, scales.offset(i))
+        elif model.offset == "shared":
+            add("offset", (i, -1), axis, response.unit, scales.offset(i))
+    for i, response in enumerate(layout.responses):
+        for name in NOISES[noise].names:
+            prior = scales.sigma(i) if name == "sigma" else scales.rho() if name == "rho" else scales.nu()
+            add(name, (i, 0), layout.response_name(i), response.unit if name == "sigma" else "-", prior)
+    rows = _fix_orders(rows, layout, model)
+    return ParameterTable(layout, tuple(_with_priors(rows, priors)))
+
+
+def _fix_orders(rows: list[Parameter], layout: Layout, model: ModelSettings) -> list[Parameter]:
+    """Orders given by the study are fixed."""
+    if model.orders == "free":
+        return rows
+    if any(slot.terms != len(model.orders) for slot in layout.elements):
+        raise InputError(
+            f"[model] orders = {list(model.orders)} gives {len(model.orders)} order(s), but the elements "
+            f"have {', '.join(str(slot.terms) for slot in layout.elements)} term(s); give one order per term"
+        )
+    return [
+        Parameter(row.name, row.unit, row.kind, row.place, None, float(model.orders[row.place.second]))
+        if row.kind == "order"
+        else row
+        for row in rows
+    ]
+
+
+def _with_priors(rows: list[Parameter], priors: Mapping[str, PriorSettings]) -> list[Parameter]:
+    """The study's priors and fixed values in place of the defaults."""
+    names = {row.name for row in rows}
+    problems = [
+        f"[priors] {key}: this model has no such parameter{nearest(key, names)}"
+        for key in priors
+        if key not in names
+    ]
+    out = []
+    for row in rows:
+        setting = priors.get(row.name)
+        if setting is None:
+            out.append(row)
+            continue
+        low, high = _DOMAIN[row.kind]
+        if setting.fixed is not None:
+            if not (low < setting.fixed <= high or (row.kind in ("delay", "rho") and setting.fixed == 0)):
+                problems.append(f"[priors] {row.name} = {setting.fixed:g}: must lie in ({low:g}, {high:g}]")
+            out.append(Parameter(row.name, row.unit, row.kind, row.place, None, setting.fixed, default=False))
+            continue
+        assert setting.dist is not None
+        prior = Prior(setting.dist, setting.parameters)
+        if _mass(prior, row.kind) <= 0:
+            problems.append(
+                f"[priors] {row.name}: {prior} has no mass in ({low:g}, {high:g}], where this parameter "
+                "must lie; shift or widen it"
+            )
+        out.append(Parameter(row.name, row.unit, row.kind, row.place, prior, default=False))
+    if problems:
+        raise InputError(problems)
+    return out
+
+
+def _mass(prior: Prior, kind: str) -> float:
+    """Prior mass inside the domain of a kind."""
+    low, high = _DOMAIN[kind]
+    return float(prior.frozen.cdf(high) - prior.frozen.cdf(low))
+
+
+def _draw(row: Parameter, size: int, rng: np.random.Generator) -> Vector:
+    """Draws of one parameter from its prior within its domain."""
+    if row.prior is None:
+        return np.full(size, row.value)
+    low, high = _DOMAIN[row.kind]
+    out = np.empty(0)
+    while out.size < size:
+        drawn = row.prior.draw(2 * size, rng)
+        out = np.concatenate([out, drawn[(drawn > low) & (drawn <= high)]])
+    return out[:size]

@@ -1,0 +1,240 @@
+"""The posterior: prior and likelihood of the parameter table given the fit records."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import final
+
+import numpy as np
+from scipy.special import expit, log_expit, logit
+
+from lcopa_bayes.arrays import Array, Flags, Matrix, Vector
+from lcopa_bayes.inference.data import Observed, Samples
+from lcopa_bayes.inference.linear import NormalEquations
+from lcopa_bayes.inference.noise import GaussianNoise, Noise
+from lcopa_bayes.inference.parameters import Parameter, ParameterTable
+from lcopa_bayes.plant.forward import ForwardModel
+
+_LOG_2PI = float(np.log(2 * np.pi))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Log density of the sampled coordinates, a batch at a time.
+
+    Gains and offsets with normal priors enter linearly: under Gaussian noise they are integrated out
+    exactly and drawn afterwards (`complete`). The remaining free parameters are sampled, some by
+    their logarithm (`Parameter.log_scale`).
+    """
+
+    table: ParameterTable
+    model: ForwardModel
+    samples: tuple[Samples, ...]
+    noise: Noise
+
+    @cached_property
+    def linear(self) -> tuple[int, ...]:
+        """Table positions of the parameters that are integrated out."""
+        if not isinstance(self.noise, GaussianNoise):
+            return ()
+        return tuple(k for k, row in enumerate(self.table.rows) if _is_linear(row))
+
+    @cached_property
+    def sampled(self) -> tuple[int, ...]:
+        """Table positions of the sampled coordinates."""
+        return tuple(k for k, row in enumerate(self.table.rows) if row.free and k not in self.linear)
+
+    @property
+    def dimension(self) -> int:
+        """Number of sampled coordinates."""
+        return len(self.sampled)
+
+    @property
+    def size(self) -> int:
+        """Number of observed samples."""
+        return sum(axis.values.size for samples in self.samples for axis in samples.axes)
+
+    @cached_property
+    def _logs(self) -> Flags:
+        return np.array([self.table.rows[k].log_scale for k in self.sampled], dtype=bool)
+
+    @cached_property
+    def _logits(self) -> Flags:
+        return np.array([self.table.rows[k].logit_scale for k in self.sampled], dtype=bool)
+
+    @cached_property
+    def _template(self) -> Vector:
+        """Fixed values; NaN for what is free."""
+        return np.array([row.value for row in self.table.rows])
+
+    def values(self, coordinates: Matrix) -> Matrix:
+        """Canonical table values, (batch, rows), NaN where integrated out."""
+        values = np.tile(self._template, (coordinates.shape[0], 1))
+        natural = coordinates.copy()
+        natural[:, self._logs] = np.exp(coordinates[:, self._logs])
+        natural[:, self._logits] = expit(coordinates[:, self._logits])
+        values[:, self.sampled] = natural
+        return self.table.canonical(values)
+
+    def coordinates(self, values: Matrix) -> Matrix:
+        """Sampled coordinates of table values, (batch, dimension)."""
+        out = values[:, self.sampled]
+        out[:, self._logs] = np.log(out[:, self._logs])
+        out[:, self._logits] = logit(out[:, self._logits])
+        return out
+
+    def log_prior(self, coordinates: Matrix) -> Vector:
+        """Log prior density of the sampled coordinates, (batch,); the only source of -inf."""
+        values = self.values(coordinates)
+        total = np.where(self.table.ordered(values), self._log_order_level, -np.inf)
+        for k in self.sampled:
+            total = total + self.table.rows[k].log_prior(values[:, k])
+        steep = coordinates[:, self._logits]
+        jacobian = coordinates[:, self._logs].sum(axis=1) + (log_expit(steep) + log_expit(-steep)).sum(axis=1)
+        return total + jacobian
+
+    @cached_property
+    def _log_order_level(self) -> float:
+        # sampled unordered, an exchangeable element covers each ordered point in every permutation
+        return self.table.log_ordering - self.table.log_permutations
+
+    def log_density(self, coordinates: Matrix) -> Vector:
+        """Log of prior times likelihood, (batch,); FloatingPointError with the values where NaN."""
+        total = self.log_prior(coordinates)
+        inside = np.flatnonzero(total > -np.inf)
+        if inside.size:
+            values = self.values(coordinates[inside])
+            total[inside] += self.log_likelihood(values)
+            if np.isnan(total).any():
+                row = values[np.flatnonzero(np.isnan(total[inside]))[0]]
+                at = ", ".join(f"{n} = {v:.6g}" for n, v in zip(self.table.names, row, strict=True))
+                raise FloatingPointError(f"the log density is NaN at {at}")
+        return total
+
+    def log_likelihood(self, values: Matrix) -> Vector:
+        """Log likelihood of canonical values, linear parameters integrated out, (batch,)."""
+        units = self.model.unit_responses(self.table.dynamics(values))
+        total = np.zeros(values.shape[0])
+        for axis in range(len(self.table.layout.responses)):
+            if isinstance(self.noise, GaussianNoise):
+                equations, log_scale, count = self._equations(axis, values, units)
+                total += equations.log_marginal() - log_scale - 0.5 * count * _LOG_2PI
+            else:
+                for r, samples in enumerate(self.samples):
+                    residual = self.residual(axis, r, samples.axes[axis], values, units[r])
+                    noise = self.noise_parameters(values, axis)
+                    total += self.noise.pointwise(residual, noise, samples.axes[axis].gaps).sum(axis=1)
+        return total
+
+    def noise_parameters(self, values: Matrix, axis: int) -> Matrix:
+        """Noise parameters of a response axis, (batch, names)."""
+        return values[:, [self.table.at(name, axis) for name in self.noise.names]]
+
+    def complete(self, coordinates: Matrix, rng: np.random.Generator | None) -> Matrix:
+        """Canonical table values with the linear parameters drawn from their exact conditional.
+
+        With `rng` None they are set to their conditional mean.
+        """
+        values = self.values(coordinates)
+        if not self.linear:
+            return values
+        units = self.model.unit_responses(self.table.dynamics(values))
+        for axis in range(len(self.table.layout.responses)):
+            equations, _, _ = self._equations(axis, values, units)
+            block = self._blocks[axis]
+            standard = equations.mean() if rng is None else equations.draw(rng)
+            mean, sd = self._moments(block)
+            values[:, block] = mean + sd * standard
+        return values
+
+    def pointwise(self, values: Matrix) -> list[list[Matrix]]:
+        """Log likelihood of each sample given those before it, [record][axis] (batch, n)."""
+        units = self.model.unit_responses(self.table.dynamics(values))
+        return [
+            [
+                self.noise.pointwise(
+                    self.residual(axis, r, observed, values, units[r]),
+                    self.noise_parameters(values, axis),
+                    observed.gaps,
+                )
+                for axis, observed in enumerate(samples.axes)
+            ]
+            for r, samples in enumerate(self.samples)
+        ]
+
+    @cached_property
+    def _blocks(self) -> list[list[int]]:
+        """Linear parameters of each response axis."""
+        axes = range(len(self.table.layout.responses))
+        return [[k for k in self.linear if self.table.rows[k].place.first == axis] for axis in axes]
+
+    def _moments(self, block: Sequence[int]) -> tuple[Vector, Vector]:
+        """Prior means and standard deviations of linear parameters."""
+        priors = [self.table.rows[k].prior for k in block]
+        frozen = [prior.frozen for prior in priors if prior is not None]
+        return np.array([p.mean() for p in frozen]), np.array([p.std() for p in frozen])
+
+    @cached_property
+    def _scaled(self) -> list[tuple[Vector, Vector]]:
+        return [self._moments(block) for block in self._blocks]
+
+    def _equations(
+        self, axis: int, values: Matrix, units: list[Array]
+    ) -> tuple[NormalEquations, Vector, int]:
+        """Normal equations of a response axis, sum of log innovation sd, and number of samples."""
+        assert isinstance(self.noise, GaussianNoise)
+        batch, block = values.shape[0], self._blocks[axis]
+        mean, sd = self._scaled[axis]
+        equations = NormalEquations.of_columns(batch, len(block))
+        parameters = self.noise_parameters(values, axis)
+        log_scale, count = np.zeros(batch), 0
+        centre = values.copy()
+        centre[:, block] = mean
+        for r, samples in enumerate(self.samples):
+            observed = samples.axes[axis]
+            if observed.values.size == 0:
+                continue
+            columns, place = [], []
+            for p, k in enumerate(block):
+                column = self.column(k, axis, r, observed, units[r])
+                if column is not None:
+                    columns.append(sd[p] * np.broadcast_to(column, (batch, observed.values.size)))
+                    place.append(p)
+            columns.append(self.residual(axis, r, observed, centre, units[r]))
+            white, scale = self.noise.whiten(np.stack(columns, axis=1), parameters, observed.gaps)
+            equations.add(white[:, :-1], white[:, -1], place)
+            log_scale += scale
+            count += observed.values.size
+        return equations, log_scale, count
+
+    def column(self, k: int, axis: int, r: int, observed: Observed, units: Array) -> Array | None:
+        """What a unit of a linear parameter adds to a record; None where it does not act."""
+        row = self.table.rows[k]
+        if row.kind == "offset":
+            return np.ones((1, observed.values.size)) if row.place.second in (-1, r) else None
+        drive = row.place.second
+        unit = units[self.table.layout.unit_of[axis][drive]]
+        return self.model.experiments[r].rest[drive] + unit[:, observed.index]
+
+    def residual(self, axis: int, r: int, observed: Observed, values: Matrix, units: Array) -> Matrix:
+        """Observed minus modelled, (batch, n) [response unit]."""
+        out = np.tile(observed.values, (values.shape[0], 1))
+        for k in self.acting[axis]:
+            column = self.column(k, axis, r, observed, units)
+            if column is not None:
+                out -= values[:, k, None] * column
+        return out
+
+    @cached_property
+    def acting(self) -> list[list[int]]:
+        """Gains and offsets of each response axis."""
+        acting = self.table.of_kind("gain") + self.table.of_kind("offset")
+        axes = range(len(self.table.layout.responses))
+        return [[k for k in acting if self.table.rows[k].place.first == axis] for axis in axes]
+
+
+def _is_linear(row: Parameter) -> bool:
+    return row.kind in ("gain", "offset") and row.prior is not None and row.prior.dist == "norm"

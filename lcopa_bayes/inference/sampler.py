@@ -1,0 +1,180 @@
+"""Independent ensembles, advanced in rounds until they agree or the budget is spent."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import final
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+from tqdm import tqdm
+
+from lcopa_bayes.arrays import Array
+from lcopa_bayes.inference.chainfile import load_chain, save_chain
+from lcopa_bayes.inference.ensemble import Ensemble, advance
+from lcopa_bayes.inference.grade import RELIABLE_RHAT, Quality, qualities
+from lcopa_bayes.inference.optimum import find_optima
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.start import dispersed_start
+
+_ROUND = 50
+"""Draws kept per round and walker."""
+_THIN = 10
+"""Steps per kept draw unless the study says otherwise."""
+
+
+@final
+@dataclass(frozen=True)
+class SamplePlan:
+    """How long and how wide to sample."""
+
+    ensembles: int
+    """Independent ensembles [-]."""
+    walkers: int
+    """Walkers per ensemble [-]."""
+    steps: int
+    """Most steps per ensemble [-]."""
+    thin: int
+    """Steps per kept draw [-]."""
+    target_ess: float
+    """Effective sample size that ends sampling [draws]."""
+    seed: int
+    """Root of all randomness of the run."""
+
+    @classmethod
+    def of(
+        cls,
+        dimension: int,
+        *,
+        seed: int,
+        ensembles: int = 4,
+        walkers: int | None = None,
+        steps: int | None = None,
+        thin: int | None = None,
+        target_ess: float = 400,
+    ) -> SamplePlan:
+        """A plan with what is left open chosen from the number of sampled parameters."""
+        least = 2 * dimension + 2
+        return cls(
+            ensembles,
+            max(least + least % 2, walkers or max(64, 4 * dimension)),
+            steps or 3000 + 1000 * dimension,
+            thin or _THIN,
+            target_ess,
+            seed,
+        )
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What sampling gave."""
+
+    ensembles: tuple[Ensemble, ...]
+    plan: SamplePlan
+
+    def kept(self) -> tuple[Array, Array]:
+        """The last half of every ensemble: coordinates (ensembles, walkers, draws, dimension), log density."""
+        chain = np.stack([ensemble.chain for ensemble in self.ensembles])
+        log_density = np.stack([ensemble.log_density for ensemble in self.ensembles])
+        first = chain.shape[1] // 2
+        return chain[:, first:].swapaxes(1, 2), log_density[:, first:].swapaxes(1, 2)
+
+
+def sample(
+    posterior: Posterior,
+    plan: SamplePlan,
+    *,
+    jobs: int = 1,
+    chain_file: Path | None = None,
+    fingerprint: str = "",
+    resume: bool = False,
+    quiet: bool = True,
+) -> Run:
+    """Sample a posterior: multi-start least squares, then rounds of independent ensembles.
+
+    The draws depend on posterior and plan alone, not on `jobs` nor on interruptions: with `resume`, a
+    run killed at any moment continues from the last complete round in `chain_file`.
+    """
+    stored = load_chain(chain_file, fingerprint) if resume and chain_file else ()
+    ensembles = stored or _begin(posterior, plan)
+    rounds = max(2, -(-plan.steps // (_ROUND * plan.thin)))
+    done = ensembles[0].steps // (_ROUND * plan.thin)
+    with (
+        _crew(posterior, min(jobs, plan.ensembles)) as go_on,
+        tqdm(total=rounds, initial=done, unit="round", disable=quiet, desc="sampling") as bar,
+    ):
+        while done < rounds and not (done >= 2 and finished(posterior, Run(ensembles, plan), bar)):
+            ensembles = tuple(go_on(ensembles, plan.thin))
+            done += 1
+            if chain_file:
+                save_chain(chain_file, ensembles, fingerprint)
+            bar.update()
+    return Run(ensembles, plan)
+
+
+def finished(posterior: Posterior, run: Run, bar: tqdm[object] | None = None) -> bool:
+    """Whether every sampled parameter agrees between ensembles and has its effective sample size."""
+    found = sampled_qualities(posterior, run)
+    ess, rhat = min(q.ess for q in found), max(q.rhat for q in found)
+    if bar is not None:
+        acceptance = np.mean([ensemble.acceptance for ensemble in run.ensembles])
+        bar.set_postfix(acceptance=f"{acceptance:.2f}", ess=f"{ess:.0f}", rhat=f"{rhat:.3f}")
+    return ess >= run.plan.target_ess and rhat <= RELIABLE_RHAT
+
+
+def sampled_qualities(posterior: Posterior, run: Run) -> tuple[Quality, ...]:
+    """Quality of the sampled parameters over the kept half of a run."""
+    coordinates, _ = run.kept()
+    shape = coordinates.shape
+    values = posterior.values(coordinates.reshape(-1, shape[-1]))[:, posterior.sampled]
+    names = [posterior.table.names[k] for k in posterior.sampled]
+    return qualities(names, values.reshape(*shape[:3], -1))
+
+
+def _begin(posterior: Posterior, plan: SamplePlan) -> tuple[Ensemble, ...]:
+    """New ensembles around the least-squares optima."""
+    search, *children = np.random.SeedSequence(plan.seed).spawn(1 + plan.ensembles)
+    optima = find_optima(posterior, np.random.default_rng(search))
+    out = []
+    for child in children:
+        place, walk = child.spawn(2)
+        position = dispersed_start(posterior, optima, plan.walkers, np.random.default_rng(place))
+        out.append(Ensemble.at(posterior, position, walk))
+    return tuple(out)
+
+
+_GoOn = Callable[[Sequence[Ensemble], int], Iterator[Ensemble]]
+
+
+@contextmanager
+def _crew(posterior: Posterior, jobs: int) -> Iterator[_GoOn]:
+    """A function that advances ensembles by one round, in this process or in `jobs` others."""
+    if jobs <= 1:
+        with threadpool_limits(1):
+            yield lambda ensembles, thin: (advance(posterior, e, _ROUND, thin) for e in ensembles)
+        return
+    with ProcessPoolExecutor(
+        jobs, mp_context=get_context("spawn"), initializer=_take_up, initargs=(posterior,)
+    ) as pool:
+        yield lambda ensembles, thin: pool.map(_round, ensembles, [thin] * len(ensembles))
+
+
+_posterior: Posterior | None = None
+"""The posterior a worker process samples; set once when the process starts."""
+
+
+def _take_up(posterior: Posterior) -> None:
+    global _posterior
+    threadpool_limits(1)
+    _posterior = posterior
+
+
+def _round(ensemble: Ensemble, thin: int) -> Ensemble:
+    assert _posterior is not None
+    return advance(_posterior, ensemble, _ROUND, thin)

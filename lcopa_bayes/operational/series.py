@@ -1,0 +1,54 @@
+"""Power-series algebra on a circle: what triangular Toeplitz matrices do, at the cost of a few FFTs.
+
+A lower triangular Toeplitz matrix acts on block means as multiplication by the power series of its
+first column. Sampled at roots of unity on a circle of radius r < 1 a product is a product and a
+quotient a quotient. Wrapping around brings in ``r^length`` of later coefficients; undoing the scale
+amplifies rounding by ``r^-n``. With twice the length both stay near 1e-11.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from lcopa_bayes.arrays import Array, Vector
+
+Spectrum = NDArray[np.complex128]
+"""Values of power series on the circle, (..., length // 2 + 1)."""
+
+_WRAP = 1e-11
+"""r^length: weight of the coefficients that wrap around."""
+
+
+@final
+@dataclass(frozen=True)
+class Circle:
+    """Evaluation points for series of `n` coefficients."""
+
+    n: int
+
+    @cached_property
+    def length(self) -> int:
+        """Number of points on the circle."""
+        return fft.next_fast_len(2 * self.n, real=True)
+
+    @cached_property
+    def _decay(self) -> Vector:
+        return np.exp(np.log(_WRAP) / self.length * np.arange(self.n))
+
+    @cached_property
+    def _growth(self) -> Vector:
+        return 1.0 / self._decay
+
+    def spectrum(self, coefficients: Array) -> Spectrum:
+        """Values on the circle of the series with these coefficients, (..., n)."""
+        return fft.rfft(coefficients * self._decay, self.length)  # type: ignore[no-any-return]
+
+    def coefficients(self, spectrum: Spectrum) -> Array:
+        """The first n coefficients, (..., n)."""
+        return fft.irfft(spectrum, self.length)[..., : self.n] * self._growth  # type: ignore[no-any-return]

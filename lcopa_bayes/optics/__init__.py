@@ -1,0 +1,1 @@
+"""Static optics of a liquid-crystal phased array: far field, director and the chain from volts to angle."""

@@ -1,0 +1,124 @@
+"""Linear and planar arrays of phase elements and the law that steers them (Ta et al. 2026, Eqs. 5, 13)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import isfinite, pi
+from typing import final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lcopa_bayes.arrays import Array
+from lcopa_bayes.problems import InputError
+from lcopa_bayes.stated import PAPER, StatedOptics
+
+from .checks import finite, unless_positive
+
+_ROUNDING = 4 * float(np.finfo(float).eps)
+"""A direction cosine beyond 1 by no more than this [-] is end-fire seen through rounding."""
+
+
+@final
+@dataclass(frozen=True)
+class LinearArray:
+    """Equally spaced elements in a row; InputError for an impossible array, all problems at once."""
+
+    elements: int
+    """N [-]; at least 2."""
+    pitch: float
+    """d, centre to centre [m]."""
+    wavelength: float
+    """lambda [m]."""
+    fill_factor: float = 0.0
+    """Width of an element over the pitch [-], in [0, 1]; 0 is a point, which radiates isotropically."""
+
+    def __post_init__(self) -> None:
+        problems: list[str] = []
+        if isinstance(self.elements, bool) or not isinstance(self.elements, int) or self.elements < 2:
+            problems.append(f"`elements` must be an integer >= 2; got {self.elements!r}: one steers nothing.")
+        problems += unless_positive("pitch", self.pitch, "metres")
+        problems += unless_positive("wavelength", self.wavelength, "metres")
+        if not (isfinite(self.fill_factor) and 0 <= self.fill_factor <= 1):
+            problems.append(f"`fill_factor` must be in [0, 1]; got {self.fill_factor!r}: 0 means points.")
+        if problems:
+            raise InputError(problems)
+
+    @property
+    def period(self) -> float:
+        """Distance between lobes in direction cosine, ``lambda / d`` [-]."""
+        return self.wavelength / self.pitch
+
+    def direction_cosine(self, step: ArrayLike) -> Array:
+        """``u = sin th_s = lambda dphi / (2 pi d)`` for phase steps [rad] (Ta et al. 2026, Eq. 5).
+
+        Returns: [-], shape of `step`. Raises InputError where ``|u| > 1``: no such wave propagates.
+        """
+        return _propagating(self.period * finite(step, name="step", unit="rad") / (2 * pi))
+
+    def steering_angle(self, step: ArrayLike) -> Array:
+        """Angle th_s [rad] of the main lobe for phase steps [rad] between neighbours, exact Eq. 5.
+
+        Shape of `step`. Raises InputError for a phase step that steers beyond end-fire.
+        """
+        return np.asarray(np.arcsin(self.direction_cosine(step)))
+
+    def phase_step(self, angle: ArrayLike) -> Array:
+        """Phase step dphi [rad] that steers to `angle` [rad], ``2 pi d sin(th_s) / lambda`` (Eq. 5).
+
+        Shape of `angle`. Not reduced modulo 2 pi. Raises InputError outside [-pi/2, pi/2].
+        """
+        theta = finite(angle, name="angle", lower=-pi / 2, upper=pi / 2, unit="rad")
+        return np.asarray(2 * pi * np.sin(theta) / self.period)
+
+
+@final
+@dataclass(frozen=True)
+class PlanarArray:
+    """Two crossed linear arrays of one wavelength, ``x.elements * y.elements`` elements (Eqs. 6-13)."""
+
+    x: LinearArray
+    y: LinearArray
+
+    def __post_init__(self) -> None:
+        if self.x.wavelength != self.y.wavelength:
+            raise InputError(
+                f"both axes of a planar array share one wavelength; got {self.x.wavelength} m along x and "
+                f"{self.y.wavelength} m along y: give the same."
+            )
+
+    def phase_steps(self, polar: float, azimuth: float) -> tuple[float, float]:
+        """``(dphi_x, dphi_y)`` [rad] for a polar angle [rad] in [0, pi/2] and an azimuth [rad] (Eq. 13)."""
+        sine = np.sin(finite(polar, name="polar", lower=0.0, upper=pi / 2, unit="rad"))
+        turn = finite(azimuth, name="azimuth", unit="rad")
+        u, v = sine * np.cos(turn), sine * np.sin(turn)
+        return float(2 * pi * u / self.x.period), float(2 * pi * v / self.y.period)
+
+    def steering_angles(self, step_x: float, step_y: float) -> tuple[float, float]:
+        """Polar angle and azimuth [rad] for phase steps `step_x`, `step_y` [rad]; inverse of Eq. 13.
+
+        Raises InputError where ``u^2 + v^2 > 1``. The azimuth of a beam along the normal is 0.
+        """
+        u, v = float(self.x.direction_cosine(step_x)), float(self.y.direction_cosine(step_y))
+        return float(np.arcsin(_propagating(np.hypot(u, v)))), float(np.arctan2(v, u))
+
+
+def paper_array(optics: StatedOptics = PAPER.optics, *, fill_factor: float = 0.0) -> LinearArray:
+    """Array of Section 2: 32 elements, d = 1.2 lambda, lambda = 1064 nm.
+
+    `optics` holds the printed numbers; `fill_factor` [-], which the paper does not give, is free.
+    """
+    pitch = optics.pitch_in_wavelengths * optics.wavelength
+    return LinearArray(optics.elements, pitch, optics.wavelength, fill_factor)
+
+
+def _propagating(u: Array | np.float64) -> Array:
+    """Direction cosines [-] as given, 1 where rounding alone exceeds it; InputError beyond."""
+    out = np.asarray(u)
+    beyond = np.abs(out) > 1 + _ROUNDING
+    if beyond.any():
+        raise InputError(
+            f"the phase step steers to direction cosine {float(out[beyond].flat[0]):.6g}, beyond +-1: "
+            "no such wave propagates; use a smaller phase step or a larger pitch."
+        )
+    return np.where(np.abs(out) > 1, np.sign(out), out)

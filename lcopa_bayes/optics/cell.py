@@ -1,0 +1,68 @@
+"""Planar nematic cell with strong anchoring: its material and the field inside it.
+
+Convention: the tilt th is measured out of the plates, 0 for a director lying in them and pi/2 along the
+cell normal, as ``G`` and the electric term of Ta et al. 2026, Eq. 20 read it (Eq. 17 counts from the
+normal). The director stays in one plane and varies across the cell only, so the terms in ``ph_x`` of
+Eq. 20 vanish, and with them the twist constant. Position is a fraction of the cell: the thickness, which the
+paper does not give, drops out of the tilt.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from math import isfinite, pi, sqrt
+from typing import final
+
+from lcopa_bayes.problems import InputError
+from lcopa_bayes.stated import PAPER, StatedOptics
+
+from .checks import unless_positive
+
+
+class Field(Enum):
+    """Field inside the cell."""
+
+    UNIFORM = "uniform"
+    """``dV/dz = V / d`` everywhere: the plain reading of Ta et al. 2026, Eq. 20."""
+    SELF_CONSISTENT = "self-consistent"
+    """Constant displacement ``D``, ``dV/dz = D / (eps + deps sin^2 th)``, which integrates to V."""
+
+
+@final
+@dataclass(frozen=True)
+class Cell:
+    """Nematic of positive dielectric anisotropy between parallel plates; InputError for anything else."""
+
+    k1: float
+    """Splay constant [N]."""
+    k3: float
+    """Bend constant [N]."""
+    permittivity: float
+    """eps, perpendicular to the director [F/m]."""
+    permittivity_anisotropy: float
+    """deps [F/m]; positive, or the field would not tilt the director."""
+    pretilt: float = 0.0
+    """Tilt at both plates [rad], in [0, pi/2); the same sense on both."""
+
+    def __post_init__(self) -> None:
+        problems = unless_positive("k1", self.k1, "newtons") + unless_positive("k3", self.k3, "newtons")
+        problems += unless_positive("permittivity", self.permittivity, "F/m")
+        problems += unless_positive("permittivity_anisotropy", self.permittivity_anisotropy, "F/m")
+        if not (isfinite(self.pretilt) and 0 <= self.pretilt < pi / 2):
+            problems.append(f"`pretilt` must be in [0, pi/2) rad; got {self.pretilt!r}: give it in radians.")
+        if problems:
+            raise InputError(problems)
+
+    @property
+    def threshold(self) -> float:
+        """Freedericksz voltage ``pi sqrt(k1 / deps)`` [V], for no pretilt and either field."""
+        return pi * sqrt(self.k1 / self.permittivity_anisotropy)
+
+
+def paper_cell(optics: StatedOptics = PAPER.optics, *, pretilt: float = 0.0) -> Cell:
+    """Liquid crystal of Section 3.2 (Ta et al. 2026, below Eqs. 18 and 19).
+
+    `optics` holds the printed numbers; `pretilt` [rad], which the paper does not give, is free.
+    """
+    return Cell(optics.k1, optics.k3, optics.permittivity, optics.permittivity_anisotropy, pretilt)

@@ -1,0 +1,237 @@
+"""Mean tilt against voltage: the solved curve beside the law fitted in the paper; the numbers of claim S1."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf, nextafter, pi
+from typing import final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lcopa_bayes.arrays import Array, Matrix, Vector, frozen
+from lcopa_bayes.problems import InputError
+from lcopa_bayes.stated import PAPER, StatedOptics
+
+from .cell import Cell, Field, paper_cell
+from .checks import finite
+from .director import CELLS, equilibrium
+
+
+@final
+@dataclass(frozen=True)
+class DirectorCurve:
+    """Equilibria of one cell over a range of voltages: the data of Figs. 10 and 11."""
+
+    field: Field
+    voltage: Vector
+    """Ascending, (m,) [V]."""
+    position: Vector
+    """Fraction of the cell thickness, (n,) [-]."""
+    tilt: Matrix
+    """(m, n) [rad], out of the plates."""
+    mean: Vector
+    """Spatial mean, (m,) [rad]."""
+
+    def mean_at(self, voltage: ArrayLike) -> Array:
+        """Mean tilt [rad] at each `voltage` [V], linear between the solved ones.
+
+        InputError outside their range. The square-root rise at threshold costs up to 0.04 rad within one
+        spacing of 10 mV of it; `director.equilibrium` has no such error.
+        """
+        inside = finite(voltage, name="voltage", lower=self.voltage[0], upper=self.voltage[-1], unit="V")
+        return np.asarray(np.interp(inside, self.voltage, self.mean))
+
+
+def director_curve(
+    cell: Cell, voltages: ArrayLike, *, field: Field = Field.UNIFORM, cells: int = CELLS
+) -> DirectorCurve:
+    """Solve `director.equilibrium` of `cell` at `voltages` (m,) [V], continuing from the highest downwards.
+
+    Downwards the previous profile lies on the tilted branch, which the flat state below threshold would not.
+    `field` and `cells` go to `equilibrium`, whose errors apply; InputError unless the voltages ascend.
+    """
+    volts = frozen(finite(np.atleast_1d(voltages), name="voltages", lower=0.0, unit="V"), name="voltages")
+    if volts.size == 0 or (np.diff(volts) <= 0).any():
+        raise InputError("`voltages` must hold at least one value and ascend strictly [V]: sort them.")
+    found = []
+    guess: Vector | None = None
+    for volt in volts[::-1]:
+        profile = equilibrium(cell, float(volt), field=field, cells=cells, guess=guess)
+        found.append(profile)
+        guess = profile.tilt
+    found.reverse()
+    tilt = frozen([p.tilt for p in found], name="tilt", ndim=2)
+    mean = frozen([p.mean for p in found], name="mean")
+    return DirectorCurve(field, volts, found[0].position, tilt, mean)
+
+
+@final
+@dataclass(frozen=True)
+class TiltLaw:
+    """Two straight branches, ``low u`` below the knee and ``high (u - origin) + start`` from it on."""
+
+    low: float
+    """[rad/V]."""
+    high: float
+    """[rad/V]."""
+    start: float
+    """Value of the upper branch at its origin [rad]."""
+    origin: float
+    """Voltage from which the upper branch is counted [V]."""
+    knee: float
+    """First voltage of the upper branch [V]."""
+    limit: float
+    """Last voltage of the upper branch [V]."""
+
+    def __call__(self, voltage: ArrayLike) -> Array:
+        """Mean tilt [rad] at voltages [V] in ``[0, limit]``; InputError outside."""
+        u = finite(voltage, name="voltage", lower=0.0, upper=self.limit, unit="V")
+        return np.asarray(np.where(u < self.knee, self.low * u, self.high * (u - self.origin) + self.start))
+
+    @property
+    def jump(self) -> float:
+        """Upper minus lower branch at the knee [rad]."""
+        return float(self(self.knee)) - self.low * self.knee
+
+
+def printed_law(optics: StatedOptics = PAPER.optics) -> TiltLaw:
+    """Ta et al. 2026, Eq. 24 as printed, ``0.095215 u + 1.2058`` from 3 V on; numbers from `optics`."""
+    return _law(optics, 0.0)
+
+
+def continuous_law(optics: StatedOptics = PAPER.optics) -> TiltLaw:
+    """Eq. 24 of `optics`, upper branch counted from the knee, ``0.095215 (u - 3) + 1.2058``: jump 1e-4
+    rad."""
+    return _law(optics, optics.knee_voltage)
+
+
+def best_law(curve: DirectorCurve, optics: StatedOptics = PAPER.optics) -> TiltLaw:
+    """Least-squares law of the form of Eq. 24 on the solved curve, each branch on its own range of `optics`.
+
+    No other coefficients with this knee have a larger R^2 on these voltages.
+    """
+    u, mean = curve.voltage, curve.mean
+    upper = (u >= optics.knee_voltage) & (u <= optics.largest_voltage)
+    lower = u < optics.knee_voltage
+    if upper.sum() < 2 or not u[lower].any():
+        raise InputError("the solved curve needs voltages on both branches of the law: solve a wider range.")
+    low = float(u[lower] @ mean[lower] / (u[lower] @ u[lower]))
+    high, start = np.polyfit(u[upper] - optics.knee_voltage, mean[upper], 1)
+    knee, limit = optics.knee_voltage, optics.largest_voltage
+    return TiltLaw(low, float(high), float(start), knee, knee, limit)
+
+
+@final
+@dataclass(frozen=True)
+class FitQuality:
+    """How a law follows the solved mean tilt over a range of voltages."""
+
+    lower: float
+    """First voltage [V]."""
+    upper: float
+    """Last voltage [V]."""
+    points: int
+    """Solved voltages compared [-]."""
+    r_squared: float
+    """1 - residual over total sum of squares [-]; negative where the mean of the curve does better."""
+    largest_relative_error: float
+    """Of the solved tilt [-]; infinite where that is zero and the law is not."""
+    largest_error: float
+    """[rad]."""
+
+
+def fit_quality(curve: DirectorCurve, law: TiltLaw, lower: float, upper: float) -> FitQuality:
+    """Compare `law` with `curve` at its solved voltages in ``[lower, upper]`` [V].
+
+    Raises InputError for a range beyond the solved one, or with fewer than three voltages in it.
+    """
+    finite([lower, upper], name="range", lower=curve.voltage[0], upper=curve.voltage[-1], unit="V")
+    inside = (curve.voltage >= lower) & (curve.voltage <= upper)
+    if inside.sum() < 3:
+        raise InputError(f"fewer than three solved voltages in [{lower:.6g}, {upper:.6g}] V: solve more.")
+    solved, error = curve.mean[inside], law(curve.voltage[inside]) - curve.mean[inside]
+    relative = np.full(error.shape, inf)
+    np.divide(np.abs(error), solved, out=relative, where=solved > 0)
+    relative[error == 0] = 0.0
+    return FitQuality(
+        float(curve.voltage[inside][0]),
+        float(curve.voltage[inside][-1]),
+        int(inside.sum()),
+        1 - float(error @ error) / float(((solved - solved.mean()) ** 2).sum()),
+        float(relative.max()),
+        float(np.abs(error).max()),
+    )
+
+
+@final
+@dataclass(frozen=True)
+class TiltLawCheck:
+    """Numbers behind claim S1; each tuple runs over `RANGES`."""
+
+    threshold: float
+    """Freedericksz voltage [V]; below it the solved tilt is zero."""
+    curve: DirectorCurve
+    printed: tuple[FitQuality, ...]
+    continuous: tuple[FitQuality, ...]
+    best: tuple[FitQuality, ...]
+    printed_jump: float
+    """Of the law as printed at the knee [rad]."""
+    continuous_jump: float
+    """Of the continuous reading at the knee [rad]."""
+    solved_change: float
+    """Change of the solved mean tilt over 2 mV about the knee [rad]; small when there is no jump."""
+    largest_printed_tilt: float
+    """[rad]; no mean tilt out of the plates can exceed pi/2."""
+    tilt_limit: float = pi / 2
+    """[rad]."""
+
+
+RANGES = ("whole", "lower branch", "upper branch", "tilted")
+"""``[0, limit]``, ``[0, knee)``, ``[knee, limit]`` and ``(threshold, limit]`` in volts."""
+
+
+def tilt_law_check(
+    optics: StatedOptics = PAPER.optics,
+    *,
+    field: Field = Field.UNIFORM,
+    pretilt: float = 0.0,
+    points: int = 501,
+    cells: int = CELLS,
+) -> TiltLawCheck:
+    """Solve the paper's cell at `points` voltages over the range of Eq. 24 and compare (claim S1, Fig. 11).
+
+    `optics` holds the printed numbers; `pretilt` [rad] is not among them. `field` and `cells` set the
+    solver. Errors as `director_curve`.
+    """
+    cell, knee, limit = paper_cell(optics, pretilt=pretilt), optics.knee_voltage, optics.largest_voltage
+    curve = director_curve(cell, np.linspace(0.0, limit, points), field=field, cells=cells)
+    spans = ((0.0, limit), (0.0, nextafter(knee, 0)), (knee, limit), (nextafter(cell.threshold, inf), limit))
+
+    def judged(law: TiltLaw) -> tuple[FitQuality, ...]:
+        return tuple(fit_quality(curve, law, *span) for span in spans)
+
+    printed, continuous = printed_law(optics), continuous_law(optics)
+    near = director_curve(cell, [knee - 1e-3, knee + 1e-3], field=field, cells=cells)
+    return TiltLawCheck(
+        cell.threshold,
+        curve,
+        judged(printed),
+        judged(continuous),
+        judged(best_law(curve, optics)),
+        printed.jump,
+        continuous.jump,
+        float(np.diff(near.mean)[0]),
+        float(printed(limit)),
+    )
+
+
+def _law(optics: StatedOptics, origin: float) -> TiltLaw:
+    return TiltLaw(
+        optics.tilt_slope_low,
+        optics.tilt_slope_high,
+        optics.tilt_intercept_high,
+        origin,
+        optics.knee_voltage,
+        optics.largest_voltage,
+    )

@@ -1,0 +1,58 @@
+"""A drive that is constant between its changes, and its block means under a continuous delay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.arrays import Matrix, Vector, frozen
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """Deviation of a drive from its resting value, as a sequence of changes."""
+
+    times: Vector
+    """Instants of change [time unit], increasing, (changes,)."""
+    values: Vector
+    """Deviation from rest after each change [drive unit], (changes,)."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "times", frozen(self.times, name="times"))
+        object.__setattr__(self, "values", frozen(self.values, name="values"))
+
+    @classmethod
+    def of_rows(cls, time: Vector, rows: Vector) -> Drive:
+        """From a record's rows: a value holds from its row to the next; rest is the first row's."""
+        changed = np.flatnonzero(np.diff(rows) != 0) + 1
+        return cls(time[changed], rows[changed] - rows[0])
+
+    @property
+    def moves(self) -> bool:
+        """Whether the drive ever leaves its resting value."""
+        return self.times.size > 0
+
+    @cached_property
+    def _pieces(self) -> tuple[Vector, Vector]:
+        """Value after, and integral up to, each change; a resting piece stands in front."""
+        integral = np.concatenate(([0.0, 0.0], np.cumsum(self.values[:-1] * np.diff(self.times))))
+        return np.concatenate(([0.0], self.values)), integral
+
+    def block_means(self, edges: Vector, delays: Vector) -> tuple[Matrix, Matrix]:
+        """Exact means over the blocks between `edges` of the drive delayed by `delays`, and their slope.
+
+        Parameters: edges (n+1,) equidistant [time unit]; delays (batch,) [time unit].
+        Returns: means (batch, n) [drive unit] and their derivative in the delay, which jumps where a
+        delayed change crosses an edge (the right-hand limit is returned).
+        """
+        late = edges - delays[:, None]
+        piece = np.searchsorted(self.times, late.ravel(), side="right").reshape(late.shape)
+        value, integral = self._pieces
+        origin = np.concatenate((self.times[:1], self.times))
+        area = integral[piece] + value[piece] * (late - origin[piece])
+        width = edges[1] - edges[0]
+        return np.diff(area, axis=1) / width, -np.diff(value[piece], axis=1) / width

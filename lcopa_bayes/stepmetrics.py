@@ -1,0 +1,137 @@
+"""Figures engineers read off a step response, each with its credible interval."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.arrays import Array, Flags, Matrix, Vector
+from lcopa_bayes.estimate import Estimate
+from lcopa_bayes.inference.draws import Draws
+from lcopa_bayes.plant.drive import Drive
+from lcopa_bayes.plant.forward import Experiment, ForwardModel
+from lcopa_bayes.plant.grid import Mesh
+from lcopa_bayes.plant.layout import Layout
+
+_POINTS = 1000
+"""Samples of the step response."""
+_DRAWS = 1000
+"""Draws behind the metrics."""
+_SETTLED = 0.02
+"""A response within this share of its steady value counts as settled [-]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class StepCurves:
+    """Responses of every path to a unit step at time 0, over the longest record."""
+
+    time: Vector
+    """(n,) [time unit]."""
+    normalised: Array
+    """Response over its steady value, (units, draws, n) [-]; steady is 1 by construction."""
+    gains: Array
+    """Steady response per unit step, (draws, responses, drives) [response unit / drive unit]."""
+    delays: Matrix
+    """(draws, delay slots) [time unit]."""
+
+
+def step_curves(draws: Draws, span: float) -> StepCurves:
+    """Unit step responses of posterior draws over `span` [time unit]."""
+    layout = draws.table.layout
+    values = draws.thinned(_DRAWS)
+    time = span * np.arange(1, _POINTS + 1) / _POINTS
+    step = Drive(np.zeros(1), np.ones(1))
+    drives = tuple(step for _ in layout.drives)
+    experiment = Experiment("step", Mesh.of_samples(time, 0.0), drives, np.zeros(len(layout.drives)))
+    model = ForwardModel(layout, (experiment,))
+    parts = np.array_split(values, max(1, values.shape[0] // 64))
+    units = np.concatenate([model.unit_responses(draws.table.dynamics(part))[0] for part in parts], axis=1)
+    return StepCurves(time, units, draws.table.gains(values), draws.table.dynamics(values).delays)
+
+
+def crossing(time: Vector, curves: Matrix, level: float) -> Vector:
+    """First time at which each curve (draws, n) reaches `level`; infinite when it never does."""
+    above = curves >= level
+    first = above.argmax(axis=1)
+    reached = above.any(axis=1)
+    rows = np.arange(curves.shape[0])
+    before = np.where(first > 0, curves[rows, first - 1], 0.0)
+    start = np.where(first > 0, time[first - 1], 0.0)
+    after = curves[rows, first]
+    share = (level - before) / np.where(after > before, after - before, 1.0)
+    return np.where(reached, start + share * (time[first] - start), np.inf)
+
+
+def settling(time: Vector, curves: Matrix, band: float) -> Vector:
+    """Last time at which each curve is more than `band` away from 1; infinite when it still is at the end."""
+    outside = np.abs(curves - 1.0) > band
+    last = outside.shape[1] - 1 - outside[:, ::-1].argmax(axis=1)
+    ever = outside.any(axis=1)
+    after = np.minimum(last + 1, time.size - 1)
+    out = np.where(ever, time[after], time[0])
+    return np.where(ever & (last == time.size - 1), np.inf, out)
+
+
+def step_metrics(draws: Draws, curves: StepCurves, *, time_unit: str) -> list[Estimate]:
+    """Metrics of every path: rise 10-90 %, delay, settling, overshoot, value at the end, steady state.
+
+    Times are counted from the step. What is not reached within the record is open above.
+    """
+    layout, grade, ess = draws.table.layout, draws.grade.level, draws.ess
+    out: list[Estimate] = []
+
+    def add(name: str, unit: str, values: Vector, note: str = "") -> None:
+        out.append(Estimate.of(name, unit, values, ess=ess, grade=grade, note=note))
+
+    for i, response in enumerate(layout.responses):
+        for j, drive in enumerate(layout.drives):
+            curve = curves.normalised[layout.unit_of[i][j]]
+            gain, unit = curves.gains[:, i, j], f"{response.unit}/{drive.unit}"
+            path = layout.path_name(i, j) or response.name
+            low, high = crossing(curves.time, curve, 0.1), crossing(curves.time, curve, 0.9)
+            unsettled = share_unsettled(curve)
+            note = (
+                f"{100 * unsettled:.0f} % of draws are not within {_SETTLED:.0%} of steady state at the end "
+                "of the record"
+                if unsettled > 0.05
+                else ""
+            )
+            add(f"rise_10_90[{path}]", time_unit, _difference(high, low), note)
+            add(f"delay[{path}]", time_unit, curves.delays[:, layout.delay_of[i][j]])
+            add(f"settling_2[{path}]", time_unit, settling(curves.time, curve, 0.02), note)
+            add(f"settling_5[{path}]", time_unit, settling(curves.time, curve, 0.05), note)
+            add(f"overshoot[{path}]", "-", np.maximum(curve.max(axis=1) - 1.0, 0.0))
+            add(f"value_at_end[{path}]", unit, gain * curve[:, -1])
+            add(f"steady_state[{path}]", unit, gain, note)
+    out.extend(_crosstalk(layout, curves, ess=ess, grade=grade))
+    return out
+
+
+def share_unsettled(curve: Matrix) -> float:
+    """Share of draws that are not within 2 % of their steady state at the end."""
+    return float(np.mean(np.abs(curve[:, -1] - 1.0) > _SETTLED))
+
+
+def _difference(high: Vector, low: Vector) -> Vector:
+    """high - low, infinite where `high` is never reached."""
+    reached: Flags = np.isfinite(high)
+    return np.where(reached, np.where(reached, high, 0.0) - np.where(reached, low, 0.0), np.inf)
+
+
+def _crosstalk(layout: Layout, curves: StepCurves, *, ess: float, grade: str) -> list[Estimate]:
+    """Steady response of the other axes over that of the driven one, where two axes respond."""
+    out = []
+    names = {axis.name for axis in layout.drives} & {axis.name for axis in layout.responses}
+    for j, drive in enumerate(layout.drives):
+        own = [i for i, r in enumerate(layout.responses) if (r.name == drive.name if names else i == j)]
+        for i, response in enumerate(layout.responses):
+            if own and i != own[0]:
+                direct = curves.gains[:, own[0], j]
+                ratio = np.where(direct != 0, curves.gains[:, i, j] / np.where(direct != 0, direct, 1), np.inf)
+                name = f"crosstalk[{response.name}/{layout.responses[own[0]].name} by {drive.name}]"
+                unit = f"{response.unit}/{layout.responses[own[0]].unit}"
+                out.append(Estimate.of(name, unit, ratio, ess=ess, grade=grade))
+    return out

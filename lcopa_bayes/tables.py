@@ -1,0 +1,171 @@
+"""The tables of a run: every curve and number a figure shows, as one tidy table each."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from lcopa_bayes.fit import Fit, results
+
+_QUANTILE_NAMES = ("05", "25", "50", "75", "95")
+_PRIOR_POINTS = 200
+
+
+def tables(fit: Fit) -> dict[str, pd.DataFrame]:
+    """Tables by file name."""
+    told = results(fit)
+    return {
+        "parameters": pd.DataFrame(told["parameters"]),
+        "step_metrics": pd.DataFrame(told["step_metrics"]),
+        "scores": pd.DataFrame(
+            [row | {"held_out": False} for row in told["fit_scores"]]
+            + [row | {"held_out": True} for row in told["held_out"]]
+        ),
+        "bands": _bands(fit),
+        "drives": _drives(fit),
+        "residuals": _residuals(fit),
+        "autocorrelation": _autocorrelation(fit),
+        "spectrum": _spectrum(fit),
+        "step_response": _step_response(fit),
+        "priors": _priors(fit),
+        "prior_density": _prior_density(fit),
+    }
+
+
+def _bands(fit: Fit) -> pd.DataFrame:
+    frames = []
+    for band in fit.bands:
+        columns = {
+            "record": band.record,
+            "axis": band.axis,
+            "unit": band.unit,
+            "held_out": band.held_out,
+            "time": band.time,
+            "observed": band.observed,
+        }
+        columns |= {f"plant_{q}": row for q, row in zip(_QUANTILE_NAMES, band.plant, strict=True)}
+        columns |= {f"noisy_{q}": row for q, row in zip(_QUANTILE_NAMES, band.noisy, strict=True)}
+        frames.append(pd.DataFrame(columns))
+    return pd.concat(frames, ignore_index=True)
+
+
+def _drives(fit: Fit) -> pd.DataFrame:
+    frames = [
+        pd.DataFrame(
+            {
+                "record": record.name,
+                "axis": axis.name,
+                "unit": axis.unit,
+                "time": record.time,
+                "drive": record.drive[:, j],
+            }
+        )
+        for record in (*fit.study.fit, *fit.study.held_out)
+        for j, axis in enumerate(record.drive_axes)
+    ]
+    return pd.concat(frames, ignore_index=True)
+
+
+def _residuals(fit: Fit) -> pd.DataFrame:
+    frames = [
+        pd.DataFrame(
+            {
+                "record": left.record,
+                "axis": left.axis,
+                "unit": left.unit,
+                "held_out": left.held_out,
+                "time": left.time,
+                "residual": left.values,
+                "innovation": left.innovations,
+            }
+        )
+        for left in fit.residuals
+    ]
+    return pd.concat(frames, ignore_index=True)
+
+
+def _autocorrelation(fit: Fit) -> pd.DataFrame:
+    frames = [
+        pd.DataFrame(
+            {
+                "record": left.record,
+                "axis": left.axis,
+                "held_out": left.held_out,
+                "lag": np.arange(1, left.autocorrelation.size + 1),
+                "autocorrelation": left.autocorrelation,
+                "white_band_95": left.white_band,
+            }
+        )
+        for left in fit.residuals
+    ]
+    return pd.concat(frames, ignore_index=True)
+
+
+def _spectrum(fit: Fit) -> pd.DataFrame:
+    frames = [
+        pd.DataFrame(
+            {
+                "record": left.record,
+                "axis": left.axis,
+                "held_out": left.held_out,
+                "frequency": left.frequency,
+                "power_over_white": left.spectrum,
+            }
+        )
+        for left in fit.residuals
+    ]
+    return pd.concat(frames, ignore_index=True)
+
+
+def _step_response(fit: Fit) -> pd.DataFrame:
+    layout, curves, frames = fit.draws.table.layout, fit.curves, []
+    for i, response in enumerate(layout.responses):
+        for j, drive in enumerate(layout.drives):
+            response_curve = curves.gains[:, i, j, None] * curves.normalised[layout.unit_of[i][j]]
+            rows = np.quantile(response_curve, (0.05, 0.25, 0.5, 0.75, 0.95), axis=0)
+            steady = np.quantile(curves.gains[:, i, j], (0.05, 0.5, 0.95))
+            columns = {
+                "path": layout.path_name(i, j) or response.name,
+                "unit": f"{response.unit}/{drive.unit}",
+                "time": curves.time,
+            }
+            columns |= {f"response_{q}": row for q, row in zip(_QUANTILE_NAMES, rows, strict=True)}
+            columns |= {f"steady_{q}": v for q, v in zip(("05", "50", "95"), steady, strict=True)}
+            frames.append(pd.DataFrame(columns))
+    return pd.concat(frames, ignore_index=True)
+
+
+def _priors(fit: Fit) -> pd.DataFrame:
+    return pd.DataFrame(
+        [
+            {
+                "name": row.name,
+                "unit": row.unit,
+                "prior": f"fixed at {row.value:.6g}" if row.prior is None else str(row.prior),
+                "from": "default" if row.default and row.free else "study",
+                "integrated_out": k in fit.problem.posterior.linear,
+            }
+            for k, row in enumerate(fit.draws.table.rows)
+        ]
+    )
+
+
+def _prior_density(fit: Fit) -> pd.DataFrame:
+    """Prior densities over the range the posterior covers, on the scale each parameter is sampled on."""
+    frames = []
+    for row in fit.draws.table.rows:
+        if row.prior is None:
+            continue
+        drawn = fit.draws.column(row.name)
+        low, high = float(drawn.min()), float(drawn.max())
+        reach = 0.3 * (high - low)
+        if row.log_scale:
+            factor = (high / low) ** 0.3
+            x = np.geomspace(low / factor, high * factor, _PRIOR_POINTS)
+        else:
+            x = np.linspace(low - reach, high + reach, _PRIOR_POINTS)
+        density = np.exp(row.log_prior(x)) * (x if row.log_scale else 1.0)
+        frames.append(
+            pd.DataFrame({"name": row.name, "log_scale": row.log_scale, "x": x, "density": density})
+        )
+    return pd.concat(frames, ignore_index=True)
