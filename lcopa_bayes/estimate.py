@@ -42,9 +42,7 @@ class Estimate:
     note: str = ""
 
     @classmethod
-    def of(
-        cls, name: str, unit: str, draws: Vector, *, ess: float, grade: str, note: str = ""
-    ) -> Estimate:
+    def of(cls, name: str, unit: str, draws: Vector, *, ess: float, grade: str, note: str = "") -> Estimate:
         """From draws; infinite draws (never reached) may make a side open, NaN draws raise ValueError."""
         if np.isnan(draws).any():
             raise ValueError(f"{name}: {np.isnan(draws).sum()} of {draws.size} draws are NaN")
@@ -69,7 +67,8 @@ class Estimate:
             "ess": self.ess,
             "grade": self.grade,
         }
-        return plain(out | ({"note": self.note} if self.note else {}))
+        told: dict[str, Any] = plain(out | ({"note": self.note} if self.note else {}))
+        return told
 
 
 def _quantile(draws: Vector, probability: float) -> float:

@@ -69,9 +69,7 @@ def fit(
     )
     draws = gather(problem.posterior, run)
     noise, rng = problem.posterior.noise, np.random.default_rng([plan.seed, 2])
-    shown = bands(
-        draws, problem.posterior.model, problem.posterior.samples, noise, held_out=False, rng=rng
-    )
+    shown = bands(draws, problem.posterior.model, problem.posterior.samples, noise, held_out=False, rng=rng)
     if study.held_out:
         samples, model = problem.simulated(study.held_out)
         shown += bands(draws, model, samples, noise, held_out=True, rng=rng)
@@ -140,7 +138,7 @@ def results(fit: Fit) -> dict[str, Any]:
     parameters = [
         estimate.as_json() | {"rhat": quality[estimate.name].rhat} for estimate in fit.draws.estimates()
     ]
-    return plain(
+    told: dict[str, Any] = plain(
         {
             "study": fit.study.name,
             "verdict": verdict(fit),
@@ -160,12 +158,19 @@ def results(fit: Fit) -> dict[str, Any]:
             "fit_scores": [_score(band) for band in fit.bands if not band.held_out],
             "step_metrics": [metric.as_json() for metric in fit.metrics],
             "residual_tests": [
-                {"record": r.record, "axis": r.axis, "held_out": r.held_out, "p_white": r.p_white, "rms": r.rms}
+                {
+                    "record": r.record,
+                    "axis": r.axis,
+                    "held_out": r.held_out,
+                    "p_white": r.p_white,
+                    "rms": r.rms,
+                }
                 for r in fit.residuals
             ],
             "sampler": _sampler(fit),
         }
     )
+    return told
 
 
 def residual_rms(fit: Fit) -> dict[str, float]:

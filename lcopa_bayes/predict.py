@@ -59,10 +59,9 @@ class Band:
 
 def responses(table: ParameterTable, model: ForwardModel, values: Matrix) -> list[Array]:
     """Plant responses without offsets, per experiment (axes, batch, samples) [response unit]."""
-    gains = table.gains(values)
-    layout = table.layout
-    out = []
-    for experiment, units in zip(model.experiments, model.unit_responses(table.dynamics(values)), strict=True):
+    gains, layout, out = table.gains(values), table.layout, []
+    unit_responses = model.unit_responses(table.dynamics(values))
+    for experiment, units in zip(model.experiments, unit_responses, strict=True):
         total = np.zeros((len(layout.responses), values.shape[0], units.shape[2]))
         for i, row in enumerate(layout.unit_of):
             for j, unit in enumerate(row):
@@ -173,7 +172,7 @@ def _given(
     white, _ = gaussian.whiten(columns, parameters, observed.gaps[used])
     precision = np.einsum("bn,bn->b", white[:, 0], white[:, 0])
     mean = np.einsum("bn,bn->b", white[:, 0], white[:, 1]) / precision
-    return mean + rng.standard_normal(mean.size) / np.sqrt(precision)
+    return np.asarray(mean + rng.standard_normal(mean.size) / np.sqrt(precision))
 
 
 def _first_change(record: Samples) -> float:

@@ -10,8 +10,11 @@ from dataclasses import asdict, is_dataclass
 from importlib.metadata import version
 from typing import Any
 
+import numpy as np
+
 from lcopa_bayes.estimate import plain
 from lcopa_bayes.inference.sampler import SamplePlan
+from lcopa_bayes.record import Record
 from lcopa_bayes.study import Study
 
 _PACKAGES = ("lcopa-bayes", "numpy", "scipy", "emcee", "arviz-base", "arviz-stats", "pandas", "xarray")
@@ -36,11 +39,20 @@ def fingerprint(study: Study, plan: SamplePlan) -> str:
     """Hash of everything the draws depend on: inputs, settings, plan and this package's version."""
     told = {
         "inputs": dict(study.inputs),
+        "records": [_digest(record) for record in study.fit],
         "settings": settings_of(study),
         "plan": asdict(plan),
         "version": version("lcopa-bayes"),
     }
     return hashlib.sha256(json.dumps(told, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def _digest(record: Record) -> str:
+    """Hash of what a record holds: a study made in Python names no input files."""
+    held = hashlib.sha256(repr((record.drive_axes, record.response_axes, record.time_unit)).encode())
+    for array in (record.time, record.drive, record.response):
+        held.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
+    return held.hexdigest()
 
 
 def provenance(study: Study, command: Sequence[str]) -> dict[str, Any]:

@@ -9,25 +9,21 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn, final
+from typing import final
 
 import numpy as np
 import pandas as pd
 
 from lcopa_bayes.arrays import Array, Matrix, Vector, frozen
+from lcopa_bayes.cells import FORM, SUFFIXES, CellTable, read_cells, refuse
 from lcopa_bayes.files import write_whole
 from lcopa_bayes.problems import InputError, nearest
 
 TIME_UNITS = {"s": 0, "ms": -3, "us": -6}
 """Each time unit as a power of ten of a second."""
-SUFFIXES = (".csv", ".parquet")
-"""Kinds of record files."""
 _ROLES = ("time", "drive", "response")
-_FORM = "time_<unit>, drive_<axis>_<unit> or response_<axis>_<unit>"
-_MOST = 5  # problems told per column, so that one shifted column does not bury the others
 
 
 def in_time_unit(time: Array | float, given: str, wanted: str) -> Array:
@@ -101,95 +97,14 @@ class Record:
         return Record, (self.name, *arrays, self.drive_axes, self.response_axes, self.time_unit)
 
 
-@dataclass(frozen=True)
-class _Table:
-    """A file as text, so that every bad cell can be quoted; `rows` are line (CSV) or row numbers."""
-
-    path: Path
-    names: list[str]
-    rows: list[int]
-    columns: list[Sequence[str]]
-    problems: list[str]
-
-    def place(self, column: int, row: int | None = None) -> str:
-        """Where a column or one of its cells stands, in the words of the user's file."""
-        count = "line" if self.path.suffix.lower() == ".csv" else "row"
-        middle = "" if row is None else f", {count} {self.rows[row]}"
-        return f"{self.path}{middle}, column {self.names[column]!r}"
-
-    def tell(self, problems: Sequence[str], place: str) -> None:
-        """Add the first problems of a kind and the number of the others."""
-        self.problems.extend(problems[:_MOST])
-        if len(problems) > _MOST:
-            self.problems.append(f"{place}: and {len(problems) - _MOST} more like these")
-
-
-def _refuse(path: Path, why: str) -> NoReturn:
-    raise InputError(f"{path}: {why}")
-
-
-def _csv_table(path: Path) -> _Table:
-    rows, cells, ragged = [], [], []
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        reader = csv.reader(file, skipinitialspace=True, strict=True)
-        try:
-            names = [name.strip() for name in next((row for row in reader if row), [])]
-            for row in reader:
-                if len(row) == len(names):
-                    rows.append(reader.line_num)
-                    cells.append(row)
-                elif len(row) > 1 or "".join(row).strip():  # an empty line is no row
-                    what = f"has {len(row)} cell(s) where the header has {len(names)}"
-                    ragged.append(f"{path}, line {reader.line_num}: {what}; write every cell, even if empty")
-        except UnicodeDecodeError:
-            _refuse(path, "is not UTF-8 text; save it as comma-separated UTF-8")
-        except csv.Error as error:
-            _refuse(path, f"line {reader.line_num} is not comma-separated text ({error})")
-    if not names:
-        _refuse(path, f"is empty; expected a header of columns {_FORM}")
-    if len(names) == 1 and any(separator in names[0] for separator in ";\t"):
-        _refuse(path, "line 1: the columns are not separated by commas; separate them by commas")
-    table = _Table(path, names, rows, [*zip(*cells, strict=True)] if cells else [()] * len(names), [])
-    table.tell(ragged, str(path))
-    return table
-
-
-def _parquet_table(path: Path) -> _Table:
-    frame = pd.read_parquet(path)
-
-    def text(value: object) -> str:
-        gone = value is None or value is pd.NA or (isinstance(value, float) and math.isnan(value))
-        return "" if gone else str(value)  # str of a float is exact
-
-    columns: list[Sequence[str]] = [
-        [text(v) for v in frame.iloc[:, j].tolist()] for j in range(frame.shape[1])
-    ]
-    return _Table(path, [str(c) for c in frame.columns], [*range(1, len(frame) + 1)], columns, [])
-
-
-def _table(path: Path) -> _Table:
-    """The file as text; InputError when there is none or it cannot be read."""
-    try:
-        if not path.exists():
-            beside = (file.name for file in path.parent.glob("*") if file.suffix.lower() in SUFFIXES)
-            _refuse(path, f"no such file{nearest(path.name, beside)}")
-        if path.suffix.lower() not in SUFFIXES or not path.is_file():
-            _refuse(path, f"is not a record; expected a file ending in {' or '.join(SUFFIXES)}")
-        return _csv_table(path) if path.suffix.lower() == ".csv" else _parquet_table(path)
-    except InputError:
-        raise
-    except (OSError, ValueError, NotImplementedError) as error:
-        _refuse(path, f"cannot be read ({error})")
-
-
-def _roles(table: _Table) -> tuple[str, dict[str, dict[int, Axis]]]:
+def _roles(table: CellTable) -> tuple[str, dict[str, dict[int, Axis]]]:
     """Time unit, and the axis of every usable column by role; what is wrong joins `table.problems`."""
     found: dict[str, dict[int, Axis]] = {role: {} for role in _ROLES}
     for index, name in enumerate(table.names):
         role, _, rest = name.partition("_")
         axis, _, unit = ("time", "", rest) if role == "time" else rest.rpartition("_")
         if role not in _ROLES:
-            problem = f"the role {role!r} is not known, columns are {_FORM}{nearest(role, _ROLES)}"
+            problem = f"the role {role!r} is not known, columns are {FORM}{nearest(role, _ROLES)}"
         elif role == "time" and unit not in TIME_UNITS:
             problem = f"the time unit {unit!r} is not known{nearest(unit, TIME_UNITS)}"
         elif not (axis.strip() and unit.strip() and name.isprintable()):
@@ -202,11 +117,11 @@ def _roles(table: _Table) -> tuple[str, dict[str, dict[int, Axis]]]:
         table.problems.append(f"{table.place(index)} (column {index + 1} of {len(table.names)}): {problem}")
     for role in _ROLES:
         if not any(name.partition("_")[0] == role for name in table.names):
-            table.problems.append(f"{table.path}: has no {role} column; columns are {_FORM}")
+            table.problems.append(f"{table.path}: has no {role} column; columns are {FORM}")
     return next((axis.unit for axis in found["time"].values()), "s"), found
 
 
-def _numbers(table: _Table, column: int, *, missing: bool) -> Vector:
+def _numbers(table: CellTable, column: int, *, missing: bool) -> Vector:
     """(n,) numbers of a column; a bad cell is NaN here and joins `table.problems`."""
     out, bad = np.full(len(table.rows), np.nan), []
     for row, cell in enumerate(table.columns[column]):
@@ -234,7 +149,7 @@ def load_record(path: Path, time_unit: str | None = "ms") -> Record:
     """
     if time_unit is not None and time_unit not in TIME_UNITS:
         raise InputError(f"unknown time unit {time_unit!r}{nearest(time_unit, TIME_UNITS)}")
-    table = _table(Path(path))
+    table = read_cells(Path(path))
     n_rows = len(table.rows) if not table.problems else 2  # rows of another length are told already
     given, axes = _roles(table)
     values = {role: [_numbers(table, j, missing=role == "response") for j in axes[role]] for role in _ROLES}
@@ -263,7 +178,7 @@ def save_record(record: Record, path: Path) -> None:
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
-        _refuse(path, f"expected a name ending in {' or '.join(SUFFIXES)}")
+        refuse(path, f"expected a name ending in {' or '.join(SUFFIXES)}")
     columns = {f"time_{record.time_unit}": record.time}
     columns |= {f"drive_{a.name}_{a.unit}": v for a, v in zip(record.drive_axes, record.drive.T, strict=True)}
     responses = zip(record.response_axes, record.response.T, strict=True)
@@ -281,4 +196,4 @@ def save_record(record: Record, path: Path) -> None:
     try:
         write_whole(path, write)
     except OSError as error:
-        _refuse(path, f"cannot be written ({error.strerror or error})")
+        refuse(path, f"cannot be written ({error.strerror or error})")

@@ -6,13 +6,11 @@ Every class checks its own values on construction and raises InputError with all
 from __future__ import annotations
 
 import dataclasses
-import math
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from itertools import pairwise
-from numbers import Integral, Real
 from types import MappingProxyType
 from typing import Any, Literal, TypeVar, final
 
@@ -20,57 +18,13 @@ import numpy as np
 from scipy import stats
 from scipy.stats.distributions import rv_frozen
 
+from lcopa_bayes.checks import file_names, is_number, one_of, rebuilt, refuse_if, whole_number
 from lcopa_bayes.problems import InputError, nearest
 from lcopa_bayes.record import TIME_UNITS
 
-STAGES = ("fit", "audit", "compare", "loop", "claims")
-"""Stages a study may name."""
+STAGES: Mapping[str, frozenset[str]] = MappingProxyType({"fit": frozenset()})
+"""Stages a study may name, each with the keys of its settings."""
 S = TypeVar("S")
-
-
-def _number(value: object) -> bool:
-    try:
-        return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
-    except OverflowError:  # an integer beyond the floats
-        return False
-
-
-def _whole(key: str, value: object, low: int, high: int | None = None) -> list[str]:
-    if (
-        isinstance(value, Integral)
-        and not isinstance(value, bool)
-        and low <= int(value) <= (high or int(value))
-    ):
-        return []
-    bounds = f"of at least {low}" if high is None else f"from {low} to {high}"
-    return [f"`{key}` must be a whole number {bounds}; got {value!r}"]
-
-
-def _one_of(key: str, value: object, known: Iterable[str]) -> list[str]:
-    if isinstance(value, str) and value in known:
-        return []
-    hint = nearest(str(value), known).partition("; known")[0]
-    return [f"`{key}` must be one of {', '.join(known)}; got {value!r}{hint}"]
-
-
-def _names(key: str, value: object) -> list[str]:
-    if isinstance(value, tuple) and all(isinstance(name, str) and name for name in value):
-        return []
-    return [f'`{key}` must be a list of file names, as in ["a.csv", "b.csv"]; got {value!r}']
-
-
-def _refuse(problems: list[str]) -> None:
-    if problems:
-        raise InputError(problems)
-
-
-def rebuilt(made: Any) -> tuple[object, ...]:
-    """For ``__reduce__``: make anew from the fields; a mapping proxy cannot go to another process."""
-
-    def plain(value: object) -> object:
-        return {k: plain(v) for k, v in value.items()} if isinstance(value, Mapping) else value
-
-    return type(made), tuple(plain(getattr(made, f.name)) for f in dataclasses.fields(made))
 
 
 @final
@@ -89,7 +43,9 @@ class HeadingSettings:
         bad = self.name is not None and not (isinstance(self.name, str) and self.name.strip(" ."))
         bad = bad or any(mark in (self.name or "") for mark in "/\\\0\n")
         problems = [f"`name` must be text fit for a folder; got {self.name!r}"] if bad else []
-        _refuse([*problems, *_one_of("time_unit", self.time_unit, TIME_UNITS), *_whole("seed", self.seed, 0)])
+        refuse_if(
+            [*problems, *one_of("time_unit", self.time_unit, TIME_UNITS), *whole_number("seed", self.seed, 0)]
+        )
 
 
 @final
@@ -104,8 +60,8 @@ class RecordsSettings:
 
     def __post_init__(self) -> None:
         fit = () if self.fit is None else self.fit
-        problems = _names("fit", fit) + _names("held_out", self.held_out)
-        _refuse(problems + (["`fit` names no record; name one or more"] if self.fit == () else []))
+        problems = file_names("fit", fit) + file_names("held_out", self.held_out)
+        refuse_if(problems + (["`fit` names no record; name one or more"] if self.fit == () else []))
 
 
 @final
@@ -133,12 +89,12 @@ class ModelSettings:
         each = self.terms if isinstance(self.terms, Mapping) else {"": self.terms}
         problems = [] if each else ["`terms` names no element; give a number or one number per element"]
         for name, terms in each.items():
-            problems += _whole(f"terms.{name}" if name else "terms", terms, 1, 6)
+            problems += whole_number(f"terms.{name}" if name else "terms", terms, 1, 6)
         if isinstance(self.terms, Mapping):
             object.__setattr__(self, "terms", MappingProxyType(dict(self.terms)))
         orders: Any = self.orders
         if isinstance(orders, tuple):
-            if not orders or not all(_number(order) and 0 < order <= 2 for order in orders):
+            if not orders or not all(is_number(order) and 0 < order <= 2 for order in orders):
                 problems.append(f"`orders` must be numbers in (0, 2]; got {list(orders)}")
             elif any(later > order for order, later in pairwise(orders)):
                 problems.append(f"`orders` must not increase; got {list(orders)}")
@@ -150,13 +106,13 @@ class ModelSettings:
                 object.__setattr__(self, "orders", tuple(float(order) for order in orders))
         elif orders != "free":
             problems.append(f'`orders` must be "free" or a list such as [2, 1]; got {orders!r}')
-        problems += _one_of("share", self.share, ("paper", "all", "none"))
-        problems += _one_of("delay", self.delay, ("shared", "element", "path"))
-        problems += _one_of("offset", self.offset, ("record", "shared", "none"))
-        problems += _whole("blocks", self.blocks, 2) if self.blocks is not None else []
-        if not _number(self.exposure) or self.exposure < 0:
+        problems += one_of("share", self.share, ("paper", "all", "none"))
+        problems += one_of("delay", self.delay, ("shared", "element", "path"))
+        problems += one_of("offset", self.offset, ("record", "shared", "none"))
+        problems += whole_number("blocks", self.blocks, 2) if self.blocks is not None else []
+        if not is_number(self.exposure) or self.exposure < 0:
             problems.append(f"`exposure` must be a time, zero or more; got {self.exposure!r}")
-        _refuse(problems)
+        refuse_if(problems)
 
     __reduce__ = rebuilt
 
@@ -170,7 +126,7 @@ class NoiseSettings:
     """Independent Gaussian, first-order autoregressive or independent Student noise."""
 
     def __post_init__(self) -> None:
-        _refuse(_one_of("kind", self.kind, ("white", "ar1", "student")))
+        refuse_if(one_of("kind", self.kind, ("white", "ar1", "student")))
 
 
 @final
@@ -194,7 +150,7 @@ class SamplerSettings:
         chosen = {key: getattr(self, key) for key in least}
         optional = ("walkers", "steps", "thin")
         stated = [key for key in least if not (key in optional and chosen[key] is None)]
-        _refuse([problem for key in stated for problem in _whole(key, chosen[key], least[key])])
+        refuse_if([problem for key in stated for problem in whole_number(key, chosen[key], least[key])])
 
 
 @cache
@@ -218,13 +174,13 @@ class PriorSettings:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parameters", MappingProxyType(dict(self.parameters)))
-        _refuse([f"prior of {self.name!r}: {problem}" for problem in self._problems()])
+        refuse_if([f"prior of {self.name!r}: {problem}" for problem in self._problems()])
 
     def _problems(self) -> list[str]:
         if (self.fixed is None) == (self.dist is None):
             return ['expected a number, or a distribution such as {dist = "norm", loc = 0, scale = 1}']
         if self.dist is None:
-            bad = not _number(self.fixed) or self.parameters
+            bad = not is_number(self.fixed) or self.parameters
             return [f"a fixed value must be one finite number; got {self.fixed!r}"] if bad else []
         if not isinstance(self.dist, str) or self.dist not in _distributions():
             return [f"unknown distribution {self.dist!r}{nearest(str(self.dist), _distributions())}"]
@@ -235,7 +191,7 @@ class PriorSettings:
         ]
         problems += [f"{self.dist} needs its parameter {key!r}" for key in shapes if key not in given]
         problems += [
-            f"{key!r} must be a finite number; got {v!r}" for key, v in given.items() if not _number(v)
+            f"{key!r} must be a finite number; got {v!r}" for key, v in given.items() if not is_number(v)
         ]
         if problems:
             return problems

@@ -66,13 +66,16 @@ def crossing(time: Vector, curves: Matrix, level: float) -> Vector:
 
 
 def settling(time: Vector, curves: Matrix, band: float) -> Vector:
-    """Last time at which each curve is more than `band` away from 1; infinite when it still is at the end."""
-    outside = np.abs(curves - 1.0) > band
-    last = outside.shape[1] - 1 - outside[:, ::-1].argmax(axis=1)
-    ever = outside.any(axis=1)
+    """Last time at which each curve is `band` away from 1; infinite when it is farther at the end."""
+    time = np.concatenate(([0.0], time))
+    away = np.pad(curves - 1.0, ((0, 0), (1, 0)), constant_values=-1.0)  # nothing has moved at time 0
+    last = time.size - 1 - (np.abs(away) > band)[:, ::-1].argmax(axis=1)
     after = np.minimum(last + 1, time.size - 1)
-    out = np.where(ever, time[after], time[0])
-    return np.where(ever & (last == time.size - 1), np.inf, out)
+    rows = np.arange(curves.shape[0])
+    outside, inside = away[rows, last], away[rows, after]
+    travelled = np.where(last < after, outside - inside, 1.0)
+    share = (outside - np.sign(outside) * band) / travelled
+    return np.where(last < after, time[last] + share * (time[after] - time[last]), np.inf)
 
 
 def step_metrics(draws: Draws, curves: StepCurves, *, time_unit: str) -> list[Estimate]:
@@ -130,7 +133,8 @@ def _crosstalk(layout: Layout, curves: StepCurves, *, ess: float, grade: str) ->
         for i, response in enumerate(layout.responses):
             if own and i != own[0]:
                 direct = curves.gains[:, own[0], j]
-                ratio = np.where(direct != 0, curves.gains[:, i, j] / np.where(direct != 0, direct, 1), np.inf)
+                other = curves.gains[:, i, j]
+                ratio = np.where(direct != 0, other / np.where(direct != 0, direct, 1), np.inf)
                 name = f"crosstalk[{response.name}/{layout.responses[own[0]].name} by {drive.name}]"
                 unit = f"{response.unit}/{layout.responses[own[0]].unit}"
                 out.append(Estimate.of(name, unit, ratio, ess=ess, grade=grade))

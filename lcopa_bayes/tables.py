@@ -81,7 +81,7 @@ def _residuals(fit: Fit) -> pd.DataFrame:
         )
         for left in fit.residuals
     ]
-    return pd.concat(frames, ignore_index=True)
+    return _stacked(frames)
 
 
 def _autocorrelation(fit: Fit) -> pd.DataFrame:
@@ -98,7 +98,7 @@ def _autocorrelation(fit: Fit) -> pd.DataFrame:
         )
         for left in fit.residuals
     ]
-    return pd.concat(frames, ignore_index=True)
+    return _stacked(frames)
 
 
 def _spectrum(fit: Fit) -> pd.DataFrame:
@@ -114,7 +114,7 @@ def _spectrum(fit: Fit) -> pd.DataFrame:
         )
         for left in fit.residuals
     ]
-    return pd.concat(frames, ignore_index=True)
+    return _stacked(frames)
 
 
 def _step_response(fit: Fit) -> pd.DataFrame:
@@ -169,3 +169,8 @@ def _prior_density(fit: Fit) -> pd.DataFrame:
             pd.DataFrame({"name": row.name, "log_scale": row.log_scale, "x": x, "density": density})
         )
     return pd.concat(frames, ignore_index=True)
+
+
+def _stacked(frames: list[pd.DataFrame]) -> pd.DataFrame:
+    """Frames below each other; empty when every record is too short for a residual test."""
+    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()

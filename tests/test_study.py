@@ -18,7 +18,8 @@ from lcopa_bayes.settings import (
     RecordsSettings,
     SamplerSettings,
 )
-from lcopa_bayes.study import Study, load_study
+from lcopa_bayes.study import Study
+from lcopa_bayes.studyfile import load_study
 
 HEADER = "time_ms,drive_x_rad,response_x_rad\n"
 STEP = HEADER + "0,0,\n0.5,1,0.1\n1.5,1,0.2\n"
@@ -54,7 +55,7 @@ def test_three_lines_are_a_study(tmp_path):
     assert study.drive_axes == study.response_axes == (Axis("x", "rad"),)
     assert (study.model, study.noise, study.sampler) == (ModelSettings(), NoiseSettings(), SamplerSettings())
     assert dict(study.priors) == {}
-    assert list(study.stages) == ["fit", "audit", "compare", "loop"]
+    assert list(study.stages) == ["fit"]
     expected = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in os.listdir(folder)}
     assert dict(study.inputs) == expected
     assert load_study(folder / "study.toml").inputs == study.inputs
@@ -94,9 +95,7 @@ steps = 5000
 target_ess = 100
 thin = 2
 [stages]
-fit = true
-loop = {most = 2, places = ["drive"]}
-compare = false
+fit = {}
 """
 
 
@@ -111,10 +110,7 @@ def test_every_setting_arrives(tmp_path):
     gain, order = study.priors["gain"].frozen(), study.priors["order"].frozen()
     assert gain.logpdf(0.1) == stats.loguniform(1e-3, 10).logpdf(0.1)
     assert order.pdf(1.3) == stats.beta(2, 2, scale=2).pdf(1.3)
-    assert {name: dict(settings) for name, settings in study.stages.items()} == {
-        "fit": {},
-        "loop": {"most": 2, "places": ["drive"]},
-    }
+    assert {name: dict(settings) for name, settings in study.stages.items()} == {"fit": {}}
 
 
 @pytest.mark.parametrize(
@@ -179,7 +175,8 @@ def test_every_setting_arrives(tmp_path):
         ("[sampler]\nthin = 0", ["[sampler]", "`thin`", "at least 1"]),
         ("[sampler]\nwalker = 8", ["[sampler]", "'walker'", "'walkers'"]),
         ("[stages.fits]\na = 1", ["[stages]", "'fits'", "'fit'"]),
-        ('stages = ["fit", "adit"]', ["[stages]", "'adit'", "'audit'"]),
+        ('stages = ["fit", "fitt"]', ["[stages]", "'fitt'", "'fit'"]),
+        ("[stages]\nfit = {most = 2}", ["[stages]", "fit", "'most'"]),
         ("[stages]\nfit = 3", ["[stages]", "`fit`", "3"]),
         ("[stages]\nfit = false", ["[stages]", "names no stage"]),
         ('stages = "fit"', ["[stages]", "must be a table or a list", "'fit'"]),
@@ -319,7 +316,7 @@ def test_a_study_is_locked_and_can_be_sent_to_another_process(tmp_path):
             study.inputs,
         )
         assert one.model.terms == {"xx": 2, "xy": 1}
-        for mapping in (one.priors, one.stages, one.stages["loop"], one.inputs, one.model.terms):
+        for mapping in (one.priors, one.stages, one.stages["fit"], one.inputs, one.model.terms):
             with pytest.raises(TypeError):
                 mapping["other"] = 1  # type: ignore[index]
         np.testing.assert_array_equal(one.fit[0].response, study.fit[0].response)

@@ -72,5 +72,3 @@ def prepared(
         exposure=study.model.exposure,
     )
     return samples, model
-
-

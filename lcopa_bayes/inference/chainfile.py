@@ -24,11 +24,11 @@ def save_chain(path: Path, ensembles: Sequence[Ensemble], fingerprint: str) -> N
             for number, ensemble in enumerate(ensembles):
                 group = file.create_group(f"ensemble_{number}")
                 for name in _ARRAYS:
-                    group.create_dataset(name, data=getattr(ensemble, name))
+                    group.create_dataset(name, data=getattr(ensemble, name), fletcher32=True)
                 group.attrs["steps"] = ensemble.steps
                 kind, keys, position, has_gauss, gauss = ensemble.random
                 group.attrs["random_kind"] = kind
-                group.create_dataset("random_keys", data=keys)
+                group.create_dataset("random_keys", data=keys, fletcher32=True)
                 group.attrs["random_rest"] = np.array([position, has_gauss, gauss], dtype=float)
 
     write_whole(path, write)
@@ -44,11 +44,13 @@ def load_chain(path: Path, fingerprint: str) -> tuple[Ensemble, ...]:
     advice = "leave out --resume to start anew, or choose another --out"
     try:
         with h5py.File(path, "r") as file:
-            if file.attrs["fingerprint"] != fingerprint:
-                raise InputError(f"{path}: made from other records, settings or seed; {advice}")
-            return tuple(_ensemble(file[f"ensemble_{number}"]) for number in range(len(file)))
-    except (OSError, KeyError) as error:
-        raise InputError(f"{path}: not a chain this program wrote ({error}); {advice}") from None
+            own = file.attrs["fingerprint"] == fingerprint
+            ensembles = tuple(_ensemble(file[f"ensemble_{number}"]) for number in range(len(file)))
+    except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:  # as h5py meets damage
+        raise InputError(f"{path}: not a chain this program wrote, or damaged ({error}); {advice}") from None
+    if not own:
+        raise InputError(f"{path}: made from other records, settings or seed; {advice}")
+    return ensembles
 
 
 def _ensemble(group: h5py.Group) -> Ensemble:

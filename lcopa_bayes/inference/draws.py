@@ -51,12 +51,12 @@ class Draws:
     @property
     def ess(self) -> float:
         """Smallest effective sample size [draws]."""
-        return min(quality.ess for quality in self.qualities)
+        return float(np.min([quality.ess for quality in self.qualities]))
 
     def thinned(self, count: int) -> Matrix:
         """About `count` draws spread evenly over all of them, (count, rows)."""
         flat = self.flat
-        return flat[np.linspace(0, flat.shape[0] - 1, min(count, flat.shape[0])).astype(int)]
+        return np.asarray(flat[np.linspace(0, flat.shape[0] - 1, min(count, flat.shape[0])).astype(int)])
 
     def column(self, name: str) -> Vector:
         """All draws of one parameter."""
@@ -81,7 +81,7 @@ def gather(posterior: Posterior, run: Run) -> Draws:
     coordinates, log_density = run.kept()
     ensembles, walkers, count, _ = coordinates.shape
     stride = max(1, -(-ensembles * walkers * count // _MEASURED))
-    coordinates, log_density = coordinates[:, :, ::-1][:, :, ::stride], log_density[:, :, ::-1][:, :, ::stride]
+    coordinates, log_density = (kept[:, :, ::-1][:, :, ::stride] for kept in (coordinates, log_density))
     rng = np.random.default_rng(np.random.SeedSequence(run.plan.seed, spawn_key=(1_000,)))
     flat = coordinates.reshape(-1, coordinates.shape[-1])
     chunks = np.array_split(flat, max(1, flat.shape[0] // _CHUNK))

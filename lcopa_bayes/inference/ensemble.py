@@ -36,7 +36,7 @@ class Ensemble:
     def at(cls, posterior: Posterior, position: Matrix, seed: np.random.SeedSequence) -> Ensemble:
         """A new ensemble; emcee needs a legacy generator, seeded here and nowhere else."""
         walkers, dimension = position.shape
-        state = np.random.RandomState(np.random.MT19937(seed)).get_state()  # noqa: NPY002
+        state = np.random.RandomState(np.random.MT19937(seed)).get_state()
         return cls(
             np.empty((0, walkers, dimension)),
             np.empty((0, walkers)),

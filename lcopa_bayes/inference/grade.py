@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal, final
 
 import numpy as np
-from arviz_stats.base import array_stats
+from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 
 from lcopa_bayes.arrays import Array
 
@@ -37,8 +37,8 @@ class Quality:
 
     @property
     def ess(self) -> float:
-        """The smaller of the two effective sample sizes [draws]."""
-        return min(self.ess_bulk, self.ess_tail)
+        """The smaller of the two effective sample sizes, NaN when either is [draws]."""
+        return float(np.minimum(self.ess_bulk, self.ess_tail))
 
     def grade(self, target_ess: float) -> Grade:
         """Grade of this parameter against a wanted effective sample size."""
@@ -79,9 +79,9 @@ def qualities(names: Sequence[str], values: Array) -> tuple[Quality, ...]:
         out.append(
             Quality(
                 name,
-                float(array_stats.ess(chains, method="bulk")),
-                float(array_stats.ess(chains, method="tail", prob=(0.05, 0.95))),
-                float(array_stats.rhat_nested(chains, owner)),
+                float(array_stats.ess(chains, method="bulk")),  # type: ignore[no-untyped-call]
+                float(array_stats.ess(chains, method="tail", prob=(0.05, 0.95))),  # type: ignore[no-untyped-call]
+                float(array_stats.rhat_nested(chains, owner)),  # type: ignore[no-untyped-call]
             )
         )
     return tuple(out)

@@ -42,14 +42,14 @@ class NormalEquations:
         factor = np.linalg.cholesky(self.gram)
         bent = np.linalg.solve(factor, self.moment[..., None])[..., 0]
         half_log_det = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
-        return -0.5 * (self.square - np.einsum("bp,bp->b", bent, bent)) - half_log_det
+        return np.asarray(-0.5 * (self.square - np.einsum("bp,bp->b", bent, bent)) - half_log_det)
 
     def mean(self) -> Matrix:
         """Conditional mean of b, (batch, p)."""
-        return np.linalg.solve(self.gram, self.moment[..., None])[..., 0]
+        return np.asarray(np.linalg.solve(self.gram, self.moment[..., None])[..., 0])
 
     def draw(self, rng: np.random.Generator) -> Matrix:
         """One draw of b for each member of the batch, (batch, p)."""
         factor = np.linalg.cholesky(self.gram)
         noise = rng.standard_normal(self.moment.shape)
-        return self.mean() + np.linalg.solve(factor.swapaxes(1, 2), noise[..., None])[..., 0]
+        return np.asarray(self.mean() + np.linalg.solve(factor.swapaxes(1, 2), noise[..., None])[..., 0])

@@ -14,7 +14,8 @@ from lcopa_bayes.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.inference.data import Observed, Samples
 from lcopa_bayes.inference.linear import NormalEquations
 from lcopa_bayes.inference.noise import GaussianNoise, Noise
-from lcopa_bayes.inference.parameters import Parameter, ParameterTable
+from lcopa_bayes.inference.parameter import Parameter
+from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.plant.forward import ForwardModel
 
 _LOG_2PI = float(np.log(2 * np.pi))
@@ -94,7 +95,7 @@ class Posterior:
             total = total + self.table.rows[k].log_prior(values[:, k])
         steep = coordinates[:, self._logits]
         jacobian = coordinates[:, self._logs].sum(axis=1) + (log_expit(steep) + log_expit(-steep)).sum(axis=1)
-        return total + jacobian
+        return np.asarray(total + jacobian)
 
     @cached_property
     def _log_order_level(self) -> float:
@@ -217,7 +218,7 @@ class Posterior:
             return np.ones((1, observed.values.size)) if row.place.second in (-1, r) else None
         drive = row.place.second
         unit = units[self.table.layout.unit_of[axis][drive]]
-        return self.model.experiments[r].rest[drive] + unit[:, observed.index]
+        return np.asarray(self.model.experiments[r].rest[drive] + unit[:, observed.index])
 
     def residual(self, axis: int, r: int, observed: Observed, values: Matrix, units: Array) -> Matrix:
         """Observed minus modelled, (batch, n) [response unit]."""

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -79,7 +79,7 @@ class Run:
     plan: SamplePlan
 
     def kept(self) -> tuple[Array, Array]:
-        """The last half of every ensemble: coordinates (ensembles, walkers, draws, dimension), log density."""
+        """The last half of each ensemble: coordinates (ensembles, walkers, draws, dimension), log density."""
         chain = np.stack([ensemble.chain for ensemble in self.ensembles])
         log_density = np.stack([ensemble.log_density for ensemble in self.ensembles])
         first = chain.shape[1] // 2
@@ -118,10 +118,10 @@ def sample(
     return Run(ensembles, plan)
 
 
-def finished(posterior: Posterior, run: Run, bar: tqdm[object] | None = None) -> bool:
+def finished(posterior: Posterior, run: Run, bar: tqdm[Any] | None = None) -> bool:
     """Whether every sampled parameter agrees between ensembles and has its effective sample size."""
     found = sampled_qualities(posterior, run)
-    ess, rhat = min(q.ess for q in found), max(q.rhat for q in found)
+    ess, rhat = float(np.min([q.ess for q in found])), float(np.max([q.rhat for q in found]))
     if bar is not None:
         acceptance = np.mean([ensemble.acceptance for ensemble in run.ensembles])
         bar.set_postfix(acceptance=f"{acceptance:.2f}", ess=f"{ess:.0f}", rhat=f"{rhat:.3f}")

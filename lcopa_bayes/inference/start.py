@@ -52,4 +52,4 @@ def _spread(covariance: Matrix) -> Matrix:
     """A square root of the covariance with no direction wider than `_WIDEST`."""
     values, vectors = np.linalg.eigh(covariance)
     widths = np.sqrt(np.maximum(values, 1e-16))
-    return vectors * np.minimum(widths, _WIDEST / _INFLATION)
+    return np.asarray(vectors * np.minimum(widths, _WIDEST / _INFLATION))

@@ -1,0 +1,214 @@
+"""Output-error least squares of the plant at fixed noise, with the exact Jacobian."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import final
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from lcopa_bayes.arrays import Matrix, Vector
+from lcopa_bayes.inference.noise import GaussianNoise, White
+from lcopa_bayes.inference.posterior import Posterior
+
+_EDGE = 1e-6
+"""Distance kept from the ends of a parameter's domain, relative to the domain or to 1."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class LeastSquares:
+    """Output-error least squares of a posterior's plant parameters at fixed noise parameters.
+
+    Works in the sampled coordinates of the plant (logarithms of time constants) and the plain values
+    of gains and offsets, with the exact Jacobian; normal priors enter as extra rows, the support of
+    the others as bounds.
+    """
+
+    posterior: Posterior
+
+    @cached_property
+    def columns(self) -> list[int]:
+        """Table positions of the free plant parameters."""
+        rows = self.posterior.table.rows
+        return [k for k, row in enumerate(rows) if row.free and row.kind not in ("sigma", "rho", "nu")]
+
+    @cached_property
+    def bounds(self) -> tuple[Vector, Vector]:
+        """Lower and upper ends of the search coordinates."""
+        low, high = [], []
+        for k in self.columns:
+            row = self.posterior.table.rows[k]
+            a, b = row.domain
+            if row.log_scale:
+                a, b = (np.log(max(a, 1e-300)), np.log(b))
+            edge = _EDGE * (b - a if np.isfinite(b - a) else 1.0)
+            low.append(a + edge)
+            high.append(b - edge)
+        return np.array(low), np.array(high)
+
+    def _bounds_around(self, values: Vector) -> tuple[Vector, Vector]:
+        """Bounds that also keep orders decreasing where terms cannot be exchanged.
+
+        An order stays on its own side of the middle between its start and a free neighbour's, and of
+        the value of a fixed neighbour.
+        """
+        low, high = (ends.copy() for ends in self.bounds)
+        table = self.posterior.table
+        for element, slot in enumerate(table.layout.elements):
+            if table.exchangeable[element]:
+                continue
+            columns = [table.at("order", element, term) for term in range(slot.terms)]
+            for upper, lower in pairwise(columns):
+                free = table.rows[upper].free, table.rows[lower].free
+                wall = values[upper] if not free[0] else values[lower]
+                wall = (values[upper] + values[lower]) / 2 if all(free) else wall
+                for k, ends, choose in ((upper, low, max), (lower, high, min)):
+                    if k in self.columns:
+                        limit = np.log(wall) if table.rows[k].log_scale else wall
+                        position = self.columns.index(k)
+                        ends[position] = choose(ends[position], limit)
+        return low, high
+
+    def coordinates(self, values: Vector) -> Vector:
+        """Search coordinates of table values."""
+        rows = self.posterior.table.rows
+        return np.array([np.log(values[k]) if rows[k].log_scale else values[k] for k in self.columns])
+
+    def values(self, x: Vector, template: Vector) -> Vector:
+        """Table values of search coordinates, the rest from `template`; not sorted."""
+        out = template.copy()
+        rows = self.posterior.table.rows
+        for position, k in enumerate(self.columns):
+            out[k] = np.exp(x[position]) if rows[k].log_scale else x[position]
+        return out
+
+    def residual(self, x: Vector, template: Vector) -> tuple[Vector, Matrix]:
+        """Whitened residual (model minus data, then prior rows) and its exact Jacobian in `x`.
+
+        `template` (rows,) gives fixed values and noise parameters.
+        """
+        posterior, table = self.posterior, self.posterior.table
+        raw = self.values(x, template)
+        values, source = table.sorted_with_source(raw[None])
+        jacobian = np.zeros((posterior.size, len(table.rows)))
+        parts, start = [], 0
+        slopes = posterior.model.unit_slopes(table.dynamics(values))
+        for r, samples in enumerate(posterior.samples):
+            units, unit_slopes = slopes[r]
+            for axis, observed in enumerate(samples.axes):
+                stop = start + observed.values.size
+                block = jacobian[start:stop]
+                misfit = -posterior.residual(axis, r, observed, values, units)[0]
+                for k in posterior.acting[axis]:
+                    column = posterior.column(k, axis, r, observed, units)
+                    if column is not None:
+                        block[:, k] = column[0]
+                for drive, unit in enumerate(table.layout.unit_of[axis]):
+                    gain = values[0, table.at("gain", axis, drive)]
+                    element, delay, _ = table.layout.units[unit]
+                    slope = gain * unit_slopes[unit][:, 0, observed.index]
+                    terms = table.layout.elements[element].terms
+                    for i in range(terms):
+                        block[:, table.at("time", element, i)] += slope[i]
+                        block[:, table.at("order", element, i)] += slope[terms + i]
+                    block[:, table.at("delay", delay)] += slope[2 * terms]
+                stacked = np.concatenate([block.T, misfit[None]])
+                white = self._whiten(stacked, values, axis, observed.gaps)
+                jacobian[start:stop] = white[:-1].T
+                parts.append(white[-1])
+                start = stop
+        jacobian = jacobian[:, source[0]]  # derivatives by sorted position -> by search coordinate
+        for k in self.columns:  # time slopes are in the logarithm already, other log scales are not
+            row = table.rows[k]
+            if row.log_scale and row.kind != "time":
+                jacobian[:, k] *= raw[k]
+            elif row.kind == "time" and not row.log_scale:
+                jacobian[:, k] /= raw[k]
+        rows, prior = self._prior_rows(raw)
+        return (
+            np.concatenate([*parts, prior]),
+            np.concatenate([jacobian, rows])[:, self.columns],
+        )
+
+    def _whiten(self, columns: Matrix, values: Matrix, axis: int, gaps: Vector) -> Matrix:
+        noise = self.posterior.noise if isinstance(self.posterior.noise, GaussianNoise) else White()
+        parameters = self.posterior.noise_parameters(values, axis)
+        white: Matrix = noise.whiten(columns[None], parameters, gaps)[0][0]
+        return white
+
+    def _prior_rows(self, raw: Vector) -> tuple[Matrix, Vector]:
+        """Standardised normal priors as residual rows."""
+        table = self.posterior.table
+        rows, prior = [], []
+        for k in self.columns:
+            row = table.rows[k]
+            if row.prior is not None and row.prior.dist == "norm" and not row.log_scale:
+                mean, sd = row.prior.frozen.mean(), row.prior.frozen.std()
+                unit = np.zeros(len(table.rows))
+                unit[k] = 1 / sd
+                rows.append(unit)
+                prior.append((raw[k] - mean) / sd)
+        return np.array(rows).reshape(-1, len(table.rows)), np.array(prior)
+
+    def solve(self, values: Vector) -> tuple[Vector, Matrix]:
+        """From a start to a local minimum: table values and the Jacobian there."""
+        low, high = self._bounds_around(values)
+        start = np.clip(self.coordinates(values), low, high)
+        memory: dict[bytes, tuple[Vector, Matrix]] = {}
+
+        def both(x: Vector) -> tuple[Vector, Matrix]:
+            key = x.tobytes()
+            if key not in memory:
+                memory.clear()
+                memory[key] = self.residual(x, values)
+            return memory[key]
+
+        def residual(x: Vector) -> Vector:
+            return both(x)[0]
+
+        def jacobian(x: Vector) -> Matrix:
+            return both(x)[1]
+
+        found = least_squares(
+            residual,
+            start,
+            jacobian,
+            bounds=(low, high),
+            x_scale="jac",
+            max_nfev=100,
+        )
+        solution = self.posterior.table.canonical(self.values(found.x, values)[None])[0]
+        return solution, np.asarray(found.jac)
+
+    def with_noise(self, values: Vector) -> Vector:
+        """The same plant with noise parameters estimated from its residual, where these are free."""
+        posterior, table = self.posterior, self.posterior.table
+        out = values.copy()
+        units = posterior.model.unit_responses(table.dynamics(values[None]))
+        for axis in range(len(table.layout.responses)):
+            residuals = [
+                posterior.residual(axis, r, samples.axes[axis], values[None], units[r])[0]
+                for r, samples in enumerate(posterior.samples)
+            ]
+            power = sum(float(residual @ residual) for residual in residuals)
+            count = sum(residual.size for residual in residuals)
+            lagged = sum(float(residual[1:] @ residual[:-1]) for residual in residuals)
+            estimates = {"sigma": np.sqrt(power / count), "rho": lagged / power if power else 0.0, "nu": 10.0}
+            for name in posterior.noise.names:
+                k = table.at(name, axis)
+                if table.rows[k].free:
+                    out[k] = _inside(estimates[name], table.rows[k].domain)
+        return out
+
+
+def _inside(value: float, domain: tuple[float, float]) -> float:
+    """A starting value moved off the ends of its domain (starts only: never a density)."""
+    low, high = domain
+    if low > 0:  # a domain of decades
+        return float(np.clip(value, 1.01 * low, max(1.01 * low, high / 1.01)))
+    margin = 1e-3 * (high - low) if np.isfinite(high - low) else 1e-12
+    return float(np.clip(value, low + margin, high - margin))

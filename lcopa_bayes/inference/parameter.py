@@ -1,0 +1,142 @@
+"""One number of the model: its name, unit, place, prior and the scale it is sampled on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from math import inf, log
+from typing import NamedTuple, final
+
+import numpy as np
+
+from lcopa_bayes.arrays import Flags, Vector
+from lcopa_bayes.inference.priors import Prior
+
+_DOMAIN = {
+    "gain": (-inf, inf),
+    "time": (0.0, inf),
+    "order": (0.0, 2.0),
+    "delay": (0.0, inf),
+    "offset": (-inf, inf),
+    "sigma": (0.0, inf),
+    "rho": (0.0, 1.0),
+    "nu": (0.0, inf),
+}
+"""Where each kind of parameter must lie; ends are excluded but for the order 2."""
+_MAY_BE_ZERO = frozenset({"delay", "rho"})
+"""Kinds that may be fixed at 0: no delay, no correlation."""
+_LOG_KINDS = frozenset({"time", "sigma", "nu"})
+"""Kinds sampled by their logarithm."""
+_LEAST_MASS = 1e-9
+"""A prior with less mass in its parameter's domain is a mistake [-]."""
+_REJECTION = 0.1
+"""Draws are rejected until inside the domain down to this mass [-], and found by inversion below it."""
+
+
+class Place(NamedTuple):
+    """Where a parameter enters: (response, drive) for gains, (element, term) for times and orders,
+    (slot, 0) for delays, (response, record or -1 for all) for offsets, (response, 0) for noise."""
+
+    first: int
+    second: int
+
+
+@final
+@dataclass(frozen=True)
+class Parameter:
+    """One number of the model."""
+
+    name: str
+    unit: str
+    kind: str
+    place: Place
+    prior: Prior | None
+    """None when fixed."""
+    value: float = np.nan
+    """Fixed value, in `unit`."""
+    default: bool = True
+    """Whether the prior is the default one."""
+
+    @property
+    def free(self) -> bool:
+        """Whether the parameter is inferred."""
+        return self.prior is not None
+
+    @property
+    def log_scale(self) -> bool:
+        """Whether it is sampled by its logarithm."""
+        positive = self.prior is not None and self.prior.dist == "loguniform" and self.prior.support[0] >= 0
+        return self.kind in _LOG_KINDS or (positive and not self.logit_scale)
+
+    @property
+    def logit_scale(self) -> bool:
+        """Whether it is sampled by its logit: near 1 a noise correlation and the logarithm of the noise
+        scale then trade off along a straight line."""
+        return self.kind == "rho"
+
+    @property
+    def domain(self) -> tuple[float, float]:
+        """Interval on which the posterior can be positive: the prior's support within the kind's."""
+        low, high = _DOMAIN[self.kind]
+        support = (low, high) if self.prior is None else self.prior.support
+        return max(low, support[0]), min(high, support[1])
+
+    def log_prior(self, x: Vector) -> Vector:
+        """Log density of the prior, restricted to the domain and normalised there."""
+        assert self.prior is not None
+        density = self.prior.log_density(x)
+        # a logit beyond 37 rounds to a correlation of exactly 1, where the noise has no density
+        if self._log_mass == 0.0 and not self.logit_scale:
+            return density
+        return np.where(_inside(self.kind, x), density - self._log_mass, -np.inf)
+
+    def draw(self, size: int, rng: np.random.Generator) -> Vector:
+        """Draws from the prior within the domain, or copies of the fixed value."""
+        if self.prior is None:
+            return np.full(size, self.value)
+        low, high = (float(self.prior.frozen.cdf(end)) for end in _DOMAIN[self.kind])
+        if high - low < _REJECTION:
+            return np.asarray(self.prior.frozen.ppf(rng.uniform(low, high, size)), dtype=float)
+        out = np.empty(0)
+        while out.size < size:
+            drawn = self.prior.draw(2 * size, rng)
+            out = np.concatenate([out, drawn[_inside(self.kind, drawn)]])
+        return out[:size]
+
+    @property
+    def problems(self) -> list[str]:
+        """What is wrong with the prior or the fixed value for this kind of parameter."""
+        low, high = _DOMAIN[self.kind]
+        zero = self.kind in _MAY_BE_ZERO
+        where = f"{'[' if zero else '('}{low:g}, {high:g}{']' if self.kind == 'order' else ')'}"
+        if self.prior is None:
+            fits = bool(_inside(self.kind, np.array(self.value))) or (zero and self.value == 0)
+            return [] if fits else [f"[priors] {self.name} = {self.value:g}: must lie in {where}"]
+        if self._mass >= _LEAST_MASS:
+            return []
+        return [
+            f"[priors] {self.name}: {self.prior} has no mass in {where}, where this parameter must lie; "
+            "shift or widen it"
+        ]
+
+    @cached_property
+    def _mass(self) -> float:
+        """Prior mass inside the domain of the kind."""
+        assert self.prior is not None
+        low, high = _DOMAIN[self.kind]
+        return float(self.prior.frozen.cdf(high) - self.prior.frozen.cdf(low))
+
+    @cached_property
+    def _log_mass(self) -> float:
+        """Logarithm of the mass; exactly 0 when the support lies within the domain of the kind."""
+        assert self.prior is not None
+        low, high = _DOMAIN[self.kind]
+        within = self.prior.support[0] >= low and self.prior.support[1] <= high
+        return 0.0 if within else log(self._mass)
+
+
+def _inside(kind: str, x: Vector) -> Flags:
+    """Whether values lie in the domain of a kind."""
+    low, high = _DOMAIN[kind]
+    inside: Flags = (x > low) & ((x <= high) if kind == "order" else (x < high))
+    return inside

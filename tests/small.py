@@ -1,0 +1,110 @@
+"""Small studies with a known truth, made on the bench, for the tests of inference."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from lcopa_bayes.arrays import Matrix, Vector
+from lcopa_bayes.bench.acquisition import Bench, simulate
+from lcopa_bayes.bench.command import Command, on_off, step
+from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.inference.draws import Draws
+from lcopa_bayes.inference.grade import Quality
+from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.record import Axis, Record
+from lcopa_bayes.settings import ModelSettings, NoiseSettings, PriorSettings, SamplerSettings
+from lcopa_bayes.study import Study
+
+U, Y = Axis("u", "V"), Axis("y", "rad")
+TRUTH = {"gain": 2.0, "time_1": 1.5, "order_1": 0.8, "delay": 0.73, "offset": 0.3, "sigma": 0.02}
+
+
+def path(gain: float, delay: float, times: Sequence[float], orders: Sequence[float]) -> TransferPath:
+    etas = tuple(time**order for time, order in zip(times, orders, strict=True))
+    return TransferPath(gain, delay, etas, tuple(orders), 1.0)
+
+
+ONE = Device(
+    ((path(TRUTH["gain"], TRUTH["delay"], (TRUTH["time_1"],), (TRUTH["order_1"],)),),),
+    (U,),
+    (Y,),
+    (TRUTH["offset"],),
+)
+DIRECT, CROSS = ((1.2, 2.5), (1.6, 0.7)), ((2.0,), (0.9,))
+TWO = Device(
+    (
+        (path(1.0, 0.4, *DIRECT), path(0.2, 0.4, *CROSS)),
+        (path(0.3, 0.4, *CROSS), path(1.5, 0.4, *DIRECT)),
+    ),
+    (Axis("x", "V"), Axis("y", "V")),
+    (Axis("x", "rad"), Axis("y", "rad")),
+    (0.1, -0.2),
+)
+
+
+def record(
+    seed: int = 1,
+    *,
+    device: Device = ONE,
+    command: Command | None = None,
+    camera: float = 0.2,
+    duration: float = 12.0,
+    noise_sd: float = TRUTH["sigma"],
+    correlation: float = 0.0,
+    name: str = "step",
+) -> Record:
+    command = command or (
+        step(1.0, at=0.35) if device is ONE else on_off((1.0, 0.6), hold=5.0, at=0.35, rest=(0.0, 0.2))
+    )
+    bench = Bench(camera=camera, noise_sd=noise_sd, noise_correlation=correlation)
+    rng = np.random.default_rng(seed)
+    return simulate(device, bench, command, duration=duration, name=name, rng=rng)
+
+
+def study(
+    *fit: Record,
+    held_out: Sequence[Record] = (),
+    noise: str = "white",
+    priors: Mapping[str, float | tuple[str, Mapping[str, float]]] | None = None,
+    sampler: Mapping[str, int] | None = None,
+    seed: int = 5,
+    **model: object,
+) -> Study:
+    told = {
+        name: PriorSettings(name, dist=value[0], parameters=value[1])
+        if isinstance(value, tuple)
+        else PriorSettings(name, fixed=value)
+        for name, value in (priors or {}).items()
+    }
+    return Study(
+        "small",
+        None,
+        fit[0].time_unit,
+        seed,
+        tuple(fit),
+        tuple(held_out),
+        model=ModelSettings(**model),
+        priors=told,
+        noise=NoiseSettings(noise),
+        sampler=SamplerSettings(**(sampler or {})),
+    )
+
+
+def problem(*fit: Record, **options: object) -> Problem:
+    return problem_of(study(*(fit or (record(),)), **options))
+
+
+def row_values(table: ParameterTable, told: Mapping[str, float]) -> Vector:
+    """Values in table order; an unnamed parameter is an error."""
+    return np.array([told[name] for name in table.names])
+
+
+def draws_of(table: ParameterTable, values: Matrix) -> Draws:
+    """Draws that count as perfectly converged, in two ensembles."""
+    half = values.shape[0] // 2
+    found = tuple(Quality(row.name, 1e4, 1e4, 1.0) for row in table.rows if row.free)
+    stacked = values[: 2 * half].reshape(2, half, -1)
+    return Draws(table, stacked, np.zeros((2, half)), found, 400.0)

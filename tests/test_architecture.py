@@ -1,0 +1,102 @@
+"""The shape of the package: imports flow one way, plotting stays in `report/`, modules stay small."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "lcopa_bayes"
+MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.name != "__init__.py")
+
+ORDER = (
+    ("problems", "cores"),
+    ("arrays", "files", "checks"),
+    ("stated", "cells", "estimate"),
+    ("record",),
+    ("settings",),
+    ("study",),
+    ("studyfile",),
+    ("operational",),
+    ("plant",),
+    ("optics",),
+    ("inference",),
+    ("provenance",),
+    ("predict", "stepmetrics"),
+    ("residuals",),
+    ("bench",),
+    ("fit",),
+    ("tables",),
+    ("runfolder",),
+    ("paper",),
+    ("report",),
+    ("cli",),
+)
+"""Rows from the door to the command line; a module imports only from rows above its own, or from its
+own folder."""
+PLOTTING = {"matplotlib", "corner"}
+LONGEST = 250
+
+
+def row_of(part: str) -> int:
+    for number, row in enumerate(ORDER):
+        if part in row:
+            return number
+    raise AssertionError(f"{part} has no place in ORDER; give it one")
+
+
+def place(path: Path) -> str:
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def imports(source: str) -> set[str]:
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found.add(node.module)
+            found.update(f"{node.module}.{alias.name}" for alias in node.names)
+    return found
+
+
+def breaches(part: str, source: str) -> list[str]:
+    """Imports of the package from the module's own row or below it, its own folder excepted."""
+    used = {name.split(".")[1] for name in imports(source) if name.startswith("lcopa_bayes.")}
+    return sorted(other for other in used if other != part and row_of(other) >= row_of(part))
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_imports_flow_down(path: Path):
+    assert breaches(place(path), path.read_text()) == []
+
+
+def test_a_breach_is_seen():
+    assert breaches("record", "from lcopa_bayes.study import Study") == ["study"]
+    assert breaches("record", "from lcopa_bayes.arrays import frozen") == []
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_only_the_report_plots(path: Path):
+    used = {name.split(".")[0] for name in imports(path.read_text())}
+    assert place(path) == "report" or not used & PLOTTING
+
+
+@pytest.mark.parametrize("folder", ["operational", "plant", "inference"])
+def test_the_bench_shares_no_numerics_with_the_model(folder: str):
+    for path in (PACKAGE / "bench").glob("*.py"):
+        assert not any(name.startswith(f"lcopa_bayes.{folder}") for name in imports(path.read_text()))
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_modules_are_one_sitting_long(path: Path):
+    assert len(path.read_text().splitlines()) <= LONGEST
+
+
+def test_importing_has_no_side_effects():
+    code = (
+        "import sys, lcopa_bayes; "
+        "sys.exit(bool({'matplotlib', 'corner', 'emcee', 'pandas'} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
