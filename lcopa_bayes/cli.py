@@ -18,7 +18,7 @@ from lcopa_bayes.cores import cores
 from lcopa_bayes.files import writable_folder
 from lcopa_bayes.fit import fit
 from lcopa_bayes.problems import InputError
-from lcopa_bayes.report.page import write_report
+from lcopa_bayes.report import write_report
 from lcopa_bayes.runfolder import save_fit
 from lcopa_bayes.study import Study
 from lcopa_bayes.studyfile import load_study

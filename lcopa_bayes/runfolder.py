@@ -45,7 +45,8 @@ def save_posterior(fit: Fit, path: Path) -> None:
     """Draws as netCDF with the ArviZ groups.
 
     One variable per free parameter; per record and axis one of `log_likelihood`,
-    `posterior_predictive` (plant with noise) and `observed_data`, named `<record>_<axis>`.
+    `posterior_predictive` (plant with noise) and `observed_data`, named `<record>_<axis>`. A slash in a
+    name, which netCDF keeps for groups, is written as a vertical bar.
     """
     draws, posterior = fit.draws, fit.problem.posterior
     table, shape = draws.table, draws.values.shape[:2]
@@ -53,11 +54,12 @@ def save_posterior(fit: Fit, path: Path) -> None:
     likelihood, predictive, observed, constant = _by_record(fit)
     tree = arviz_base.from_dict(
         {
-            "posterior": {table.names[k]: draws.values[..., k] for k in free},
+            "posterior": {_variable(table.names[k]): draws.values[..., k] for k in free},
             "sample_stats": {"lp": draws.log_density},
             "log_prior": {
-                table.names[k]: table.rows[k].log_prior(draws.values[..., k].ravel()).reshape(shape)
-                for k in free
+                _variable(row.name): row.log_prior(draws.values[..., k].ravel()).reshape(shape)
+                for k, row in enumerate(table.rows)
+                if row.free
             },
             "log_likelihood": likelihood,
             "posterior_predictive": predictive,
@@ -66,11 +68,15 @@ def save_posterior(fit: Fit, path: Path) -> None:
         }
     )
     for k in free:
-        tree["posterior"][table.names[k]].attrs["units"] = table.rows[k].unit
+        tree["posterior"][_variable(table.names[k])].attrs["units"] = table.rows[k].unit
     tree.attrs["grade"] = draws.grade.level
     tree.attrs["grade_reason"] = draws.grade.reason
     tree.attrs["noise"] = posterior.noise.kind
     tree.to_netcdf(path, engine="h5netcdf")
+
+
+def _variable(name: str) -> str:
+    return name.replace("/", "|")
 
 
 def _by_record(fit: Fit) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any], dict[str, Any]]:
@@ -86,7 +92,7 @@ def _by_record(fit: Fit) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]
         for axis, seen in enumerate(samples.axes):
             if seen.values.size == 0:
                 continue
-            name = f"{samples.record.name}_{samples.record.response_axes[axis].name}"
+            name = _variable(f"{samples.record.name}_{samples.record.response_axes[axis].name}")
             density = np.concatenate([part[r][axis] for part in pointwise])
             response = np.concatenate([part[r][axis][:, seen.index] for part in plant])
             offset = draws.table.offset(values, axis, r)

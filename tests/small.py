@@ -57,7 +57,9 @@ def record(
     name: str = "step",
 ) -> Record:
     command = command or (
-        step(1.0, at=0.35) if device is ONE else on_off((1.0, 0.6), hold=5.0, at=0.35, rest=(0.0, 0.2))
+        step(1.0, at=0.35)
+        if len(device.drive_axes) == 1
+        else on_off((1.0, 0.6), hold=5.0, at=0.35, rest=(0.0, 0.2))
     )
     bench = Bench(camera=camera, noise_sd=noise_sd, noise_correlation=correlation)
     rng = np.random.default_rng(seed)

@@ -1,0 +1,1 @@
+"""The virtual bench: synthetic records by numerics that share no code with the forward model."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -24,12 +25,14 @@ def save_chain(path: Path, ensembles: Sequence[Ensemble], fingerprint: str) -> N
             for number, ensemble in enumerate(ensembles):
                 group = file.create_group(f"ensemble_{number}")
                 for name in _ARRAYS:
-                    group.create_dataset(name, data=getattr(ensemble, name), fletcher32=True)
+                    group.create_dataset(name, data=getattr(ensemble, name))
                 group.attrs["steps"] = ensemble.steps
+                group.attrs["log_evidence"] = ensemble.log_evidence
                 kind, keys, position, has_gauss, gauss = ensemble.random
                 group.attrs["random_kind"] = kind
-                group.create_dataset("random_keys", data=keys, fletcher32=True)
+                group.create_dataset("random_keys", data=keys)
                 group.attrs["random_rest"] = np.array([position, has_gauss, gauss], dtype=float)
+                group.attrs["digest"] = _digest(ensemble)
 
     write_whole(path, write)
 
@@ -57,5 +60,18 @@ def _ensemble(group: h5py.Group) -> Ensemble:
     chain, log_density, position, position_log_density, accepted = (group[name][()] for name in _ARRAYS)
     at, has_gauss, gauss = group.attrs["random_rest"]
     random = (group.attrs["random_kind"], group["random_keys"][()], int(at), int(has_gauss), float(gauss))
-    steps = int(group.attrs["steps"])
-    return Ensemble(chain, log_density, position, position_log_density, accepted, steps, random)
+    steps, evidence = int(group.attrs["steps"]), float(group.attrs["log_evidence"])
+    ensemble = Ensemble(chain, log_density, position, position_log_density, accepted, steps, random, evidence)
+    if group.attrs["digest"] != _digest(ensemble):
+        raise ValueError(f"{group.name} is not what was written")
+    return ensemble
+
+
+def _digest(ensemble: Ensemble) -> str:
+    """Hash of all that an ensemble holds."""
+    kind, keys, *rest = ensemble.random
+    numbers = [float(number) for number in (*rest, ensemble.steps, ensemble.log_evidence)]
+    held = hashlib.sha256(repr((kind, numbers)).encode())
+    for array in (keys, *(getattr(ensemble, name) for name in _ARRAYS)):
+        held.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
+    return held.hexdigest()

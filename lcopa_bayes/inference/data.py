@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import final
 
 import numpy as np
@@ -23,6 +24,12 @@ class Observed:
     """[response unit]."""
     gaps: Vector
     """Time since the previous sample, in sampling periods; 1 for the first."""
+
+    @cached_property
+    def chosen(self) -> Index | slice:
+        """`index`, as a slice where it is one: taking a slice copies nothing."""
+        first, last = int(self.index[0]), int(self.index[-1]) + 1
+        return slice(first, last) if last - first == self.index.size else self.index
 
 
 @final

@@ -10,6 +10,8 @@ import numpy as np
 
 from lcopa_bayes.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.ridgemoves import moves
+from lcopa_bayes.inference.tempering import temper
 
 
 @final
@@ -31,20 +33,25 @@ class Ensemble:
     """Steps taken."""
     random: tuple[Any, ...]
     """State of the legacy generator that emcee draws from."""
+    log_evidence: float
+    """Evidence from the population's way out of the prior [nat]."""
 
     @classmethod
-    def at(cls, posterior: Posterior, position: Matrix, seed: np.random.SeedSequence) -> Ensemble:
-        """A new ensemble; emcee needs a legacy generator, seeded here and nowhere else."""
-        walkers, dimension = position.shape
-        state = np.random.RandomState(np.random.MT19937(seed)).get_state()
+    def born(cls, posterior: Posterior, walkers: int, sweeps: int, seed: np.random.SeedSequence) -> Ensemble:
+        """A population tempered from the prior; emcee needs a legacy generator, seeded here and nowhere
+        else."""
+        draw, walk = seed.spawn(2)
+        random = tuple(np.random.RandomState(np.random.MT19937(walk)).get_state())
+        population, random = temper(posterior, walkers, sweeps, np.random.default_rng(draw), random)
         return cls(
-            np.empty((0, walkers, dimension)),
+            np.empty((0, walkers, posterior.dimension)),
             np.empty((0, walkers)),
-            position,
-            posterior.log_density(position),
+            population.position,
+            population.log_density,
             np.zeros(walkers),
             0,
-            tuple(state),
+            random,
+            population.log_evidence,
         )
 
     @property
@@ -53,24 +60,15 @@ class Ensemble:
         return float(self.accepted.mean() / max(1, self.chain.shape[0]))
 
 
-def moves() -> list[tuple[emcee.moves.Move, float]]:
-    """Differential evolution along the ensemble's own differences, some of it long enough to change
-    hills, with snooker and stretch moves against degenerate directions."""
-    return [
-        (emcee.moves.DEMove(), 0.55),
-        (emcee.moves.DEMove(gamma0=1.0), 0.1),
-        (emcee.moves.DESnookerMove(), 0.1),
-        (emcee.moves.StretchMove(), 0.25),
-    ]
-
-
 def advance(posterior: Posterior, ensemble: Ensemble, draws: int, thin: int) -> Ensemble:
     """The ensemble after ``draws * thin`` more steps, every `thin`-th of them kept.
 
     Deterministic: the same ensemble advanced twice gives the same draws, in whatever process.
     """
     walkers, dimension = ensemble.position.shape
-    sampler = emcee.EnsembleSampler(walkers, dimension, posterior.log_density, moves=moves(), vectorize=True)
+    sampler = emcee.EnsembleSampler(
+        walkers, dimension, posterior.log_density, moves=moves(posterior), vectorize=True
+    )
     sampler.random_state = ensemble.random
     state = emcee.State(ensemble.position, log_prob=ensemble.position_log_density)
     last = sampler.run_mcmc(state, draws, thin_by=thin, skip_initial_state_check=True)
@@ -82,4 +80,5 @@ def advance(posterior: Posterior, ensemble: Ensemble, draws: int, thin: int) -> 
         ensemble.accepted + sampler.backend.accepted,
         ensemble.steps + draws * thin,
         tuple(sampler.random_state),
+        ensemble.log_evidence,
     )

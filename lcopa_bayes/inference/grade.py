@@ -8,8 +8,9 @@ from typing import Literal, final
 
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]
+from scipy.stats import spearmanr
 
-from lcopa_bayes.arrays import Array
+from lcopa_bayes.arrays import Array, Matrix
 
 Level = Literal["reliable", "tentative", "unusable"]
 
@@ -17,6 +18,10 @@ RELIABLE_RHAT = 1.02
 """Nested R-hat of independent ensembles [-] (Margossian et al. 2024, Bayesian Analysis 19)."""
 TENTATIVE_RHAT = 1.1
 """Above it the ensembles tell different stories."""
+RELIABLE_MEMORY = 0.3
+"""Walkers have forgotten where they started [-]."""
+TENTATIVE_MEMORY = 0.7
+"""Above it walkers hardly travel [-]."""
 TENTATIVE_ESS = 100.0
 """Below it not even a mean is known well [draws]."""
 _RANK: dict[Level, int] = {"reliable": 0, "tentative": 1, "unusable": 2}
@@ -34,6 +39,9 @@ class Quality:
     """Effective sample size for the 5 and 95 % quantiles [draws]."""
     rhat: float
     """Nested rank R-hat between ensembles [-]."""
+    memory: float = 0.0
+    """Rank correlation, over walkers, of where they stand at the start and at the end of the draws [-];
+    walkers that do not travel have 1, and their number says nothing about the posterior."""
 
     @property
     def ess(self) -> float:
@@ -42,13 +50,19 @@ class Quality:
 
     def grade(self, target_ess: float) -> Grade:
         """Grade of this parameter against a wanted effective sample size."""
-        if not (self.rhat <= TENTATIVE_RHAT and self.ess >= TENTATIVE_ESS):
+        if not (
+            self.rhat <= TENTATIVE_RHAT and self.ess >= TENTATIVE_ESS and self.memory <= TENTATIVE_MEMORY
+        ):
             level: Level = "unusable"
-        elif self.rhat <= RELIABLE_RHAT and self.ess >= target_ess:
+        elif self.rhat <= RELIABLE_RHAT and self.ess >= target_ess and self.memory <= RELIABLE_MEMORY:
             level = "reliable"
         else:
             level = "tentative"
-        return Grade(level, f"{self.name}: R-hat {self.rhat:.3f}, effective sample size {self.ess:.0f}")
+        return Grade(
+            level,
+            f"{self.name}: R-hat {self.rhat:.3f}, effective sample size {self.ess:.0f}, "
+            f"walkers' memory {self.memory:.2f}",
+        )
 
 
 @final
@@ -82,9 +96,17 @@ def qualities(names: Sequence[str], values: Array) -> tuple[Quality, ...]:
                 float(array_stats.ess(chains, method="bulk")),  # type: ignore[no-untyped-call]
                 float(array_stats.ess(chains, method="tail", prob=(0.05, 0.95))),  # type: ignore[no-untyped-call]
                 float(array_stats.rhat_nested(chains, owner)),  # type: ignore[no-untyped-call]
+                _memory(chains),
             )
         )
     return tuple(out)
+
+
+def _memory(chains: Matrix) -> float:
+    """Rank correlation of first and last draws over chains, centred; 1 when nothing moved."""
+    if np.ptp(chains[:, 0]) == 0.0 or np.ptp(chains[:, -1]) == 0.0:
+        return 1.0
+    return float(spearmanr(chains[:, 0], chains[:, -1]).statistic)
 
 
 def overall(found: Sequence[Quality], target_ess: float) -> Grade:
@@ -102,6 +124,8 @@ def overall(found: Sequence[Quality], target_ess: float) -> Grade:
         "the ensembles disagree: the posterior has several hills or a long ridge; sample more steps, "
         "fix or narrow what the record cannot tell"
         if worst.rhat > RELIABLE_RHAT
+        else "the walkers have hardly travelled; sample more steps"
+        if worst.memory > RELIABLE_MEMORY
         else "too few effective draws; sample more steps"
     )
     others = f" (also {', '.join(n for n in weak if n != worst.name)})" if len(weak) > 1 else ""

@@ -16,6 +16,8 @@ from lcopa_bayes.inference.posterior import Posterior
 
 _EDGE = 1e-6
 """Distance kept from the ends of a parameter's domain, relative to the domain or to 1."""
+_TAIL = 1e-9
+"""Prior mass beyond either end of the search on a logarithmic scale [-]."""
 
 
 @final
@@ -43,8 +45,9 @@ class LeastSquares:
         for k in self.columns:
             row = self.posterior.table.rows[k]
             a, b = row.domain
-            if row.log_scale:
-                a, b = (np.log(max(a, 1e-300)), np.log(b))
+            if row.log_scale and row.prior is not None:  # along a flat direction logarithms run to infinity
+                tails = row.prior.frozen.ppf((_TAIL, 1 - _TAIL))
+                a, b = np.log(max(a, tails[0], 1e-300)), np.log(min(b, tails[1]))
             edge = _EDGE * (b - a if np.isfinite(b - a) else 1.0)
             low.append(a + edge)
             high.append(b - edge)

@@ -60,7 +60,7 @@ class White(GaussianNoise):
     def whiten(self, columns: Array, parameters: Matrix, gaps: Vector) -> tuple[Array, Vector]:
         """Whitened columns (batch, k, n) and the sum over samples of log innovation sd, (batch,)."""
         sigma = parameters[:, 0]
-        return columns / sigma[:, None, None], gaps.size * np.log(sigma)
+        return columns * (1 / sigma)[:, None, None], gaps.size * np.log(sigma)
 
     def log_scales(self, parameters: Matrix, gaps: Vector) -> Matrix:
         """Log standard deviation, (batch, 1)."""

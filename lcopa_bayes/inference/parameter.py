@@ -84,11 +84,9 @@ class Parameter:
     def log_prior(self, x: Vector) -> Vector:
         """Log density of the prior, restricted to the domain and normalised there."""
         assert self.prior is not None
-        density = self.prior.log_density(x)
-        # a logit beyond 37 rounds to a correlation of exactly 1, where the noise has no density
-        if self._log_mass == 0.0 and not self.logit_scale:
-            return density
-        return np.where(_inside(self.kind, x), density - self._log_mass, -np.inf)
+        # also for a prior within the domain: far logits and logarithms round to its ends, where there
+        # is no likelihood (a correlation of 1) or a density may be infinite (a scale of 0)
+        return np.where(_inside(self.kind, x), self.prior.log_density(x) - self._log_mass, -np.inf)
 
     def draw(self, size: int, rng: np.random.Generator) -> Vector:
         """Draws from the prior within the domain, or copies of the fixed value."""

@@ -19,6 +19,8 @@ from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.plant.forward import ForwardModel
 
 _LOG_2PI = float(np.log(2 * np.pi))
+_PORTION = 64
+"""Parameter sets evaluated at once: what one portion holds stays in the processor's cache."""
 
 
 @final
@@ -75,7 +77,8 @@ class Posterior:
         """Canonical table values, (batch, rows), NaN where integrated out."""
         values = np.tile(self._template, (coordinates.shape[0], 1))
         natural = coordinates.copy()
-        natural[:, self._logs] = np.exp(coordinates[:, self._logs])
+        with np.errstate(over="ignore"):  # what is proposed as infinite lies outside every prior
+            natural[:, self._logs] = np.exp(coordinates[:, self._logs])
         natural[:, self._logits] = expit(coordinates[:, self._logits])
         values[:, self.sampled] = natural
         return self.table.canonical(values)
@@ -102,13 +105,13 @@ class Posterior:
         # sampled unordered, an exchangeable element covers each ordered point in every permutation
         return self.table.log_ordering - self.table.log_permutations
 
-    def log_density(self, coordinates: Matrix) -> Vector:
-        """Log of prior times likelihood, (batch,); FloatingPointError with the values where NaN."""
+    def log_density(self, coordinates: Matrix, *, heat: float = 1.0) -> Vector:
+        """Log of prior times likelihood^heat, (batch,); FloatingPointError with the values where NaN."""
         total = self.log_prior(coordinates)
         inside = np.flatnonzero(total > -np.inf)
         if inside.size:
             values = self.values(coordinates[inside])
-            total[inside] += self.log_likelihood(values)
+            total[inside] += heat * self.log_likelihood(values)
             if np.isnan(total).any():
                 row = values[np.flatnonzero(np.isnan(total[inside]))[0]]
                 at = ", ".join(f"{n} = {v:.6g}" for n, v in zip(self.table.names, row, strict=True))
@@ -117,6 +120,9 @@ class Posterior:
 
     def log_likelihood(self, values: Matrix) -> Vector:
         """Log likelihood of canonical values, linear parameters integrated out, (batch,)."""
+        if values.shape[0] > _PORTION:
+            portions = (values[k : k + _PORTION] for k in range(0, values.shape[0], _PORTION))
+            return np.concatenate([self.log_likelihood(portion) for portion in portions])
         units = self.model.unit_responses(self.table.dynamics(values))
         total = np.zeros(values.shape[0])
         for axis in range(len(self.table.layout.responses)):
@@ -198,14 +204,14 @@ class Posterior:
             observed = samples.axes[axis]
             if observed.values.size == 0:
                 continue
-            columns, place = [], []
-            for p, k in enumerate(block):
-                column = self.column(k, axis, r, observed, units[r])
-                if column is not None:
-                    columns.append(sd[p] * np.broadcast_to(column, (batch, observed.values.size)))
-                    place.append(p)
-            columns.append(self.residual(axis, r, observed, centre, units[r]))
-            white, scale = self.noise.whiten(np.stack(columns, axis=1), parameters, observed.gaps)
+            acting = [(p, self.column(k, axis, r, observed, units[r])) for p, k in enumerate(block)]
+            columns = [(p, column) for p, column in acting if column is not None]
+            stacked = np.empty((batch, len(columns) + 1, observed.values.size))
+            for slot, (p, column) in enumerate(columns):
+                np.multiply(sd[p], column, out=stacked[:, slot])
+            stacked[:, -1] = self.residual(axis, r, observed, centre, units[r])
+            white, scale = self.noise.whiten(stacked, parameters, observed.gaps)
+            place = [p for p, _ in columns]
             equations.add(white[:, :-1], white[:, -1], place)
             log_scale += scale
             count += observed.values.size
@@ -217,14 +223,17 @@ class Posterior:
         if row.kind == "offset":
             return np.ones((1, observed.values.size)) if row.place.second in (-1, r) else None
         drive = row.place.second
-        unit = units[self.table.layout.unit_of[axis][drive]]
-        return np.asarray(self.model.experiments[r].rest[drive] + unit[:, observed.index])
+        rest = self.model.experiments[r].rest[drive]
+        if not self.model.experiments[r].drives[drive].moves:
+            return np.full((1, observed.values.size), rest) if rest != 0.0 else None
+        unit = units[self.table.layout.unit_of[axis][drive]][:, observed.chosen]
+        return np.asarray(unit + rest) if rest != 0.0 else unit
 
     def residual(self, axis: int, r: int, observed: Observed, values: Matrix, units: Array) -> Matrix:
         """Observed minus modelled, (batch, n) [response unit]."""
         out = np.tile(observed.values, (values.shape[0], 1))
         for k in self.acting[axis]:
-            column = self.column(k, axis, r, observed, units)
+            column = self.column(k, axis, r, observed, units) if values[:, k].any() else None
             if column is not None:
                 out -= values[:, k, None] * column
         return out

@@ -1,8 +1,8 @@
-"""Independent ensembles, advanced in rounds until they agree or the budget is spent."""
+"""Independent ensembles from the prior, advanced in rounds until they agree or the budget is spent."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,13 +17,13 @@ from tqdm import tqdm
 from lcopa_bayes.arrays import Array
 from lcopa_bayes.inference.chainfile import load_chain, save_chain
 from lcopa_bayes.inference.ensemble import Ensemble, advance
-from lcopa_bayes.inference.grade import RELIABLE_RHAT, Quality, qualities
-from lcopa_bayes.inference.optimum import find_optima
+from lcopa_bayes.inference.grade import Quality, qualities
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.inference.start import dispersed_start
 
-_ROUND = 50
+_ROUND = 20
 """Draws kept per round and walker."""
+_SWEEPS = 40
+"""Moves of every walker at each temperature on the way from the prior."""
 _THIN = 10
 """Steps per kept draw unless the study says otherwise."""
 
@@ -62,8 +62,8 @@ class SamplePlan:
         least = 2 * dimension + 2
         return cls(
             ensembles,
-            max(least + least % 2, walkers or max(64, 4 * dimension)),
-            steps or 3000 + 1000 * dimension,
+            max(least + least % 2, walkers or max(128, 24 * dimension)),
+            steps or 2000 + 400 * dimension,
             thin or _THIN,
             target_ess,
             seed,
@@ -96,36 +96,47 @@ def sample(
     resume: bool = False,
     quiet: bool = True,
 ) -> Run:
-    """Sample a posterior: multi-start least squares, then rounds of independent ensembles.
+    """Sample a posterior: populations tempered from the prior, then rounds of emcee.
 
     The draws depend on posterior and plan alone, not on `jobs` nor on interruptions: with `resume`, a
     run killed at any moment continues from the last complete round in `chain_file`.
     """
-    stored = load_chain(chain_file, fingerprint) if resume and chain_file else ()
-    ensembles = stored or _begin(posterior, plan)
+    ensembles = load_chain(chain_file, fingerprint) if resume and chain_file else ()
     rounds = max(2, -(-plan.steps // (_ROUND * plan.thin)))
-    done = ensembles[0].steps // (_ROUND * plan.thin)
+    done = ensembles[0].steps // (_ROUND * plan.thin) if ensembles else 0
     with (
-        _crew(posterior, min(jobs, plan.ensembles)) as go_on,
-        tqdm(total=rounds, initial=done, unit="round", disable=quiet, desc="sampling") as bar,
+        _crew(posterior, min(jobs, plan.ensembles)) as crew,
+        tqdm(total=rounds, initial=done, unit="round", disable=quiet, desc="from the prior") as bar,
     ):
+        if not ensembles:
+            seeds = np.random.SeedSequence(plan.seed).spawn(plan.ensembles)
+            ensembles = tuple(crew(_Birth(plan.walkers, _SWEEPS), seeds))
+            _store(chain_file, ensembles, fingerprint)
+        bar.set_description("sampling")
         while done < rounds and not (done >= 2 and finished(posterior, Run(ensembles, plan), bar)):
-            ensembles = tuple(go_on(ensembles, plan.thin))
+            ensembles = tuple(crew(_Round(plan.thin), ensembles))
             done += 1
-            if chain_file:
-                save_chain(chain_file, ensembles, fingerprint)
+            _store(chain_file, ensembles, fingerprint)
             bar.update()
     return Run(ensembles, plan)
+
+
+def _store(chain_file: Path | None, ensembles: Sequence[Ensemble], fingerprint: str) -> None:
+    if chain_file:
+        save_chain(chain_file, ensembles, fingerprint)
 
 
 def finished(posterior: Posterior, run: Run, bar: tqdm[Any] | None = None) -> bool:
     """Whether every sampled parameter agrees between ensembles and has its effective sample size."""
     found = sampled_qualities(posterior, run)
-    ess, rhat = float(np.min([q.ess for q in found])), float(np.max([q.rhat for q in found]))
     if bar is not None:
+        ess, rhat = float(np.min([q.ess for q in found])), float(np.max([q.rhat for q in found]))
+        memory = float(np.max([q.memory for q in found]))
         acceptance = np.mean([ensemble.acceptance for ensemble in run.ensembles])
-        bar.set_postfix(acceptance=f"{acceptance:.2f}", ess=f"{ess:.0f}", rhat=f"{rhat:.3f}")
-    return ess >= run.plan.target_ess and rhat <= RELIABLE_RHAT
+        bar.set_postfix(
+            acceptance=f"{acceptance:.2f}", ess=f"{ess:.0f}", rhat=f"{rhat:.3f}", memory=f"{memory:.2f}"
+        )
+    return all(quality.grade(run.plan.target_ess).level == "reliable" for quality in found)
 
 
 def sampled_qualities(posterior: Posterior, run: Run) -> tuple[Quality, ...]:
@@ -137,32 +148,43 @@ def sampled_qualities(posterior: Posterior, run: Run) -> tuple[Quality, ...]:
     return qualities(names, values.reshape(*shape[:3], -1))
 
 
-def _begin(posterior: Posterior, plan: SamplePlan) -> tuple[Ensemble, ...]:
-    """New ensembles around the least-squares optima."""
-    search, *children = np.random.SeedSequence(plan.seed).spawn(1 + plan.ensembles)
-    optima = find_optima(posterior, np.random.default_rng(search))
-    out = []
-    for child in children:
-        place, walk = child.spawn(2)
-        position = dispersed_start(posterior, optima, plan.walkers, np.random.default_rng(place))
-        out.append(Ensemble.at(posterior, position, walk))
-    return tuple(out)
+@final
+@dataclass(frozen=True)
+class _Birth:
+    """Task: a new ensemble of a seed."""
+
+    walkers: int
+    sweeps: int
+
+    def __call__(self, posterior: Posterior, seed: np.random.SeedSequence) -> Ensemble:
+        return Ensemble.born(posterior, self.walkers, self.sweeps, seed)
 
 
-_GoOn = Callable[[Sequence[Ensemble], int], Iterator[Ensemble]]
+@final
+@dataclass(frozen=True)
+class _Round:
+    """Task: an ensemble one round further."""
+
+    thin: int
+
+    def __call__(self, posterior: Posterior, ensemble: Ensemble) -> Ensemble:
+        return advance(posterior, ensemble, _ROUND, self.thin)
+
+
+_Crew = Callable[[Callable[[Posterior, Any], Ensemble], Sequence[Any]], Iterable[Ensemble]]
 
 
 @contextmanager
-def _crew(posterior: Posterior, jobs: int) -> Iterator[_GoOn]:
-    """A function that advances ensembles by one round, in this process or in `jobs` others."""
+def _crew(posterior: Posterior, jobs: int) -> Iterator[_Crew]:
+    """A map of a task over its inputs, in this process or in `jobs` others."""
     if jobs <= 1:
         with threadpool_limits(1):
-            yield lambda ensembles, thin: (advance(posterior, e, _ROUND, thin) for e in ensembles)
+            yield lambda task, inputs: (task(posterior, one) for one in inputs)
         return
     with ProcessPoolExecutor(
         jobs, mp_context=get_context("spawn"), initializer=_take_up, initargs=(posterior,)
     ) as pool:
-        yield lambda ensembles, thin: pool.map(_round, ensembles, [thin] * len(ensembles))
+        yield lambda task, inputs: pool.map(_perform, [task] * len(inputs), inputs)
 
 
 _posterior: Posterior | None = None
@@ -175,6 +197,6 @@ def _take_up(posterior: Posterior) -> None:
     _posterior = posterior
 
 
-def _round(ensemble: Ensemble, thin: int) -> Ensemble:
+def _perform(task: Callable[[Posterior, Any], Ensemble], given: Any) -> Ensemble:
     assert _posterior is not None
-    return advance(_posterior, ensemble, _ROUND, thin)
+    return task(_posterior, given)

@@ -1,0 +1,1 @@
+"""Block pulses and the triangular Toeplitz algebra of their fractional integrals."""

@@ -11,20 +11,25 @@ from typing import final
 @final
 @dataclass(frozen=True)
 class Element:
-    """Denominator ``1 + sum_i (T_i s)^order_i`` (Ta et al. 2026, Eq. 28, stiffness divided out)."""
+    """Denominator ``1 + sum_i (T_i s)^order_i`` (Ta et al. 2026, Eq. 28, stiffness divided out).
+
+    Equal orders are one term in effect; the paper's integer rival has orders 2, 1, 1. Raises ValueError
+    for anything the fields do not allow.
+    """
 
     times: tuple[float, ...]
     """Time constants T_i [time unit], one per order; positive."""
     orders: tuple[float, ...]
-    """Fractional orders [-], decreasing, in (0, 2]."""
+    """Fractional orders [-], not increasing, in (0, 2]."""
 
     def __post_init__(self) -> None:
         if len(self.times) != len(self.orders) or not self.orders:
             raise ValueError(f"one time constant per order; got {len(self.times)} and {len(self.orders)}")
         if not all(0 < time < inf for time in self.times):
             raise ValueError(f"`times` must be positive and finite; got {self.times}")
-        if not (self.orders[0] <= 2 and all(a > b for a, b in pairwise((*self.orders, 0.0)))):
-            raise ValueError(f"`orders` must decrease within (0, 2]; got {self.orders}")
+        falling = all(a >= b for a, b in pairwise(self.orders))  # NaN fails
+        if not (self.orders[0] <= 2 and falling and self.orders[-1] > 0):
+            raise ValueError(f"`orders` must not increase and lie within (0, 2]; got {self.orders}")
 
 
 @final

@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 from lcopa_bayes.operational.blockpulse import integration_matrix
 from lcopa_bayes.plant.drive import Drive
 from lcopa_bayes.plant.forward import Dynamics, Experiment, ForwardModel
-from lcopa_bayes.plant.grid import Grid, Mesh, Reading
+from lcopa_bayes.plant.grid import Mesh
 from lcopa_bayes.plant.layout import Layout
 from lcopa_bayes.record import Axis
 from lcopa_bayes.settings import ModelSettings
@@ -39,7 +39,7 @@ def dynamics(batch: int) -> Dynamics:
 
 def model(n: int) -> ForwardModel:
     layout = Layout.of([Axis("x", "rad")], [Axis("x", "rad")], ModelSettings(terms=3))
-    mesh = Mesh(Grid(0.0, SPAN / n, n), Reading(n, 0, slice(0, None, 1), None))
+    mesh = Mesh.of_samples(SPAN / n * np.arange(n), 0.0, blocks=n)
     drive = Drive(np.zeros(1), np.ones(1))
     return ForwardModel(layout, (Experiment("step", mesh, (drive,), np.zeros(1)),))
 

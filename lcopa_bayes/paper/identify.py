@@ -1,0 +1,220 @@
+"""The verb `identify`: the paper's identification of every path, and what to hold it against."""
+
+from __future__ import annotations
+
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from typing import Any, final
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+from tqdm import tqdm
+
+from lcopa_bayes.estimate import plain
+from lcopa_bayes.paper.equation import Convention, PathModel, equation_rmse, least_squares, output_rmse
+from lcopa_bayes.paper.intervals import Interval, Scan
+from lcopa_bayes.paper.outputerror import output_error_fit
+from lcopa_bayes.paper.paths import PathData, path_data
+from lcopa_bayes.paper.scan import Scanned, scan
+from lcopa_bayes.problems import InputError
+from lcopa_bayes.study import Study
+
+
+@final
+@dataclass(frozen=True)
+class Identified:
+    """A model of a path with its errors on the records it was identified from."""
+
+    method: str
+    model: PathModel
+    equation_rmse: float
+    """Equation error over blocks, per unit of left side [response unit]; see `equation_rmse`."""
+    output_rmse: float
+    """Response minus model over samples [response unit]."""
+    candidates: int | None = None
+    """Candidates scanned [-]; None for a fit."""
+    physical: int | None = None
+    """Of these, with positive viscosities and stiffness [-]."""
+    unconstrained_rmse: float | None = None
+    """Least output error among candidates of any sign, over blocks [response unit]."""
+
+
+@final
+@dataclass(frozen=True)
+class Identification:
+    """One path of a study, identified in several ways from the same records."""
+
+    data: PathData
+    scan: Identified
+    """Least squares inside the scan with k given (Eqs. 62-64)."""
+    scan_last_eta: Identified
+    """The same with the last eta 1 instead (the form of Eq. 65)."""
+    output_error: Identified
+    """Output-error fit: many starts, continuous delay."""
+    integer: Identified
+    """The scan with k given and orders 2, 1, 1 (Section 5.2); equal orders act as one term."""
+    integer_output_error: Identified
+    """Output-error fit with the integer orders."""
+    stiffness: tuple[tuple[float, float], ...]
+    """Values of k scanned at the winner [-] and the output error with each [response unit]."""
+
+    @property
+    def models(self) -> tuple[Identified, ...]:
+        """All models, in the order of the fields."""
+        return (
+            self.scan,
+            self.scan_last_eta,
+            self.output_error,
+            self.integer,
+            self.integer_output_error,
+        )
+
+
+def identify(
+    study: Study, *, plan: Scan | None = None, quiet: bool = True, jobs: int = 1
+) -> tuple[Identification, ...]:
+    """Identify every path of a study, row by row; the same for any number of `jobs`.
+
+    A path is identified from the fit records in which its drive alone moves. Its number of terms, and
+    its orders if fixed, are the study's. InputError when records or intervals cannot be used.
+    """
+    plan = _within_study(plan or Scan(), study)
+    paths = path_data(study)
+    problems: list[str] = []
+    for data in paths:
+        try:
+            plan.first_round(data.terms, data.span, data.records[0].blocks.grid.step)
+        except InputError as error:
+            problems += [f"path {data.name}: {problem}" for problem in error.problems]
+    if problems:
+        raise InputError(problems)
+    if jobs <= 1 or len(paths) == 1:
+        with tqdm(total=0, unit="candidate", disable=quiet) as bar:
+            return tuple(_identify(study, data, plan, bar) for data in paths)
+    workers = min(jobs, len(paths))
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        count = len(paths)
+        made = pool.map(_identify, [study] * count, paths, [plan] * count)
+        return tuple(tqdm(made, total=count, unit="path", disable=quiet))
+
+
+def integer_orders(terms: int) -> tuple[float, ...]:
+    """Orders 2, 1, 1 of the integer rival, the equal ones merged: their terms act as one."""
+    return (2.0, 1.0) if terms > 1 else (1.0,)
+
+
+def _within_study(plan: Scan, study: Study) -> Scan:
+    """The plan with the orders that the study fixes."""
+    orders = study.model.orders
+    if orders == "free":
+        return plan
+    distinct = sorted(set(orders), reverse=True)  # equal orders act as one term
+    return replace(plan, orders=tuple(Interval(order, order) for order in distinct))
+
+
+def _identify(study: Study, data: PathData, plan: Scan, bar: tqdm[Any] | None = None) -> Identification:
+    with threadpool_limits(1):
+        fixed, whole = study.model.orders != "free", integer_orders(data.terms)
+        rigid = replace(plan, orders=tuple(Interval(order, order) for order in whole))
+        scanned = []
+        for title, count, limits, convention in (
+            ("k given", data.terms, plan, Convention.STIFFNESS),
+            ("last eta = 1", data.terms, plan, Convention.LAST_ETA),
+            ("integer orders", len(whole), rigid, Convention.STIFFNESS),
+        ):
+            if bar is not None:
+                bar.set_description(f"{data.name}, {title}")
+            blocks = [each.blocks for each in data.records]
+            made = scan(blocks, count, data.span, limits, convention=convention, bar=bar)
+            scanned.append(_of_scan(f"scan, {title}", data, made))
+        winner = scanned[0].model
+        if bar is not None:
+            bar.set_description(f"{data.name}, output error")
+        rng = np.random.default_rng([study.seed, data.response, data.drive])
+        free = output_error_fit(
+            study, data, rng, terms=data.terms, orders=winner.form.orders if fixed else "free", start=winner
+        )
+        rival = scanned[2].model
+        stiff = output_error_fit(study, data, rng, terms=len(whole), orders=whole, start=rival)
+        return Identification(
+            data,
+            scanned[0],
+            scanned[1],
+            _described("output error", data, free),
+            scanned[2],
+            _described("output error, integer orders", data, stiff),
+            tuple((k, output_rmse(data.records, _with_stiffness(data, winner, k))) for k in plan.stiffness),
+        )
+
+
+def _with_stiffness(data: PathData, winner: PathModel, stiffness: float) -> PathModel:
+    """Eq. 63 solved anew at the winner's orders and delay with another k."""
+    blocks = [each.blocks for each in data.records]
+    return least_squares(blocks, winner.form.orders, winner.delay, known=stiffness)
+
+
+def _described(method: str, data: PathData, model: PathModel) -> Identified:
+    blocks = [each.blocks for each in data.records]
+    return Identified(method, model, equation_rmse(blocks, model), output_rmse(data.records, model))
+
+
+def _of_scan(method: str, data: PathData, made: Scanned) -> Identified:
+    return replace(
+        _described(method, data, made.model),
+        candidates=made.candidates,
+        physical=made.physical,
+        unconstrained_rmse=made.unconstrained_rmse,
+    )
+
+
+def results(study: Study, found: tuple[Identification, ...], plan: Scan | None = None) -> dict[str, Any]:
+    """Every number as plain JSON values; units beside them."""
+    stiffness = (plan or Scan()).stiffness[0]
+    told: dict[str, Any] = plain(
+        {
+            "study": study.name,
+            "time_unit": study.time_unit,
+            "paths": [_path(each, stiffness, study.time_unit) for each in found],
+        }
+    )
+    return told
+
+
+def _path(found: Identification, stiffness: float, time_unit: str) -> dict[str, Any]:
+    data = found.data
+    return {
+        "path": data.name,
+        "response_unit": data.response_unit,
+        "drive_unit": data.drive_unit,
+        "block": data.records[0].blocks.grid.step,
+        "block_unit": time_unit,
+        "records": [
+            {"record": each.record.name, "level": each.level, "level_from": each.level_from}
+            for each in data.records
+        ],
+        "models": [_model(each, stiffness, time_unit) for each in found.models],
+        "stiffness_scan": [{"stiffness": k, "output_rmse": rmse} for k, rmse in found.stiffness],
+    }
+
+
+def _model(made: Identified, stiffness: float, time_unit: str) -> dict[str, Any]:
+    model = made.model
+    return {
+        "method": made.method,
+        "orders": model.form.orders,
+        "delay": model.delay,
+        "delay_unit": time_unit,
+        "coefficients": {
+            convention.value: {"gain": form.gain, "etas": form.etas, "stiffness": form.stiffness}
+            for convention in Convention
+            for form in (model.scaled(convention, stiffness),)
+        },
+        "steady": model.steady,
+        "physical": model.physical,
+        "equation_rmse": made.equation_rmse,
+        "output_rmse": made.output_rmse,
+        "candidates": made.candidates,
+        "physical_candidates": made.physical,
+        "unconstrained_output_rmse": made.unconstrained_rmse,
+    }

@@ -1,0 +1,81 @@
+"""Output-error fit of one path: many starts, exact Jacobian, continuous delay."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from lcopa_bayes.arrays import Vector
+from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.inference.leastsquares import LeastSquares
+from lcopa_bayes.inference.optimum import find_optima
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.paper.equation import PathModel, output_rmse
+from lcopa_bayes.paper.paths import PathData
+from lcopa_bayes.plant.element import Element, to_paper
+from lcopa_bayes.settings import ModelSettings, NoiseSettings
+from lcopa_bayes.study import Study
+
+
+def output_error_fit(
+    study: Study,
+    data: PathData,
+    rng: np.random.Generator,
+    *,
+    terms: int,
+    orders: tuple[float, ...] | Literal["free"] = "free",
+    start: PathModel | None = None,
+    starts: int = 12,
+) -> PathModel:
+    """Least sum of squares of response minus model over etas, b, orders and delay together.
+
+    The data are those of the scan, resting levels subtracted. Starts are the best of many draws from
+    the default priors and, if it is physical, the model `start` (as many terms, decreasing orders). The
+    default normal prior of the gain, five times the record's, is the only penalty. k is 1 in the result.
+    """
+    posterior = _posterior(study, data, terms, orders)
+    found = [optimum.values for optimum in find_optima(posterior, rng, starts=starts)]
+    if start is not None and start.physical:
+        least = LeastSquares(posterior)
+        values = least.with_noise(_values(posterior, start))
+        found.append(least.solve(values)[0])
+    models = [_model(posterior, values) for values in found]
+    return min(models, key=lambda model: output_rmse(data.records, model))
+
+
+def _posterior(
+    study: Study, data: PathData, terms: int, orders: tuple[float, ...] | Literal["free"]
+) -> Posterior:
+    single = Study(
+        f"{study.name}-{data.name}",
+        None,
+        study.time_unit,
+        study.seed,
+        tuple(each.record for each in data.records),
+        model=ModelSettings(terms=terms, orders=orders, offset="none", exposure=study.model.exposure),
+        noise=NoiseSettings("white"),
+    )
+    return problem_of(single).posterior
+
+
+def _values(posterior: Posterior, model: PathModel) -> Vector:
+    """Table values of a physical model; the noise scale is a guess."""
+    table, form = posterior.table, replace(model.form)
+    out = np.zeros(len(table.rows))
+    out[table.at("gain", 0)] = model.steady
+    for k, (eta, order) in enumerate(zip(form.etas, form.orders, strict=True)):
+        out[table.at("time", 0, k)] = (eta / form.stiffness) ** (1 / order)
+        out[table.at("order", 0, k)] = order
+    out[table.at("delay", 0)] = model.delay
+    out[table.at("sigma", 0)] = 1.0
+    return out
+
+
+def _model(posterior: Posterior, values: Vector) -> PathModel:
+    table = posterior.table
+    dynamics = table.dynamics(values[None])
+    times, orders = (tuple(float(v) for v in part[0][0]) for part in (dynamics.times, dynamics.orders))
+    gain = float(values[table.at("gain", 0)])
+    return PathModel(to_paper(gain, Element(times, orders), stiffness=1.0), float(dynamics.delays[0, 0]))

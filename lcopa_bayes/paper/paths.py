@@ -1,0 +1,208 @@
+"""The records from which one path is identified: one drive moves, deviations from rest, block pulses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.arrays import Array, Vector
+from lcopa_bayes.plant.drive import Drive
+from lcopa_bayes.plant.grid import Grid
+from lcopa_bayes.plant.layout import Layout
+from lcopa_bayes.problems import InputError
+from lcopa_bayes.record import Record
+from lcopa_bayes.study import Study
+
+MOST_BLOCKS = 1024
+"""A record with more samples is identified on this many block means: the algebra is quadratic in them."""
+_EVEN = 1e-4
+"""Largest deviation from equidistance that still counts as equidistant, in sampling periods."""
+_RESTING = 5
+"""So many samples before the first change of the drive give a resting level of their own."""
+_AT_MOST = 0.1
+"""Largest share of a record's samples whose mean is taken for its resting level [-]."""
+_DEPARTED = 3.5
+"""A sample this many noise sd from the mean of those before it has left the resting level."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """One path of one record as block pulses (Ta et al. 2026, Eqs. 43-46), deviations from rest."""
+
+    grid: Grid
+    """Blocks of one sampling period, samples at their midpoints, where the samples allow it."""
+    drive: Drive
+    response: Vector
+    """Block means, (n,) [response unit]."""
+
+    @classmethod
+    def of(cls, record: Record, exposure: float = 0.0) -> Blocks:
+        """From a record of one drive and one response, both deviations from rest.
+
+        A sample stands for the middle of its `exposure` [time unit].
+
+        Equidistant samples are taken as the means of blocks around them. Others, or more than
+        `MOST_BLOCKS`, give the exact block means of straight lines between samples.
+        """
+        taken = np.isfinite(record.response[:, 0])
+        times, values = record.time[taken] - exposure / 2, record.response[taken, 0]
+        drive = Drive.of_rows(record.time, record.drive[:, 0])
+        begin = float(drive.times[0])
+        after = times > begin
+        knots = np.concatenate(([begin], times[after]))
+        heights = np.concatenate(([0.0], values[after]))
+        period = float(times[-1] - times[0]) / (times.size - 1)
+        even = np.abs(np.diff(times) - period).max() < _EVEN * period
+        back = int(np.ceil((times[-1] - begin) / period - 0.5 + 1e-9))
+        if even and back < MOST_BLOCKS:
+            grid = Grid(float(times[-1]) - (back + 0.5) * period, period, back + 1)
+            middles = grid.start + grid.step * (np.arange(grid.n) + 0.5)
+            return cls(grid, drive, np.interp(middles, knots, heights))
+        n = min(MOST_BLOCKS, knots.size)
+        grid = Grid(begin, float(times[-1] - begin) / n, n)
+        return cls(grid, drive, _means(grid, knots, heights))
+
+
+def _means(grid: Grid, knots: Vector, heights: Vector) -> Vector:
+    """Block means of the straight lines through the knots, exact."""
+    areas = np.concatenate(([0.0], np.cumsum(np.diff(knots) * (heights[1:] + heights[:-1]) / 2)))
+    edges = np.clip(grid.edges, knots[0], knots[-1])  # rounding may put the last edge beyond the last sample
+    piece = np.minimum(np.searchsorted(knots, edges, side="right") - 1, knots.size - 2)
+    into = edges - knots[piece]
+    slope = np.diff(heights)[piece] / np.diff(knots)[piece]
+    return np.asarray(np.diff(areas[piece] + into * (heights[piece] + slope * into / 2)) / grid.step)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class PathRecord:
+    """What one record says about one path."""
+
+    record: Record
+    """One drive, less its resting value; one response, less its resting level."""
+    level: float
+    """Resting level that was subtracted [response unit]."""
+    level_from: str
+    """The samples it is the mean of."""
+    exposure: float
+    """Time over which a sample is a mean [time unit]."""
+    blocks: Blocks
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class PathData:
+    """The records of a study from which one path is identified."""
+
+    response: int
+    drive: int
+    name: str
+    """``<response>_<drive>``."""
+    response_unit: str
+    drive_unit: str
+    terms: int
+    """Viscous terms [-]; of fixed orders that are equal, one."""
+    records: tuple[PathRecord, ...]
+
+    @property
+    def span(self) -> float:
+        """Shortest time from a record's first drive change to its end [time unit]."""
+        return min(float(each.blocks.grid.edges[-1] - each.blocks.drive.times[0]) for each in self.records)
+
+
+def path_data(study: Study) -> tuple[PathData, ...]:
+    """Every path of a study, row by row; each from the fit records where its drive alone moves.
+
+    InputError, for all paths together, when no record moves a drive alone, and when samples are
+    fewer than a path's unknowns or do not move.
+    """
+    layout = Layout.of(study.drive_axes, study.response_axes, study.model)
+    fixed = len(set(study.model.orders)) if study.model.orders != "free" else 0
+    problems: list[str] = []
+    alone = [[r for r in study.fit if _moving(r) == [j]] for j in range(len(layout.drives))]
+    for j, axis in enumerate(layout.drives):
+        if alone[j]:
+            continue
+        together = ", ".join(repr(r.name) for r in study.fit if j in _moving(r))
+        problems.append(
+            f"no fit record moves drive {axis.name!r} alone"
+            + (f"; in {together} several drives move at once, which mixes paths" if together else "")
+            + "; add a record with a step of this drive only"
+        )
+    paths = []
+    for i, response in enumerate(layout.responses):
+        for j, drive in enumerate(layout.drives):
+            name = f"{response.name}_{drive.name}"
+            terms = fixed or layout.elements[layout.element_of[i][j]].terms
+            usable = [r for r in alone[j] if _samples_after(r, i, j) > 0]
+            unknowns = 2 * terms + 2
+            count = sum(_samples_after(r, i, j) for r in usable)
+            if alone[j] and count <= unknowns:
+                problems.append(
+                    f"path {name}: {count} response samples after the drive moves cannot determine "
+                    f"{unknowns} unknowns; add samples or choose fewer terms under [model]"
+                )
+            elif alone[j]:
+                records = tuple(_path_record(r, i, j, study.model.exposure) for r in usable)
+                if not any(np.any(each.blocks.response) for each in records):
+                    problems.append(f"path {name}: the response never moves; leave its column out")
+                paths.append(PathData(i, j, name, response.unit, drive.unit, terms, records))
+    if problems:
+        raise InputError(problems)
+    return tuple(paths)
+
+
+def _moving(record: Record) -> list[int]:
+    return [int(j) for j in np.flatnonzero((record.drive != record.drive[0]).any(axis=0))]
+
+
+def _begin(record: Record, drive: int) -> float:
+    return float(Drive.of_rows(record.time, record.drive[:, drive]).times[0])
+
+
+def _samples_after(record: Record, response: int, drive: int) -> int:
+    later = record.time > _begin(record, drive)
+    return int(np.isfinite(record.response[later, response]).sum())
+
+
+def _path_record(record: Record, response: int, drive: int, exposure: float) -> PathRecord:
+    taken = np.isfinite(record.response[:, response])
+    level, level_from = _resting_level(
+        record.time[taken], record.response[taken, response], _begin(record, drive)
+    )
+    column = record.drive[:, [drive]]
+    single = Record(
+        record.name,
+        record.time,
+        column - column[0],
+        record.response[:, [response]] - level,
+        (record.drive_axes[drive],),
+        (record.response_axes[response],),
+        record.time_unit,
+    )
+    return PathRecord(single, level, level_from, exposure, Blocks.of(single, exposure))
+
+
+def _resting_level(times: Vector, values: Vector, begin: float) -> tuple[float, str]:
+    """Mean of the samples up to the first drive change, or of the first samples that do not leave it."""
+    before = int(np.searchsorted(times, begin, side="right"))
+    if before >= _RESTING:
+        return float(values[:before].mean()), f"the {before} samples before the drive moves"
+    count = _unmoved(values, max(1, before))
+    first = f"the first {count} samples, which do not leave their mean" if count > 1 else "the first sample"
+    return float(values[:count].mean()), first
+
+
+def _unmoved(values: Array, least: int) -> int:
+    """How many first samples stay within the noise of the mean of those before them, at least `least`."""
+    bends = np.abs(np.diff(values, 2))  # of white noise, sqrt(6) sd; of a smooth response, nearly nothing
+    sd = float(np.median(bends)) / (0.6745 * np.sqrt(6.0)) if bends.size else 0.0
+    most = max(least, int(_AT_MOST * values.size))
+    for count in range(least, most):
+        mean = float(values[:count].mean())
+        if abs(float(values[count]) - mean) > _DEPARTED * sd * np.sqrt(1 + 1 / count):
+            return count
+    return most

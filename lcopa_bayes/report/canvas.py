@@ -1,0 +1,116 @@
+"""How figures look, and how they become the same bytes every time."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
+
+INK = "#1a1a1a"
+SEEN = "#1a1a1a"
+"""Observations of records that were fitted."""
+HELD_OUT = "#b3410b"
+"""Observations of records that were held out."""
+BAND = "#0072b2"
+NOISE = "#8a8a8a"
+STEADY = "#b3410b"
+CYCLE = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#7a6a00", "#000000")
+"""Okabe and Ito 2008, colours that people with any colour vision tell apart; yellow darkened."""
+WIDTH = 7.4
+"""Width of a figure [in]."""
+_LOOK: Mapping[Any, Any] = {
+    "svg.hashsalt": "lcopa-bayes",
+    "svg.fonttype": "path",
+    "font.family": "DejaVu Sans",
+    "font.size": 8.5,
+    "axes.titlesize": 9,
+    "axes.labelsize": 8.5,
+    "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5,
+    "legend.fontsize": 7.5,
+    "legend.frameon": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": INK,
+    "axes.linewidth": 0.7,
+    "axes.formatter.useoffset": False,
+    "lines.linewidth": 1.1,
+    "figure.constrained_layout.w_pad": 0.07,
+    "path.simplify": True,
+    "savefig.dpi": 100,
+    "figure.dpi": 100,
+}
+_COORDINATES = re.compile(r'\s(?:d|x|y)="[^"]*"')
+_LONG_DECIMALS = re.compile(r"(\.\d\d)\d+")
+_NO_METADATA = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+
+
+@contextmanager
+def look() -> Iterator[None]:
+    """Inside, figures are drawn in the look of the report; outside nothing has changed."""
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(_LOOK)
+        yield
+
+
+def blank(height: float, width: float = WIDTH) -> Figure:
+    """An empty figure of a height and width [in]."""
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def grid(count: int, *, columns: int, height: float) -> tuple[Figure, Sequence[Axes]]:
+    """A figure with `count` panels in `columns`, each row `height` [in] high."""
+    rows = -(-count // columns)
+    figure = blank(0.2 + rows * height)
+    panels = figure.subplots(rows, min(columns, count), squeeze=False).ravel()
+    for spare in panels[count:]:
+        spare.remove()
+    return figure, list(panels[:count])
+
+
+def log_ticks(axis: Axis, low: float, high: float) -> None:
+    """Ticks of a logarithmic axis: round numbers when it spans few decades, else powers of ten."""
+    if high < 200.0 * low:
+        wide = high > 5.0 * low
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)) if wide else MaxNLocator(4, steps=[1, 2, 5, 10]))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_locator(NullLocator())
+    else:
+        axis.set_major_locator(LogLocator(numticks=4))
+        axis.set_minor_formatter(NullFormatter())
+
+
+def plain(text: str) -> str:
+    """`text` as matplotlib shows it unchanged."""
+    return text.replace("$", r"\$")
+
+
+def label(name: str, unit: str) -> str:
+    """Axis label `name [unit]`."""
+    return f"{plain(name)} [{plain(unit)}]"
+
+
+def svg_of(figure: Figure) -> str:
+    """The figure as SVG without dates or links to software, its coordinates to a hundredth of a point."""
+    out = io.StringIO()
+    figure.savefig(out, format="svg", metadata=_NO_METADATA)
+    return _COORDINATES.sub(lambda found: _LONG_DECIMALS.sub(r"\1", found[0]), out.getvalue())
+
+
+def inlined(svg: str, prefix: str) -> str:
+    """The `<svg>` element alone, its ids made unique by `prefix`, as it stands inside an HTML page."""
+    element = svg[svg.index("<svg") :]
+    element = re.sub(r'\sxmlns(:\w+)?="[^"]*"', "", element)
+    element = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", element, flags=re.DOTALL)
+    element = re.sub(r'\bid="', f'id="{prefix}-', element)
+    element = element.replace('href="#', f'href="#{prefix}-').replace("url(#", f"url(#{prefix}-")
+    return element.strip()

@@ -1,0 +1,42 @@
+"""Fewer points for the same picture: long curves are drawn through the extremes of short stretches."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lcopa_bayes.arrays import Index, Vector
+
+MOST = 600
+"""Points of a curve that are drawn; a figure is about 500 points wide."""
+
+
+def extremes(*curves: Vector, most: int = MOST) -> Index:
+    """Positions to draw, increasing: all of them up to `most`, else the least and greatest per stretch.
+
+    The curves share their positions, as the two edges of a band do. Stretches hold equally many samples;
+    the first, the last and every overall extreme are among the positions. NaN counts as missing. At most
+    `most` + 2 positions are returned. ValueError when the curves differ in length or `most` is less than
+    two per curve.
+    """
+    size = curves[0].size
+    if any(curve.size != size for curve in curves) or most < 2 * len(curves):
+        raise ValueError(f"need curves of one length and room for 2 points of each; got {most} points")
+    if size <= most:
+        return np.arange(size)
+    stretches = most // (2 * len(curves))
+    edges = np.linspace(0, size, stretches + 1).astype(int)[:-1]
+    owner = np.repeat(np.arange(stretches), np.diff(np.append(edges, size)))
+    picked = [np.array([0, size - 1])]
+    for curve in curves:
+        for values in (curve, -curve):
+            filled = np.where(np.isnan(values), np.inf, values)
+            order = np.lexsort((filled, owner))
+            picked.append(order[edges])
+    return np.unique(np.concatenate(picked))
+
+
+def said(size: int, *, most: int = MOST) -> str:
+    """A sentence for the caption when a record of `size` samples is longer than what is drawn."""
+    if size <= most:
+        return ""
+    return f"Drawn through the extremes of short stretches: the record has {size} samples."

@@ -1,0 +1,116 @@
+"""Sections become one HTML page that needs nothing else, and figures become files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import final
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from lcopa_bayes.files import write_text
+from lcopa_bayes.report.canvas import inlined, look
+from lcopa_bayes.report.saved import SavedRun, load_run
+from lcopa_bayes.report.section import Drawing, Section
+from lcopa_bayes.report.sections import (
+    data,
+    origin,
+    pairs,
+    parameters,
+    priors,
+    residuals,
+    steps,
+    traces,
+)
+
+_SECTIONS = (
+    data.section,
+    residuals.section,
+    parameters.section,
+    pairs.section,
+    traces.section,
+    steps.section,
+    priors.section,
+    origin.section,
+)
+"""What a report shows, in this order; a later stage adds its own section here."""
+_ADVICE = {
+    "reliable": "The sampling can be relied on; what the model leaves unexplained is said next.",
+    "tentative": "Read the numbers below with caution: a longer run may move them.",
+    "unusable": "Do not use the numbers below: the draws have not converged.",
+}
+
+
+@final
+@dataclass(frozen=True)
+class Verdict:
+    """What stands in the box on top of a page."""
+
+    grade: str
+    sentence: str
+    reason: str
+
+    @property
+    def advice(self) -> str:
+        """What the grade means for the reader."""
+        return _ADVICE.get(self.grade, "")
+
+    @classmethod
+    def of(cls, run: SavedRun) -> Verdict:
+        """Verdict of a run; the reason is not said twice."""
+        told = run.results
+        sentence, reason = str(told["verdict"]), str(told["grade_reason"])
+        return cls(str(told["grade"]), sentence, "" if reason in sentence else reason)
+
+
+def write_report(folder: Path) -> Path:
+    """Draw the report of a run folder: `figures/*.svg` and `report.html`, whose path is returned.
+
+    Reads only the folder and calculates nothing; the same folder gives the same bytes. InputError when a
+    file of the folder is missing or cannot be used.
+    """
+    run = load_run(folder)
+    with look():
+        sections = [compose(run) for compose in _SECTIONS]
+    return write_page(folder, str(run.results["study"]), sections, Verdict.of(run))
+
+
+def write_page(
+    folder: Path,
+    title: str,
+    sections: Sequence[Section],
+    verdict: Verdict | None = None,
+    name: str = "report.html",
+) -> Path:
+    """Write the figures of some sections and the page `name` that shows them; returns its path."""
+    figures = folder / "figures"
+    figures.mkdir(exist_ok=True)
+    for section in sections:
+        for drawing in section.drawings:
+            write_text(figures / f"{file_stem(drawing)}.svg", drawing.svg)
+    path = folder / name
+    write_text(path, page(title, sections, verdict))
+    return path
+
+
+def page(title: str, sections: Sequence[Section], verdict: Verdict | None = None) -> str:
+    """The page as HTML with its figures inside."""
+    environment = Environment(
+        loader=PackageLoader("lcopa_bayes.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["tied"] = lambda text: text.replace(" %", "\u00a0%").replace("p = ", "p\u00a0=\u00a0")
+    environment.filters["svg"] = lambda drawing: Markup(inlined(drawing.svg, file_stem(drawing)))
+    shown = environment.get_template("report.html")
+    return shown.render(title=title, sections=sections, verdict=verdict) + "\n"
+
+
+def file_stem(drawing: Drawing) -> str:
+    """Stem of a drawing's file, whatever its record is called."""
+    return re.sub(r"[^A-Za-z0-9_-]+", "_", drawing.stem)

@@ -1,0 +1,59 @@
+"""The table of parameters: median, interval and how far to trust them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from lcopa_bayes.report.saved import SavedRun
+from lcopa_bayes.report.section import Column, Section, Table
+from lcopa_bayes.report.wording import figures, interval, percent, to_spread
+
+
+def section(run: SavedRun) -> Section:
+    """Free parameters with intervals and grades, and the fixed ones."""
+    free, fixed = run.results["parameters"], run.results["fixed"]
+    kind = ", ".join(dict.fromkeys(f"{percent(row['level'])} {row['interval']}" for row in free))
+    tables = [
+        Table(
+            (
+                *(Column("name", "code"), Column("median", "number"), Column("unit")),
+                *(Column("90 % interval" if _all_at(free, 0.9) else "interval", "number"),),
+                *(Column("mean", "number"), Column("sd", "number"), Column("ESS", "number")),
+                *(Column("R-hat", "number"), Column("grade", "grade")),
+            ),
+            tuple(_row(row) for row in free),
+            f"Intervals are {kind}. Digits go to the second significant one of the standard deviation. "
+            "ESS is the smaller of the effective sample sizes of bulk and tails; R-hat compares independent "
+            "ensembles.",
+        )
+    ]
+    if fixed:
+        tables.append(
+            Table(
+                (Column("fixed parameter", "code"), Column("value", "number"), Column("unit")),
+                tuple((str(row["name"]), figures(row["value"], 6), str(row["unit"])) for row in fixed),
+            )
+        )
+    text = () if fixed else ("No parameter was fixed.",)
+    return Section("Parameters", text, tables=tuple(tables))
+
+
+def _row(row: Mapping[str, Any]) -> tuple[str, ...]:
+    sd = row["sd"]
+    rhat = row.get("rhat")
+    return (
+        str(row["name"]),
+        to_spread(row["value"], sd),
+        str(row["unit"]),
+        interval(row["lower"], row["upper"], sd),
+        to_spread(row["mean"], sd),
+        figures(sd, 2),
+        figures(row["ess"]) if (row["ess"] or 0) < 100 else f"{row['ess']:.0f}",
+        "–" if rhat is None else f"{rhat:.3f}",  # noqa: RUF001
+        str(row["grade"]),
+    )
+
+
+def _all_at(rows: list[Mapping[str, Any]], level: float) -> bool:
+    return all(row["level"] == level for row in rows)

@@ -1,0 +1,102 @@
+"""Step responses of each path and what engineers read off them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import pandas as pd
+from matplotlib.axes import Axes
+
+from lcopa_bayes.report.canvas import BAND, STEADY, grid, plain, svg_of
+from lcopa_bayes.report.decimation import extremes
+from lcopa_bayes.report.saved import SavedRun
+from lcopa_bayes.report.section import Column, Drawing, Section, Table
+from lcopa_bayes.report.wording import NOT_REACHED, OPEN, figures, interval, to_spread
+
+_PER_FIGURE = 6
+"""Paths on one figure."""
+_WORDS = {
+    "rise_10_90": "rise time, 10 to 90 %",
+    "settling_2": "settling time to 2 %",
+    "settling_5": "settling time to 5 %",
+    "value_at_end": "value at end of record",
+    "steady_state": "steady state",
+}
+"""Names of metrics that do not read as words."""
+_TIMES = ("rise", "settling")
+
+
+def section(run: SavedRun) -> Section:
+    """Bands of the response to a unit step, and the table of step metrics."""
+    curves = run.tables["step_response"]
+    paths = list(dict.fromkeys(curves["path"]))
+    pages = [paths[k : k + _PER_FIGURE] for k in range(0, len(paths), _PER_FIGURE)]
+    caption = (
+        "Response of the plant to a unit step at time 0, over the longest record: median, 50 and 90 % bands. "
+        "Dashed: median and 90 % band of the steady state it tends to."
+    )
+    drawings = tuple(
+        Drawing(f"step_{number:02d}", _drawn(run, curves, page), caption)
+        for number, page in enumerate(pages, start=1)
+    )
+    tables = (_metrics(run.results["step_metrics"]),) if run.results["step_metrics"] else ()
+    return Section("Step responses", drawings=drawings, tables=tables)
+
+
+def _drawn(run: SavedRun, curves: pd.DataFrame, paths: Sequence[str]) -> str:
+    figure, panels = grid(len(paths), columns=2, height=2.2)
+    for panel, path in zip(panels, paths, strict=True):
+        rows = curves[curves["path"] == path]
+        _path(panel, rows)
+        panel.set_title(plain(path), loc="left")
+        panel.set_ylabel(f"response [{plain(rows['unit'].iloc[0])}]")
+        panel.set_xlabel(f"time [{plain(run.time_unit)}]")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
+    return svg_of(figure)
+
+
+def _path(panel: Axes, rows: pd.DataFrame) -> None:
+    time = rows["time"].to_numpy()
+    for low, high, alpha, name in (("05", "95", 0.30, "90 %"), ("25", "75", 0.45, "50 %")):
+        lower, upper = rows[f"response_{low}"].to_numpy(), rows[f"response_{high}"].to_numpy()
+        at = extremes(lower, upper)
+        panel.fill_between(time[at], lower[at], upper[at], color=BAND, alpha=alpha, lw=0, label=name)
+    middle = rows["response_50"].to_numpy()
+    at = extremes(middle)
+    panel.plot(time[at], middle[at], color=BAND, label="median")
+    for quantile, width, name in (("50", 1.1, "steady state"), ("05", 0.7, ""), ("95", 0.7, "")):
+        level = float(rows[f"steady_{quantile}"].iloc[0])
+        panel.axhline(level, color=STEADY, lw=width, ls=(0, (4, 3)), label=name or None)
+    panel.axhline(0.0, color="#b0b0b0", lw=0.6, zorder=0)
+
+
+def _metrics(metrics: Sequence[Mapping[str, Any]]) -> Table:
+    columns = (
+        *(Column("path"), Column("metric"), Column("median", "interval"), Column("unit")),
+        *(Column("90 % interval", "interval"), Column("sd", "number"), Column("grade", "grade")),
+        Column("note", "prose"),
+    )
+    return Table(
+        columns,
+        tuple(_row(metric) for metric in metrics),
+        "Times count from the step. Intervals are 90 % equal-tailed credible; where they are open, the "
+        "response of that share of the draws does not get there within the record.",
+    )
+
+
+def _row(metric: Mapping[str, Any]) -> tuple[str, ...]:
+    kind, _, where = str(metric["name"]).partition("[")
+    never = NOT_REACHED if kind.startswith(_TIMES) else OPEN
+    lower, upper, sd = metric["lower"], metric["upper"], metric["sd"]
+    ends = interval(lower, upper, sd, nothing=never)
+    return (
+        where.rstrip("]"),
+        _WORDS.get(kind, kind.replace("_", " ")),
+        never if metric["value"] is None else to_spread(metric["value"], sd),
+        str(metric["unit"]),
+        ends if (lower is None) == (upper is None) or never == OPEN else ends.replace(OPEN, never),
+        figures(sd, 2),
+        str(metric["grade"]),
+        str(metric.get("note", "")),
+    )

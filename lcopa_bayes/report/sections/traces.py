@@ -1,0 +1,55 @@
+"""The draws of each parameter in the order they were made."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import cycle
+
+import numpy as np
+
+from lcopa_bayes.report.canvas import CYCLE, grid, label, log_ticks, svg_of
+from lcopa_bayes.report.saved import SavedRun
+from lcopa_bayes.report.section import Drawing, Section
+
+_PER_FIGURE = 12
+"""Parameters on one figure."""
+
+
+def section(run: SavedRun) -> Section:
+    """Traces with the ensembles in colours and R-hat in the titles."""
+    names = list(run.units)
+    pages = [names[k : k + _PER_FIGURE] for k in range(0, len(names), _PER_FIGURE)]
+    drawings = tuple(
+        Drawing(f"trace_{number:02d}", _drawn(run, page), _caption(run, page))
+        for number, page in enumerate(pages, start=1)
+    )
+    return Section(
+        "Traces",
+        ("Each colour is an independent ensemble. Do not trust draws whose colours separate or drift.",),
+        drawings,
+    )
+
+
+def _caption(run: SavedRun, names: Sequence[str]) -> str:
+    ensembles, draws = run.draws[names[0]].shape
+    return (
+        f"{draws} draws of each of {ensembles} ensembles, thinned evenly from the kept part of the run, "
+        "walkers side by side within a step."
+    )
+
+
+def _drawn(run: SavedRun, names: Sequence[str]) -> str:
+    rhat = {row["name"]: row.get("rhat") for row in run.results["parameters"]}
+    figure, panels = grid(len(names), columns=2, height=1.15)
+    for panel, name in zip(panels, names, strict=True):
+        for chain, colour in zip(run.draws[name], cycle(CYCLE), strict=False):
+            panel.plot(np.arange(chain.size), chain, color=colour, lw=0.4, alpha=0.8, rasterized=True)
+        if run.spans_decades(name):
+            panel.set_yscale("log")
+            log_ticks(panel.yaxis, *panel.get_ylim())
+        told = "not defined" if rhat[name] is None else f"{rhat[name]:.3f}"
+        panel.set_title(f"{label(name, run.units[name])}   R-hat {told}", loc="left", fontsize=8)
+        panel.margins(x=0.01)
+    for panel in panels[-2:]:
+        panel.set_xlabel("draw [-]")
+    return svg_of(figure)

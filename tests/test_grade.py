@@ -1,0 +1,126 @@
+"""Grades: independent normal draws pass, hills that ensembles disagree about do not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lcopa_bayes.inference.grade import Grade, Quality, overall, qualities
+
+SHAPE = (4, 16, 60)
+"""Ensembles, walkers, draws."""
+
+
+def one(values: np.ndarray) -> Quality:
+    (quality,) = qualities(["it"], values[..., None])
+    return quality
+
+
+def normal(seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=SHAPE)
+
+
+def test_independent_normal_draws_are_reliable():
+    quality = one(normal())
+    count = np.prod(SHAPE)
+    assert quality.rhat < 1.005
+    assert 0.7 * count < quality.ess_bulk < 1.3 * count
+    assert 0.5 * count < quality.ess_tail < 1.5 * count
+    assert quality.grade(400).level == "reliable"
+    assert overall([quality], 400).level == "reliable"
+    assert "independent ensembles agree" in overall([quality], 400).reason
+
+
+def test_ensembles_on_different_hills_are_unusable_however_many_draws():
+    apart = normal() + np.array([0.0, 0.0, 0.0, 6.0])[:, None, None]
+    quality = one(apart)
+    assert quality.rhat > 1.1
+    assert quality.grade(1).level == "unusable"
+    told = overall([quality], 1)
+    assert told.level == "unusable"
+    assert "several hills" in told.reason
+
+
+def test_hills_that_all_ensembles_weigh_differently_are_not_reliable():
+    rng = np.random.default_rng(1)
+    share = np.array([0.2, 0.4, 0.6, 0.8])
+    hill = rng.random(SHAPE[:2]) < share[:, None]  # a walker never changes its hill
+    assert one(normal() + 5.0 * hill[..., None]).grade(1).level != "reliable"
+
+
+def test_hills_that_every_walker_visits_are_fine():
+    hill = np.random.default_rng(2).random(SHAPE) < 0.5
+    assert one(normal() + 5.0 * hill).grade(400).level == "reliable"
+
+
+def test_ensembles_of_different_width_are_seen():
+    wide = normal() * np.array([1.0, 1.0, 1.0, 4.0])[:, None, None]
+    assert one(wide).grade(400).level != "reliable"
+
+
+def test_slow_walkers_have_few_effective_draws():
+    rng = np.random.default_rng(3)
+    rho, walk = 0.98, rng.normal(size=SHAPE)
+    for k in range(1, SHAPE[2]):
+        walk[..., k] = rho * walk[..., k - 1] + np.sqrt(1 - rho**2) * walk[..., k]
+    quality = one(walk)
+    assert quality.ess_bulk < 0.1 * np.prod(SHAPE)
+    assert quality.grade(np.prod(SHAPE)).level != "reliable"
+
+
+def test_effective_sample_size_of_an_autoregression():
+    rng, rho = np.random.default_rng(4), 0.7
+    chains = rng.normal(size=(4, 4, 2000))
+    for k in range(1, 2000):
+        chains[..., k] = rho * chains[..., k - 1] + np.sqrt(1 - rho**2) * chains[..., k]
+    exact = chains.size * (1 - rho) / (1 + rho)
+    assert one(chains).ess_bulk == pytest.approx(exact, rel=0.15)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_a_parameter_that_does_not_vary_is_unusable():
+    stuck = np.ones(SHAPE)
+    assert one(stuck).grade(1).level == "unusable"
+
+
+@pytest.mark.parametrize("bulk_tail", [(np.nan, 500.0), (500.0, np.nan)])
+def test_an_undefined_sample_size_is_never_overlooked(bulk_tail):
+    quality = Quality("it", *bulk_tail, 1.0)
+    assert np.isnan(quality.ess)
+    assert quality.grade(1).level == "unusable"
+
+
+@pytest.mark.parametrize(
+    ("rhat", "ess", "level"),
+    [
+        (1.0, 400, "reliable"),
+        (1.02, 400, "reliable"),
+        (1.021, 400, "tentative"),
+        (1.0, 399, "tentative"),
+        (1.1, 100, "tentative"),
+        (1.101, 400, "unusable"),
+        (1.0, 99, "unusable"),
+        (np.nan, 400, "unusable"),
+    ],
+)
+def test_levels(rhat, ess, level):
+    quality = Quality("it", ess, 2 * ess, rhat)
+    assert quality.grade(400).level == level
+    assert f"R-hat {rhat:.3f}, effective sample size {ess}" in quality.grade(400).reason
+
+
+def test_the_worst_parameter_grades_the_run_and_is_named():
+    good, weak, bad = (
+        Quality("good", 900, 900, 1.0),
+        Quality("weak", 300, 300, 1.0),
+        Quality("bad", 9, 9, 1.3),
+    )
+    assert overall([good], 400).level == "reliable"
+    told = overall([good, weak, Quality("other", 350, 350, 1.0)], 400)
+    assert told.level == "tentative"
+    assert told.reason.startswith("weak")
+    assert "(also other)" in told.reason
+    assert "sample more steps" in told.reason
+    assert overall([good, weak, bad], 400).reason.startswith("bad")
+    worst = Grade.worst([quality.grade(400) for quality in (good, bad, weak)])
+    assert worst == bad.grade(400)
