@@ -77,7 +77,7 @@ class Draws:
 
 
 def gather(posterior: Posterior, run: Run) -> Draws:
-    """Draws of a run: the kept half, thinned evenly, with the linear parameters drawn exactly."""
+    """Draws of a run: the kept part, thinned evenly, with the linear parameters drawn exactly."""
     coordinates, log_density = run.kept()
     ensembles, walkers, count, _ = coordinates.shape
     stride = max(1, -(-ensembles * walkers * count // _MEASURED))

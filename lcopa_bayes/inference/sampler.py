@@ -82,7 +82,7 @@ class Run:
         """The last half of each ensemble: coordinates (ensembles, walkers, draws, dimension), log density."""
         chain = np.stack([ensemble.chain for ensemble in self.ensembles])
         log_density = np.stack([ensemble.log_density for ensemble in self.ensembles])
-        first = chain.shape[1] // 2
+        first = 2 * chain.shape[1] // 5
         return chain[:, first:].swapaxes(1, 2), log_density[:, first:].swapaxes(1, 2)
 
 
@@ -140,7 +140,7 @@ def finished(posterior: Posterior, run: Run, bar: tqdm[Any] | None = None) -> bo
 
 
 def sampled_qualities(posterior: Posterior, run: Run) -> tuple[Quality, ...]:
-    """Quality of the sampled parameters over the kept half of a run."""
+    """Quality of the sampled parameters over the kept part of a run."""
     coordinates, _ = run.kept()
     shape = coordinates.shape
     values = posterior.values(coordinates.reshape(-1, shape[-1]))[:, posterior.sampled]

@@ -20,6 +20,8 @@ from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.ridgemoves import moves
 
+_WARM = 0.01
+"""Below this power of the likelihood a population travels fast and a third of the sweeps is enough."""
 _EFFECTIVE = 0.5
 """Share of the population that stays effective in one rise of the temperature."""
 
@@ -44,7 +46,7 @@ def temper(
 ) -> tuple[Population, tuple[Any, ...]]:
     """A population of the posterior and the state of emcee's generator afterwards.
 
-    `sweeps` moves of every walker at each temperature. Deterministic given `rng` and `random`.
+    `sweeps` moves of every walker at each temperature, a third of them while it is low. Deterministic given `rng` and `random`.
     """
     position = posterior.coordinates(posterior.table.draw(walkers, rng))
     prior = posterior.log_prior(position)
@@ -66,7 +68,8 @@ def temper(
         )
         sampler.random_state = random
         state = emcee.State(position, log_prob=prior + heat * likelihood)
-        last = sampler.run_mcmc(state, sweeps, skip_initial_state_check=True, store=False)
+        enough = sweeps if heat > _WARM else max(1, sweeps // 3)
+        last = sampler.run_mcmc(state, enough, skip_initial_state_check=True, store=False)
         random = tuple(sampler.random_state)
         position = np.array(last.coords)
         prior = posterior.log_prior(position)
