@@ -15,7 +15,6 @@ import lcopa_bayes
 from lcopa_bayes.bench.campaign import write_campaign
 from lcopa_bayes.bench.plan import load_plan
 from lcopa_bayes.cores import cores
-from lcopa_bayes.files import writable_folder
 from lcopa_bayes.fit import fit
 from lcopa_bayes.problems import InputError
 from lcopa_bayes.report import write_report
@@ -99,7 +98,7 @@ def _run(options: argparse.Namespace, command: list[str]) -> dict[str, Any]:
 
 def _fit(options: argparse.Namespace, command: list[str]) -> dict[str, Any]:
     study = _study(options)
-    folder = writable_folder(options.out or Path("reports") / study.name)
+    folder = options.out or Path("reports") / study.name
     made = fit(
         study,
         jobs=options.jobs or cores(),

@@ -10,6 +10,7 @@ from typing import Any, final
 import numpy as np
 
 from lcopa_bayes.estimate import Estimate, plain
+from lcopa_bayes.files import writable_folder
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.draws import Draws, gather
 from lcopa_bayes.inference.sampler import Run, SamplePlan, sample
@@ -54,9 +55,12 @@ def fit(
     """Sample the posterior of a study and derive what it predicts.
 
     With `folder`, sampling is stored there in `chain.h5` and `resume` goes on from it; the result is
-    the same as without interruption. InputError when the study does not fit its records.
+    the same as without interruption. InputError when the study does not fit its records or the folder
+    cannot be written to; then nothing is written.
     """
     problem = problem_of(study)
+    if folder:
+        writable_folder(folder)
     plan = plan_of(problem, quick=quick)
     run = sample(
         problem.posterior,

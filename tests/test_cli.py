@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -61,7 +62,7 @@ def test_fit_prints_one_json_object_and_writes_the_run_folder(record, tmp_path, 
     assert abs(gain["mean"] - 2.0) < 5 * gain["sd"]
     for name in ("report.html", "results.json", "posterior.nc", "chain.h5", "provenance.json"):
         assert (out / name).stat().st_size > 0
-    assert json.loads((out / "results.json").read_text())["verdict"] in (out / "report.html").read_text()
+    assert json.loads((out / "results.json").read_text())["verdict"] in unescape((out / "report.html").read_text())
     code, printed, _ = run(capsys, "report", out, "--json")
     assert code == 0 and json.loads(printed)["report"] == str(out / "report.html")
 
