@@ -46,7 +46,8 @@ def temper(
 ) -> tuple[Population, tuple[Any, ...]]:
     """A population of the posterior and the state of emcee's generator afterwards.
 
-    `sweeps` moves of every walker at each temperature, a third of them while it is low. Deterministic given `rng` and `random`.
+    `sweeps` moves of every walker at each temperature, a third of them while it is low. Deterministic
+    given `rng` and `random`.
     """
     position = posterior.coordinates(posterior.table.draw(walkers, rng))
     prior = posterior.log_prior(position)
