@@ -18,6 +18,9 @@ from lcopa_bayes.predict import responses
 from lcopa_bayes.provenance import provenance
 from lcopa_bayes.tables import tables
 
+_PORTION = 64
+"""Draws written at a time."""
+
 
 def save_fit(fit: Fit, folder: Path, command: Sequence[str]) -> dict[str, Any]:
     """Write a fit's files into `folder` and return what `results.json` holds."""
@@ -80,25 +83,39 @@ def _variable(name: str) -> str:
 
 
 def _by_record(fit: Fit) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any], dict[str, Any]]:
-    """Log likelihood, predictive draws, observations and times of every axis of every fit record."""
+    """Log likelihood, predictive draws, observations and times of every axis of every fit record.
+
+    Single precision, a few draws at a time: these are by far the largest arrays of a run.
+    """
     draws, posterior = fit.draws, fit.problem.posterior
     values, shape = draws.flat, draws.values.shape[:2]
     rng = np.random.default_rng([fit.run.plan.seed, 3])
-    parts = np.array_split(values, max(1, values.shape[0] // 64))
-    pointwise = [posterior.pointwise(part) for part in parts]
-    plant = [responses(draws.table, posterior.model, part) for part in parts]
-    likelihood, predictive, observed, constant = {}, {}, {}, {}
+    likelihood: dict[str, Any] = {}
+    predictive: dict[str, Any] = {}
+    observed: dict[str, Any] = {}
+    constant: dict[str, Any] = {}
+    names = {}
     for r, samples in enumerate(posterior.samples):
         for axis, seen in enumerate(samples.axes):
-            if seen.values.size == 0:
-                continue
-            name = _variable(f"{samples.record.name}_{samples.record.response_axes[axis].name}")
-            density = np.concatenate([part[r][axis] for part in pointwise])
-            response = np.concatenate([part[r][axis][:, seen.index] for part in plant])
-            offset = draws.table.offset(values, axis, r)
-            noise = posterior.noise.draw(posterior.noise_parameters(values, axis), seen.gaps, rng)
-            likelihood[name] = density.reshape(*shape, -1).astype(np.float32)
-            predictive[name] = (response + offset[:, None] + noise).reshape(*shape, -1).astype(np.float32)
-            observed[name] = seen.values
-            constant[f"{name}_time"] = samples.times[seen.index]
+            if seen.values.size:
+                name = _variable(f"{samples.record.name}_{samples.record.response_axes[axis].name}")
+                names[r, axis] = name
+                likelihood[name], predictive[name] = (
+                    np.empty((values.shape[0], seen.values.size), np.float32) for _ in range(2)
+                )
+                observed[name] = seen.values
+                constant[f"{name}_time"] = samples.times[seen.index]
+    for first in range(0, values.shape[0], _PORTION):
+        rows = slice(first, first + _PORTION)
+        part = values[rows]
+        density, plant = posterior.pointwise(part), responses(draws.table, posterior.model, part)
+        for (r, axis), name in names.items():
+            seen = posterior.samples[r].axes[axis]
+            noise = posterior.noise.draw(posterior.noise_parameters(part, axis), seen.gaps, rng)
+            offset = draws.table.offset(part, axis, r)[:, None]
+            likelihood[name][rows] = density[r][axis]
+            predictive[name][rows] = plant[r][axis][:, seen.index] + offset + noise
+    for arrays in (likelihood, predictive):
+        for name in arrays:
+            arrays[name] = arrays[name].reshape(*shape, -1)
     return likelihood, predictive, observed, constant
