@@ -18,8 +18,8 @@ RELIABLE_RHAT = 1.02
 """Nested R-hat of independent ensembles [-] (Margossian et al. 2024, Bayesian Analysis 19)."""
 TENTATIVE_RHAT = 1.1
 """Above it the ensembles tell different stories."""
-RELIABLE_MEMORY = 0.3
-"""Walkers have forgotten where they started [-]."""
+RELIABLE_MEMORY = 0.5
+"""Walkers have left where they started [-]."""
 TENTATIVE_MEMORY = 0.7
 """Above it walkers hardly travel [-]."""
 TENTATIVE_ESS = 100.0

@@ -22,6 +22,8 @@ from lcopa_bayes.inference.posterior import Posterior
 
 _ROUND = 20
 """Draws kept per round and walker."""
+_MEMORY = 0.4
+"""Largest memory of a walker at which sampling stops [-]."""
 _SWEEPS = 40
 """Moves of every walker at each temperature on the way from the prior."""
 _THIN = 10
@@ -127,7 +129,11 @@ def _store(chain_file: Path | None, ensembles: Sequence[Ensemble], fingerprint: 
 
 
 def finished(posterior: Posterior, run: Run, bar: tqdm[Any] | None = None) -> bool:
-    """Whether every sampled parameter agrees between ensembles and has its effective sample size."""
+    """Whether every sampled parameter agrees between ensembles and has its effective sample size.
+
+    Walkers travel a little further than a grade asks, so that the linear parameters, which are drawn
+    afterwards, have too.
+    """
     found = sampled_qualities(posterior, run)
     if bar is not None:
         ess, rhat = float(np.min([q.ess for q in found])), float(np.max([q.rhat for q in found]))
@@ -136,7 +142,10 @@ def finished(posterior: Posterior, run: Run, bar: tqdm[Any] | None = None) -> bo
         bar.set_postfix(
             acceptance=f"{acceptance:.2f}", ess=f"{ess:.0f}", rhat=f"{rhat:.3f}", memory=f"{memory:.2f}"
         )
-    return all(quality.grade(run.plan.target_ess).level == "reliable" for quality in found)
+    return all(
+        quality.grade(run.plan.target_ess).level == "reliable" and quality.memory <= _MEMORY
+        for quality in found
+    )
 
 
 def sampled_qualities(posterior: Posterior, run: Run) -> tuple[Quality, ...]:
