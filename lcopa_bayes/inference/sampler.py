@@ -64,7 +64,7 @@ class SamplePlan:
         least = 2 * dimension + 2
         return cls(
             ensembles,
-            max(least + least % 2, walkers or max(128, 24 * dimension)),
+            max(least + least % 2, walkers or max(128, 16 * dimension)),
             steps or 2000 + 400 * dimension,
             thin or _THIN,
             target_ess,
