@@ -9,18 +9,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 import lcopa_bayes
-from lcopa_bayes.bench.campaign import write_campaign
-from lcopa_bayes.bench.plan import load_plan
-from lcopa_bayes.cores import cores
-from lcopa_bayes.fit import fit
+from lcopa_bayes import verbs
+from lcopa_bayes.optics.cell import Field
+from lcopa_bayes.paper.intervals import Scan
 from lcopa_bayes.problems import InputError
-from lcopa_bayes.report import write_report
-from lcopa_bayes.runfolder import save_fit
-from lcopa_bayes.study import Study
-from lcopa_bayes.studyfile import load_study
 
 USAGE_ERROR = 2
 """Exit code for input that cannot be used."""
@@ -42,11 +35,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("interrupted; the same command with --resume goes on where it stopped", file=sys.stderr)
         return INTERRUPTED
     if options.json:
-        print(json.dumps(told, allow_nan=False))
+        print(json.dumps(told.values, allow_nan=False))
     elif not options.quiet:
-        print(told.get("verdict", ""))
-        if "report" in told:
-            print(f"report: {told['report']}")
+        print("\n".join(told.words))
     return 0
 
 
@@ -55,29 +46,30 @@ def _parser() -> argparse.ArgumentParser:
         prog="lcopa-bayes",
         description=lcopa_bayes.__doc__,
     )
-    verbs = parser.add_subparsers(required=True, metavar="VERB")
-    study = argparse.ArgumentParser(add_help=False)
-    study.add_argument("source", nargs="+", type=Path, help="study folder or file, or record files")
-    study.add_argument("--held-out", nargs="+", type=Path, default=[], help="records not to fit")
-    study.add_argument("--out", type=Path, help="run folder (default: reports/<study>)")
-    study.add_argument("--seed", type=int, help="seed in place of the study's")
-    study.add_argument("--jobs", type=int, default=None, help="processes (default: all cores)")
-    study.add_argument("--resume", action="store_true", help="go on with an interrupted run")
-    study.add_argument("--quick", action="store_true", help="a quarter of the steps")
+    verb = parser.add_subparsers(required=True, metavar="VERB")
     told = argparse.ArgumentParser(add_help=False)
     told.add_argument("--quiet", action="store_true", help="no progress, no closing words")
     told.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
 
-    def add(name: str, verb: Callable[..., dict[str, Any]], parents: list[Any], text: str) -> Any:
-        made = verbs.add_parser(name, parents=[*parents, told], help=text, description=text)
-        made.set_defaults(verb=verb)
+    def add(name: str, does: Callable[..., verbs.Told], parents: list[Any], text: str) -> Any:
+        made = verb.add_parser(name, parents=[*parents, told], help=text, description=text)
+        made.set_defaults(verb=does)
         return made
 
-    add("run", _run, [study], "all stages the study names, then the report")
-    add("fit", _fit, [study], "posterior, bands and step metrics, with a report")
-    report = add("report", _report, [], "render the report of a run folder again")
+    study, sampled = _study_options(), _sampler_options()
+    add("run", verbs.run, [study, sampled], "all stages the study names, then the report")
+    add("fit", verbs.fit_study, [study, sampled], "posterior, bands and step metrics, with a report")
+    _identify_options(
+        add("identify", verbs.identify_study, [study], "the paper's own least-squares scan, with a report")
+    )
+    _optics_options(
+        add("optics", verbs.optics, [], "far field, director and the chain from volts to angle, with figures")
+    )
+    claims = add("claims", verbs.claims, [], "the paper's claims, each with a computed verdict")
+    claims.add_argument("--out", type=Path, default=Path("reports/claims"), help="folder for the page")
+    report = add("report", verbs.report, [], "render the report of a run folder again")
     report.add_argument("folder", type=Path, help="run folder")
-    bench = add("simulate", _simulate, [], "measure a campaign file on the virtual bench")
+    bench = add("simulate", verbs.simulate, [], "measure a campaign file on the virtual bench")
     bench.add_argument("campaign", type=Path, help="campaign file (TOML)")
     bench.add_argument("--out", type=Path, required=True, help="folder for the records and their study")
     bench.add_argument("--seed", type=int, help="seed in place of the campaign's")
@@ -85,49 +77,74 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _study(options: argparse.Namespace) -> Study:
-    """The study asked for, with the seed of the command line if one is given."""
-    study = load_study(options.source, held_out=options.held_out)
-    return study if options.seed is None else study.with_seed(options.seed)
+def _study_options() -> argparse.ArgumentParser:
+    study = argparse.ArgumentParser(add_help=False)
+    study.add_argument("source", nargs="+", type=Path, help="study folder or file, or record files")
+    study.add_argument("--held-out", nargs="+", type=Path, default=[], help="records not to fit")
+    study.add_argument("--out", type=Path, help="run folder (default: reports/<study>)")
+    study.add_argument("--seed", type=int, help="seed in place of the study's")
+    study.add_argument("--jobs", type=int, default=None, help="processes (default: all cores)")
+    return study
 
 
-def _run(options: argparse.Namespace, command: list[str]) -> dict[str, Any]:
-    """Stages run in the order of their dependence; the fit comes first and feeds the others."""
-    return _fit(options, command)
+def _sampler_options() -> argparse.ArgumentParser:
+    sampled = argparse.ArgumentParser(add_help=False)
+    sampled.add_argument("--resume", action="store_true", help="go on with an interrupted run")
+    sampled.add_argument("--quick", action="store_true", help="a quarter of the steps")
+    return sampled
 
 
-def _fit(options: argparse.Namespace, command: list[str]) -> dict[str, Any]:
-    study = _study(options)
-    folder = options.out or Path("reports") / study.name
-    made = fit(
-        study,
-        jobs=options.jobs or cores(),
-        folder=folder,
-        resume=options.resume,
-        quick=options.quick,
-        quiet=options.quiet,
+def _identify_options(parser: argparse.ArgumentParser) -> None:
+    plan = Scan()
+    for name, which in (("alpha", "largest"), ("beta", "second"), ("gamma", "third")):
+        parser.add_argument(
+            f"--{name}",
+            nargs=2,
+            type=float,
+            metavar=("LOW", "HIGH"),
+            help=f"scanned interval of the {which} order, within (0, 2]",
+        )
+    parser.add_argument(
+        "--delay",
+        nargs=2,
+        type=float,
+        metavar=("LOW", "HIGH"),
+        help="scanned interval of the delay [time unit of the study]",
     )
-    told = save_fit(made, folder, command)
-    return told | {"report": str(write_report(folder))}
-
-
-def _report(options: argparse.Namespace, command: list[str]) -> dict[str, Any]:
-    return {"report": str(write_report(options.folder))}
-
-
-def _simulate(options: argparse.Namespace, command: list[str]) -> dict[str, Any]:
-    plan = load_plan(options.campaign)
-    seed = plan.seed if options.seed is None else options.seed
-    records = plan.run(np.random.default_rng(seed))
-    paths = write_campaign(
-        options.out,
-        records,
-        held_out=plan.held_out,
-        name=plan.name,
-        seed=seed,
-        overwrite=options.overwrite,
+    parser.add_argument("--order-step", type=float, default=plan.order_step, help="spacing of scanned orders")
+    parser.add_argument("--any-delay", action="store_true", help="refine the delay below a whole block")
+    parser.add_argument(
+        "--stiffness",
+        nargs="+",
+        type=float,
+        default=plan.stiffness,
+        help="values of k; the first is reported",
     )
-    return {"verdict": f"{len(records)} records in {options.out}", "files": [str(path) for path in paths]}
+    parser.add_argument("--rounds", type=int, default=plan.rounds, help="refinements around the best")
+    parser.add_argument("--posterior", type=Path, help="run folder of a fit, to show its intervals beside")
+
+
+def _optics_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", type=Path, default=Path("reports/optics"), help="folder for the page")
+    parser.add_argument("--elements", type=int, help="elements along an axis (default: the paper's 32)")
+    parser.add_argument("--pitch", type=float, help="distance of elements [m] (default: 1.2 wavelengths)")
+    parser.add_argument("--wavelength", type=float, help="wavelength [m] (default: the paper's 1064e-9)")
+    parser.add_argument(
+        "--fill-factor", type=float, default=1.0, help="element width over pitch, for the lobe table"
+    )
+    parser.add_argument(
+        "--targets", nargs="+", type=float, metavar="DEG", help="steering angles [deg] (default: Fig. 3)"
+    )
+    parser.add_argument(
+        "--voltages", nargs="+", type=float, metavar="V", default=[1.0, 2.0, 3.0, 4.0, 5.0], help="[V]"
+    )
+    parser.add_argument("--pretilt", type=float, default=0.0, help="tilt at the plates [rad]")
+    parser.add_argument(
+        "--field",
+        choices=[field.value for field in Field],
+        default=Field.UNIFORM.value,
+        help="how the voltage spreads over the cell",
+    )
 
 
 if __name__ == "__main__":

@@ -31,6 +31,7 @@ ORDER = (
     ("runfolder",),
     ("paper",),
     ("report",),
+    ("verbs",),
     ("cli",),
 )
 """Rows from the door to the command line; a module imports only from rows above its own, or from its

@@ -22,6 +22,7 @@ from lcopa_bayes.arrays import Array, Matrix, Vector
 from lcopa_bayes.operational.blockpulse import integration_weights, lower_toeplitz
 from lcopa_bayes.operational.series import Circle, Spectrum
 from lcopa_bayes.paper.paths import Blocks, PathRecord
+from lcopa_bayes.plant.drive import Drive
 from lcopa_bayes.plant.element import PaperForm
 from lcopa_bayes.plant.grid import Mesh
 
@@ -119,27 +120,33 @@ def equation_rmse(records: Sequence[Blocks], model: PathModel) -> float:
 
 
 def responses(records: Sequence[PathRecord], model: PathModel, *, blocks: int | None = None) -> list[Vector]:
-    """Modelled response at every sample of every record [response unit].
-
-    On the meshes of the forward model, hence second order in a block no wider than a sampling period;
-    `blocks` as in `Mesh.of_samples`. Coefficients may have any sign; a response that runs away is of
-    the right size only.
-    """
+    """Modelled response at every sample of every record [response unit]; `blocks` as in `response_to`."""
     out = []
     for each in records:
         taken = np.isfinite(each.record.response[:, 0])
-        drive = each.blocks.drive
-        times, begin = each.record.time[taken], float(drive.times[0])
-        mesh = Mesh.of_samples(times, begin, blocks=blocks, exposure=each.exposure)
-        circle = Circle(mesh.grid.n)
-        form, top = model.form, model.form.orders[0]
-        exponents = np.array([*(top - order for order in form.orders), top])
-        spectra = differenced_integrals(exponents, circle, mesh.grid.step)
-        means = drive.block_means(mesh.grid.edges, np.array([model.delay]))[0]
-        denominator = np.array([*form.etas, form.stiffness]) @ spectra
-        quotient = form.gain * spectra[-1] / denominator
-        out.append(mesh.reading(circle.coefficients(quotient * circle.spectrum(means)))[0])
+        times, drive = each.record.time[taken], each.blocks.drive
+        out.append(response_to(drive, model, times, blocks=blocks, exposure=each.exposure))
     return out
+
+
+def response_to(
+    drive: Drive, model: PathModel, times: Vector, *, blocks: int | None = None, exposure: float = 0.0
+) -> Vector:
+    """Modelled deviation from rest at `times` [time unit] under a drive that moves [response unit].
+
+    On the meshes of the forward model, hence second order in a block no wider than a sampling period;
+    `blocks` and `exposure` as in `Mesh.of_samples`. Coefficients may have any sign; a response that runs
+    away is of the right size only.
+    """
+    mesh = Mesh.of_samples(times, float(drive.times[0]), blocks=blocks, exposure=exposure)
+    circle = Circle(mesh.grid.n)
+    form, top = model.form, model.form.orders[0]
+    exponents = np.array([*(top - order for order in form.orders), top])
+    spectra = differenced_integrals(exponents, circle, mesh.grid.step)
+    means = drive.block_means(mesh.grid.edges, np.array([model.delay]))[0]
+    quotient = form.gain * spectra[-1] / (np.array([*form.etas, form.stiffness]) @ spectra)
+    read: Vector = mesh.reading(circle.coefficients(quotient * circle.spectrum(means)))[0]
+    return read
 
 
 def output_rmse(records: Sequence[PathRecord], model: PathModel, *, blocks: int | None = None) -> float:

@@ -79,6 +79,20 @@ def identify(
     A path is identified from the fit records in which its drive alone moves. Its number of terms, and
     its orders if fixed, are the study's. InputError when records or intervals cannot be used.
     """
+    paths = scannable(study, plan)
+    plan = _within_study(plan or Scan(), study)
+    if jobs <= 1 or len(paths) == 1:
+        with tqdm(total=0, unit="candidate", disable=quiet) as bar:
+            return tuple(_identify(study, data, plan, bar) for data in paths)
+    workers = min(jobs, len(paths))
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        count = len(paths)
+        made = pool.map(_identify, [study] * count, paths, [plan] * count)
+        return tuple(tqdm(made, total=count, unit="path", disable=quiet))
+
+
+def scannable(study: Study, plan: Scan | None = None) -> tuple[PathData, ...]:
+    """Every path of a study that the plan can scan; InputError when records or intervals cannot be used."""
     plan = _within_study(plan or Scan(), study)
     paths = path_data(study)
     problems: list[str] = []
@@ -89,14 +103,7 @@ def identify(
             problems += [f"path {data.name}: {problem}" for problem in error.problems]
     if problems:
         raise InputError(problems)
-    if jobs <= 1 or len(paths) == 1:
-        with tqdm(total=0, unit="candidate", disable=quiet) as bar:
-            return tuple(_identify(study, data, plan, bar) for data in paths)
-    workers = min(jobs, len(paths))
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        count = len(paths)
-        made = pool.map(_identify, [study] * count, paths, [plan] * count)
-        return tuple(tqdm(made, total=count, unit="path", disable=quiet))
+    return paths
 
 
 def integer_orders(terms: int) -> tuple[float, ...]:

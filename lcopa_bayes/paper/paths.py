@@ -170,7 +170,7 @@ def _samples_after(record: Record, response: int, drive: int) -> int:
 
 def _path_record(record: Record, response: int, drive: int, exposure: float) -> PathRecord:
     taken = np.isfinite(record.response[:, response])
-    level, level_from = _resting_level(
+    level, level_from = resting_level(
         record.time[taken], record.response[taken, response], _begin(record, drive)
     )
     column = record.drive[:, [drive]]
@@ -186,8 +186,12 @@ def _path_record(record: Record, response: int, drive: int, exposure: float) -> 
     return PathRecord(single, level, level_from, exposure, Blocks.of(single, exposure))
 
 
-def _resting_level(times: Vector, values: Vector, begin: float) -> tuple[float, str]:
-    """Mean of the samples up to the first drive change, or of the first samples that do not leave it."""
+def resting_level(times: Vector, values: Vector, begin: float) -> tuple[float, str]:
+    """Mean of the samples up to the first drive change, or of the first samples that do not leave it.
+
+    Parameters: times [time unit] and values [response unit] of the samples; begin [time unit], the change.
+    Returns: the level [response unit] and the samples it is the mean of, in words.
+    """
     before = int(np.searchsorted(times, begin, side="right"))
     if before >= _RESTING:
         return float(values[:before].mean()), f"the {before} samples before the drive moves"

@@ -1,0 +1,166 @@
+"""Figures 13 to 17 of Ta et al. 2026 on given records: what was seen and what identified models say.
+
+Data only. A record is one of the paper's figures when it drives the axes x and y, in radians, as the text
+says; any other record has the same curves and no printed numbers beside them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.arrays import Vector
+from lcopa_bayes.paper.equation import PathModel, response_to
+from lcopa_bayes.paper.identify import Identification, Identified
+from lcopa_bayes.paper.paths import resting_level
+from lcopa_bayes.plant.drive import Drive
+from lcopa_bayes.record import Record
+from lcopa_bayes.stated import PAPER, Stated
+from lcopa_bayes.study import Study
+
+KINDS = ("fractional", "integer", "fractional, output error", "integer, output error")
+"""Models that are shown: the paper's scan with free and with integer orders, and the output-error fits."""
+_SAME_DRIVE = 1e-3
+"""Drives closer than this are the same step [rad]; the text gives fractions of pi."""
+
+
+def model_of(found: Identification, kind: str) -> Identified:
+    """The identified model of a path of one of the `KINDS`."""
+    models = (found.scan, found.integer, found.output_error, found.integer_output_error)
+    return dict(zip(KINDS, models, strict=True))[kind]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """One model on one axis of one record."""
+
+    kind: str
+    response: Vector
+    """At the samples [response unit]."""
+    rmse: float
+    """Of the samples about it [response unit]."""
+    printed_rmse: str = ""
+    """What the text says of this model on such a record, in words; empty when nothing."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """One response axis of one record."""
+
+    record: str
+    axis: str
+    unit: str
+    held_out: bool
+    figure: str
+    """Figure of the paper that shows such a record, such as "Fig. 13"; empty when none does."""
+    time: Vector
+    """Of the samples [time unit]."""
+    observed: Vector
+    """[response unit]."""
+    curves: tuple[Curve, ...]
+    printed_level: float | None
+    """Steady response that the text gives for this axis [response unit]; None when it gives none."""
+
+
+def panels(study: Study, found: Sequence[Identification], stated: Stated = PAPER) -> tuple[Panel, ...]:
+    """Every response axis of every record, fitted records first, with the models of `KINDS`.
+
+    `found` are the paths of the study. A model of an axis is the sum over the drives that move; its resting
+    level is that of the record, as in the identification.
+    """
+    out = []
+    for held, records in ((False, study.fit), (True, study.held_out)):
+        for record in records:
+            figure = paper_figure(record, stated)
+            for i, axis in enumerate(study.response_axes):
+                taken = np.isfinite(record.response[:, i])
+                if taken.any() and _moved(record):
+                    time, seen = record.time[taken], record.response[taken, i]
+                    sums = {kind: _response(study, found, record, i, kind) for kind in KINDS}
+                    curves = tuple(
+                        Curve(
+                            kind,
+                            response,
+                            float(np.sqrt(np.mean((seen - response) ** 2))),
+                            _printed_rmse(figure, kind, stated),
+                        )
+                        for kind, response in sums.items()
+                    )
+                    level = _printed_level(figure, axis.name, stated)
+                    panel = (record.name, axis.name, axis.unit, held, figure, time, seen, curves, level)
+                    out.append(Panel(*panel))
+    return tuple(out)
+
+
+def paper_figure(record: Record, stated: Stated = PAPER) -> str:
+    """The figure that shows such a record: "Fig. 13" (on), "Fig. 14" (off), "Fig. 16", "Fig. 17" or ""."""
+    axes = {axis.name: j for j, axis in enumerate(record.drive_axes) if axis.unit == "rad"}
+    if "x" not in axes or len(axes) != len(record.drive_axes) or set(axes) - {"x", "y"}:
+        return ""
+    first, last = (
+        tuple(float(record.drive[row, axes[name]]) if name in axes else 0.0 for name in "xy")
+        for row in (0, -1)
+    )
+    steps = [Drive.of_rows(record.time, record.drive[:, j]).times.size for j in axes.values()]
+    if max(steps) > 1:
+        return ""
+    given, rest = stated.records, (0.0, 0.0)
+    known = {
+        "Fig. 13": (rest, (given.step_drive, 0.0)),
+        "Fig. 14": ((given.step_drive, 0.0), rest),
+        "Fig. 16": (rest, (given.single_axis_drive, 0.0)),
+        "Fig. 17": (rest, given.two_axis_drive),
+    }
+    for figure, ends in known.items():
+        if np.allclose((first, last), ends, rtol=0, atol=_SAME_DRIVE):
+            return figure
+    return ""
+
+
+def _moved(record: Record) -> list[Drive]:
+    drives = [Drive.of_rows(record.time, column) for column in record.drive.T]
+    return [drive for drive in drives if drive.moves]
+
+
+def _response(
+    study: Study, found: Sequence[Identification], record: Record, response: int, kind: str
+) -> Vector:
+    taken = np.isfinite(record.response[:, response])
+    times, seen = record.time[taken], record.response[taken, response]
+    begin = min(float(drive.times[0]) for drive in _moved(record))
+    out = np.full(times.size, resting_level(times, seen, begin)[0])
+    for each in found:
+        drive = Drive.of_rows(record.time, record.drive[:, each.data.drive])
+        if each.data.response == response and drive.moves:
+            model: PathModel = model_of(each, kind).model
+            out += response_to(drive, model, times, exposure=study.model.exposure)
+    return out
+
+
+def _printed_rmse(figure: str, kind: str, stated: Stated) -> str:
+    given = stated.records
+    if not figure or "," in kind:  # the text has no output-error fits
+        return ""
+    if kind == "integer":
+        return f"> {given.integer_rmse:g}"
+    two = figure == "Fig. 17"
+    return f"{given.fractional_rmse_two_axes if two else given.fractional_rmse:g}"
+
+
+def _printed_level(figure: str, axis: str, stated: Stated) -> float | None:
+    given = stated.records
+    x = given.single_axis_ideal
+    known = {
+        ("Fig. 13", "x"): given.measured.steady,
+        ("Fig. 14", "x"): 0.0,
+        ("Fig. 16", "x"): x,
+        ("Fig. 16", "y"): x * given.crosstalk_measured,
+        ("Fig. 17", "x"): given.two_axis_steady[0],
+        ("Fig. 17", "y"): given.two_axis_steady[1],
+    }
+    return known.get((figure, axis))

@@ -1,0 +1,211 @@
+"""The verb `optics`: Section 2 and 3.2 of Ta et al. 2026 for a given array and cell (Figs. 3, 5, 10, 11)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import pi
+from typing import Any, final
+
+import numpy as np
+
+from lcopa_bayes.arrays import Matrix, Vector
+from lcopa_bayes.estimate import plain
+from lcopa_bayes.optics.chain import linearisation_error, linearised_angle, paper_chain
+from lcopa_bayes.optics.checks import finite
+from lcopa_bayes.optics.director import Profile, equilibrium
+from lcopa_bayes.optics.farfield import LinearPatterns, PlanarPattern, planar_patterns, steered_patterns
+from lcopa_bayes.optics.lobes import LobeRow, lobe_table, main_lobe, side_lobe_level
+from lcopa_bayes.optics.tiltlaw import RANGES, TiltLawCheck, continuous_law, printed_law, tilt_law_check
+from lcopa_bayes.paper.opticsplan import OpticsPlan
+
+_CHAIN_POINTS = 241
+_NOTHING = 1e-12
+"""Relative intensity that is zero but for rounding [-]."""
+
+
+@final
+@dataclass(frozen=True)
+class Steered:
+    """The array steered to one target."""
+
+    target: float
+    """[rad]."""
+    phase_step: float
+    """[rad]."""
+    main_lobe: float
+    """Angle of the maximum found on the pattern [rad]."""
+    side_lobe: float
+    """Largest relative intensity away from every lobe [-]; NaN when there is none."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class ChainCurves:
+    """Voltage to tilt, phase and angle over the lower branch of Eq. 24, as far as the beam propagates."""
+
+    voltage: Vector
+    """(n,) [V]."""
+    tilt: Vector
+    """By Eq. 24 [rad]."""
+    phase: Vector
+    """By Eq. 23 [rad]."""
+    angle: Vector
+    """By Eq. 5, exact [rad]."""
+    linearised: Vector
+    """By Eq. 26 [rad]."""
+    relative_error: Vector
+    """Linearised over exact - 1 [-]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class StaticOptics:
+    """Everything the verb tells and draws."""
+
+    plan: OpticsPlan
+    check: TiltLawCheck
+    profiles: tuple[Profile, ...]
+    """One per voltage of the plan."""
+    patterns: LinearPatterns
+    planar: tuple[PlanarPattern, ...]
+    steered: tuple[Steered, ...]
+    lobes: tuple[LobeRow, ...]
+    chain: ChainCurves
+
+    @property
+    def laws(self) -> Matrix:
+        """Eq. 24 as printed and its continuous reading at the voltages of the plan, (2, n) [rad]."""
+        optics = self.plan.optics
+        return np.array([law(self.plan.voltages) for law in (printed_law(optics), continuous_law(optics))])
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values; every number says its unit in its name or beside it."""
+        optics, chain = self.plan.optics, self.chain
+        fits = zip(RANGES, self.check.printed, self.check.continuous, self.check.best, strict=True)
+        told: dict[str, Any] = plain(
+            {
+                "array": {
+                    "elements": optics.elements,
+                    "pitch_m": optics.pitch_in_wavelengths * optics.wavelength,
+                    "wavelength_m": optics.wavelength,
+                    "fill_factor": self.plan.fill_factor,
+                },
+                "field": self.plan.field.value,
+                "pretilt_rad": self.plan.pretilt,
+                "threshold_voltage": {"value": self.check.threshold, "unit": "V"},
+                "mean_tilt": [
+                    {
+                        "voltage_V": profile.voltage,
+                        "tilt_rad": profile.mean,
+                        "largest_tilt_rad": profile.largest,
+                        "printed_law_rad": printed,
+                        "continuous_law_rad": continuous,
+                    }
+                    for profile, printed, continuous in zip(self.profiles, *self.laws, strict=True)
+                ],
+                "tilt_law": [
+                    {
+                        "range": name,
+                        "from_V": a.lower,
+                        "to_V": a.upper,
+                        **{
+                            law: {
+                                "r_squared": fit.r_squared,
+                                "largest_relative_error": fit.largest_relative_error,
+                                "largest_error_rad": fit.largest_error,
+                            }
+                            for law, fit in (("printed", a), ("continuous", b), ("best", c))
+                        },
+                    }
+                    for name, a, b, c in fits
+                ],
+                "steering": [
+                    {
+                        "target_deg": np.degrees(each.target),
+                        "phase_step_rad": each.phase_step,
+                        "main_lobe_deg": np.degrees(each.main_lobe),
+                        "side_lobe": each.side_lobe,
+                    }
+                    for each in self.steered
+                ],
+                "grating_lobes": [
+                    {
+                        "target_deg": np.degrees(row.target),
+                        "order": row.order,
+                        "angle_deg": np.degrees(row.angle),
+                        "isotropic": row.isotropic,
+                        "with_element": row.with_element,
+                    }
+                    for row in self.lobes
+                ],
+                "chain": [
+                    {
+                        "voltage_V": chain.voltage[k],
+                        "tilt_rad": chain.tilt[k],
+                        "phase_rad": chain.phase[k],
+                        "angle_rad": chain.angle[k],
+                        "angle_linearised_rad": chain.linearised[k],
+                    }
+                    for k in range(0, chain.voltage.size, (_CHAIN_POINTS - 1) // 12)
+                ],
+            }
+        )
+        return told
+
+    def words(self) -> list[str]:
+        """A short table to read."""
+        lines = [
+            f"threshold voltage {self.check.threshold:.4f} V",
+            "",
+            "voltage [V]  mean tilt [rad]  Eq. 24",
+        ]
+        for profile, law in zip(self.profiles, self.laws[0], strict=True):
+            lines.append(f"{profile.voltage:11.4g}  {profile.mean:15.5f}  {law:.5f}")
+        lines += ["", "target [deg]  phase step [rad]  lobes: order, angle [deg], intensity over main lobe"]
+        for each in self.steered:
+            own = [row for row in self.lobes if row.target == each.target and row.order]
+            said = "; ".join(f"{r.order:+d}, {np.degrees(r.angle):.1f}, {_height(r):.2g}" for r in own)
+            lines.append(f"{np.degrees(each.target):12.4g}  {each.phase_step:16.4f}  {said or 'none'}")
+        return lines
+
+
+def static_optics(plan: OpticsPlan) -> StaticOptics:
+    """Solve and evaluate everything; errors as in the optics modules."""
+    optics, array = plan.optics, plan.array
+    targets = np.radians(optics.targets_1d_deg)
+    steered = []
+    for target in targets:
+        step = float(array.phase_step(target))
+        lobe, side = main_lobe(array, step), side_lobe_level(array, step)
+        steered.append(Steered(float(target), step, lobe, side))
+    return StaticOptics(
+        plan,
+        tilt_law_check(optics, field=plan.field, pretilt=plan.pretilt),
+        tuple(equilibrium(plan.cell, volt, field=plan.field) for volt in plan.voltages),
+        steered_patterns(optics),
+        planar_patterns(optics),
+        tuple(steered),
+        lobe_table(targets, optics, fill_factor=plan.fill_factor),
+        _chain(plan),
+    )
+
+
+def _height(row: LobeRow) -> float:
+    return row.with_element if row.with_element > _NOTHING else 0.0
+
+
+def _chain(plan: OpticsPlan) -> ChainCurves:
+    """Up to the knee of Eq. 24, or to where the phase steers to end-fire."""
+    array = plan.array
+    chain = paper_chain(plan.optics, array=array)
+    end = min(np.nextafter(chain.voltage_limit, 0), 2 * pi / array.period / chain.phase_per_volt)
+    voltage = finite(np.linspace(0.0, end, _CHAIN_POINTS), name="voltage")
+    phase = chain.phase(voltage)
+    return ChainCurves(
+        voltage,
+        chain.tilt(voltage),
+        phase,
+        chain.angle(voltage),
+        linearised_angle(array, phase),
+        linearisation_error(array, phase),
+    )

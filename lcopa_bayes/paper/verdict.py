@@ -1,0 +1,89 @@
+"""A claim of the paper, the evidence it may call on, and the verdict that follows from numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, final
+
+from lcopa_bayes.estimate import plain
+from lcopa_bayes.stated import Stated
+
+
+class Kind(Enum):
+    """What became of a claim."""
+
+    SUPPORTED = "supported"
+    CONTRADICTED = "contradicted"
+    UNDECIDED = "undecided"
+    """Cannot be decided from the evidence at hand; the reason says what is missing."""
+
+    @classmethod
+    def of(cls, holds: bool) -> Kind:
+        """A claim that its criterion decides."""
+        return cls.SUPPORTED if holds else cls.CONTRADICTED
+
+
+@final
+@dataclass(frozen=True)
+class Verdict:
+    """Outcome of one test."""
+
+    kind: Kind
+    number: float | None
+    """What decides, in `unit`; None when there is nothing to compute from."""
+    unit: str
+    how: str
+    """The calculation in a sentence or two, its criterion included; for an undecided claim, the reason."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What beyond the printed numbers a test may read: the results of other stages, absent until run."""
+
+    audit: Mapping[str, Any] | None = None
+    """Results of an identifiability audit of the paper's record."""
+    compare: Mapping[str, Any] | None = None
+    """Results of a comparison of integer and fractional models."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Claim:
+    """A sentence of the paper and the test of it.
+
+    A test computes its verdict from the stated numbers and the evidence alone: a copy of `Stated` with
+    another number can give another verdict.
+    """
+
+    id: str
+    text: str
+    source: str
+    """Section or equation of Ta et al. 2026."""
+    test: Callable[[Stated, Evidence], Verdict]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A claim with its verdict."""
+
+    claim: Claim
+    verdict: Verdict
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        told: dict[str, Any] = plain(
+            {
+                "id": self.claim.id,
+                "verdict": self.verdict.kind.value,
+                "number": self.verdict.number,
+                "unit": self.verdict.unit,
+                "how": self.verdict.how,
+                "text": self.claim.text,
+                "source": self.claim.source,
+            }
+        )
+        return told

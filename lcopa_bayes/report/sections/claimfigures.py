@@ -1,0 +1,231 @@
+"""What the verdicts rest on, drawn: step response, crosstalk, delays, tilt, lobes, steering."""
+
+from __future__ import annotations
+
+from math import pi
+
+import numpy as np
+
+from lcopa_bayes.optics.array import LinearArray, paper_array
+from lcopa_bayes.optics.chain import geometry_check, linearisation_error
+from lcopa_bayes.optics.lobes import strongest_grating_lobe
+from lcopa_bayes.optics.tiltlaw import continuous_law, printed_law
+from lcopa_bayes.paper.crosstalkclaims import crosstalk_rules
+from lcopa_bayes.paper.equation import response_to
+from lcopa_bayes.paper.numericsclaims import delay_costs
+from lcopa_bayes.paper.opticsclaims import FAR_WEAKER, tilt_checks
+from lcopa_bayes.paper.printedmodel import RECORD_LENGTH, SETTLING_BANDS, PrintedModel, integer_rival
+from lcopa_bayes.plant.drive import Drive
+from lcopa_bayes.report.canvas import BAND, CYCLE, HELD_OUT, NOISE, STEADY, blank, svg_of
+from lcopa_bayes.report.section import Drawing, Section
+from lcopa_bayes.report.wording import figures
+from lcopa_bayes.stated import PAPER, Stated
+
+_SHOWN = 100.0
+"""Time of the long panel [ms]."""
+
+
+def sections(stated: Stated = PAPER) -> list[Section]:
+    """One section for each family of claims."""
+    rival = integer_rival(stated)
+    costs = delay_costs(stated)
+    return [
+        Section(
+            "M2, M3: steady state and settling",
+            drawings=(
+                Drawing(
+                    "claim_steady",
+                    _steady(stated),
+                    "The step of Fig. 13 through Eq. 65, over a record and beyond it, with 2 and 5 % bands "
+                    "about the value it tends to; the integer-order model closest to it over the record "
+                    f"(RMSE {figures(rival.rmse)} rad); the measured steady value.",
+                ),
+            ),
+        ),
+        Section(
+            "X1 to X3: crosstalk and two axes",
+            drawings=(
+                Drawing(
+                    "claim_crosstalk",
+                    _crosstalk(stated),
+                    "Left: b / k of the coupling paths against the printed crosstalk gains. Middle: y over x "
+                    "with x driven, at rest and at the end of the record, against the measured ratio. Right: "
+                    "steady values of both axes driven together.",
+                ),
+            ),
+        ),
+        Section(
+            "N2: delays in whole blocks",
+            drawings=(
+                Drawing(
+                    "claim_delay",
+                    _delays(stated),
+                    "Shift of the other parameters when the delay is held at the nearest camera period, for "
+                    f"the printed delay of {figures(costs[0].delay, 4)} ms and for the worst one, "
+                    f"{figures(costs[1].delay, 4)} ms.",
+                ),
+            ),
+        ),
+        Section(
+            "S1: tilt law",
+            drawings=(
+                Drawing(
+                    "claim_tilt",
+                    _tilt(stated),
+                    "Mean tilt in a uniform and a self-consistent field, and Eq. 24; right: about the knee.",
+                ),
+            ),
+        ),
+        Section(
+            "S2 to S4: lobes, linearised steering, geometry",
+            drawings=(
+                Drawing(
+                    "claim_steering",
+                    _steering(stated),
+                    "Left: strongest grating lobe over the main lobe. Middle: size of the error of Eq. 26, "
+                    "and the steady-state error the paper claims. Right: angle by Eq. 5 for the pitch of "
+                    "Section 2 and for the pitch that the measured step implies.",
+                ),
+            ),
+        ),
+    ]
+
+
+def _steady(stated: Stated) -> str:
+    model, rival, given = PrintedModel(stated), integer_rival(stated), stated.records
+    steady = model.steady(given.step_drive, 0.0)[0]
+    figure = blank(3.2)
+    near, far = figure.subplots(1, 2, sharey=True)
+    for panel, end in ((near, RECORD_LENGTH), (far, _SHOWN)):
+        at = (model.times > 0) & (model.times <= end)
+        times = model.times[at]
+        for band, shade in zip(sorted(SETTLING_BANDS, reverse=True), (0.15, 0.3), strict=True):
+            panel.axhspan(
+                steady * (1 - band),
+                steady * (1 + band),
+                color=BAND,
+                alpha=shade,
+                lw=0,
+                label=f"within {band:.0%}",
+            )
+        panel.plot(times, model.step_on[at], color=BAND, label="Eq. 65")
+        drive = Drive(np.zeros(1), np.full(1, given.step_drive))
+        integer = response_to(drive, rival.model, times)
+        panel.plot(times, integer, color=CYCLE[1], ls=(0, (4, 2)), label="closest integer order")
+        panel.axhline(
+            given.measured.steady, color=STEADY, lw=0.8, ls=(0, (1, 1.5)), label="measured steady value"
+        )
+        panel.axvline(given.fractional.settling, color=NOISE, lw=0.8, label="settling as printed")
+        panel.set_xlabel("time [ms]")
+        panel.set_xlim(0, end)
+    near.set_ylabel("x [rad]")
+    near.set_ylim(0.8 * steady, 1.06 * steady)
+    figure.legend(*near.get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    return svg_of(figure)
+
+
+def _crosstalk(stated: Stated) -> str:
+    model, given = PrintedModel(stated), stated.records
+    figure = blank(2.9)
+    gains, ratio, both = figure.subplots(1, 3)
+    wide = 0.38
+    gains.bar(np.arange(2) - wide / 2, crosstalk_rules(stated)["b / k"], wide, color=BAND, label="Eq. 65")
+    gains.bar(np.arange(2) + wide / 2, given.crosstalk_gains, wide, color=STEADY, label="printed")
+    gains.set_xticks([0, 1], ["x to y", "y to x"])
+    gains.set_ylabel("crosstalk gain [rad/rad]")
+    drive = given.single_axis_drive
+    values = [y / x for x, y in (model.steady(drive, 0.0), model.at_end(drive, 0.0))]
+    ratio.bar([0, 1], values, 0.6, color=BAND)
+    ratio.bar([2], [given.crosstalk_measured], 0.6, color=STEADY)
+    ratio.set_xticks([0, 1, 2], ["at rest", f"{RECORD_LENGTH:g} ms", "stated"])
+    ratio.set_ylabel("y over x, x driven [-]")
+    readings = (
+        model.steady(*given.two_axis_drive),
+        model.at_end(*given.two_axis_drive),
+        given.two_axis_steady,
+    )
+    for k, (values_, colour) in enumerate(zip(readings, (BAND, CYCLE[4], STEADY), strict=True)):
+        name = ("at rest", f"{RECORD_LENGTH:g} ms", "stated")[k]
+        both.bar(np.arange(2) + 0.27 * (k - 1), values_, 0.27, color=colour, label=name)
+    both.set_xticks([0, 1], ["x", "y"])
+    both.set_ylabel("both driven [rad]")
+    for panel in (gains, both):
+        panel.set_ylim(top=panel.get_ylim()[1] * 1.25)
+        panel.legend(loc="upper right" if panel is both else "upper left")
+    return svg_of(figure)
+
+
+def _delays(stated: Stated) -> str:
+    figure = blank(2.3)
+    panel = figure.subplots()
+    for k, (cost, colour) in enumerate(zip(delay_costs(stated), (CYCLE[0], CYCLE[1]), strict=True)):
+        at = np.arange(len(cost.shifts)) + 0.36 * (k - 0.5)
+        sizes = [abs(shift.in_sd) for shift in cost.shifts]
+        panel.bar(at, sizes, 0.36, color=colour, label=f"{cost.delay:g} held at {cost.rounded:g} ms")
+    panel.set_xticks(range(len(cost.shifts)), [shift.name.replace("_", " ") for shift in cost.shifts])
+    panel.set_ylabel("shift [sd]")
+    panel.set_ylim(top=panel.get_ylim()[1] * 1.25)
+    panel.legend(loc="upper left", ncols=2)
+    return svg_of(figure)
+
+
+def _tilt(stated: Stated) -> str:
+    optics = stated.optics
+    figure = blank(3.0)
+    whole, knee = figure.subplots(1, 2, width_ratios=[2, 1])
+    for panel in (whole, knee):
+        for check, colour in zip(tilt_checks(optics), (CYCLE[0], CYCLE[4]), strict=True):
+            panel.plot(
+                check.curve.voltage, check.curve.mean, color=colour, label=f"{check.curve.field.value} field"
+            )
+        for law, shade, name, dashes in (
+            (printed_law(optics), STEADY, "Eq. 24 as printed", "-"),
+            (continuous_law(optics), CYCLE[2], "Eq. 24, continuous", (0, (4, 2))),
+        ):
+            below = np.array([0.0, np.nextafter(optics.knee_voltage, 0)])
+            above = np.array([optics.knee_voltage, optics.largest_voltage])
+            panel.plot(below, law(below), color=shade, ls=dashes, label=name)
+            panel.plot(above, law(above), color=shade, ls=dashes)
+        panel.axhline(pi / 2, color=NOISE, lw=0.7, label="pi/2")
+        panel.set_xlabel("voltage [V]")
+    whole.set_ylabel("mean tilt [rad]")
+    whole.set_ylim(0, 1.8)
+    knee.set_xlim(optics.knee_voltage - 0.3, optics.knee_voltage + 0.3)
+    knee.set_ylim(1.0, 1.7)
+    figure.legend(*whole.get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    return svg_of(figure)
+
+
+def _steering(stated: Stated) -> str:
+    optics, check = stated.optics, geometry_check(stated)
+    figure = blank(2.9)
+    lobes, error, angle = figure.subplots(1, 3)
+    targets = np.linspace(0.0, max(optics.targets_1d_deg), 81)
+    for fill, colour, name in ((0.0, HELD_OUT, "point elements"), (1.0, BAND, "elements as wide as d")):
+        height = strongest_grating_lobe(np.radians(targets), optics, fill_factor=fill)
+        lobes.plot(targets, height, color=colour, label=name)
+    lobes.axhline(FAR_WEAKER, color=NOISE, lw=0.8, ls=(0, (4, 3)), label="far weaker")
+    lobes.set_xlabel("steering angle [deg]")
+    lobes.set_ylabel("grating lobe over main lobe [-]")
+    lobes.set_ylim(0, 1.45)
+    phases = np.linspace(0.0, pi, 400)
+    implied = LinearArray(optics.elements, check.implied_pitch, optics.wavelength)
+    pitches = (
+        (paper_array(optics), HELD_OUT, f"d = {optics.pitch_in_wavelengths:g} wavelengths"),
+        (implied, BAND, f"d = {check.implied_pitch_in_wavelengths:.2f} wavelengths"),
+    )
+    for array, colour, name in pitches:
+        error.semilogy(phases, np.abs(linearisation_error(array, phases)), color=colour, label=name)
+        angle.plot(phases, array.steering_angle(phases), color=colour, label=name)
+    limit = stated.records.steady_state_error
+    error.axhline(limit, color=NOISE, lw=0.8, ls=(0, (4, 3)), label="claimed error")
+    error.set_ylabel("error of Eq. 26 [-]")
+    error.set_ylim(1e-6, 2.0)
+    angle.plot(check.step, check.measured_angle, "o", ms=4, color=STEADY, label="measured")
+    angle.set_ylabel("angle [rad]")
+    angle.set_ylim(0, 0.65)
+    for panel in (error, angle):
+        panel.set_xlabel("phase step [rad]")
+    for panel in (lobes, error, angle):
+        panel.legend(loc="upper left", fontsize=6.5)
+    return svg_of(figure)

@@ -1,0 +1,167 @@
+"""What each verb of the command line does with its options: the values it tells, and the words."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from lcopa_bayes.bench.campaign import write_campaign
+from lcopa_bayes.bench.plan import load_plan
+from lcopa_bayes.cores import cores
+from lcopa_bayes.files import writable_folder
+from lcopa_bayes.fit import fit
+from lcopa_bayes.paper.claims import judge
+from lcopa_bayes.paper.identify import identify, results, scannable
+from lcopa_bayes.paper.intervals import MOST_TERMS, Interval, Scan
+from lcopa_bayes.paper.opticsplan import OpticsPlan
+from lcopa_bayes.paper.staticoptics import static_optics
+from lcopa_bayes.paper.steptable import load_posterior, step_table
+from lcopa_bayes.report import write_report
+from lcopa_bayes.report.paperpages import write_claims, write_identification, write_optics
+from lcopa_bayes.runfolder import save_fit, save_json
+from lcopa_bayes.study import Study
+from lcopa_bayes.studyfile import load_study
+
+
+@final
+@dataclass(frozen=True)
+class Told:
+    """Outcome of a verb."""
+
+    values: dict[str, Any]
+    """What ``--json`` prints."""
+    words: tuple[str, ...] = ()
+    """Lines for a reader."""
+
+
+def run(options: argparse.Namespace, command: list[str]) -> Told:
+    """All stages of a study; the fit comes first and feeds the others."""
+    return fit_study(options, command)
+
+
+def fit_study(options: argparse.Namespace, command: list[str]) -> Told:
+    """Posterior, bands and step metrics, with a report."""
+    study = _study(options)
+    folder = options.out or Path("reports") / study.name
+    made = fit(
+        study,
+        jobs=options.jobs or cores(),
+        folder=folder,
+        resume=options.resume,
+        quick=options.quick,
+        quiet=options.quiet,
+    )
+    told = save_fit(made, folder, command)
+    return _with_report(told, write_report(folder), told["verdict"])
+
+
+def report(options: argparse.Namespace, command: list[str]) -> Told:
+    """The report of a run folder, drawn again."""
+    return _with_report({}, write_report(options.folder))
+
+
+def simulate(options: argparse.Namespace, command: list[str]) -> Told:
+    """Records of a campaign file, measured on the virtual bench."""
+    plan = load_plan(options.campaign)
+    seed = plan.seed if options.seed is None else options.seed
+    records = plan.run(np.random.default_rng(seed))
+    paths = write_campaign(
+        options.out,
+        records,
+        held_out=plan.held_out,
+        name=plan.name,
+        seed=seed,
+        overwrite=options.overwrite,
+    )
+    verdict = f"{len(records)} records in {options.out}"
+    return Told({"verdict": verdict, "files": [str(path) for path in paths]}, (verdict,))
+
+
+def optics(options: argparse.Namespace, command: list[str]) -> Told:
+    """Far field, director and the chain from volts to angle, with figures."""
+    made = static_optics(
+        OpticsPlan.of(
+            elements=options.elements,
+            pitch=options.pitch,
+            wavelength=options.wavelength,
+            fill_factor=options.fill_factor,
+            targets_deg=options.targets,
+            voltages=options.voltages,
+            pretilt=options.pretilt,
+            field=options.field,
+        )
+    )
+    folder = writable_folder(options.out)
+    values = made.as_json()
+    save_json(values, folder / "results.json")
+    return _with_report(values, write_optics(folder, made), *made.words())
+
+
+def identify_study(options: argparse.Namespace, command: list[str]) -> Told:
+    """The paper's least-squares scan of every path, with the integer rival and Table 1."""
+    plan = _scan(options)
+    study = _study(options)
+    folder = options.out or Path("reports") / study.name
+    posterior = load_posterior(options.posterior, study) if options.posterior else None
+    scannable(study, plan)
+    writable_folder(folder)
+    found = identify(study, plan=plan, quiet=options.quiet, jobs=options.jobs or cores())
+    rows = step_table(study, found, posterior=posterior)
+    values = results(study, found, plan) | {"step_metrics": [row.as_json() for row in rows]}
+    save_json(values, folder / "identify.json")
+    words = [f"{'path':8}{'model':30}{'orders':24}{'delay':>8}{'steady':>12}{'RMSE':>11}  unit"]
+    for path in values["paths"]:
+        for model in path["models"]:
+            orders = ", ".join(f"{order:.3g}" for order in model["orders"])
+            words.append(
+                f"{path['path']:8}{model['method']:30}{orders:24}{model['delay']:8.4g}{model['steady']:12.5g}"
+                f"{model['output_rmse']:11.3g}  {path['response_unit']}"
+            )
+    return _with_report(values, write_identification(folder, study, found, rows), *words)
+
+
+def claims(options: argparse.Namespace, command: list[str]) -> Told:
+    """Every claim of the paper with its computed verdict."""
+    judged = judge()
+    folder = writable_folder(options.out)
+    values = {"claims": [each.as_json() for each in judged]}
+    save_json(values, folder / "results.json")
+    words = [f"{'claim':6}{'verdict':14}{'number':>12}  unit"]
+    for each in judged:
+        number = "-" if each.verdict.number is None else f"{each.verdict.number:.4g}"
+        words.append(f"{each.claim.id:6}{each.verdict.kind.value:14}{number:>12}  {each.verdict.unit}")
+    return _with_report(values, write_claims(folder, judged), *words)
+
+
+def _with_report(values: dict[str, Any], path: Path, *words: str) -> Told:
+    return Told(values | {"report": str(path)}, (*words, f"report: {path}"))
+
+
+def _study(options: argparse.Namespace) -> Study:
+    """The study asked for, with the seed of the command line if one is given."""
+    study = load_study(options.source, held_out=options.held_out)
+    return study if options.seed is None else study.with_seed(options.seed)
+
+
+def _scan(options: argparse.Namespace) -> Scan:
+    """The scan of the command line; an order without an interval is scanned up to the one above it."""
+    given: Sequence[Sequence[float] | None] = (options.alpha, options.beta, options.gamma)
+    orders: list[Interval] = []
+    for ends in given:
+        top = orders[-1].high if orders else 2.0
+        # an interval that ends below the smallest scanned order leaves nothing below it but itself
+        orders.append(Interval(*ends) if ends else Interval(min(options.order_step, top), top))
+    assert len(orders) == MOST_TERMS
+    return Scan(
+        orders=tuple(orders) if any(given) else None,
+        order_step=options.order_step,
+        delay=Interval(*options.delay) if options.delay else None,
+        whole_blocks=not options.any_delay,
+        stiffness=tuple(options.stiffness),
+        rounds=options.rounds,
+    )
