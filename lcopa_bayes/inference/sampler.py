@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -202,6 +203,7 @@ _posterior: Posterior | None = None
 
 def _take_up(posterior: Posterior) -> None:
     global _posterior
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # an interrupt ends a worker without a word
     threadpool_limits(1)
     _posterior = posterior
 
