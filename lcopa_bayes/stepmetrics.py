@@ -127,15 +127,14 @@ def _difference(high: Vector, low: Vector) -> Vector:
 def _crosstalk(layout: Layout, curves: StepCurves, *, ess: float, grade: str) -> list[Estimate]:
     """Steady response of the other axes over that of the driven one, where two axes respond."""
     out = []
-    names = {axis.name for axis in layout.drives} & {axis.name for axis in layout.responses}
     for j, drive in enumerate(layout.drives):
-        own = [i for i, r in enumerate(layout.responses) if (r.name == drive.name if names else i == j)]
+        own = layout.own_response(j)
         for i, response in enumerate(layout.responses):
-            if own and i != own[0]:
-                direct = curves.gains[:, own[0], j]
+            if own is not None and i != own:
+                direct = curves.gains[:, own, j]
                 other = curves.gains[:, i, j]
                 ratio = np.where(direct != 0, other / np.where(direct != 0, direct, 1), np.inf)
-                name = f"crosstalk[{response.name}/{layout.responses[own[0]].name} by {drive.name}]"
-                unit = f"{response.unit}/{layout.responses[own[0]].unit}"
+                name = f"crosstalk[{response.name}/{layout.responses[own].name} by {drive.name}]"
+                unit = f"{response.unit}/{layout.responses[own].unit}"
                 out.append(Estimate.of(name, unit, ratio, ess=ess, grade=grade))
     return out

@@ -1,4 +1,4 @@
-"""Least squares from many starts: where the posterior's hills stand before sampling begins."""
+"""Least squares from many starts: where the posterior's hills stand."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def find_optima(posterior: Posterior, rng: np.random.Generator, *, starts: int =
         for name, value in (("sigma", 0.05 * scale), ("rho", 0.1), ("nu", 10.0)):
             if name in posterior.noise.names and table.rows[table.at(name, axis)].free:
                 drawn[:, table.at(name, axis)] = value
-    chosen = drawn[np.argsort(-_screen(posterior, drawn), kind="stable")]
+    chosen = drawn[np.argsort(-posterior.log_likelihood(drawn), kind="stable")]
     optima: list[Optimum] = []
     for values in _distinct(posterior, chosen, starts):
         values = posterior.complete(posterior.coordinates(values[None]), None)[0]
@@ -62,12 +62,6 @@ def find_optima(posterior: Posterior, rng: np.random.Generator, *, starts: int =
 
 def _plain(posterior: Posterior, optimum: Optimum) -> Vector:
     return np.asarray(posterior.coordinates(optimum.values[None])[0])
-
-
-def _screen(posterior: Posterior, values: Matrix) -> Vector:
-    """Log likelihood of each draw, a chunk at a time."""
-    chunks = np.array_split(values, max(1, values.shape[0] // 64))
-    return np.concatenate([posterior.log_likelihood(chunk) for chunk in chunks])
 
 
 def _spread(posterior: Posterior) -> list[float]:

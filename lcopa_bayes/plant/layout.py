@@ -83,6 +83,11 @@ class Layout:
             for i in range(len(self.responses))
         ]
 
+    def own_response(self, drive: int) -> int | None:
+        """The response axis that a drive is meant to move; None when there is none."""
+        own = [row[drive] for row in _direct(self.drives, self.responses)]
+        return own.index(True) if any(own) else None
+
     def path_name(self, response: int, drive: int) -> str:
         """`<response>_<drive>`, or nothing when the plant has one path."""
         if len(self.drives) == len(self.responses) == 1:
@@ -94,20 +99,24 @@ class Layout:
         return self.responses[response].name if len(self.responses) > 1 else ""
 
 
+def _direct(drives: Sequence[Axis], responses: Sequence[Axis]) -> list[list[bool]]:
+    """Whether a path leads from an axis to itself, [response][drive]: by name, or by position when no axis
+    name is both drive and response."""
+    shared = {axis.name for axis in drives} & {axis.name for axis in responses}
+    return [
+        [response.name == drive.name if shared else i == j for j, drive in enumerate(drives)]
+        for i, response in enumerate(responses)
+    ]
+
+
 def _slots(drives: Sequence[Axis], responses: Sequence[Axis], share: str) -> list[list[str]]:
     """Slot name of each path, [response][drive]."""
     if share == "all" or len(drives) == len(responses) == 1:
         return [["" for _ in drives] for _ in responses]
     if share == "none":
         return [[f"{response.name}_{drive.name}" for drive in drives] for response in responses]
-    names = {axis.name for axis in drives} & {axis.name for axis in responses}
-    table = [
-        [
-            "direct" if (response.name == drive.name if names else i == j) else "cross"
-            for j, drive in enumerate(drives)
-        ]
-        for i, response in enumerate(responses)
-    ]
+    direct = _direct(drives, responses)
+    table = [["direct" if own else "cross" for own in row] for row in direct]
     if len({kind for row in table for kind in row}) == 1:
         return [["" for _ in drives] for _ in responses]
     return table
