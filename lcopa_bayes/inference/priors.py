@@ -17,7 +17,8 @@ from lcopa_bayes.arrays import Array, Vector
 
 def _uniform(x: Vector, p: Mapping[str, float]) -> Vector:
     low, width = p.get("loc", 0.0), p.get("scale", 1.0)
-    return np.where((x >= low) & (x <= low + width), -log(width), -np.inf)
+    standard = (x - low) / width  # as scipy rounds, so that both agree on which ends are inside
+    return np.where((standard >= 0) & (standard <= 1), -log(width), -np.inf)
 
 
 def _loguniform(x: Vector, p: Mapping[str, float]) -> Vector:
