@@ -57,8 +57,17 @@ def _parser() -> argparse.ArgumentParser:
         return made
 
     study, sampled = _study_options(), _sampler_options()
-    add("run", verbs.run, [study, sampled], "all stages the study names, then the report")
-    add("fit", verbs.fit_study, [study, sampled], "posterior, bands and step metrics, with a report")
+    checked = _check_options()
+    add("run", verbs.run, [study, sampled, checked], "all stages the study names, then the report")
+    add("fit", verbs.fit_study, [study, sampled, checked], "posterior, bands and step metrics, with a report")
+    _calibrate_options(
+        add(
+            "calibrate",
+            verbs.calibrate_study,
+            [_study_options("reports/calibration/<study>"), sampled],
+            "simulation-based calibration and coverage of the whole inference of a study, with a report",
+        )
+    )
     _identify_options(
         add("identify", verbs.identify_study, [study], "the paper's own least-squares scan, with a report")
     )
@@ -77,11 +86,11 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _study_options() -> argparse.ArgumentParser:
+def _study_options(out: str = "reports/<study>") -> argparse.ArgumentParser:
     study = argparse.ArgumentParser(add_help=False)
     study.add_argument("source", nargs="+", type=Path, help="study folder or file, or record files")
     study.add_argument("--held-out", nargs="+", type=Path, default=[], help="records not to fit")
-    study.add_argument("--out", type=Path, help="run folder (default: reports/<study>)")
+    study.add_argument("--out", type=Path, help=f"run folder (default: {out})")
     study.add_argument("--seed", type=int, help="seed in place of the study's")
     study.add_argument("--jobs", type=int, default=None, help="processes (default: all cores)")
     return study
@@ -92,6 +101,29 @@ def _sampler_options() -> argparse.ArgumentParser:
     sampled.add_argument("--resume", action="store_true", help="go on with an interrupted run")
     sampled.add_argument("--quick", action="store_true", help="a quarter of the steps")
     return sampled
+
+
+def _check_options() -> argparse.ArgumentParser:
+    checked = argparse.ArgumentParser(add_help=False)
+    checked.add_argument(
+        "--cross-check",
+        action="store_true",
+        help="sample by a second, independent method too; where they disagree, grades are lowered",
+    )
+    return checked
+
+
+def _calibrate_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--replicas", type=int, default=100, help="simulated studies (default: 100)")
+    parser.add_argument(
+        "--around",
+        type=Path,
+        metavar="RUNFOLDER",
+        help="draw truths from the posterior of a fit, not the prior",
+    )
+    parser.add_argument(
+        "--dask", metavar="ADDRESS", help="scheduler of a Dask cluster that does the replicas"
+    )
 
 
 def _identify_options(parser: argparse.ArgumentParser) -> None:

@@ -17,7 +17,17 @@ from lcopa_bayes.inference.sampler import SamplePlan
 from lcopa_bayes.record import Record
 from lcopa_bayes.study import Study
 
-_PACKAGES = ("lcopa-bayes", "numpy", "scipy", "emcee", "arviz-base", "arviz-stats", "pandas", "xarray")
+_PACKAGES = (
+    "lcopa-bayes",
+    "numpy",
+    "scipy",
+    "emcee",
+    "dynesty",
+    "arviz-base",
+    "arviz-stats",
+    "pandas",
+    "xarray",
+)
 
 
 def settings_of(study: Study) -> dict[str, Any]:

@@ -193,7 +193,4 @@ def save_record(record: Record, path: Path) -> None:
             writer.writerow(columns)
             writer.writerows(["" if math.isnan(v) else repr(v) for v in row] for row in rows)
 
-    try:
-        write_whole(path, write)
-    except OSError as error:
-        refuse(path, f"cannot be written ({error.strerror or error})")
+    write_whole(path, write)

@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from lcopa_bayes.fit import Fit, results
+from lcopa_bayes.fit import Fit
+from lcopa_bayes.inference.crosscheck import CrossCheck
+from lcopa_bayes.results import results
 
 _QUANTILE_NAMES = ("05", "25", "50", "75", "95")
 _PRIOR_POINTS = 200
+_BINS = 30
 
 
 def tables(fit: Fit) -> dict[str, pd.DataFrame]:
@@ -16,6 +19,7 @@ def tables(fit: Fit) -> dict[str, pd.DataFrame]:
     told = results(fit)
     return {
         "parameters": pd.DataFrame(told["parameters"]),
+        "sensitivity": pd.DataFrame(told["sensitivity"]),
         "step_metrics": pd.DataFrame(told["step_metrics"]),
         "scores": pd.DataFrame(
             [row | {"held_out": False} for row in told["fit_scores"]]
@@ -29,7 +33,7 @@ def tables(fit: Fit) -> dict[str, pd.DataFrame]:
         "step_response": _step_response(fit),
         "priors": _priors(fit),
         "prior_density": _prior_density(fit),
-    }
+    } | ({} if fit.cross_check is None else _cross_check(fit, fit.cross_check))
 
 
 def _bands(fit: Fit) -> pd.DataFrame:
@@ -169,6 +173,37 @@ def _prior_density(fit: Fit) -> pd.DataFrame:
             pd.DataFrame({"name": row.name, "log_scale": row.log_scale, "x": x, "density": density})
         )
     return pd.concat(frames, ignore_index=True)
+
+
+def _cross_check(fit: Fit, check: CrossCheck) -> dict[str, pd.DataFrame]:
+    """Marginals by both methods, as numbers and as densities over the same bins, which span 99.8 % of the
+    draws of both."""
+    rows, densities = [], []
+    for one in check.parameters:
+        told = {"name": one.name, "unit": one.unit}
+        for method, summary in (("ensembles", one.run), ("nested", one.nested)):
+            told |= {f"{method}_{key}": value for key, value in summary.as_json().items()}
+        rows.append(told | {"distance": one.distance, "p": one.p, "resolution": one.resolution})
+        k = fit.draws.table.names.index(one.name)
+        log = fit.draws.table.rows[k].log_scale
+        both = [draws[:, k] for draws in (fit.draws.flat, check.nested.values)]
+        both = [np.log(draws) for draws in both] if log else both
+        ends = np.array([np.quantile(draws, (0.001, 0.999)) for draws in both])
+        edges = np.linspace(ends[:, 0].min(), ends[:, 1].max(), _BINS + 1)
+        heights = [np.histogram(draws, edges)[0] / (draws.size * np.diff(edges)) for draws in both]
+        shown = np.exp(edges) if log else edges
+        densities.append(
+            pd.DataFrame(
+                {
+                    **{"name": one.name, "log_scale": log, "left": shown[:-1], "right": shown[1:]},
+                    **{"ensembles": heights[0], "nested": heights[1]},
+                }
+            )
+        )
+    return {
+        "cross_check": pd.DataFrame(rows),
+        "cross_check_density": pd.concat(densities, ignore_index=True),
+    }
 
 
 def _stacked(frames: list[pd.DataFrame]) -> pd.DataFrame:

@@ -12,6 +12,9 @@ import numpy as np
 
 from lcopa_bayes.bench.campaign import write_campaign
 from lcopa_bayes.bench.plan import load_plan
+from lcopa_bayes.calibration.calibrate import calibrate
+from lcopa_bayes.calibration.summary import results as calibration_results
+from lcopa_bayes.calibration.summary import tables
 from lcopa_bayes.cores import cores
 from lcopa_bayes.files import writable_folder
 from lcopa_bayes.fit import fit
@@ -21,9 +24,11 @@ from lcopa_bayes.paper.intervals import MOST_TERMS, Interval, Scan
 from lcopa_bayes.paper.opticsplan import OpticsPlan
 from lcopa_bayes.paper.staticoptics import static_optics
 from lcopa_bayes.paper.steptable import load_posterior, step_table
+from lcopa_bayes.provenance import provenance
 from lcopa_bayes.report import write_report
+from lcopa_bayes.report.calibrationpage import is_calibration, write_calibration
 from lcopa_bayes.report.paperpages import write_claims, write_identification, write_optics
-from lcopa_bayes.runfolder import save_fit, save_json
+from lcopa_bayes.runfolder import save_fit, save_json, save_table
 from lcopa_bayes.study import Study
 from lcopa_bayes.studyfile import load_study
 
@@ -54,6 +59,7 @@ def fit_study(options: argparse.Namespace, command: list[str]) -> Told:
         folder=folder,
         resume=options.resume,
         quick=options.quick,
+        cross_check=options.cross_check,
         quiet=options.quiet,
     )
     told = save_fit(made, folder, command)
@@ -62,7 +68,32 @@ def fit_study(options: argparse.Namespace, command: list[str]) -> Told:
 
 def report(options: argparse.Namespace, command: list[str]) -> Told:
     """The report of a run folder, drawn again."""
-    return _with_report({}, write_report(options.folder))
+    folder = options.folder
+    return _with_report({}, write_calibration(folder) if is_calibration(folder) else write_report(folder))
+
+
+def calibrate_study(options: argparse.Namespace, command: list[str]) -> Told:
+    """Coverage and ranks of truths over many simulated replicas of a study, with a report."""
+    study = _study(options)
+    folder = options.out or Path("reports/calibration") / study.name
+    made = calibrate(
+        study,
+        replicas=options.replicas,
+        around=options.around,
+        jobs=options.jobs or cores(),
+        dask=options.dask,
+        folder=folder,
+        resume=options.resume,
+        quick=options.quick,
+        quiet=options.quiet,
+    )
+    values = calibration_results(made)
+    writable_folder(folder / "tables")
+    for name, table in tables(made).items():
+        save_table(table, folder / "tables" / f"{name}.csv")
+    save_json(provenance(study, command), folder / "provenance.json")
+    save_json(values, folder / "results.json")
+    return _with_report(values, write_calibration(folder), values["verdict"])
 
 
 def simulate(options: argparse.Namespace, command: list[str]) -> Told:

@@ -17,13 +17,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from lcopa_bayes.inference import defaults
+from lcopa_bayes.inference.ridges import Ridges
 from lcopa_bayes.problems import InputError
 from lcopa_bayes.report import write_page, write_report
 from lcopa_bayes.report.canvas import inlined
 from lcopa_bayes.report.decimation import extremes
 from lcopa_bayes.report.saved import load_run
 from lcopa_bayes.report.section import Column, Drawing, Section, Table
-from lcopa_bayes.report.sections import data, pairs, residuals, steps
+from lcopa_bayes.report.sections import data, pairs, parameters, residuals, sensitivity, steps
 from lcopa_bayes.report.wording import NOT_REACHED, figures, interval, to_spread
 
 PARAMETERS = {
@@ -102,6 +103,12 @@ def tables_of(size: int) -> dict[str, pd.DataFrame]:
     }
 
 
+def moved(name: str, prior: float | None, diagnosis: str) -> dict:
+    told = {"parameter": name, "prior": prior, "prior_mcse": prior and 0.0123, "likelihood": prior}
+    told |= {"likelihood_mcse": prior and 0.0123, "prior_k": None, "likelihood_k": 0.312, "threshold": 0.05}
+    return told | {"grade": "tentative", "diagnosis": diagnosis, "note": ""}
+
+
 def results_of() -> dict:
     scores = {"axis": "x", "unit": "rad", "coverage_50": 0.5, "coverage_90": 0.91, "samples": 80, "draws": 40}
     return {
@@ -122,6 +129,9 @@ def results_of() -> dict:
             estimate("settling_5[x]", "ms", None, None, "reliable", lower=7.5),
             estimate("overshoot[x]", "-", 0.04, 0.002, "reliable"),
         ],
+        "ridges": [],
+        "cross_check": None,
+        "sensitivity": [moved("time_1", 0.21, "prior-data conflict"), moved("gain", None, "not trusted")],
         "residual_tests": [
             {"record": record, "axis": "x", "held_out": held, "p_white": 3.2e-7, "rms": 1e-4}
             for record, held in RECORDS
@@ -178,7 +188,7 @@ def test_sections_come_in_the_order_of_reading(html):
     titles = re.findall(r"<h2>(.*?)</h2>", html)
     assert titles == [
         *("Data and bands", "Residuals", "Parameters", "Pairs of parameters", "Traces", "Step responses"),
-        *("Priors and posteriors", "Sampler and provenance"),
+        *("Priors and posteriors", "Prior sensitivity", "Second method", "Sampler and provenance"),
     ]
 
 
@@ -415,3 +425,36 @@ def test_step_table_is_left_out_when_there_are_no_metrics(folder, tmp_path):
     run = load_run(folder)
     bare = type(run)({**run.results, "step_metrics": []}, run.provenance, run.tables, run.draws)
     assert steps.section(bare).tables == ()
+
+
+def with_results(folder: Path, **more: object):
+    run = load_run(folder)
+    return type(run)({**run.results, **more}, run.provenance, run.tables, run.draws)
+
+
+def test_several_ridges_are_shown_with_their_shares(folder):
+    assert len(parameters.section(load_run(folder)).tables) == 2
+    found = Ridges("time_1", "ms", (1.1,), np.array([[0.3, 0.7], [0.5, 0.5]]), np.full((2, 2), 0.02))
+    row = found.as_json() | {"grade": "tentative"}
+    table = parameters.section(with_results(folder, ridges=[row])).tables[1]
+    assert table.rows[0][:6] == (
+        *("time_1", "1.10", "ms", "0.40 ± 0.10, 0.60 ± 0.10", "0.30 to 0.50, 0.50 to 0.70", "tentative"),
+    )
+    assert "run longer" in table.rows[0][6]
+
+
+def test_the_most_prior_sensitive_parameters_are_shown_and_the_rest_counted(folder):
+    shown = sensitivity.section(load_run(folder))
+    assert shown.tables[0].rows[0] == (
+        *("time_1", "0.210 ± 0.012", "0.210 ± 0.012", "prior-data conflict", "0.31", "tentative", ""),
+    )
+    assert shown.tables[0].rows[1][1:4] == ("–", "–", "not trusted")  # noqa: RUF001
+    assert any("matters for 1 of 2 parameters: time_1" in text for text in shown.text)
+    assert any("Not trusted for 1 parameter(s), gain" in text for text in shown.text)
+    many = sensitivity.section(
+        with_results(folder, sensitivity=[moved(f"p{k}", 0.01, "-") for k in range(30)])
+    )
+    assert len(many.tables[0].rows) == 20
+    assert any("20 most affected of 30" in text for text in many.text)
+    assert any("No parameter depends noticeably" in text for text in many.text)
+    assert sensitivity.section(with_results(folder, sensitivity=[])).tables == ()

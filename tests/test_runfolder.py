@@ -9,14 +9,19 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 from small import record, study
 
 from lcopa_bayes.bench.command import on_off
-from lcopa_bayes.fit import Fit, fit, results
+from lcopa_bayes.fit import Fit, fit
+from lcopa_bayes.problems import InputError
 from lcopa_bayes.record import Axis, Record
-from lcopa_bayes.runfolder import save_fit, save_json, save_posterior, save_table
+from lcopa_bayes.report.saved import load_run
+from lcopa_bayes.results import results
+from lcopa_bayes.runfolder import save_fit, save_json, save_posterior, save_table, variable_names
 from lcopa_bayes.tables import tables
 
 TINY = {"ensembles": 2, "walkers": 16, "steps": 60, "thin": 1, "target_ess": 100}
@@ -140,7 +145,7 @@ def test_a_failed_save_leaves_no_file(fitted, tmp_path, monkeypatch):
         raise OSError("disk full")
 
     monkeypatch.setattr("lcopa_bayes.runfolder.save_posterior", fail)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(InputError, match=r"posterior\.nc: cannot be written \(disk full\)"):
         save_fit(fitted, tmp_path, [])
     assert sorted(p.name for p in tmp_path.iterdir()) == ["tables"]
 
@@ -170,3 +175,60 @@ def test_a_record_too_short_for_residual_tests_is_saved_all_the_same(tmp_path):
     assert short.response.size - np.isnan(short.response).sum() == 8
     told = save_fit(fit(study(short, sampler=TINY)), tmp_path, [])
     assert told["residual_tests"] == []
+
+
+def test_names_are_kept_plain_unless_they_collide():
+    assert variable_names(["a_x", "b_x", "a/b_c"]) == ["a_x", "b_x", "a|b_c"]
+    assert variable_names(["a_b_c", "a_b_c", "d"]) == ["a_b_c_1", "a_b_c_2", "d"]
+    assert variable_names(["a_b_c", "a_b_c_1", "a_b_c"]) == ["a_b_c_2", "a_b_c_1", "a_b_c_3"]
+    assert variable_names(["a/b", "a|b"]) == ["a|b_1", "a|b_2"]
+    assert variable_names(["a_y", "a_y_time"]) == ["a_y", "a_y_time_1"]
+
+
+@given(st.lists(st.text("ab_/|1", min_size=1, max_size=3) | st.sampled_from(["a_time", "a_time_time"])))
+def test_names_and_their_times_never_collide(wanted):
+    names = variable_names(wanted)
+    times = [f"{name}_time" for name in names]
+    assert len({*names, *times}) == 2 * len(wanted)
+    assert not any("/" in name for name in names)
+    for name, want in zip(names, wanted, strict=True):
+        assert name.startswith(want.replace("/", "|"))
+    assert variable_names(wanted) == names
+
+
+def test_records_and_axes_with_the_same_joint_name_are_kept_apart(tmp_path):
+    """Record a_b with axis c against record a with axis b_c."""
+    plain = PAIR[0]
+    drive, response = np.tile(plain.drive, 1), np.column_stack([plain.response, 0.9 * plain.response])
+    axes = Axis("c", "rad"), Axis("b_c", "rad")
+    both = [
+        Record(name, plain.time, drive, response + shift, (Axis("u", "V"),), axes, "ms")
+        for name, shift in (("a_b", 0.0), ("a", 0.01))
+    ]
+    known = {"time_1": 1.5, "order_1": 0.8, "delay": 0.73}
+    made = fit(study(*both, sampler=TINY | {"steps": 20}, share="all", offset="shared", priors=known))
+    save_posterior(made, tmp_path / "posterior.nc")
+    with xarray.open_datatree(tmp_path / "posterior.nc", engine="h5netcdf") as read:
+        groups = [read[g] for g in ("observed_data", "log_likelihood", "posterior_predictive")]
+        for group in groups:
+            told = {(v.attrs["record"], v.attrs["axis"]): name for name, v in group.data_vars.items()}
+            assert told == {
+                ("a_b", "c"): "a_b_c_1",
+                ("a_b", "b_c"): "a_b_b_c",
+                ("a", "c"): "a_c",
+                ("a", "b_c"): "a_b_c_2",
+            }
+        seen = ~np.isnan(response[:, 1])
+        assert_array_equal(read["observed_data"]["a_b_c_2"], response[seen, 1] + 0.01)
+        assert read["constant_data"]["a_b_c_2_time"].attrs["record"] == "a"
+
+
+def test_the_report_finds_parameters_whose_names_hold_a_slash(tmp_path):
+    plain = PAIR[0]
+    axes = Axis("front/left", "rad"), Axis("rear", "rad")
+    two = Record(
+        "a", plain.time, plain.drive, np.column_stack([plain.response] * 2), (Axis("u", "V"),), axes, "ms"
+    )
+    known = {"time_1": 1.5, "order_1": 0.8, "delay": 0.73}
+    save_fit(fit(study(two, sampler=TINY | {"steps": 20}, share="all", priors=known)), tmp_path, [])
+    assert "gain_front/left_u" in load_run(tmp_path).draws

@@ -13,6 +13,7 @@ import numpy as np
 from lcopa_bayes.bench.acquisition import PAPER_BENCH, Bench, simulate
 from lcopa_bayes.bench.command import quiet, step, two_axis
 from lcopa_bayes.bench.device import PAPER_DEVICE, Device
+from lcopa_bayes.files import told_as, writable_folder, write_text
 from lcopa_bayes.problems import InputError, nearest
 from lcopa_bayes.record import Record, save_record
 from lcopa_bayes.stated import PAPER
@@ -63,7 +64,7 @@ def write_campaign(
     Everything is written beside its place first and then renamed, the study last: a campaign cut
     short leaves no file half written and no new study without its records. Raises InputError when a file
     is there already (unless `overwrite`), names repeat or cannot be file names, time units differ, a
-    held-out name is unknown, or nothing is left to fit.
+    held-out name is unknown, nothing is left to fit, or the folder or a file in it cannot be written.
     """
     held_out = tuple(held_out)
     names = [record.name for record in records]
@@ -107,13 +108,17 @@ def write_campaign(
     lines += (
         [f"held_out = {_toml([f'{each}.csv' for each in names if each in held_out])}"] if held_out else []
     )
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".campaign-", dir=folder) as beside:
-        for record, target in zip(records, targets, strict=False):
-            save_record(record, Path(beside) / target.name)
-        (Path(beside) / "study.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    writable_folder(folder)
+    with told_as(folder), tempfile.TemporaryDirectory(prefix=".campaign-", dir=folder) as beside:
+        try:
+            for record, target in zip(records, targets, strict=False):
+                save_record(record, Path(beside) / target.name)
+            write_text(Path(beside) / "study.toml", "\n".join(lines) + "\n")
+        except InputError as error:  # name the file that was wanted
+            raise InputError([p.replace(beside, str(folder)) for p in error.problems]) from error
         for target in targets:
-            os.replace(Path(beside) / target.name, target)
+            with told_as(target):
+                os.replace(Path(beside) / target.name, target)
     return tuple(targets)
 
 

@@ -9,32 +9,41 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from lcopa_bayes.files import write_whole
+from lcopa_bayes.files import enduring, write_whole
 from lcopa_bayes.inference.ensemble import Ensemble
 from lcopa_bayes.problems import InputError
 
-_ARRAYS = ("chain", "log_density", "position", "position_log_density", "accepted")
+_ARRAYS = ("chain", "log_density", "position", "position_log_density", "accepted", "trail")
 
 
 def save_chain(path: Path, ensembles: Sequence[Ensemble], fingerprint: str) -> None:
-    """Write all ensembles; the file of the last save stays intact until this one is complete."""
+    """Write all ensembles; the file of the last save stays intact until this one is complete.
+
+    InputError when the file cannot be written, saying whether the rounds before this one are kept.
+    """
 
     def write(beside: Path) -> None:
-        with h5py.File(beside, "w") as file:
+        with enduring(beside) as raw, h5py.File(raw, "w") as file:
             file.attrs["fingerprint"] = fingerprint
             for number, ensemble in enumerate(ensembles):
                 group = file.create_group(f"ensemble_{number}")
                 for name in _ARRAYS:
                     group.create_dataset(name, data=getattr(ensemble, name))
                 group.attrs["steps"] = ensemble.steps
-                group.attrs["log_evidence"] = ensemble.log_evidence
+                group.attrs["way"] = ensemble.way
                 kind, keys, position, has_gauss, gauss = ensemble.random
                 group.attrs["random_kind"] = kind
                 group.create_dataset("random_keys", data=keys)
                 group.attrs["random_rest"] = np.array([position, has_gauss, gauss], dtype=float)
                 group.attrs["digest"] = _digest(ensemble)
 
-    write_whole(path, write)
+    try:
+        write_whole(path, write)
+    except InputError as error:
+        if any(ensemble.steps for ensemble in ensembles) and path.exists():  # not the first save
+            kept = "; the rounds before it are kept: the same command with --resume goes on from them"
+            raise InputError([problem + kept for problem in error.problems]) from error
+        raise
 
 
 def load_chain(path: Path, fingerprint: str) -> tuple[Ensemble, ...]:
@@ -57,11 +66,15 @@ def load_chain(path: Path, fingerprint: str) -> tuple[Ensemble, ...]:
 
 
 def _ensemble(group: h5py.Group) -> Ensemble:
-    chain, log_density, position, position_log_density, accepted = (group[name][()] for name in _ARRAYS)
+    chain, log_density, position, position_log_density, accepted, trail = (
+        group[name][()] for name in _ARRAYS
+    )
     at, has_gauss, gauss = group.attrs["random_rest"]
     random = (group.attrs["random_kind"], group["random_keys"][()], int(at), int(has_gauss), float(gauss))
-    steps, evidence = int(group.attrs["steps"]), float(group.attrs["log_evidence"])
-    ensemble = Ensemble(chain, log_density, position, position_log_density, accepted, steps, random, evidence)
+    steps, way = int(group.attrs["steps"]), int(group.attrs["way"])
+    ensemble = Ensemble(
+        chain, log_density, position, position_log_density, accepted, steps, random, trail, way
+    )
     if group.attrs["digest"] != _digest(ensemble):
         raise ValueError(f"{group.name} is not what was written")
     return ensemble
@@ -70,7 +83,7 @@ def _ensemble(group: h5py.Group) -> Ensemble:
 def _digest(ensemble: Ensemble) -> str:
     """Hash of all that an ensemble holds."""
     kind, keys, *rest = ensemble.random
-    numbers = [float(number) for number in (*rest, ensemble.steps, ensemble.log_evidence)]
+    numbers = [float(number) for number in (*rest, ensemble.steps, ensemble.way)]
     held = hashlib.sha256(repr((kind, numbers)).encode())
     for array in (keys, *(getattr(ensemble, name) for name in _ARRAYS)):
         held.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())

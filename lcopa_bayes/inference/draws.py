@@ -10,9 +10,10 @@ import numpy as np
 
 from lcopa_bayes.arrays import Array, Matrix, Vector
 from lcopa_bayes.estimate import Estimate
-from lcopa_bayes.inference.grade import Grade, Quality, overall, qualities
+from lcopa_bayes.inference.grade import Grade, Quality, overall, qualities, shares_grade
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.ridges import Ridges, ridges
 from lcopa_bayes.inference.sampler import Run, sampled_qualities
 
 _MEASURED = 12_000
@@ -37,11 +38,19 @@ class Draws:
     """Of every free parameter, in table order."""
     target_ess: float
     """Effective sample size asked for [draws]."""
+    ridges: tuple[Ridges, ...] = ()
+    """Of the sampled parameters whose marginal has more than one hill."""
+    cap: Grade | None = None
+    """No number from these draws is graded better, because of what a second method found."""
 
     @cached_property
     def grade(self) -> Grade:
         """Grade of the whole run."""
-        return overall(self.qualities, self.target_ess)
+        return self.capped(overall(self.qualities, self.target_ess, self.ridges))
+
+    def capped(self, grade: Grade) -> Grade:
+        """`grade`, or the cap where that is lower or as low."""
+        return grade if self.cap is None else Grade.worst([self.cap, grade])
 
     @property
     def flat(self) -> Matrix:
@@ -64,13 +73,16 @@ class Draws:
 
     def estimates(self) -> tuple[Estimate, ...]:
         """Median, interval and grade of every free parameter."""
+        shares = {found.parameter: [shares_grade(found)] for found in self.ridges}
         return tuple(
             Estimate.of(
                 quality.name,
                 self.table.rows[self.table.names.index(quality.name)].unit,
                 self.column(quality.name),
                 ess=quality.ess,
-                grade=quality.grade(self.target_ess).level,
+                grade=self.capped(
+                    Grade.worst([quality.grade(self.target_ess), *shares.get(quality.name, [])])
+                ).level,
             )
             for quality in self.qualities
         )
@@ -92,7 +104,12 @@ def gather(posterior: Posterior, run: Run) -> Draws:
         names = [posterior.table.names[k] for k in posterior.linear]
         found |= {q.name: q for q in qualities(names, values[..., posterior.linear])}
     ordered = tuple(found[name] for name in posterior.table.names if name in found)
+    rows = [(k, posterior.table.rows[k]) for k in posterior.sampled]
+    hills = [ridges(row.name, row.unit, values[..., k], log_scale=row.log_scale) for k, row in rows]
+    several = tuple(found for found in hills if found.boundaries)
     by_draw = values.swapaxes(1, 2).reshape(ensembles, -1, values.shape[-1])
     densities = log_density.swapaxes(1, 2).reshape(ensembles, -1)
     picked = np.linspace(0, by_draw.shape[1] - 1, min(_PER_ENSEMBLE, by_draw.shape[1])).astype(int)
-    return Draws(posterior.table, by_draw[:, picked], densities[:, picked], ordered, run.plan.target_ess)
+    return Draws(
+        posterior.table, by_draw[:, picked], densities[:, picked], ordered, run.plan.target_ess, several
+    )

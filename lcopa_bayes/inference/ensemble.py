@@ -9,6 +9,7 @@ import emcee
 import numpy as np
 
 from lcopa_bayes.arrays import Array, Matrix, Vector
+from lcopa_bayes.inference.mixture import Mixture
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.ridgemoves import moves
 from lcopa_bayes.inference.tempering import temper
@@ -33,8 +34,10 @@ class Ensemble:
     """Steps taken."""
     random: tuple[Any, ...]
     """State of the legacy generator that emcee draws from."""
-    log_evidence: float
-    """Evidence from the population's way out of the prior [nat]."""
+    trail: Matrix
+    """Where the population stood on the last part of its way from the prior, (points, dimension)."""
+    way: int
+    """Moves per walker that the way from the prior took [-]."""
 
     @classmethod
     def born(cls, posterior: Posterior, walkers: int, sweeps: int, seed: np.random.SeedSequence) -> Ensemble:
@@ -51,7 +54,8 @@ class Ensemble:
             np.zeros(walkers),
             0,
             random,
-            population.log_evidence,
+            population.trail,
+            population.moves,
         )
 
     @property
@@ -60,14 +64,17 @@ class Ensemble:
         return float(self.accepted.mean() / max(1, self.chain.shape[0]))
 
 
-def advance(posterior: Posterior, ensemble: Ensemble, draws: int, thin: int) -> Ensemble:
+def advance(
+    posterior: Posterior, ensemble: Ensemble, draws: int, thin: int, mixture: Mixture | None = None
+) -> Ensemble:
     """The ensemble after ``draws * thin`` more steps, every `thin`-th of them kept.
 
-    Deterministic: the same ensemble advanced twice gives the same draws, in whatever process.
+    With `mixture` some moves follow it. Deterministic: the same ensemble advanced twice gives the same
+    draws, in whatever process.
     """
     walkers, dimension = ensemble.position.shape
     sampler = emcee.EnsembleSampler(
-        walkers, dimension, posterior.log_density, moves=moves(posterior), vectorize=True
+        walkers, dimension, posterior.log_density, moves=moves(posterior, mixture), vectorize=True
     )
     sampler.random_state = ensemble.random
     state = emcee.State(ensemble.position, log_prob=ensemble.position_log_density)
@@ -80,5 +87,6 @@ def advance(posterior: Posterior, ensemble: Ensemble, draws: int, thin: int) -> 
         ensemble.accepted + sampler.backend.accepted,
         ensemble.steps + draws * thin,
         tuple(sampler.random_state),
-        ensemble.log_evidence,
+        ensemble.trail,
+        ensemble.way,
     )

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import ceil
 from typing import Literal, final
 
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 from scipy.stats import spearmanr
 
-from lcopa_bayes.arrays import Array, Matrix
+from lcopa_bayes.arrays import Array, Vector
+from lcopa_bayes.inference.ridges import Ridges
 
 Level = Literal["reliable", "tentative", "unusable"]
 
@@ -24,6 +26,10 @@ TENTATIVE_MEMORY = 0.7
 """Above it walkers hardly travel [-]."""
 TENTATIVE_ESS = 100.0
 """Below it not even a mean is known well [draws]."""
+RELIABLE_SHARES = 0.05
+"""Difference of a hill's share between ensembles, beyond Monte Carlo error, that moves little [-]."""
+TENTATIVE_SHARES = 0.2
+"""Above it the weights of the hills are not known."""
 _RANK: dict[Level, int] = {"reliable": 0, "tentative": 1, "unusable": 2}
 
 
@@ -64,6 +70,28 @@ class Quality:
             f"walkers' memory {self.memory:.2f}",
         )
 
+    def remedy(self, target_ess: float) -> str:
+        """In plain words: what keeps this parameter from being reliable, and what to do."""
+        if np.isnan(self.rhat) or np.isnan(self.ess):
+            return "its draws do not vary; sample more steps, and check its prior"
+        wrong, steps = [], "sample more steps"
+        if self.rhat > RELIABLE_RHAT:
+            wrong.append(
+                f"the independent populations tell different stories about it (R-hat {self.rhat:.3f}, at "
+                f"most {RELIABLE_RHAT:g} when they agree): the posterior has several hills or a long ridge"
+            )
+        if self.memory > RELIABLE_MEMORY:
+            wrong.append(
+                f"the walkers have hardly travelled (memory of their start {self.memory:.2f}, at most "
+                f"{RELIABLE_MEMORY:g} when they have)"
+            )
+        if self.ess < target_ess:
+            wrong.append(f"it has {self.ess:.0f} effective draws where {target_ess:.0f} are wanted")
+            steps += f", about {max(2, ceil(target_ess / max(self.ess, 1.0)))} times as many"
+        if self.rhat > RELIABLE_RHAT:
+            steps += "; or fix or narrow what the record cannot tell"
+        return f"{'; '.join(wrong)}; {steps}"
+
 
 @final
 @dataclass(frozen=True)
@@ -96,21 +124,46 @@ def qualities(names: Sequence[str], values: Array) -> tuple[Quality, ...]:
                 float(array_stats.ess(chains, method="bulk")),  # type: ignore[no-untyped-call]
                 float(array_stats.ess(chains, method="tail", prob=(0.05, 0.95))),  # type: ignore[no-untyped-call]
                 float(array_stats.rhat_nested(chains, owner)),  # type: ignore[no-untyped-call]
-                _memory(chains),
+                rank_correlation(chains[:, 0], chains[:, -1]),
             )
         )
     return tuple(out)
 
 
-def _memory(chains: Matrix) -> float:
-    """Rank correlation of first and last draws over chains, centred; 1 when nothing moved."""
-    if np.ptp(chains[:, 0]) == 0.0 or np.ptp(chains[:, -1]) == 0.0:
+def rank_correlation(before: Vector, after: Vector) -> float:
+    """Spearman's correlation over walkers; 1 where either does not vary, as when nothing moved."""
+    if np.ptp(before) == 0.0 or np.ptp(after) == 0.0:
         return 1.0
-    return float(spearmanr(chains[:, 0], chains[:, -1]).statistic)
+    return float(spearmanr(before, after).statistic)
 
 
-def overall(found: Sequence[Quality], target_ess: float) -> Grade:
-    """Grade of a run: the worst parameter's, with the remedy when it is not reliable."""
+def shares_grade(found: Ridges) -> Grade:
+    """Grade of how alike the ensembles weigh the hills of a parameter."""
+    level: Level = (
+        "reliable"
+        if found.spread <= RELIABLE_SHARES
+        else "tentative"
+        if found.spread <= TENTATIVE_SHARES
+        else "unusable"
+    )
+    return Grade(level, found.sentence())
+
+
+def overall(found: Sequence[Quality], target_ess: float, ridges: Sequence[Ridges] = ()) -> Grade:
+    """Grade of a run: the worst parameter's, lowered where ensembles weigh hills differently, with what is
+    wrong and the remedy when it is not reliable."""
+    told = _by_quality(found, target_ess)
+    graded = sorted(((one.spread, shares_grade(one)) for one in ridges), key=lambda pair: -pair[0])
+    uneven = [grade for _, grade in graded if grade.level != "reliable"]
+    if not uneven:
+        return told
+    others = f" (and {len(uneven) - 1} more like this)" if len(uneven) > 1 else ""
+    reason = uneven[0].reason + others + ("" if told.level == "reliable" else f"; {told.reason}")
+    return Grade(Grade.worst([told, uneven[0]]).level, reason)
+
+
+def _by_quality(found: Sequence[Quality], target_ess: float) -> Grade:
+    """The worst parameter's grade, and why."""
     worst = max(found, key=lambda quality: (_RANK[quality.grade(target_ess).level], -quality.ess))
     grade = worst.grade(target_ess)
     weak = [quality.name for quality in found if quality.grade(target_ess).level == grade.level]
@@ -120,13 +173,5 @@ def overall(found: Sequence[Quality], target_ess: float) -> Grade:
             f"independent ensembles agree (largest R-hat {max(q.rhat for q in found):.3f}) and the smallest "
             f"effective sample size is {min(q.ess for q in found):.0f} ({worst.name})",
         )
-    remedy = (
-        "the ensembles disagree: the posterior has several hills or a long ridge; sample more steps, "
-        "fix or narrow what the record cannot tell"
-        if worst.rhat > RELIABLE_RHAT
-        else "the walkers have hardly travelled; sample more steps"
-        if worst.memory > RELIABLE_MEMORY
-        else "too few effective draws; sample more steps"
-    )
     others = f" (also {', '.join(n for n in weak if n != worst.name)})" if len(weak) > 1 else ""
-    return Grade(grade.level, f"{grade.reason}{others}; {remedy}")
+    return Grade(grade.level, f"{worst.name}{others}: {worst.remedy(target_ess)}")

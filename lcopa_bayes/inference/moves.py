@@ -1,4 +1,4 @@
-"""Moves of a population, as moves of emcee: in the sampled coordinates, and of whole terms."""
+"""Moves of a population, as moves of emcee, and the one made in the sampled coordinates."""
 
 from __future__ import annotations
 
@@ -51,14 +51,26 @@ class Terrain:
                     out[:, columns] = np.take_along_axis(z[:, columns], rank, axis=1)
         return out
 
-    def frequencies(self, terms: int, random: Any) -> Vector:
-        """One random frequency from each of terms + 1 equal logarithmic parts of the range."""
-        edges = np.linspace(np.log(self.slowest), np.log(self.fastest), terms + 2)
-        return np.asarray(np.exp(edges[:-1] + random.rand(terms + 1) * np.diff(edges)))
+    def in_order(self, z: Matrix) -> Flags:
+        """Whether exchangeable terms stand by decreasing order, (batch,)."""
+        ordered = np.ones(len(z), dtype=bool)
+        for element, same in zip(self.elements, self.exchangeable, strict=True):
+            if same:
+                ordered &= (np.diff(z[:, element.orders], axis=1) <= 0).all(axis=1)
+        return ordered
+
+    def frequencies(self, ratios: int, random: Any) -> Vector:
+        """One random frequency from each of ratios + 1 equal logarithmic parts of the range."""
+        edges = np.linspace(np.log(self.slowest), np.log(self.fastest), ratios + 2)
+        return np.asarray(np.exp(edges[:-1] + random.rand(ratios + 1) * np.diff(edges)))
 
 
 class PopulationMove(emcee.moves.Move):  # type: ignore[misc]
     """A move of one half of the walkers given the other, accepted for all of them at once."""
+
+    crosses = False
+    """Whether exchangeable terms may change places in the order. A step taken from sorted terms to sorted
+    terms does not lead back the way it came when they crossed, unless it treats all terms alike."""
 
     def __init__(self, terrain: Terrain) -> None:
         self.terrain = terrain
@@ -77,6 +89,8 @@ class PopulationMove(emcee.moves.Move):  # type: ignore[misc]
             moving, still = order[half::2], order[1 - half :: 2]
             found, factor = self.proposal(coordinates[moving], coordinates[still], model.random)
             void = ~np.isfinite(found).all(axis=1) | (factor == -np.inf)
+            if not self.crosses:
+                void |= ~self.terrain.in_order(found)
             found[void] = coordinates[moving[void]]  # evaluated for a full batch, never accepted
             new = np.asarray(model.compute_log_prob_fn(found)[0], dtype=float)
             gain = np.where(void, -np.inf, new - log_density[moving] + np.where(void, 0.0, factor))
@@ -121,19 +135,3 @@ class DifferenceMove(PopulationMove):
         scale = scales(len(here), here.shape[1] * share, random)
         step = scale * jittered(others[a] - others[b], random)
         return here + np.where(moved, step, 0.0), np.zeros(len(here))
-
-
-@final
-class TermRedraw(PopulationMove):
-    """Order and log time of one term are drawn anew, evenly: free travel where a term is negligible."""
-
-    def proposal(self, here: Matrix, others: Matrix, random: Any) -> tuple[Matrix, Vector]:
-        """See `PopulationMove.proposal`; symmetric, from and to the range of the redraw."""
-        element = self.element(random)
-        rows, term = np.arange(len(here)), random.randint(0, element.terms, len(here))
-        low, high = (bound[term] for bound in element.reach)
-        proposed = here.copy()
-        standing = here[rows, element.times[term]]
-        proposed[rows, element.orders[term]] = LARGEST_ORDER * random.rand(len(here))
-        proposed[rows, element.times[term]] = low + (high - low) * random.rand(len(here))
-        return proposed, np.where((standing >= low) & (standing <= high), 0.0, -np.inf)

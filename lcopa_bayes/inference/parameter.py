@@ -8,6 +8,7 @@ from math import inf, log
 from typing import NamedTuple, final
 
 import numpy as np
+from scipy.special import logit
 
 from lcopa_bayes.arrays import Flags, Vector
 from lcopa_bayes.inference.priors import Prior
@@ -80,6 +81,16 @@ class Parameter:
         low, high = _DOMAIN[self.kind]
         support = (low, high) if self.prior is None else self.prior.support
         return max(low, support[0]), min(high, support[1])
+
+    @property
+    def sampled_domain(self) -> tuple[float, float]:
+        """`domain` on the scale the parameter is sampled on."""
+        low, high = self.domain
+        if self.logit_scale:
+            return float(logit(low)), float(logit(high))
+        if not self.log_scale:
+            return low, high
+        return (log(low) if low > 0 else -inf), (log(high) if high < inf else inf)
 
     def log_prior(self, x: Vector) -> Vector:
         """Log density of the prior, restricted to the domain and normalised there."""

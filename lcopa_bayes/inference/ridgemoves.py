@@ -14,11 +14,13 @@ import emcee
 import numpy as np
 
 from lcopa_bayes.arrays import Flags, Matrix, Vector
+from lcopa_bayes.inference.chart import Chart
+from lcopa_bayes.inference.mixture import Mixture
+from lcopa_bayes.inference.mixturemove import MixtureMove, MixtureWalk
 from lcopa_bayes.inference.moves import (
     LARGEST_ORDER,
     DifferenceMove,
     PopulationMove,
-    TermRedraw,
     Terrain,
     jittered,
     pairs,
@@ -27,9 +29,16 @@ from lcopa_bayes.inference.moves import (
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.shape import ElementColumns
 
+_DENSE = 3.0
+"""Orders drawn anew are dense at 0: twice a uniform number to this power [-]."""
+_ANEW = 0.3
+"""Share of moves that draw anew from the mixture."""
+_NEARBY = 0.3
+"""Share of moves that walk along it."""
+
 
 class RidgeMove(PopulationMove):
-    """A move that says where ratios and orders of one element go; the times follow."""
+    """A move that says where ratios, orders and held times of one element go; the other times follow."""
 
     def rebuilt(
         self,
@@ -37,19 +46,20 @@ class RidgeMove(PopulationMove):
         here: Matrix,
         element: ElementColumns,
         log_ratios: Matrix,
-        orders: Matrix,
         frequencies: Vector,
     ) -> tuple[Matrix, Vector]:
-        """`proposed` with the element of these ratios and orders; its gains keep the level D(s_0).
+        """`proposed` with the times that follow from its ratios; its gains keep the level D(s_0).
 
         The factor is the ratio of the volumes that the change of coordinates spans at both ends.
         """
         before = element.shape(here, frequencies)
+        orders = proposed[:, element.orders]
         inside: Flags = np.asarray(((orders > 0) & (orders <= LARGEST_ORDER)).all(axis=1))
         safe = np.where(inside[:, None], orders, here[:, element.orders])
-        times = element.log_times(log_ratios, safe, frequencies)
+        held = None if element.held is None else proposed[:, element.times[element.held]]
+        times = element.log_times(log_ratios, safe, frequencies, held)
         void: Flags = np.logical_not(inside & np.isfinite(times).all(axis=1))
-        proposed[:, element.orders], proposed[:, element.times] = safe, times
+        proposed[:, element.following] = times
         proposed[void] = here[void]
         after = element.shape(proposed, frequencies)
         factor = before.log_volume - after.log_volume
@@ -62,6 +72,11 @@ class RidgeMove(PopulationMove):
                 factor = factor + rise
         return proposed, np.where(void, -np.inf, factor)
 
+    def sometimes_holding(self, element: ElementColumns, random: Any) -> ElementColumns:
+        """The element with a random term held, or none: each fits another part of a ridge."""
+        term = int(random.randint(-1, element.terms))
+        return element if term < 0 else element.holding(term)
+
 
 @final
 class ShapeMove(RidgeMove):
@@ -69,9 +84,10 @@ class ShapeMove(RidgeMove):
 
     def proposal(self, here: Matrix, others: Matrix, random: Any) -> tuple[Matrix, Vector]:
         """See `PopulationMove.proposal`."""
-        elements = self.terrain.elements if random.rand() < 0.5 else (self.element(random),)
-        a, b = (others[chosen] for chosen in pairs(len(here), len(others), random))
-        still = [e for e in self.terrain.elements if e not in elements]
+        chosen = self.terrain.elements if random.rand() < 0.5 else (self.element(random),)
+        still = [e for e in self.terrain.elements if e not in chosen]
+        elements = [self.sometimes_holding(element, random) for element in chosen]
+        a, b = (others[drawn] for drawn in pairs(len(here), len(others), random))
         moving = here.shape[1] - sum(2 * element.terms for element in still)
         scale = scales(len(here), moving, random)
         proposed = here + scale * jittered(a - b, random)
@@ -82,7 +98,7 @@ class ShapeMove(RidgeMove):
             proposed[:, columns] = here[:, columns]
         total = np.zeros(len(here))
         for element in elements:
-            frequencies = self.terrain.frequencies(element.terms, random)
+            frequencies = self.terrain.frequencies(element.ratios, random)
             shapes = [element.shape(points, frequencies) for points in (here, a, b)]
             for column, by_logarithm in element.gains:
                 if by_logarithm:  # differences of gain over level, which `rebuilt` turns into gains
@@ -91,8 +107,7 @@ class ShapeMove(RidgeMove):
             ratios = shapes[0].log_ratios + scale * jittered(
                 shapes[1].log_ratios - shapes[2].log_ratios, random
             )
-            orders = proposed[:, element.orders]
-            proposed, factor = self.rebuilt(proposed, here, element, ratios, orders, frequencies)
+            proposed, factor = self.rebuilt(proposed, here, element, ratios, frequencies)
             total = total + factor
         return proposed, total
 
@@ -103,43 +118,80 @@ class OrderSlide(RidgeMove):
 
     def proposal(self, here: Matrix, others: Matrix, random: Any) -> tuple[Matrix, Vector]:
         """See `PopulationMove.proposal`."""
-        element = self.element(random)
-        frequencies = self.terrain.frequencies(element.terms, random)
+        element = self.sometimes_holding(self.element(random), random)
+        frequencies = self.terrain.frequencies(element.ratios, random)
         a, b = pairs(len(here), len(others), random)
         count, terms = len(here), element.terms
         scale = np.exp(random.uniform(np.log(0.01), np.log(1.5), (count, 1)))
         difference = others[a][:, element.orders] - others[b][:, element.orders]
         step = scale * (difference + 0.02 * random.randn(count, terms))
-        orders = here[:, element.orders] + np.where(random.rand(count, terms) < 0.6, step, 0.0)
+        proposed = here.copy()
+        proposed[:, element.orders] += np.where(random.rand(count, terms) < 0.6, step, 0.0)
         ratios = element.shape(here, frequencies).log_ratios
-        return self.rebuilt(here.copy(), here, element, ratios, orders, frequencies)
+        return self.rebuilt(proposed, here, element, ratios, frequencies)
 
 
 @final
 class OrderRoam(RidgeMove):
     """One order of one element is drawn anew from (0, 2), its ratios stay."""
 
+    crosses = True
+
     def proposal(self, here: Matrix, others: Matrix, random: Any) -> tuple[Matrix, Vector]:
         """See `PopulationMove.proposal`."""
         element = self.element(random)
-        frequencies = self.terrain.frequencies(element.terms, random)
-        orders = here[:, element.orders].copy()
-        rows = np.arange(len(here))
-        orders[rows, random.randint(0, element.terms, len(here))] = LARGEST_ORDER * random.rand(len(here))
+        frequencies = self.terrain.frequencies(element.ratios, random)
+        proposed = here.copy()
+        rows, term = np.arange(len(here)), random.randint(0, element.terms, len(here))
+        proposed[rows, element.orders[term]] = LARGEST_ORDER * random.rand(len(here))
         ratios = element.shape(here, frequencies).log_ratios
-        return self.rebuilt(here.copy(), here, element, ratios, orders, frequencies)
+        return self.rebuilt(proposed, here, element, ratios, frequencies)
 
 
-def moves(posterior: Posterior) -> list[tuple[emcee.moves.Move, float]]:
-    """The mixture a posterior is sampled with, and how often each move is made."""
+@final
+class TermRedraw(RidgeMove):
+    """One term is drawn anew and the others follow: free travel where it is negligible or a spring."""
+
+    crosses = True
+
+    def proposal(self, here: Matrix, others: Matrix, random: Any) -> tuple[Matrix, Vector]:
+        """See `PopulationMove.proposal`: log times evenly, orders dense at 0, half of them left alone."""
+        element = self.element(random)
+        element = element.holding(int(random.randint(element.terms)))
+        frequencies = self.terrain.frequencies(element.ratios, random)
+        time, order = (columns[element.held] for columns in (element.times, element.orders))
+        low, high = (bound[element.held] for bound in element.reach)
+        proposed = here.copy()
+        proposed[:, time] = low + (high - low) * random.rand(len(here))
+        drawn = LARGEST_ORDER * (1.0 - random.rand(len(here))) ** _DENSE
+        proposed[:, order] = np.where(random.rand(len(here)) < 0.5, drawn, here[:, order])
+        thinning = (1 - 1 / _DENSE) * (np.log(proposed[:, order]) - np.log(here[:, order]))
+        ratios = element.shape(here, frequencies).log_ratios
+        proposed, factor = self.rebuilt(proposed, here, element, ratios, frequencies)
+        reached: Flags = (here[:, time] >= low) & (here[:, time] <= high)
+        return proposed, np.where(reached & np.isfinite(factor), factor + thinning, -np.inf)
+
+
+def moves(posterior: Posterior, mixture: Mixture | None = None) -> list[tuple[emcee.moves.Move, float]]:
+    """The moves a posterior is sampled with, and how often each is made; with `mixture` also moves
+    that follow it."""
     terrain = Terrain.of(posterior)
-    if not terrain.elements:
-        return [(DifferenceMove(terrain), 0.6), (emcee.moves.StretchMove(), 0.4)]
+    local: list[tuple[emcee.moves.Move, float]] = (
+        [
+            (DifferenceMove(terrain), 0.25),
+            (ShapeMove(terrain), 0.25),
+            (OrderSlide(terrain), 0.25),
+            (OrderRoam(terrain), 0.1),
+            (TermRedraw(terrain), 0.15),
+        ]
+        if terrain.elements
+        else [(DifferenceMove(terrain), 0.6), (emcee.moves.StretchMove(), 0.4)]
+    )
+    if mixture is None:
+        return local
+    chart = Chart.of(posterior)
     return [
-        (DifferenceMove(terrain), 0.2),
-        (ShapeMove(terrain), 0.35),
-        (OrderSlide(terrain), 0.25),
-        (OrderRoam(terrain), 0.1),
-        (TermRedraw(terrain), 0.05),
-        (emcee.moves.StretchMove(), 0.05),
+        (MixtureMove(chart, mixture), _ANEW),
+        (MixtureWalk(chart, mixture), _NEARBY),
+        *((move, (1 - _ANEW - _NEARBY) * often) for move, often in local),
     ]

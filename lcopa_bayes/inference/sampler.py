@@ -19,15 +19,26 @@ from lcopa_bayes.arrays import Array
 from lcopa_bayes.inference.chainfile import load_chain, save_chain
 from lcopa_bayes.inference.ensemble import Ensemble, advance
 from lcopa_bayes.inference.grade import Quality, qualities
+from lcopa_bayes.inference.mixture import Mixture
+from lcopa_bayes.inference.mixturemove import learned
 from lcopa_bayes.inference.posterior import Posterior
 
 _ROUND = 20
 """Draws kept per round and walker."""
 _MEMORY = 0.4
 """Largest memory of a walker at which sampling stops [-]."""
-_SWEEPS = 40
-"""Moves of every walker at each temperature on the way from the prior."""
-_THIN = 10
+_SWEEPS = 80
+"""Most moves of every walker at each temperature on the way from the prior."""
+_LEARNING = 2
+"""Rounds before the mixture is learned from the draws of all ensembles; and again at each doubling."""
+_WIDE = 0.5
+"""Share of the mixture that is learned from the way from the prior [-]."""
+_LEAST = 5
+"""Rounds before sampling may stop: what is kept of them comes after the first learning."""
+_AS_LONG = 0.4
+"""Sampling takes at least this share of the moves that the way from the prior took: a posterior that was
+hard to reach has hills that fill slowly [-]."""
+_THIN = 5
 """Steps per kept draw unless the study says otherwise."""
 
 
@@ -116,12 +127,33 @@ def sample(
             ensembles = tuple(crew(_Birth(plan.walkers, _SWEEPS), seeds))
             _store(chain_file, ensembles, fingerprint)
         bar.set_description("sampling")
-        while done < rounds and not (done >= 2 and finished(posterior, Run(ensembles, plan), bar)):
-            ensembles = tuple(crew(_Round(plan.thin), ensembles))
+        mixture = _taught(posterior, ensembles, plan)
+        hardest = max(ensemble.way for ensemble in ensembles)
+        least = max(_LEAST, round(_AS_LONG * hardest / (_ROUND * plan.thin)))
+        while done < rounds and not (done >= least and finished(posterior, Run(ensembles, plan), bar)):
+            if done >= _LEARNING and done.bit_count() == 1:
+                mixture = _taught(posterior, ensembles, plan)
+            ensembles = tuple(crew(_Round(plan.thin, mixture), ensembles))
             done += 1
             _store(chain_file, ensembles, fingerprint)
             bar.update()
     return Run(ensembles, plan)
+
+
+def _taught(posterior: Posterior, ensembles: Sequence[Ensemble], plan: SamplePlan) -> Mixture:
+    """The mixture that moves follow: learned from the later half of the draws at the last power of two,
+    and in part from the populations' way from the prior, which saw hills that few walkers stand on.
+
+    A function of the chains alone, so that a resumed run learns the same; learning thins out, as the
+    ergodicity of adaptive sampling asks (Roberts and Rosenthal 2007, J. Appl. Probab. 44).
+    """
+    wide = learned(posterior, [ensemble.trail for ensemble in ensembles], plan.seed).levelled()
+    done = ensembles[0].chain.shape[0] // _ROUND
+    if done < _LEARNING:
+        return wide
+    lesson = _ROUND << (done.bit_length() - 1)
+    own = learned(posterior, [ensemble.chain[lesson // 2 : lesson] for ensemble in ensembles], plan.seed)
+    return own.levelled().blended(wide, _WIDE)
 
 
 def _store(chain_file: Path | None, ensembles: Sequence[Ensemble], fingerprint: str) -> None:
@@ -176,9 +208,10 @@ class _Round:
     """Task: an ensemble one round further."""
 
     thin: int
+    mixture: Mixture | None
 
     def __call__(self, posterior: Posterior, ensemble: Ensemble) -> Ensemble:
-        return advance(posterior, ensemble, _ROUND, self.thin)
+        return advance(posterior, ensemble, _ROUND, self.thin, self.mixture)
 
 
 _Crew = Callable[[Callable[[Posterior, Any], Ensemble], Sequence[Any]], Iterable[Ensemble]]

@@ -2,8 +2,7 @@
 
 A population drawn from the prior follows ``prior * likelihood^b`` while b rises from 0 to 1. Each rise is
 as large as keeps half the population effective; the population is then resampled and moved by the same
-emcee moves that sample the posterior (Del Moral, Doucet and Jasra 2006, J. R. Statist. Soc. B 68). The
-mean weights multiply to the evidence.
+emcee moves that sample the posterior (Del Moral, Doucet and Jasra 2006, J. R. Statist. Soc. B 68).
 """
 
 from __future__ import annotations
@@ -17,13 +16,23 @@ from scipy.optimize import brentq
 from scipy.special import logsumexp
 
 from lcopa_bayes.arrays import Matrix, Vector
+from lcopa_bayes.inference.grade import rank_correlation
+from lcopa_bayes.inference.mixturemove import learned
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.ridgemoves import moves
 
 _WARM = 0.01
 """Below this power of the likelihood a population travels fast and a third of the sweeps is enough."""
+_NEAR = 0.1
+"""From this power on populations are remembered: they lie where the posterior does, only wider."""
 _EFFECTIVE = 0.5
 """Share of the population that stays effective in one rise of the temperature."""
+_CROWD = 4
+"""How many times more walkers come from the prior than are kept."""
+_BLOCK = 5
+"""Moves of every walker between two looks at how far they have travelled."""
+_TRAVELLED = 0.3
+"""Memory of a population at which it has travelled enough at one temperature [-]."""
 
 
 @final
@@ -35,10 +44,10 @@ class Population:
     """(walkers, dimension)."""
     log_density: Vector
     """Log posterior density, (walkers,) [nat]."""
-    log_evidence: float
-    """Estimate of this population alone [nat]."""
-    rises: int
-    """Number of temperatures passed."""
+    trail: Matrix
+    """Where the population stood on the last part of its way, (points, dimension)."""
+    moves: int
+    """Moves per walker delivered that the way took [-]."""
 
 
 def temper(
@@ -46,36 +55,47 @@ def temper(
 ) -> tuple[Population, tuple[Any, ...]]:
     """A population of the posterior and the state of emcee's generator afterwards.
 
-    `sweeps` moves of every walker at each temperature, a third of them while it is low. Deterministic
-    given `rng` and `random`.
+    At each temperature every walker makes moves until the population has left where it stood, at most
+    `sweeps` of them and a third while the temperature is low. Deterministic given `rng` and `random`.
     """
-    position = posterior.coordinates(posterior.table.draw(walkers, rng))
+    crowd = _CROWD * walkers
+    position = posterior.coordinates(posterior.table.draw(crowd, rng))
     prior = posterior.log_prior(position)
     likelihood = posterior.log_density(position) - prior
-    heat, log_evidence, rises = 0.0, 0.0, 0
+    heat, rises, made, trail = 0.0, 0, 0, []
     while heat < 1.0:
         rise = _rise(likelihood, 1.0 - heat)
         heat, rises = (1.0 if heat + rise > 1.0 - 1e-9 else heat + rise), rises + 1
-        weights = rise * likelihood
-        log_evidence += float(logsumexp(weights)) - np.log(walkers)
-        kept = _resampled(weights, rng)
+        kept = _resampled(rise * likelihood, rng)
         position, prior, likelihood = position[kept], prior[kept], likelihood[kept]
         sampler = emcee.EnsembleSampler(
-            walkers,
+            crowd,
             posterior.dimension,
             _Tempered(posterior, heat),
-            moves=moves(posterior),
+            moves=moves(posterior, learned(posterior, [position], rises)),
             vectorize=True,
         )
         sampler.random_state = random
         state = emcee.State(position, log_prob=prior + heat * likelihood)
-        enough = sweeps if heat > _WARM else max(1, sweeps // 3)
-        last = sampler.run_mcmc(state, enough, skip_initial_state_check=True, store=False)
+        for _ in range(max(1, (sweeps if heat > _WARM else sweeps // 3) // _BLOCK)):
+            state = sampler.run_mcmc(state, _BLOCK, skip_initial_state_check=True, store=False)
+            made += _CROWD * _BLOCK
+            if _memory(posterior, position, state.coords) <= _TRAVELLED:
+                break
         random = tuple(sampler.random_state)
-        position = np.array(last.coords)
+        position = np.array(state.coords)
         prior = posterior.log_prior(position)
-        likelihood = (np.array(last.log_prob) - prior) / heat
-    return Population(position, prior + likelihood, log_evidence, rises), random
+        likelihood = (np.array(state.log_prob) - prior) / heat
+        if heat > _NEAR:
+            trail.append(position)
+    kept = rng.permutation(crowd)[:walkers]
+    return Population(position[kept], (prior + likelihood)[kept], np.concatenate(trail), made), random
+
+
+def _memory(posterior: Posterior, before: Matrix, after: Matrix) -> float:
+    """Largest rank correlation over walkers of where they stood and stand, of any sampled parameter."""
+    then, now = (posterior.values(z)[:, posterior.sampled] for z in (before, after))
+    return max(rank_correlation(then[:, k], now[:, k]) for k in range(then.shape[1]))
 
 
 @final

@@ -11,17 +11,19 @@ from typing import final
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from lcopa_bayes.files import write_text
+from lcopa_bayes.files import writable_folder, write_text
 from lcopa_bayes.report.canvas import inlined, look
 from lcopa_bayes.report.saved import SavedRun, load_run
 from lcopa_bayes.report.section import Drawing, Section
 from lcopa_bayes.report.sections import (
+    crosscheck,
     data,
     origin,
     pairs,
     parameters,
     priors,
     residuals,
+    sensitivity,
     steps,
     traces,
 )
@@ -34,6 +36,8 @@ _SECTIONS = (
     traces.section,
     steps.section,
     priors.section,
+    sensitivity.section,
+    crosscheck.section,
     origin.section,
 )
 """What a report shows, in this order; a later stage adds its own section here."""
@@ -86,8 +90,7 @@ def write_page(
     name: str = "report.html",
 ) -> Path:
     """Write the figures of some sections and the page `name` that shows them; returns its path."""
-    figures = folder / "figures"
-    figures.mkdir(exist_ok=True)
+    figures = writable_folder(folder / "figures")
     for section in sections:
         for drawing in section.drawings:
             write_text(figures / f"{file_stem(drawing)}.svg", drawing.svg)

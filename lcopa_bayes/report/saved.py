@@ -37,9 +37,14 @@ _TABLES: Mapping[str, tuple[str, ...]] = {
     "prior_density": ("name", "log_scale", "x", "density"),
 }
 """Tables the report draws and the columns it needs of each."""
+_CHECK_TABLES: Mapping[str, tuple[str, ...]] = {
+    "cross_check_density": ("name", "log_scale", "left", "right", "ensembles", "nested"),
+}
+"""The same of a run that was checked by a second method."""
 _RESULTS = (
     *("study", "verdict", "grade", "grade_reason", "time_unit", "parameters", "fixed", "held_out"),
     *("fit_scores", "step_metrics", "residual_tests", "sampler"),
+    *("ridges", "sensitivity", "cross_check"),
 )
 _PROVENANCE = ("command", "seed", "inputs_sha256", "python", "versions")
 
@@ -94,8 +99,9 @@ def load_run(folder: Path) -> SavedRun:
     problems: list[str] = []
     results = _json(folder / "results.json", _RESULTS, problems)
     provenance = _json(folder / "provenance.json", _PROVENANCE, problems)
+    wanted = {**_TABLES, **(_CHECK_TABLES if results.get("cross_check") else {})}
     tables = {
-        name: _table(folder / "tables" / f"{name}.csv", needs, problems) for name, needs in _TABLES.items()
+        name: _table(folder / "tables" / f"{name}.csv", needs, problems) for name, needs in wanted.items()
     }
     draws = _draws(folder / "posterior.nc", problems)
     if not problems:
@@ -165,7 +171,7 @@ def _draws(path: Path, problems: list[str]) -> dict[str, Matrix]:
     try:
         with xr.open_dataset(path, group="posterior", engine="h5netcdf") as posterior:
             return {
-                str(name): values.transpose("chain", "draw").to_numpy()
+                str(values.attrs.get("parameter", name)): values.transpose("chain", "draw").to_numpy()
                 for name, values in posterior.data_vars.items()
                 if values.dims in (("chain", "draw"), ("draw", "chain"))
             }

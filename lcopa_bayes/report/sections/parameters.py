@@ -11,7 +11,7 @@ from lcopa_bayes.report.wording import figures, interval, percent, to_spread
 
 
 def section(run: SavedRun) -> Section:
-    """Free parameters with intervals and grades, and the fixed ones."""
+    """Free parameters with intervals and grades, those with several ridges, and the fixed ones."""
     free, fixed = run.results["parameters"], run.results["fixed"]
     kind = ", ".join(dict.fromkeys(f"{percent(row['level'])} {row['interval']}" for row in free))
     tables = [
@@ -28,6 +28,8 @@ def section(run: SavedRun) -> Section:
             "ensembles.",
         )
     ]
+    if run.results["ridges"]:
+        tables.append(_ridges(run.results["ridges"]))
     if fixed:
         tables.append(
             Table(
@@ -37,6 +39,33 @@ def section(run: SavedRun) -> Section:
         )
     text = () if fixed else ("No parameter was fixed.",)
     return Section("Parameters", text, tables=tuple(tables))
+
+
+def _ridges(rows: list[Mapping[str, Any]]) -> Table:
+    """Shares of the hills of parameters whose marginal has several."""
+    columns = (
+        *(Column("several ridges in", "code"), Column("split at", "number"), Column("unit")),
+        *(Column("shares of all draws", "interval"), Column("between populations", "interval")),
+        *(Column("grade", "grade"), Column("in words", "prose")),
+    )
+    shown = []
+    for row in rows:
+        pooled = zip(row["pooled"], row["pooled_mcse"], strict=True)
+        hills = zip(*row["shares"], strict=True)
+        shown.append(
+            (
+                *(str(row["parameter"]), ", ".join(figures(end) for end in row["boundaries"])),
+                *(str(row["unit"]), ", ".join(f"{share:.2f} ± {error:.2f}" for share, error in pooled)),
+                ", ".join(f"{min(hill):.2f} to {max(hill):.2f}" for hill in hills),
+                *(str(row["grade"]), str(row["sentence"])),
+            )
+        )
+    return Table(
+        columns,
+        tuple(shown),
+        "The draws of these parameters lie on separate hills; medians and intervals mix them. "
+        "± is the Monte Carlo standard error.",
+    )
 
 
 def _row(row: Mapping[str, Any]) -> tuple[str, ...]:

@@ -1,0 +1,1 @@
+"""Simulation-based calibration: does the whole procedure cover what it says it covers?"""

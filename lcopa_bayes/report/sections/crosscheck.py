@@ -1,0 +1,130 @@
+"""The two methods side by side, where a run was checked by a second one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
+
+from lcopa_bayes.report.canvas import BAND, HELD_OUT, grid, label, log_ticks, svg_of
+from lcopa_bayes.report.saved import SavedRun
+from lcopa_bayes.report.section import Column, Drawing, Section, Table
+from lcopa_bayes.report.wording import NONE, figures, interval, to_spread
+
+_TITLE = "Second method"
+_PER_FIGURE = 12
+"""Parameters on one figure."""
+_HOW = (
+    "The ensembles and nested sampling share the posterior, but neither proposals nor the way from the "
+    "prior. A p-value is the probability of a distance as large when both sample one posterior, adjusted for "
+    "all comparisons; below {alarm} every grade of this run is lowered."
+)
+_WIDE = 1.645 * 2
+"""Width of a normal distribution's 90 % interval in standard deviations [-]."""
+
+
+def section(run: SavedRun) -> Section:
+    """Verdict, marginals and evidences of both methods; a sentence where there was only one."""
+    check = run.results["cross_check"]
+    if check is None:
+        return Section(
+            _TITLE, ("Not run: `fit --cross-check` samples by an independent method too and compares.",)
+        )
+    said = str(check["sentence"])
+    density = run.tables["cross_check_density"]
+    names = list(dict.fromkeys(density["name"]))
+    pages = [names[k : k + _PER_FIGURE] for k in range(0, len(names), _PER_FIGURE)]
+    caption = (
+        "Marginals by both methods, over 99.8 % of their draws. Where the axis is logarithmic, densities are "
+        "per natural logarithm of the parameter."
+    )
+    return Section(
+        _TITLE,
+        (f"{said[0].upper()}{said[1:]}.", _HOW.format(alarm=figures(check["alarm"], 1))),
+        tuple(
+            Drawing(f"cross_check_{number:02d}", _drawn(run, page), caption)
+            for number, page in enumerate(pages, start=1)
+        ),
+        (_marginals(check), _evidences(check)),
+    )
+
+
+def _marginals(check: Mapping[str, Any]) -> Table:
+    columns = (
+        *(Column("name", "code"), Column("unit"), Column("ensembles: median", "number")),
+        *(Column("90 % interval", "interval"), Column("ESS", "number"), Column("nested: median", "number")),
+        *(Column("90 % interval", "interval"), Column("ESS", "number"), Column("distance", "number")),
+        *(Column("noticed from", "number"), Column("p", "number")),
+    )
+    rows = []
+    for row in check["parameters"]:
+        spread = max(row[one]["upper"] - row[one]["lower"] for one in ("run", "nested")) / _WIDE
+        cells = [str(row["name"]), str(row["unit"])]
+        for one in (row["run"], row["nested"]):
+            cells += [to_spread(one["value"], spread), interval(one["lower"], one["upper"], spread)]
+            cells.append(f"{one['ess']:.0f}")
+        noticed = f"{row['resolution']:.3f}" if row["resolution"] < 1 else NONE
+        rows.append((*cells, f"{row['distance']:.3f}", noticed, figures(row["p"], 2)))
+    return Table(
+        columns,
+        tuple(rows),
+        "Intervals are equal-tailed credible. ESS is the effective sample size. Distance is the largest "
+        "difference of the two cumulative probabilities; from the next column on it would be called a "
+        "disagreement.",
+    )
+
+
+def _evidences(check: Mapping[str, Any]) -> Table:
+    p = check["evidence_p"]
+    rows = [
+        ("ensembles", _with_error(check["run_log_evidence"], check["run_log_evidence_sd"]), ""),
+        (
+            "nested sampling",
+            _with_error(check["log_evidence"], check["log_evidence_sd"]),
+            ", ".join(f"{one:.2f}" for one in check["run_log_evidences"]),
+        ),
+    ]
+    caption = "± is the standard error. " + (
+        "The ensembles of this run gave no evidence to compare."
+        if p is None
+        else f"Adjusted p-value of the difference: {figures(p, 2)}."
+    )
+    return Table(
+        (Column("method"), Column("log evidence [nat]", "number"), Column("each run", "prose")),
+        tuple(rows),
+        caption,
+    )
+
+
+def _with_error(value: float | None, error: float | None) -> str:
+    """`value ± error` to a hundredth."""
+    return NONE if value is None or error is None else f"{value:.2f} ± {error:.2f}"
+
+
+def _drawn(run: SavedRun, names: Sequence[str]) -> str:
+    figure, panels = grid(len(names), columns=3, height=1.5)
+    for panel, name in zip(panels, names, strict=True):
+        _panel(panel, run, name)
+        panel.set_xlabel(label(name, run.units[name]), fontsize=8)
+        panel.set_yticks([])
+        panel.spines["left"].set_visible(False)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
+    return svg_of(figure)
+
+
+def _panel(panel: Axes, run: SavedRun, name: str) -> None:
+    whole = run.tables["cross_check_density"]
+    own = whole[whole["name"] == name]
+    edges = np.append(own["left"].to_numpy(), own["right"].to_numpy()[-1])
+    panel.stairs(own["ensembles"].to_numpy(), edges, fill=True, color=BAND, alpha=0.5, label="ensembles")
+    panel.stairs(own["nested"].to_numpy(), edges, color=HELD_OUT, linewidth=1.1, label="nested sampling")
+    if own["log_scale"].any():
+        panel.set_xscale("log")
+        log_ticks(panel.xaxis, float(edges[0]), float(edges[-1]))
+    else:
+        panel.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+    panel.set_ylim(bottom=0.0)
+    panel.margins(x=0.0)
