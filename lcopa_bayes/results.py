@@ -78,8 +78,8 @@ def results(fit: Fit) -> dict[str, Any]:
             "log_evidence_grade": _evidence_grade(fit),
             "cross_check": None if fit.cross_check is None else fit.cross_check.as_json(),
             "residual_rms": residual_rms(fit),
-            "held_out": [_score(band) for band in fit.bands if band.held_out],
-            "fit_scores": [_score(band) for band in fit.bands if not band.held_out],
+            "held_out": scores(fit, held_out=True),
+            "fit_scores": scores(fit, held_out=False),
             "ridges": [
                 r.as_json() | {"grade": fit.draws.capped(shares_grade(r)).level} for r in fit.draws.ridges
             ],
@@ -113,6 +113,11 @@ def residual_rms(fit: Fit) -> dict[str, float]:
         if not band.held_out:
             pooled.setdefault(band.axis, []).extend((band.observed - band.plant[2]) ** 2)
     return {axis: float(np.sqrt(np.mean(squares))) for axis, squares in pooled.items()}
+
+
+def scores(fit: Fit, *, held_out: bool) -> list[dict[str, Any]]:
+    """Error and coverage of every axis of the records that were held out, or of those fitted."""
+    return [_score(band) for band in fit.bands if band.held_out == held_out]
 
 
 def _score(band: Band) -> dict[str, Any]:

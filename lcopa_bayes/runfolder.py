@@ -18,18 +18,21 @@ from lcopa_bayes.fit import Fit
 from lcopa_bayes.predict import responses
 from lcopa_bayes.provenance import provenance
 from lcopa_bayes.results import results
+from lcopa_bayes.rival import Rival
 from lcopa_bayes.tables import tables
 
 _PORTION = 64
 """Draws written at a time."""
 
 
-def save_fit(fit: Fit, folder: Path, command: Sequence[str]) -> dict[str, Any]:
-    """Write a fit's files into `folder` and return what `results.json` holds.
+def save_fit(fit: Fit, folder: Path, command: Sequence[str], *, rival: Rival | None = None) -> dict[str, Any]:
+    """Write a fit's files into `folder`, with its rival's scores, and return what `results.json` holds.
 
     InputError naming the first file that cannot be written; those before it are whole.
     """
-    told = results(fit)
+    told = results(fit) | {"rival": plain(rival.as_json()) if rival else None}
+    if rival:
+        told["verdict"] += f" {rival.sentence}"
     writable_folder(folder / "tables")
     for name, table in tables(fit).items():
         save_table(table, folder / "tables" / f"{name}.csv")

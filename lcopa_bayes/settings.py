@@ -22,7 +22,7 @@ from lcopa_bayes.checks import file_names, is_number, one_of, rebuilt, refuse_if
 from lcopa_bayes.problems import InputError, nearest
 from lcopa_bayes.record import TIME_UNITS
 
-STAGES: Mapping[str, frozenset[str]] = MappingProxyType({"fit": frozenset()})
+STAGES: Mapping[str, frozenset[str]] = MappingProxyType({"fit": frozenset(), "rival": frozenset()})
 """Stages a study may name, each with the keys of its settings."""
 S = TypeVar("S")
 

@@ -28,6 +28,7 @@ from lcopa_bayes.provenance import provenance
 from lcopa_bayes.report import write_report
 from lcopa_bayes.report.calibrationpage import is_calibration, write_calibration
 from lcopa_bayes.report.paperpages import write_claims, write_identification, write_optics
+from lcopa_bayes.rival import integer_rival
 from lcopa_bayes.runfolder import save_fit, save_json, save_table
 from lcopa_bayes.study import Study
 from lcopa_bayes.studyfile import load_study
@@ -46,23 +47,31 @@ class Told:
 
 def run(options: argparse.Namespace, command: list[str]) -> Told:
     """All stages of a study; the fit comes first and feeds the others."""
-    return fit_study(options, command)
+    study = _study(options)
+    return _fitted(options, command, study, frozenset(study.stages))
 
 
 def fit_study(options: argparse.Namespace, command: list[str]) -> Told:
     """Posterior, bands and step metrics, with a report."""
-    study = _study(options)
-    folder = options.out or Path("reports") / study.name
+    return _fitted(options, command, _study(options), frozenset({"fit"}))
+
+
+def _fitted(options: argparse.Namespace, command: list[str], study: Study, stages: frozenset[str]) -> Told:
+    """A fit and what the stages add to it, saved and reported."""
+    folder, jobs = options.out or Path("reports") / study.name, options.jobs or cores()
     made = fit(
         study,
-        jobs=options.jobs or cores(),
+        jobs=jobs,
         folder=folder,
         resume=options.resume,
         quick=options.quick,
         cross_check=options.cross_check,
         quiet=options.quiet,
     )
-    told = save_fit(made, folder, command)
+    rival = None
+    if "rival" in stages:
+        rival = integer_rival(made, jobs=jobs, quick=options.quick, quiet=options.quiet)
+    told = save_fit(made, folder, command, rival=rival)
     return _with_report(told, write_report(folder), told["verdict"])
 
 

@@ -28,7 +28,7 @@ ORDER = (
     ("bench",),
     ("fit",),
     ("results",),
-    ("tables",),
+    ("tables", "rival"),
     ("runfolder",),
     ("calibration",),
     ("paper",),

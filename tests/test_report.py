@@ -130,6 +130,10 @@ def results_of() -> dict:
             estimate("overshoot[x]", "-", 0.04, 0.002, "reliable"),
         ],
         "ridges": [],
+        "rival": None,
+        "log_evidence": -12.345,
+        "log_evidence_sd": 0.0123,
+        "log_evidence_grade": "tentative",
         "cross_check": None,
         "sensitivity": [moved("time_1", 0.21, "prior-data conflict"), moved("gain", None, "not trusted")],
         "residual_tests": [
@@ -188,7 +192,13 @@ def test_sections_come_in_the_order_of_reading(html):
     titles = re.findall(r"<h2>(.*?)</h2>", html)
     assert titles == [
         *("Data and bands", "Residuals", "Parameters", "Pairs of parameters", "Traces", "Step responses"),
-        *("Priors and posteriors", "Prior sensitivity", "Second method", "Sampler and provenance"),
+        *(
+            "Priors and posteriors",
+            "Prior sensitivity",
+            "Evidence",
+            "Second method",
+            "Sampler and provenance",
+        ),
     ]
 
 

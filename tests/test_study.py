@@ -55,7 +55,7 @@ def test_three_lines_are_a_study(tmp_path):
     assert study.drive_axes == study.response_axes == (Axis("x", "rad"),)
     assert (study.model, study.noise, study.sampler) == (ModelSettings(), NoiseSettings(), SamplerSettings())
     assert dict(study.priors) == {}
-    assert list(study.stages) == ["fit"]
+    assert list(study.stages) == ["fit", "rival"]
     expected = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in os.listdir(folder)}
     assert dict(study.inputs) == expected
     assert load_study(folder / "study.toml").inputs == study.inputs

@@ -11,7 +11,7 @@ import numpy as np
 from lcopa_bayes.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.mixture import Mixture
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.inference.ridgemoves import moves
+from lcopa_bayes.inference.ridgemoves import walking
 from lcopa_bayes.inference.tempering import temper
 
 
@@ -72,11 +72,8 @@ def advance(
     With `mixture` some moves follow it. Deterministic: the same ensemble advanced twice gives the same
     draws, in whatever process.
     """
-    walkers, dimension = ensemble.position.shape
-    sampler = emcee.EnsembleSampler(
-        walkers, dimension, posterior.log_density, moves=moves(posterior, mixture), vectorize=True
-    )
-    sampler.random_state = ensemble.random
+    walkers = ensemble.position.shape[0]
+    sampler = walking(posterior, posterior.log_density, walkers, mixture, ensemble.random)
     state = emcee.State(ensemble.position, log_prob=ensemble.position_log_density)
     last = sampler.run_mcmc(state, draws, thin_by=thin, skip_initial_state_check=True)
     return Ensemble(

@@ -198,6 +198,10 @@ def parameter_table(
         for name in NOISES[noise].names:
             prior = scales.sigma(i) if name == "sigma" else scales.rho() if name == "rho" else scales.nu()
             add(name, (i, 0), layout.response_name(i), response.unit if name == "sigma" else "-", prior)
+    names = [row.name for row in rows]
+    if len(set(names)) < len(names):
+        twice = ", ".join(sorted({name for name in names if names.count(name) > 1}))
+        raise InputError(f"{twice}: axes and records together name two parameters alike; rename a record")
     rows = _fix_orders(rows, layout, model)
     return ParameterTable(layout, tuple(_with_priors(rows, priors)))
 

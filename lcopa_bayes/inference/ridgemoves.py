@@ -8,6 +8,7 @@ and one whole term drawn anew. Proposals that leave the support have factor -inf
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, final
 
 import emcee
@@ -195,3 +196,22 @@ def moves(posterior: Posterior, mixture: Mixture | None = None) -> list[tuple[em
         (MixtureWalk(chart, mixture), _NEARBY),
         *((move, (1 - _ANEW - _NEARBY) * often) for move, often in local),
     ]
+
+
+def walking(
+    posterior: Posterior,
+    log_density: Callable[[Matrix], Vector],
+    walkers: int,
+    mixture: Mixture | None,
+    random: tuple[Any, ...],
+) -> emcee.EnsembleSampler:
+    """emcee with these moves, at a state of its generator.
+
+    Its own wrapper, which prints what an exception or an interrupt meets, is left out: the caller tells.
+    """
+    sampler = emcee.EnsembleSampler(
+        walkers, posterior.dimension, log_density, moves=moves(posterior, mixture), vectorize=True
+    )
+    sampler.log_prob_fn = log_density
+    sampler.random_state = random
+    return sampler

@@ -19,7 +19,7 @@ from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.inference.grade import rank_correlation
 from lcopa_bayes.inference.mixturemove import learned
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.inference.ridgemoves import moves
+from lcopa_bayes.inference.ridgemoves import walking
 
 _WARM = 0.01
 """Below this power of the likelihood a population travels fast and a third of the sweeps is enough."""
@@ -68,14 +68,8 @@ def temper(
         heat, rises = (1.0 if heat + rise > 1.0 - 1e-9 else heat + rise), rises + 1
         kept = _resampled(rise * likelihood, rng)
         position, prior, likelihood = position[kept], prior[kept], likelihood[kept]
-        sampler = emcee.EnsembleSampler(
-            crowd,
-            posterior.dimension,
-            _Tempered(posterior, heat),
-            moves=moves(posterior, learned(posterior, [position], rises)),
-            vectorize=True,
-        )
-        sampler.random_state = random
+        mixture = learned(posterior, [position], rises)
+        sampler = walking(posterior, _Tempered(posterior, heat), crowd, mixture, random)
         state = emcee.State(position, log_prob=prior + heat * likelihood)
         for _ in range(max(1, (sweeps if heat > _WARM else sweeps // 3) // _BLOCK)):
             state = sampler.run_mcmc(state, _BLOCK, skip_initial_state_check=True, store=False)

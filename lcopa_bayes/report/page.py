@@ -18,6 +18,7 @@ from lcopa_bayes.report.section import Drawing, Section
 from lcopa_bayes.report.sections import (
     crosscheck,
     data,
+    evidence,
     origin,
     pairs,
     parameters,
@@ -37,12 +38,13 @@ _SECTIONS = (
     steps.section,
     priors.section,
     sensitivity.section,
+    evidence.section,
     crosscheck.section,
     origin.section,
 )
 """What a report shows, in this order; a later stage adds its own section here."""
 _ADVICE = {
-    "reliable": "The sampling can be relied on; what the model leaves unexplained is said next.",
+    "reliable": "The sampling behind the numbers can be relied on.",
     "tentative": "Read the numbers below with caution: a longer run may move them.",
     "unusable": "Do not use the numbers below: the draws have not converged.",
 }
