@@ -31,6 +31,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for problem in error.problems:
             print(f"error: {problem}", file=sys.stderr)
         return USAGE_ERROR
+    except FloatingPointError as error:  # a prior that reaches where the model cannot be computed
+        print(f"error: {error}; narrow the priors that allow these values", file=sys.stderr)
+        return USAGE_ERROR
     except KeyboardInterrupt:
         print("interrupted; the same command with --resume goes on where it stopped", file=sys.stderr)
         return INTERRUPTED
