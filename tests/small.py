@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -13,7 +14,9 @@ from lcopa_bayes.bench.device import Device, TransferPath
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.draws import Draws
 from lcopa_bayes.inference.grade import Quality
+from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.inference.priors import Prior
 from lcopa_bayes.record import Axis, Record
 from lcopa_bayes.settings import ModelSettings, NoiseSettings, PriorSettings, SamplerSettings
 from lcopa_bayes.study import Study
@@ -110,3 +113,54 @@ def draws_of(table: ParameterTable, values: Matrix) -> Draws:
     found = tuple(Quality(row.name, 1e4, 1e4, 1.0) for row in table.rows if row.free)
     stacked = values[: 2 * half].reshape(2, half, -1)
     return Draws(table, stacked, np.zeros((2, half)), found, 400.0)
+
+
+class Toy:
+    """A known density in place of a posterior without elements: what sampling asks of a posterior.
+
+    `log_likelihood` takes coordinates (batch, dimension); `priors` are uniform, normal or another density
+    of the whole line, by name.
+    """
+
+    linear = ()
+
+    def __init__(
+        self,
+        log_likelihood: Callable[[Matrix], Vector],
+        priors: Mapping[str, tuple[str, Mapping[str, float]]],
+    ) -> None:
+        self.log_likelihood = log_likelihood
+        self.rows = tuple(
+            Parameter(name, "-", "gain", Place(0, k), Prior(*prior))
+            for k, (name, prior) in enumerate(priors.items())
+        )
+        self.sampled = tuple(range(len(self.rows)))
+        self.dimension = len(self.rows)
+        grid = SimpleNamespace(n=10, step=1.0)
+        self.model = SimpleNamespace(experiments=[SimpleNamespace(mesh=SimpleNamespace(grid=grid))])
+        self.table = SimpleNamespace(
+            layout=SimpleNamespace(elements=()),
+            exchangeable=(),
+            rows=self.rows,
+            names=tuple(priors),
+            log_permutations=0.0,
+            draw=lambda size, rng: np.stack([row.draw(size, rng) for row in self.rows], axis=1),
+        )
+
+    def values(self, coordinates: Matrix) -> Matrix:
+        return coordinates.copy()
+
+    def coordinates(self, values: Matrix) -> Matrix:
+        return values.copy()
+
+    def complete(self, coordinates: Matrix, rng: np.random.Generator | None) -> Matrix:
+        return coordinates.copy()
+
+    def log_prior(self, coordinates: Matrix) -> Vector:
+        return np.sum([row.log_prior(coordinates[:, k]) for k, row in enumerate(self.rows)], axis=0)
+
+    def log_density(self, coordinates: Matrix, *, heat: float = 1.0) -> Vector:
+        total = self.log_prior(coordinates)
+        inside = total > -np.inf
+        total[inside] += heat * self.log_likelihood(coordinates[inside])
+        return total

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 
 import h5py
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
-from small import ONE, TRUTH, TWO, problem, record
+from small import ONE, TRUTH, TWO, Toy, problem, record
 
 from lcopa_bayes.inference import sampler
 from lcopa_bayes.inference.chainfile import load_chain, save_chain
 from lcopa_bayes.inference.draws import gather
 from lcopa_bayes.inference.ensemble import Ensemble, advance
 from lcopa_bayes.inference.grade import qualities
+from lcopa_bayes.inference.mixturemove import learned
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.sampler import Run, SamplePlan, finished, sample
 from lcopa_bayes.problems import InputError
@@ -34,9 +33,9 @@ def plan(**changes: int) -> SamplePlan:
 def assert_same(a: Run, b: Run) -> None:
     assert len(a.ensembles) == len(b.ensembles)
     for one, other in zip(a.ensembles, b.ensembles, strict=True):
-        for name in ("chain", "log_density", "position", "position_log_density", "accepted"):
+        for name in ("chain", "log_density", "position", "position_log_density", "accepted", "trail"):
             assert_array_equal(getattr(one, name), getattr(other, name))
-        assert one.steps == other.steps
+        assert (one.steps, one.way) == (other.steps, other.way)
         assert_array_equal(one.random[1], other.random[1])
         assert one.random[2:] == other.random[2:]
 
@@ -185,36 +184,31 @@ def test_a_plan_has_walkers_enough_for_its_dimension():
     assert SamplePlan.of(4, seed=0, steps=10, thin=2).thin == 2
 
 
-class Target:
-    """A known log density in place of a posterior without elements."""
-
-    def __init__(self, log_density: Callable[[np.ndarray], np.ndarray]) -> None:
-        self.log_density = log_density
-        grid = SimpleNamespace(n=10, step=1.0)
-        self.model = SimpleNamespace(experiments=[SimpleNamespace(mesh=SimpleNamespace(grid=grid))])
-        self.table = SimpleNamespace(layout=SimpleNamespace(elements=()), exchangeable=())
-        self.sampled = ()
-
-
 def ensemble_at(posterior, position: np.ndarray, seed: np.random.SeedSequence) -> Ensemble:
     """A new ensemble at a position of the test's choice."""
     walkers, dimension = position.shape
     state = tuple(np.random.RandomState(np.random.MT19937(seed)).get_state())
     nothing = np.empty((0, walkers, dimension)), np.empty((0, walkers))
-    return Ensemble(*nothing, position, posterior.log_density(position), np.zeros(walkers), 0, state, 0.0)
+    log_density = posterior.log_density(position)
+    return Ensemble(*nothing, position, log_density, np.zeros(walkers), 0, state, position, 0)
 
 
-def test_ensembles_sample_a_known_normal_density():
+@pytest.mark.parametrize("following", [False, True])
+def test_ensembles_sample_a_known_normal_density(following):
+    """Without and with a mixture to follow, learned from where the walkers start, which is too wide."""
     scales = np.diag([1.0, 0.01, 30.0])
     mean = np.array([1.0, -0.2, 50.0])
     covariance = scales @ np.array([[1, 0.9, 0], [0.9, 1, -0.3], [0, -0.3, 1]]) @ scales
-    target = Target(stats.multivariate_normal(mean, covariance).logpdf)
     widths = np.sqrt(np.diagonal(covariance))
+    wide = [("uniform", {"loc": m - 40 * w, "scale": 70 * w}) for m, w in zip(mean, widths, strict=True)]
+    target = Toy(stats.multivariate_normal(mean, covariance).logpdf, dict(zip("abc", wide, strict=True)))
     chains = []
     for child in np.random.SeedSequence(1).spawn(4):
         place, walk = child.spawn(2)
         start = mean + 3 * widths * np.random.default_rng(place).normal(size=(20, 3))
-        chains.append(advance(target, ensemble_at(target, start, walk), 400, 4).chain[100:].swapaxes(0, 1))
+        mixture = learned(target, [start], 1) if following else None
+        moved = advance(target, ensemble_at(target, start, walk), 400, 4, mixture)
+        chains.append(moved.chain[100:].swapaxes(0, 1))
     kept = np.array(chains)
     found = qualities("abc", kept)
     flat = kept.reshape(-1, 3)
@@ -240,10 +234,19 @@ PRIORS = {
 }
 
 
+FOLLOWING = [
+    pytest.param(name, True, marks=() if name in ("two terms", "two axes") else pytest.mark.slow)
+    for name in PRIORS
+]
+
+
 @pytest.mark.parametrize("draws", [150, pytest.param(1500, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", PRIORS)
-def test_without_information_every_move_leaves_the_prior(name, draws):
-    """Noise a million times the record: every parameter keeps its prior, or a proposal's volume is wrong."""
+@pytest.mark.parametrize(("name", "following"), [*((name, False) for name in PRIORS), *FOLLOWING])
+def test_without_information_every_move_leaves_the_prior(name, following, draws):
+    """Noise a million times the record: every parameter keeps its prior, or a proposal's volume is wrong.
+
+    The mixture that is followed was learned from prior draws on one side of the median delay.
+    """
     options = PRIORS[name]
     device = TWO if name == "two axes" else ONE
     loud = {f"sigma{axis}": 1e6 for axis in (("_x", "_y") if device is TWO else ("",))}
@@ -253,11 +256,16 @@ def test_without_information_every_move_leaves_the_prior(name, draws):
         record(device=device, camera=1.0), **(options | {"priors": priors, "noise": "student", "blocks": 8})
     ).posterior
     assert posterior.linear == ()
-    walkers, chains = 4 * posterior.dimension + 8, []
+    walkers, chains, mixture = 4 * posterior.dimension + 8, [], None
+    if following:
+        seen = posterior.coordinates(posterior.table.draw(900, np.random.default_rng(12)))
+        delay = seen[:, posterior.sampled.index(posterior.table.at("delay", 0))]
+        mixture = learned(posterior, [seen[delay < np.median(delay)]], 12)
     for child in np.random.SeedSequence(11).spawn(2):
         place, walk = child.spawn(2)
         start = posterior.coordinates(posterior.table.draw(walkers, np.random.default_rng(place)))
-        chains.append(advance(posterior, ensemble_at(posterior, start, walk), draws, 8).chain.swapaxes(0, 1))
+        moved = advance(posterior, ensemble_at(posterior, start, walk), draws, 8, mixture)
+        chains.append(moved.chain.swapaxes(0, 1))
     coordinates = np.array(chains)
     names = [posterior.table.names[k] for k in posterior.sampled]
     values = posterior.values(coordinates.reshape(-1, len(names)))[:, posterior.sampled]
@@ -299,21 +307,6 @@ def test_a_whole_run_samples_a_known_posterior(seed):
     assert abs(gain.std() / sd - 1) < 4 / np.sqrt(2 * min(draws.ess, gain.size))
 
 
-def test_the_way_from_the_prior_gives_the_known_evidence():
-    fixed = {name: TRUTH[name] for name in ("time_1", "order_1", "delay", "offset")} | {"sigma": 0.3}
-    posterior = problem(record(camera=0.6, noise_sd=0.3), priors=fixed | {"gain": GAIN}).posterior
-    seen = posterior.samples[0].axes[0]
-    dynamics = posterior.table.dynamics(posterior.values(np.zeros((1, 1))))
-    unit = posterior.model.unit_responses(dynamics)[0][0, 0, seen.index]
-    covariance = 4 * np.outer(unit, unit) + 0.3**2 * np.eye(unit.size)
-    exact = stats.multivariate_normal(1.0 * unit + TRUTH["offset"], covariance).logpdf(seen.values)
-    told = [
-        Ensemble.born(posterior, 100, 10, seed).log_evidence for seed in np.random.SeedSequence(0).spawn(12)
-    ]
-    assert abs(np.mean(told) - exact) < 4 * np.std(told, ddof=1) / np.sqrt(12)
-    assert np.std(told) < 1.0
-
-
 def test_gathered_draws_are_those_kept_with_linear_parameters_added(uninterrupted):
     draws = gather(POSTERIOR, uninterrupted)
     assert draws.values.shape[0::2] == (2, 6)
@@ -338,7 +331,8 @@ def test_a_posterior_with_two_hills_no_walker_crosses_between_is_not_reliable():
         near, far = ((coordinates - at) ** 2 for at in (0.0, 200.0))
         return np.logaddexp(-0.5 * near.sum(axis=1), -0.5 * far.sum(axis=1))
 
-    hills, chains = Target(log_density), []
+    wide = ("uniform", {"loc": -100.0, "scale": 400.0})
+    hills, chains = Toy(log_density, {"a": wide, "b": wide}), []
     for k, child in enumerate(np.random.SeedSequence(2).spawn(4)):
         start = 200.0 * (k % 2) + np.random.default_rng(k).normal(size=(12, 2))
         chains.append(advance(hills, ensemble_at(hills, start, child), 200, 4).chain[50:].swapaxes(0, 1))

@@ -102,9 +102,17 @@ class ShapeMove(RidgeMove):
             frequencies = self.terrain.frequencies(element.ratios, random)
             shapes = [element.shape(points, frequencies) for points in (here, a, b)]
             for column, by_logarithm in element.gains:
-                if by_logarithm:  # differences of gain over level, which `rebuilt` turns into gains
+                # differences of gain over level, which `rebuilt` turns into gains
+                if by_logarithm:
                     level = (a[:, column] - shapes[1].log_level) - (b[:, column] - shapes[2].log_level)
                     proposed[:, column] = here[:, column] + scale[:, 0] * level
+                else:
+                    own, one, other = (
+                        points[:, column] * np.exp(-shape.log_level)
+                        for points, shape in zip((here, a, b), shapes, strict=True)
+                    )
+                    moved = own + scale[:, 0] * (one - other)
+                    proposed[:, column] = moved * np.exp(shapes[0].log_level)
             ratios = shapes[0].log_ratios + scale * jittered(
                 shapes[1].log_ratios - shapes[2].log_ratios, random
             )
@@ -156,10 +164,20 @@ class TermRedraw(RidgeMove):
     crosses = True
 
     def proposal(self, here: Matrix, others: Matrix, random: Any) -> tuple[Matrix, Vector]:
-        """See `PopulationMove.proposal`: log times evenly, orders dense at 0, half of them left alone."""
+        """See `PopulationMove.proposal`; each walker chooses its term, for the way back may need another."""
         element = self.element(random)
-        element = element.holding(int(random.randint(element.terms)))
-        frequencies = self.terrain.frequencies(element.ratios, random)
+        term = random.randint(element.terms, size=len(here))
+        frequencies = self.terrain.frequencies(element.terms - 1, random)
+        proposed, factor = here.copy(), np.full(len(here), -np.inf)
+        for k in range(element.terms):
+            rows = np.flatnonzero(term == k)
+            proposed[rows], factor[rows] = self._redrawn(here[rows], element.holding(k), frequencies, random)
+        return proposed, factor
+
+    def _redrawn(
+        self, here: Matrix, element: ElementColumns, frequencies: Vector, random: Any
+    ) -> tuple[Matrix, Vector]:
+        """The held term drawn anew: log time evenly, order dense at 0, half of the orders left alone."""
         time, order = (columns[element.held] for columns in (element.times, element.orders))
         low, high = (bound[element.held] for bound in element.reach)
         proposed = here.copy()
