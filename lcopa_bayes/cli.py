@@ -60,6 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     checked = _check_options()
     add("run", verbs.run, [study, sampled, checked], "all stages the study names, then the report")
     add("fit", verbs.fit_study, [study, sampled, checked], "posterior, bands and step metrics, with a report")
+    add("audit", verbs.audit_study, [study, sampled], "what the records determine, parameter by parameter")
     _calibrate_options(
         add(
             "calibrate",
