@@ -19,12 +19,14 @@ from lcopa_bayes.calibration.summary import tables
 from lcopa_bayes.cores import cores
 from lcopa_bayes.files import writable_folder
 from lcopa_bayes.fit import fit
+from lcopa_bayes.paper.auditclaims import load_audit
 from lcopa_bayes.paper.claims import judge
 from lcopa_bayes.paper.identify import identify, results, scannable
 from lcopa_bayes.paper.intervals import MOST_TERMS, Interval, Scan
 from lcopa_bayes.paper.opticsplan import OpticsPlan
 from lcopa_bayes.paper.staticoptics import static_optics
 from lcopa_bayes.paper.steptable import load_posterior, step_table
+from lcopa_bayes.paper.verdict import Evidence
 from lcopa_bayes.provenance import provenance
 from lcopa_bayes.report import write_report
 from lcopa_bayes.report.auditpage import write_audit
@@ -185,7 +187,8 @@ def identify_study(options: argparse.Namespace, command: list[str]) -> Told:
 
 def claims(options: argparse.Namespace, command: list[str]) -> Told:
     """Every claim of the paper with its computed verdict."""
-    judged = judge()
+    at_hand = Evidence(audit=load_audit(options.audit)) if options.audit else None
+    judged = judge(evidence=at_hand)
     folder = writable_folder(options.out)
     values = {"claims": [each.as_json() for each in judged]}
     save_json(values, folder / "results.json")

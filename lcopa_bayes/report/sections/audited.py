@@ -57,7 +57,8 @@ def _symmetries(told: Mapping[str, Any]) -> Section:
     if not told["structure"]["certain"]:
         text.append(
             "The rank of the sensitivities changes with the tolerance: what is a symmetry and what is "
-            "merely too weak to compute cannot be told apart, and no parameter is called structurally unidentifiable."
+            "merely too weak to compute cannot be told apart, and no parameter is called structurally "
+            "unidentifiable."
         )
     if printed is not None:
         text.append(
