@@ -63,6 +63,7 @@ def _parser() -> argparse.ArgumentParser:
     checked = _check_options()
     add("run", verbs.run, [study, sampled, checked], "all stages the study names, then the report")
     add("fit", verbs.fit_study, [study, sampled, checked], "posterior, bands and step metrics, with a report")
+    add("audit", verbs.audit_study, [study, sampled], "what the records determine, parameter by parameter")
     _calibrate_options(
         add(
             "calibrate",
@@ -79,6 +80,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     claims = add("claims", verbs.claims, [], "the paper's claims, each with a computed verdict")
     claims.add_argument("--out", type=Path, default=Path("reports/claims"), help="folder for the page")
+    claims.add_argument(
+        "--audit", type=Path, metavar="RUNFOLDER", help="run folder of an audit, to decide I1-I6"
+    )
     report = add("report", verbs.report, [], "render the report of a run folder again")
     report.add_argument("folder", type=Path, help="run folder")
     bench = add("simulate", verbs.simulate, [], "measure a campaign file on the virtual bench")

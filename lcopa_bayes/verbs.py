@@ -10,6 +10,7 @@ from typing import Any, final
 
 import numpy as np
 
+from lcopa_bayes.audit.audit import audit
 from lcopa_bayes.bench.campaign import write_campaign
 from lcopa_bayes.bench.plan import load_plan
 from lcopa_bayes.calibration.calibrate import calibrate
@@ -18,14 +19,17 @@ from lcopa_bayes.calibration.summary import tables
 from lcopa_bayes.cores import cores
 from lcopa_bayes.files import writable_folder
 from lcopa_bayes.fit import fit
+from lcopa_bayes.paper.auditclaims import load_audit
 from lcopa_bayes.paper.claims import judge
 from lcopa_bayes.paper.identify import identify, results, scannable
 from lcopa_bayes.paper.intervals import MOST_TERMS, Interval, Scan
 from lcopa_bayes.paper.opticsplan import OpticsPlan
 from lcopa_bayes.paper.staticoptics import static_optics
 from lcopa_bayes.paper.steptable import load_posterior, step_table
+from lcopa_bayes.paper.verdict import Evidence
 from lcopa_bayes.provenance import provenance
 from lcopa_bayes.report import write_report
+from lcopa_bayes.report.auditpage import write_audit
 from lcopa_bayes.report.calibrationpage import is_calibration, write_calibration
 from lcopa_bayes.report.paperpages import write_claims, write_identification, write_optics
 from lcopa_bayes.rival import integer_rival
@@ -73,6 +77,22 @@ def _fitted(options: argparse.Namespace, command: list[str], study: Study, stage
         rival = integer_rival(made, jobs=jobs, quick=options.quick, quiet=options.quiet)
     told = save_fit(made, folder, command, rival=rival)
     return _with_report(told, write_report(folder), told["verdict"])
+
+
+def audit_study(options: argparse.Namespace, command: list[str]) -> Told:
+    """Identifiability of every parameter, after the fit it rests on, with a page of its own."""
+    study = _study(options)
+    folder, jobs = options.out or Path("reports") / study.name, options.jobs or cores()
+    made = fit(
+        study, jobs=jobs, folder=folder, resume=options.resume, quick=options.quick, quiet=options.quiet
+    )
+    save_fit(made, folder, command)
+    write_report(folder)
+    values = audit(made, jobs=jobs).as_json()
+    save_json(values, folder / "audit.json")
+    words = [f"{'parameter':16}{'verdict':30}why"]
+    words += [f"{row['name']:16}{row['verdict']:30}{row['reason']}" for row in values["parameters"]]
+    return _with_report(values, write_audit(folder), *words)
 
 
 def report(options: argparse.Namespace, command: list[str]) -> Told:
@@ -167,7 +187,8 @@ def identify_study(options: argparse.Namespace, command: list[str]) -> Told:
 
 def claims(options: argparse.Namespace, command: list[str]) -> Told:
     """Every claim of the paper with its computed verdict."""
-    judged = judge()
+    at_hand = Evidence(audit=load_audit(options.audit)) if options.audit else None
+    judged = judge(evidence=at_hand)
     folder = writable_folder(options.out)
     values = {"claims": [each.as_json() for each in judged]}
     save_json(values, folder / "results.json")

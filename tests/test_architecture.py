@@ -27,6 +27,7 @@ ORDER = (
     ("residuals",),
     ("bench",),
     ("fit",),
+    ("audit",),
     ("results",),
     ("tables", "rival"),
     ("runfolder",),

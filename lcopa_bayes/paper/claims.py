@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from lcopa_bayes.paper import crosstalkclaims, dynamicclaims, numericsclaims, opticsclaims
-from lcopa_bayes.paper.posteriorclaims import fractional_against_integer, needs_audit, needs_comparison
+from lcopa_bayes.paper import auditclaims, crosstalkclaims, dynamicclaims, numericsclaims, opticsclaims
+from lcopa_bayes.paper.auditclaims import from_audit
+from lcopa_bayes.paper.posteriorclaims import fractional_against_integer, needs_comparison
 from lcopa_bayes.paper.verdict import Claim, Evidence, Judged
 from lcopa_bayes.stated import PAPER, Stated
 
@@ -12,37 +13,50 @@ CLAIMS: tuple[Claim, ...] = (
         "I1",
         "Parameters map uniquely to the response; no two sets give the same one.",
         "Section 4.3",
-        needs_audit("are there symmetries, or sets of parameters with one response?"),
+        from_audit(auditclaims.unique_map, "are there symmetries, or sets of parameters with one response?"),
     ),
     Claim(
         "I2",
         "A step excites splay, twist and bend modes fully.",
         "Section 4.3",
-        needs_audit("which directions of the parameters does the record of a step leave open?"),
+        from_audit(
+            auditclaims.full_excitation,
+            "which directions of the parameters does the record of a step leave open?",
+        ),
     ),
     Claim(
         "I3",
         "The parameters' sensitivities are uncoupled.",
         "Section 4.3",
-        needs_audit("how strongly are the sensitivities correlated at the identified values?"),
+        from_audit(
+            auditclaims.uncoupled, "how strongly are the sensitivities correlated at the identified values?"
+        ),
     ),
     Claim(
         "I4",
         "All viscosities, orders, delay and gains are uniquely determined from the measured record.",
         "Section 4.3",
-        needs_audit("which parameters have bounded profiles on a record like that of Fig. 13?"),
+        from_audit(
+            auditclaims.all_determined,
+            "which parameters have bounded profiles on a record like that of Fig. 13?",
+        ),
     ),
     Claim(
         "I5",
         "The dominant order is 1.8, set by the data.",
         "Section 4.3",
-        needs_audit("what interval of the largest order does such a record leave?"),
+        from_audit(
+            auditclaims.dominant_order, "what interval of the largest order does such a record leave?"
+        ),
     ),
     Claim(
         "I6",
         "Four independent path delays can be told apart, though all print as 3.027.",
         "Section 3.2, Eq. 31",
-        needs_audit("are the intervals of the path delays narrower than their differences?"),
+        from_audit(
+            auditclaims.separate_delays,
+            "are the intervals of the path delays narrower than their differences?",
+        ),
     ),
     Claim(
         "M1",

@@ -1,4 +1,4 @@
-"""Claims I1 to I6, M1 and M4: what an audit of the posterior or a comparison of models must decide."""
+"""Claims that wait for evidence, and M1 and M4: what a comparison of models must decide."""
 
 from __future__ import annotations
 
@@ -15,9 +15,7 @@ def needs_audit(question: str) -> Test:
     """A test that waits for an identifiability audit, with what the audit has to answer."""
 
     def test(stated: Stated, evidence: Evidence) -> Verdict:
-        missing = (
-            "No audit is among the evidence" if evidence.audit is None else "No rule reads the audit yet"
-        )
+        missing = "No audit is among the evidence"
         return Verdict(Kind.UNDECIDED, None, "-", f"{missing}; it has to answer: {question}")
 
     return test
