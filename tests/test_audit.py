@@ -262,10 +262,12 @@ def test_every_level_is_nested_in_the_next():
 # -- verdicts --------------------------------------------------------------------------------------
 
 
-def laplace(landscape: Landscape, peak: Peak, rng: np.random.Generator) -> Matrix:
-    """Rough draws: the prior's, weighted by the likelihood relative to the peak, with replacement."""
-    drawn = np.concatenate([landscape.posterior.table.draw(4000, rng), np.tile(peak.values, (20, 1))])
+def rough(landscape: Landscape, peak: Peak, rng: np.random.Generator) -> Matrix:
+    """Rough draws: the prior's, weighted by the likelihood, with replacement; the peak where none is near."""
+    drawn = landscape.posterior.table.draw(4000, rng)
     weights = np.exp(landscape.log_likelihood(drawn) - peak.log_likelihood)
+    if weights.sum() ** 2 < 50 * (weights**2).sum():
+        drawn, weights = np.concatenate([drawn, peak.values[None]]), np.append(weights, 20.0)
     return drawn[rng.choice(drawn.shape[0], 400, p=weights / weights.sum())]
 
 
@@ -275,7 +277,7 @@ def found_of(name: str, seed: int, **options: object) -> Finding:
     peak = maximum(landscape)
     prior = prior_draws(landscape, rng)
     spread = prior_spread(landscape, prior)
-    draws = draws_of(posterior.table, laplace(landscape, peak, rng))
+    draws = draws_of(posterior.table, rough(landscape, peak, rng))
     belief = next(b for b in beliefs(landscape, draws, spread, ()) if b.parameter == name)
     row = posterior.table.rows[posterior.table.names.index(name)]
     return judged(
@@ -296,7 +298,11 @@ CASES = {
     "identified": ("delay", {"record_of": plain, "priors": {"gain": FLAT_GAIN}}),
     "prior-dominated": (
         "gain",
-        {"record_of": plain, "priors": {"gain": ("norm", {"loc": 2.0, "scale": 1e-3})}},
+        {
+            "record_of": plain,
+            "noise": "white",
+            "priors": KNOWN | {"offset": TRUTH["offset"], "gain": ("norm", {"loc": 2.0, "scale": 1e-3})},
+        },
     ),
     "one-sided": ("time_2", {"record_of": plain, "orders": (0.8, 0.3), "terms": 2}),
     "practically unidentifiable": (

@@ -18,6 +18,8 @@ from lcopa_bayes.inference.posterior import Posterior
 
 _TAIL = 1e-9
 """Prior mass beyond either end of a search where a prior has no end of its own [-]."""
+_FAR = 100.0
+"""Standard deviations of such a prior that are searched where it is not on a logarithmic scale [-]."""
 _EDGE = 1e-6
 """Distance kept from the ends of a search, relative to its width [-]."""
 _AT_END = 1e-3
@@ -63,11 +65,6 @@ class Landscape:
         """Whitened residuals and their exact derivatives."""
         return LeastSquares(self.posterior)
 
-    @cached_property
-    def noisy(self) -> frozenset[int]:
-        """Table positions of the free noise parameters."""
-        return frozenset(self.free) - frozenset(self.least.columns)
-
     def coordinate(self, k: int, value: float) -> float:
         """Coordinate of one parameter's value."""
         row = self.posterior.table.rows[k]
@@ -86,12 +83,15 @@ class Landscape:
         return np.asarray(np.log(x) if row.log_scale else logit(x) if row.logit_scale else x)
 
     def search(self, k: int) -> tuple[float, float]:
-        """Ends of the search of one parameter in its coordinate: its domain, or where a prior without ends
-        of its own keeps all but 1e-9 of its mass on either side."""
+        """Ends of the search of one parameter in its coordinate: its domain, or for a prior without ends of
+        its own 100 standard deviations, on logarithmic scales the decades with all but 2e-9 of its mass."""
         row = self.posterior.table.rows[k]
         assert row.prior is not None
         low, high = row.domain
         tails = row.prior.frozen.ppf((_TAIL, 1 - _TAIL))
+        if not (row.log_scale or row.logit_scale):
+            mean, sd = row.prior.frozen.mean(), row.prior.frozen.std()
+            tails = (mean - _FAR * sd, mean + _FAR * sd) if np.isfinite(sd) else tails
         closed = row.log_scale or row.logit_scale  # zero and one are infinitely far away
         if not np.isfinite(low) or (closed and low <= 0.0):
             low = max(low, float(tails[0]))
@@ -114,7 +114,7 @@ class Landscape:
 
         Plant and noise parameters are maximised in turn until nothing is gained.
         """
-        noise_moves = bool(self.noisy - {held})
+        noise_moves = any(k not in self.least.columns and k != held for k in self.free)
         values, best = start, -np.inf
         for _ in range(_ROUNDS if noise_moves else 1):
             values = self._plant(values, held, most)
