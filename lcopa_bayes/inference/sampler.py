@@ -93,7 +93,7 @@ class Run:
     plan: SamplePlan
 
     def kept(self) -> tuple[Array, Array]:
-        """The last half of each ensemble: coordinates (ensembles, walkers, draws, dimension), log density."""
+        """The last three fifths: coordinates (ensembles, walkers, draws, dimension), and log density."""
         chain = np.stack([ensemble.chain for ensemble in self.ensembles])
         log_density = np.stack([ensemble.log_density for ensemble in self.ensembles])
         first = 2 * chain.shape[1] // 5
