@@ -16,7 +16,7 @@ from lcopa_bayes.audit.bayes import beliefs, prior_draws, prior_spread
 from lcopa_bayes.audit.landscape import Landscape, Peak
 from lcopa_bayes.audit.local import curvature
 from lcopa_bayes.audit.printedform import printed_form, printed_structure
-from lcopa_bayes.audit.profile import Profile, fall_at
+from lcopa_bayes.audit.profile import Freedom, Profile
 from lcopa_bayes.audit.profilewalk import profile
 from lcopa_bayes.audit.radial import radial
 from lcopa_bayes.audit.sensitivities import sensitivities
@@ -206,8 +206,8 @@ def test_a_singular_fisher_matrix_gives_infinite_sds_and_no_crash():
 
 
 def test_profile_of_a_gain_alone_is_the_parabola():
-    narrow = ("loguniform", {"a": 0.999 * TRUTH["sigma"], "b": 1.001 * TRUTH["sigma"]})
-    posterior = problem(SHORT, priors=KNOWN | {"gain": FLAT_GAIN, "sigma": narrow}).posterior
+    known = KNOWN | {"gain": FLAT_GAIN, "sigma": TRUTH["sigma"]}
+    posterior = problem(SHORT, priors=known).posterior
     landscape = Landscape(posterior)
     peak = landscape.climb(np.array([TRUTH[name] for name in posterior.table.names]))
     made = profile_of(landscape, "gain", peak)
@@ -256,7 +256,17 @@ def test_every_level_is_nested_in_the_next():
     ends = list(made.intervals.values())
     for (a, b), (c, d) in pairwise(ends):
         assert c < a < b < d
-    assert fall_at(0.95) == pytest.approx(3.841459, abs=1e-6)
+
+
+def test_levels_are_exact_for_a_mean_with_unknown_scale_and_tend_to_chi_squared():
+    rng, n, inside = np.random.default_rng(8), 6, 0
+    freedom = Freedom(n, 1, scale_known=False)
+    for sample in rng.standard_normal((4000, n)):
+        fall = n * np.log(np.mean(sample**2) / sample.var())
+        inside += fall <= freedom.fall_at(0.9)
+    assert abs(inside / 4000 - 0.9) < 4 * np.sqrt(0.09 / 4000)
+    assert Freedom(n, 1, scale_known=True).fall_at(0.95) == pytest.approx(3.841459, abs=1e-6)
+    assert Freedom(10**7, 1, scale_known=False).fall_at(0.95) == pytest.approx(3.841459, abs=1e-5)
 
 
 # -- verdicts --------------------------------------------------------------------------------------

@@ -8,18 +8,46 @@ from functools import cached_property
 from typing import Any, final
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import chi2, t
 
 from lcopa_bayes.arrays import Vector
 from lcopa_bayes.estimate import LEVEL, plain
+from lcopa_bayes.inference.posterior import Posterior
 
 LEVELS = (0.68, LEVEL, 0.95)
 """Two-sided levels at which intervals are read [-]."""
 
 
-def fall_at(level: float) -> float:
-    """Fall of twice the log likelihood at the ends of a two-sided interval of one parameter [nat]."""
-    return float(chi2.ppf(level, 1))
+@final
+@dataclass(frozen=True)
+class Freedom:
+    """How many samples stand against how many fitted parameters."""
+
+    samples: int
+    fitted: int
+    """Parameters of the plant."""
+    scale_known: bool
+    """Whether the noise scale is fixed."""
+
+    @classmethod
+    def of(cls, posterior: Posterior) -> Freedom:
+        """Of a posterior's likelihood; samples of all axes count as one."""
+        free = [row.kind for row in posterior.table.rows if row.free]
+        plant = sum(kind not in ("sigma", "rho", "nu") for kind in free)
+        return cls(posterior.size, plant, "sigma" not in free)
+
+    def fall_at(self, level: float) -> float:
+        """Fall of twice the log likelihood at the ends of a two-sided interval of one parameter [nat].
+
+        With n samples, nu = n - fitted and Student's t, ``n log(1 + t_nu^2 / nu)``: exact for responses
+        linear in the parameters and white noise of one unknown scale, where the likelihood ratio is a
+        function of Student's t. The quantile of chi^2 is its limit for many samples; with 20 samples and 5
+        parameters an interval of 90 % that is read at the quantile holds the truth in 83 %.
+        """
+        left = self.samples - self.fitted
+        if self.scale_known or left < 1:
+            return float(chi2.ppf(level, 1))
+        return self.samples * float(np.log1p(t.ppf((1 + level) / 2, left) ** 2 / left))
 
 
 @final
@@ -27,9 +55,9 @@ def fall_at(level: float) -> float:
 class Profile:
     """Largest likelihood at each value of one parameter.
 
-    Confidence intervals hold where ``2 (max L - L)`` is below the quantile of chi^2 with one degree of
-    freedom (Venzon and Moolgavkar 1988, Applied Statistics 37); a side is open when the fall does not
-    reach it before the end of the search (Raue et al. 2009, Bioinformatics 25).
+    Confidence intervals hold where ``2 (max L - L)`` is below `Freedom.fall_at` (Venzon and Moolgavkar 1988,
+    Applied Statistics 37); a side is open when the fall does not reach it before the end of the search (Raue
+    et al. 2009, Bioinformatics 25).
     """
 
     parameter: str
@@ -50,6 +78,7 @@ class Profile:
     """Other parameters that move within that interval to make up for this one, farthest first."""
     top: Vector
     """Table values of the highest point, (rows,)."""
+    freedom: Freedom
 
     @property
     def fall(self) -> Vector:
@@ -63,7 +92,8 @@ class Profile:
 
     def _end(self, level: float, side: int) -> float | None:
         """Outermost crossing on a side, linear in the root of the fall; None when there is none."""
-        u, root, wanted = self.coordinates[::side], np.sqrt(self.fall)[::side], np.sqrt(fall_at(level))
+        u, root = self.coordinates[::side], np.sqrt(self.fall)[::side]
+        wanted = np.sqrt(self.freedom.fall_at(level))
         inside = np.flatnonzero(root <= wanted)
         last = int(inside[-1])
         if last == u.size - 1:
@@ -81,7 +111,7 @@ class Profile:
     @property
     def parts(self) -> int:
         """Number of separate stretches of the interval at `LEVEL`."""
-        inside = self.fall <= fall_at(LEVEL)
+        inside = self.fall <= self.freedom.fall_at(LEVEL)
         return int(inside[0]) + int(np.sum(inside[1:] & ~inside[:-1]))
 
     def as_json(self) -> dict[str, Any]:

@@ -8,10 +8,10 @@ import numpy as np
 
 from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.audit.landscape import Landscape, Peak
-from lcopa_bayes.audit.profile import LEVELS, Profile, fall_at
+from lcopa_bayes.audit.profile import LEVELS, Freedom, Profile
 
-_BEYOND = 5.0
-"""Fall of twice the log likelihood at which a walk ends [nat]: past the largest level."""
+_BEYOND = 1.3
+"""Fall at which a walk ends, relative to that of the largest level [-]."""
 _STRIDE = 0.4
 """Wanted change of the root of the fall per step [-]."""
 _MOST_POINTS = 30
@@ -47,6 +47,8 @@ class _Walk:
     def __init__(self, landscape: Landscape, k: int, peak: Peak, witnesses: Matrix) -> None:
         self.landscape, self.k, self.peak = landscape, k, peak
         self.low, self.high = landscape.search(k)
+        self.freedom = Freedom.of(landscape.posterior)
+        self.beyond = _BEYOND * self.freedom.fall_at(max(LEVELS))
         at = min(max(landscape.coordinate(k, peak.values[k]), self.low), self.high)
         self.points: dict[float, Peak] = {at: peak}
         self.start = at
@@ -92,7 +94,7 @@ class _Walk:
         step = min(max(step, 1e-9 * width), _LONGEST * width)
         before: tuple[float, Peak] | None = None
         for _ in range(_MOST_POINTS):
-            if u == end or self.fall(here) > _BEYOND:
+            if u == end or self.fall(here) > self.beyond:
                 return
             ahead = u + side * step
             if side * (end - ahead) < 0.2 * step:
@@ -114,8 +116,9 @@ class _Walk:
             at = sorted(self.points)
             for a, b in pairwise(at):
                 falls = [self.fall(self.points[u]) for u in (a, b)]
-                steep = abs(np.sqrt(falls[0]) - np.sqrt(falls[1])) > 1.5 * _STRIDE and min(falls) < _BEYOND
-                far = b - a > _GAP * (self.high - self.low) and max(falls) < _BEYOND
+                step = abs(np.sqrt(falls[0]) - np.sqrt(falls[1]))
+                steep = step > 1.5 * _STRIDE and min(falls) < self.beyond
+                far = b - a > _GAP * (self.high - self.low) and max(falls) < self.beyond
                 if (steep or far) and b - a > 1e-6 * (self.high - self.low):
                     middle = 0.5 * (a + b)
                     tried = [self.solve(middle, self.points[u].values) for u in (a, b)]
@@ -139,7 +142,7 @@ class _Walk:
         """Another hill beyond the end of the walk, where draws say there is one."""
         last = max(self.points) if side > 0 else min(self.points)
         best = max(point.log_likelihood for point in self.points.values())
-        far = (side * (self.where - last) > 0) & (2 * (best - self.likely) < 4 * _BEYOND)
+        far = (side * (self.where - last) > 0) & (2 * (best - self.likely) < 4 * self.beyond)
         far &= (self.where > self.low) & (self.where < self.high)
         ranked = np.flatnonzero(far)[np.argsort(-self.likely[far])][:_FAR]
         extreme = np.flatnonzero(far)[np.argsort(-side * self.where[far])][:1]
@@ -149,7 +152,7 @@ class _Walk:
                 continue
             found = self.solve(u, self.witnesses[index])
             self.points[u] = found
-            if self.fall(found) < _BEYOND:
+            if self.fall(found) < self.beyond:
                 step = abs(u - last) / 4
                 self.walk(u, -side, step) if abs(u - last) > 0 else None
                 self.walk(u, side, step)
@@ -172,7 +175,8 @@ class _Walk:
         at = np.array(sorted(self.points))
         peaks = [self.points[u] for u in at]
         best = max(point.log_likelihood for point in peaks)
-        inside = [point for point in peaks if 2 * (best - point.log_likelihood) < fall_at(max(LEVELS))]
+        widest = self.freedom.fall_at(max(LEVELS))
+        inside = [point for point in peaks if 2 * (best - point.log_likelihood) < widest]
         flagged = dict.fromkeys(
             name for point in inside for name in self.landscape.at_bound(point.values, but=self.k)
         )
@@ -197,4 +201,5 @@ class _Walk:
             ends,
             tuple(moving),
             max(peaks, key=lambda point: point.log_likelihood).values,
+            self.freedom,
         )

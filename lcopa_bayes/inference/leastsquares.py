@@ -96,7 +96,7 @@ class LeastSquares:
         """
         posterior, table = self.posterior, self.posterior.table
         raw = self.values(x, template)
-        values, source = table.sorted_with_source(raw[None])
+        values, source = table.sorted_with_source(raw[None], every=True)
         jacobian = np.zeros((posterior.size, len(table.rows)))
         parts, start = [], 0
         slopes = posterior.model.unit_slopes(table.dynamics(values))

@@ -106,12 +106,15 @@ class ParameterTable:
         """The same plants with the terms of exchangeable elements by decreasing order."""
         return self.sorted_with_source(values)[0] if any(self.exchangeable) else values
 
-    def sorted_with_source(self, values: Matrix) -> tuple[Matrix, Index]:
-        """Canonical values and where each given one went: ``canonical[b, source[b, k]] = values[b, k]``."""
+    def sorted_with_source(self, values: Matrix, *, every: bool = False) -> tuple[Matrix, Index]:
+        """Canonical values and where each given one went: ``canonical[b, source[b, k]] = values[b, k]``.
+
+        With `every`, also where priors tell the terms apart; to the plant terms are always exchangeable.
+        """
         out = values.copy()
         source = np.tile(np.arange(len(self.rows)), (values.shape[0], 1))
         for (times, orders), exchangeable in zip(self._columns, self.exchangeable, strict=True):
-            if not exchangeable:
+            if not (exchangeable or every):
                 continue
             rank = np.argsort(-values[:, orders], axis=1, kind="stable")
             back = np.argsort(rank, axis=1)
