@@ -103,7 +103,20 @@ def test_ratios_are_those_of_rates_and_verdicts_follow(report):
     assert second["ratio_told"] == pytest.approx(25.0 / 40.0)
     assert second["reached"] is False
     assert stuck["ratio_shown"] == pytest.approx(ours["ess_shown_per_s"] * 8.0 / stuck["ess_shown"])
-    assert stuck["reached"] is True
+    assert stuck["ratio_told"] == pytest.approx(25.0 / (30.0 / 8.0))
+    assert stuck["reached"] is False  # by one account only
+
+
+def test_reached_by_both_accounts_counts():
+    found = {
+        "ours": pieces([-0.1, 0.1], told=50.0, cpu=2.0),
+        "second": pieces([-0.2, 0.2], told=40.0, cpu=1.0),
+        "slow": pieces([1.0, 1.0], told=1.0, cpu=8.0),
+    }
+    *_, slow = comparison.compared(["a", "b"], found, {"ours": 4, "second": 1, "slow": 1})["methods"]
+    assert slow["ratio_told"] == pytest.approx(200.0)
+    assert slow["ratio_shown"] > 20
+    assert slow["reached"] is True
 
 
 def test_the_table_has_a_row_per_method_and_says_what_stopped(report):
@@ -111,6 +124,6 @@ def test_the_table_has_a_row_per_method_and_says_what_stopped(report):
     assert len({row.count("|") for row in (head, line, ours, second, stuck)}) == 1
     assert "stopped" in stuck
     assert "stopped" not in ours + second
-    assert "second: 2 (not reached)" in wanted
+    assert "second: told 0.625, shown 2 (not reached)" in wanted
     assert "0.0 standard errors" in apart
-    assert f"stuck: {report['methods'][2]['ratio_shown']:.3g} (reached)" in wanted
+    assert f"stuck: told 6.67, shown {report['methods'][2]['ratio_shown']:.3g} (not reached)" in wanted
