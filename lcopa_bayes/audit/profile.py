@@ -108,6 +108,12 @@ class Profile:
         lower, upper = self.intervals[LEVEL]
         return tuple(side for side, end in (("below", lower), ("above", upper)) if end is None)
 
+    def said_end(self, side: int) -> str:
+        """An end of the search as a reader wrote it: the edge that is kept from it, 1e-6, is left out."""
+        linear = bool(np.all(self.coordinates == self.values))
+        at = self.ends[side]
+        return f"{0.0 if linear and abs(at) < 1e-5 * np.ptp(self.ends) else at:.4g}"
+
     @property
     def parts(self) -> int:
         """Number of separate stretches of the interval at `LEVEL`."""

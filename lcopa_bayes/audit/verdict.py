@@ -98,20 +98,18 @@ def _decided(profile: Profile, belief: Belief, structure: Structure, flat_prior:
     level, low, high = f"{100 * LEVEL:g} %", *profile.intervals[LEVEL]
     moving = f" while {', '.join(profile.moving[:3])} make up for it" if profile.moving else ""
     if low is None and high is None:
-        a, b = profile.ends
+        a, b = profile.said_end(0), profile.said_end(1)
         most = float(profile.fall.max())
-        said = (
-            f"between {a:.3g} and {b:.3g}{unit} twice the log likelihood falls by at most {most:.2g}{moving}"
-        )
+        said = f"between {a} and {b}{unit} twice the log likelihood falls by at most {most:.2g}{moving}"
         if flat_prior:
             return "practically unidentifiable", f"the data bound it on neither side: {said}"
         return "prior-dominated", f"only its prior bounds it: {said}"
     if low is None or high is None:
         side, end = ("above", high) if low is None else ("below", low)
-        other, limit = ("below", profile.ends[0]) if low is None else ("above", profile.ends[1])
+        other, limit = ("below", profile.said_end(0)) if low is None else ("above", profile.said_end(1))
         return "one-sided", (
             f"bounded {side} by {end:.3g}{unit} ({level}), but {other} the data allow everything to the "
-            f"end of the search at {limit:.3g}{unit}{moving}"
+            f"end of the search at {limit}{unit}{moving}"
         )
     share = belief.contraction
     within = f"{low:.4g} to {high:.4g}{unit} ({level})"

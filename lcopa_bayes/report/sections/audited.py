@@ -17,8 +17,7 @@ def sections(told: Mapping[str, Any]) -> list[Section]:
 def _verdicts(told: Mapping[str, Any]) -> Section:
     columns = (
         *(Column("name", "code"), Column("unit"), Column("verdict"), Column("profile, 90 %", "interval")),
-        *(Column("contraction", "number"), Column("relative sd", "number"), Column("why", "prose")),
-        Column("partners", "prose"),
+        *(Column("contraction", "number"), Column("relative sd", "number")),
     )
     rows = []
     for row in told["parameters"]:
@@ -27,14 +26,21 @@ def _verdicts(told: Mapping[str, Any]) -> Section:
         rows.append(
             (
                 *(str(row["name"]), str(row["unit"]), str(row["verdict"]), interval(lower, upper, spread)),
-                *(figures(row["contraction"], 2), figures(row["relative_sd"], 2), str(row["reason"])),
-                ", ".join(row["partners"]) or NONE,
+                *(figures(row["contraction"], 2), figures(row["relative_sd"], 2)),
             )
         )
     caption = (
         "The profile interval is that of the likelihood alone, within the support of the priors. Contraction "
         "is 1 - posterior over prior variance on the sampled scale; relative sd is the Cramer-Rao bound "
         "at the maximum, a dash where the Fisher matrix is singular or the parameter belongs to the noise."
+    )
+    why = Table(
+        (Column("name", "code"), Column("why", "prose"), Column("partners", "prose")),
+        tuple(
+            (str(row["name"]), str(row["reason"]), ", ".join(row["partners"]) or NONE)
+            for row in told["parameters"]
+        ),
+        "Partners are parameters that can make up for this one, the most exact first.",
     )
     against = tuple(
         (str(row["name"]), str(row["verdict"]), "; ".join(row["disagreements"]))
@@ -46,7 +52,7 @@ def _verdicts(told: Mapping[str, Any]) -> Section:
         against,
         "Where the four methods disagree; a verdict follows the symmetries and the profile.",
     )
-    tables = (Table(columns, tuple(rows), caption), *((contrary,) if against else ()))
+    tables = (Table(columns, tuple(rows), caption), why, *((contrary,) if against else ()))
     return Section("Verdicts", (), (), tables)
 
 
