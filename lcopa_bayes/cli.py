@@ -81,7 +81,11 @@ def _parser() -> argparse.ArgumentParser:
     claims = add("claims", verbs.claims, [], "the paper's claims, each with a computed verdict")
     claims.add_argument("--out", type=Path, default=Path("reports/claims"), help="folder for the page")
     claims.add_argument(
-        "--audit", type=Path, metavar="RUNFOLDER", help="run folder of an audit, to decide I1-I6"
+        "--audit",
+        type=Path,
+        nargs="+",
+        metavar="RUNFOLDER",
+        help="run folders of audits, to decide I1-I6 (default: those of the bundled studies)",
     )
     report = add("report", verbs.report, [], "render the report of a run folder again")
     report.add_argument("folder", type=Path, help="run folder")

@@ -37,6 +37,9 @@ from lcopa_bayes.runfolder import save_fit, save_json, save_table
 from lcopa_bayes.study import Study
 from lcopa_bayes.studyfile import load_study
 
+BUNDLED = ("paper-step-x", "paper-step")
+"""Studies of records like the paper's, whose run folders hold evidence on its claims."""
+
 
 @final
 @dataclass(frozen=True)
@@ -187,8 +190,7 @@ def identify_study(options: argparse.Namespace, command: list[str]) -> Told:
 
 def claims(options: argparse.Namespace, command: list[str]) -> Told:
     """Every claim of the paper with its computed verdict."""
-    at_hand = Evidence(audit=load_audit(options.audit)) if options.audit else None
-    judged = judge(evidence=at_hand)
+    judged = judge(evidence=Evidence(tuple(map(load_audit, _run_folders(options.audit, "audit.json")))))
     folder = writable_folder(options.out)
     values = {"claims": [each.as_json() for each in judged]}
     save_json(values, folder / "results.json")
@@ -197,6 +199,12 @@ def claims(options: argparse.Namespace, command: list[str]) -> Told:
         number = "-" if each.verdict.number is None else f"{each.verdict.number:.4g}"
         words.append(f"{each.claim.id:6}{each.verdict.kind.value:14}{number:>12}  {each.verdict.unit}")
     return _with_report(values, write_claims(folder, judged), *words)
+
+
+def _run_folders(given: Sequence[Path] | None, name: str) -> Sequence[Path]:
+    """Run folders that were given; else those of the bundled studies where such a file is."""
+    bundled = (Path("reports") / study for study in BUNDLED)
+    return given if given is not None else [folder for folder in bundled if (folder / name).is_file()]
 
 
 def _with_report(values: dict[str, Any], path: Path, *words: str) -> Told:

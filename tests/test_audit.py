@@ -17,7 +17,7 @@ from lcopa_bayes.audit.landscape import Landscape, Peak
 from lcopa_bayes.audit.local import curvature
 from lcopa_bayes.audit.printedform import printed_form, printed_structure
 from lcopa_bayes.audit.profile import Freedom, Profile
-from lcopa_bayes.audit.profilewalk import profile
+from lcopa_bayes.audit.profilewalk import _Walk, profile
 from lcopa_bayes.audit.radial import radial
 from lcopa_bayes.audit.sensitivities import sensitivities
 from lcopa_bayes.audit.structure import Structure, structure
@@ -219,6 +219,19 @@ def test_profile_of_a_gain_alone_is_the_parabola():
         assert_allclose([low, high], [centre - half, centre + half], atol=0.02 * half)
     assert made.parts == 1
     assert made.open_sides == ()
+
+
+def test_a_walk_goes_on_from_an_end_that_turns_out_to_be_inside():
+    known = KNOWN | {"gain": FLAT_GAIN, "sigma": TRUTH["sigma"], "offset": TRUTH["offset"]}
+    landscape = Landscape(problem(SHORT, priors=known).posterior)
+    peak = landscape.climb(np.array([TRUTH[name] for name in landscape.posterior.table.names]))
+    k = landscape.posterior.table.names.index("gain")
+    walk = _Walk(landscape, k, peak, np.empty((0, peak.values.size)))
+    for u in (peak.values[k] - 1e-4, peak.values[k] + 1e-4):
+        walk.points[u] = walk.solve(u, peak.values)
+    walk.carry_on()
+    outermost = [walk.fall(walk.points[end]) for end in (min(walk.points), max(walk.points))]
+    assert min(outermost) > walk.beyond
 
 
 def test_profile_of_a_noise_scale_is_its_closed_form():

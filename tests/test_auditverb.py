@@ -123,6 +123,7 @@ def told(**changes: object) -> dict:
     }
     whole = {
         "study": "s",
+        "grade": "reliable",
         "parameters": [row],
         "printed_form": form,
         "spectrum": [{"prior_knows_more": False, "direction": {"gain": 1.0}}],
@@ -146,11 +147,29 @@ OTHERWISE = {
 @pytest.mark.parametrize("claim", OTHERWISE)
 def test_another_audit_gives_another_verdict(claim):
     def verdict(audit: dict) -> str:
-        judged = {each.claim.id: each.verdict for each in judge(evidence=Evidence(audit=audit))}
+        judged = {each.claim.id: each.verdict for each in judge(evidence=Evidence((audit,)))}
         return judged[claim].kind.value
 
     assert verdict(told()) == "supported"
     assert verdict(told(**OTHERWISE[claim])) == "contradicted"
+
+
+def test_the_first_audit_that_can_answer_decides():
+    silent = told(delays={"paths": [], "separations": [], "sentence": "one path"}, study="one path")
+    judged = {each.claim.id: each.verdict for each in judge(evidence=Evidence((silent, told())))}
+    assert judged["I6"].kind.value == "supported"
+    assert judged["I1"].how.startswith("Audit of the study one path")
+
+
+def test_audits_of_bundled_studies_are_read_where_they_are(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "reports" / "paper-step"
+    folder.mkdir(parents=True)
+    (folder / "audit.json").write_text(json.dumps(told(study="found")))
+    assert main(["claims", "--out", str(tmp_path / "page"), "--json"]) == 0
+    rows = {row["id"]: row for row in json.loads(capsys.readouterr().out)["claims"]}
+    assert rows["I6"]["verdict"] == "supported"
+    assert "found" in rows["I6"]["how"]
 
 
 # -- delays ----------------------------------------------------------------------------------------

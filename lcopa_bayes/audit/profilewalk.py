@@ -66,6 +66,8 @@ class _Walk:
             for near, far in pairwise(at):  # from either end through to the other
                 self.improve(far, self.points[near].values)
         self.from_draws()
+        self.carry_on()
+        self.refine()
         return self.made()
 
     def solve(self, u: float, start: Vector, *, most: int = 60) -> Peak:
@@ -168,6 +170,13 @@ class _Walk:
             near = np.flatnonzero((self.where >= a) & (self.where < b))
             if near.size:
                 self.improve(float(u), self.witnesses[near[np.argmax(self.likely[near])]])
+
+    def carry_on(self) -> None:
+        """Outwards again where the outermost point has been improved and is inside after all."""
+        for side, end in ((-1, self.low), (1, self.high)):
+            last, before = sorted(self.points, key=lambda u: -side * u)[:2]
+            if last != end and self.fall(self.points[last]) < self.beyond:
+                self.walk(last, side, abs(last - before) / 2)
 
     def made(self) -> Profile:
         """What the points say."""

@@ -16,7 +16,7 @@ COLLINEAR = 10.0
 """Collinearity index from which sensitivities count as coupled [-] (Brun et al. 2001)."""
 DELAY_DIGIT = 1e-3
 """Last digit of the printed delays, by which they can differ at most [ms]."""
-_NEEDS = ("study", "parameters", "printed_form", "spectrum", "local", "delays")
+_NEEDS = ("study", "grade", "parameters", "printed_form", "spectrum", "local", "delays")
 _CLAIMED = ("gain", "time", "order", "delay")
 """Kinds of parameters that the claim is about; a time stands for the viscosity."""
 
@@ -40,14 +40,17 @@ def load_audit(folder: Path) -> Mapping[str, Any]:
 
 
 def from_audit(reading: Reading, question: str) -> Test:
-    """A test that reads the audit, and says what it waits for where there is none."""
+    """A test that reads the audits in turn, and says what it waits for where there is none."""
 
     def test(stated: Stated, evidence: Evidence) -> Verdict:
-        if evidence.audit is None:
-            return needs_audit(question)(stated, evidence)
-        found = reading(stated, evidence.audit)
-        how = f"Audit of the study {evidence.audit['study']}: {found.how}"
-        return Verdict(found.kind, found.number, found.unit, how)
+        told = needs_audit(question)(stated, evidence)
+        for audit in evidence.audits:
+            found = reading(stated, audit)
+            how = f"Audit of the study {audit['study']} (draws: {audit['grade']}): {found.how}"
+            told = Verdict(found.kind, found.number, found.unit, how)
+            if told.kind is not Kind.UNDECIDED:
+                break
+        return told
 
     return test
 

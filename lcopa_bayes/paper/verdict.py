@@ -43,8 +43,8 @@ class Verdict:
 class Evidence:
     """What beyond the printed numbers a test may read: the results of other stages, absent until run."""
 
-    audit: Mapping[str, Any] | None = None
-    """Results of an identifiability audit of the paper's record."""
+    audits: tuple[Mapping[str, Any], ...] = ()
+    """Results of identifiability audits of records like the paper's; the first that can answer decides."""
     compare: Mapping[str, Any] | None = None
     """Results of a comparison of integer and fractional models."""
 
