@@ -28,6 +28,7 @@ ORDER = (
     ("bench",),
     ("fit",),
     ("audit",),
+    ("design",),
     ("results",),
     ("tables", "rival"),
     ("runfolder",),

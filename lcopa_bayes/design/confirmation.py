@@ -2,35 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 from math import isfinite
+from multiprocessing import get_context
 from typing import Any, final
 
 import numpy as np
 from scipy.stats import chi2
+from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.bench.acquisition import Bench as VirtualBench
 from lcopa_bayes.bench.acquisition import truth
-from lcopa_bayes.bench.device import Device, TransferPath
-from lcopa_bayes.design.design import Design
+from lcopa_bayes.design.design import LINEAR, Design
 from lcopa_bayes.design.information import Bench
-from lcopa_bayes.design.precision import Promise
+from lcopa_bayes.design.refit import Trial, device_of
 from lcopa_bayes.estimate import LEVEL, plain
-from lcopa_bayes.inference.assembly import Problem, problem_of
-from lcopa_bayes.inference.leastsquares import LeastSquares
-from lcopa_bayes.inference.parameters import ParameterTable
-from lcopa_bayes.record import Record
-from lcopa_bayes.settings import PriorSettings
 
-REPLICAS = 16
+REPLICAS = 12
 """Records simulated and fitted per drive."""
 _RESAMPLED = 2000
 """Bootstrap samples behind the interval of a factor."""
-_SAME = 1e-9
-"""Orders closer than this are one term [-]."""
-_AT_BOUND = 1e-3
-"""Closer to an end of the search than this, on its coordinate, an estimate leans on it."""
 
 
 @final
@@ -44,7 +38,7 @@ class Achieved:
     (records, parameters) [-]."""
     expected: Vector
     """Cramer-Rao standard deviations at the truth, likewise relative, (parameters,) [-]."""
-    at_bound: Matrix
+    at_bound: Array
     """Whether an estimate leans on the end of its search, (records, parameters) [-]."""
 
     @property
@@ -58,6 +52,8 @@ class Achieved:
 class Confirmation:
     """Expected against achieved precision of the winner and the plain step at one draw of the posterior."""
 
+    where: str
+    """Which draw, in words."""
     names: tuple[str, ...]
     among: Flags
     """Parameters that the worst is sought among, (parameters,)."""
@@ -87,11 +83,14 @@ class Confirmation:
         """What the simulation says."""
         count = self.winner.errors.shape[0]
         told = (
-            f"{count} simulated records and fits each: the worst achieved standard deviation is {self.factor:.3g} "
-            f"times ({100 * LEVEL:g} %: {self.lower:.3g} to {self.upper:.3g}) smaller than after the plain step"
+            f"{self.where}, {count} simulated records and fits each: the worst standard deviation achieved "
+            f"is {self.factor:.3g} times ({100 * LEVEL:g} %: {self.lower:.3g} to {self.upper:.3g}) smaller "
+            "than after the plain step"
         )
-        promised = f"{self.expected:.3g} promised there" if isfinite(self.expected) else "the step promises none"
-        held = int((self.step.at_bound[:, self.among] > 0).any(axis=1).sum())
+        promised = (
+            f"{self.expected:.3g} promised there" if isfinite(self.expected) else "the step promises none"
+        )
+        held = int(self.step.at_bound[:, self.among].any(axis=1).sum())
         bound = (
             f"; {held} of {count} fits after the step lean on the end of a prior, so that its scatter is "
             "smaller than the data alone would leave it"
@@ -104,6 +103,7 @@ class Confirmation:
             {
                 "confirmed": self.confirmed,
                 "sentence": self.sentence,
+                "where": self.where,
                 "replicas": self.winner.errors.shape[0],
                 "factor": {
                     "value": self.factor,
@@ -144,31 +144,93 @@ def _row(achieved: Achieved, k: int) -> dict[str, Any]:
     }
 
 
-def confirm(made: Design, *, replicas: int = REPLICAS) -> Confirmation | None:
-    """Simulate and fit records of the winner and of the plain step; None when there is nothing to compare.
+def confirm(made: Design, *, replicas: int = REPLICAS, jobs: int = 1) -> tuple[Confirmation, ...]:
+    """Simulate and fit records of the winner and of the plain step; nothing when these are the same drive.
 
-    The truth is the draw at which the winner's worst parameter is as precise as at the median draw. Fits are
+    Truths are two draws of the posterior: the one with the middle factor among those where the winner's
+    bounds are small enough to be believed, and the one whose worst bound is the median of all. Fits are
     output-error least squares with the study's priors as support, started at the truth and at another draw
-    of the posterior, the better one kept. `repeats` of the design are not simulated: both sides have one.
+    of the posterior, the better one kept. One record per fit, whatever the `repeats` of the design.
     """
     if not made.determined.any() or made.winner is made.step:
-        return None
-    worst = made.winner.relative[:, made.determined].max(axis=1)
-    both = np.where(np.isfinite(worst), worst, np.inf)
-    target = made.winner.worst(made.determined)
-    chosen = int(np.argmin(np.abs(np.log(both / target))))
-    values = made.draws[chosen]
-    other = made.draws[(chosen + made.draws.shape[0] // 2) % made.draws.shape[0]]
-    rng = np.random.default_rng([made.fit.run.plan.seed, 9])
-    winner, step = (
-        _achieved(made, promise, chosen, values, other, replicas, rng) for promise in (made.winner, made.step)
+        return ()
+    worst, factors = made.winner.worst(made.determined), made.factors(made.winner)
+    finite = np.flatnonzero(np.isfinite(worst))
+    small = finite[worst[finite] <= LINEAR]
+    places: dict[int, str] = {}
+    if small.size:
+        ranked = small[np.argsort(factors[small])]
+        places[int(ranked[(small.size - 1) // 2])] = "where linear bounds can be believed"
+    ranked = finite[np.argsort(worst[finite])]
+    places.setdefault(int(ranked[(finite.size - 1) // 2]), "at the draw of median precision")
+    return tuple(_confirmed(made, k, told, replicas, jobs) for k, told in places.items())
+
+
+def confirmed(made: Design, *, jobs: int = 1) -> dict[str, Any]:
+    """`confirm` as plain values under the key `confirmed`, the trial where bounds can be believed first."""
+    trials = confirm(made, jobs=jobs)
+    sentence = (
+        "; ".join(one.sentence for one in trials) or "nothing to confirm: no drive beats the plain step"
     )
+    return {
+        "confirmed": {
+            "confirmed": bool(trials) and all(one.confirmed for one in trials),
+            "factor": trials[0].as_json()["factor"] if trials else None,
+            "sentence": sentence,
+            "trials": [one.as_json() for one in trials],
+        }
+    }
+
+
+def _confirmed(made: Design, chosen: int, where: str, replicas: int, jobs: int) -> Confirmation:
+    """Both drives at one truth; a replica has the same noise whatever the number of processes."""
+    other = (chosen + made.draws.shape[0] // 2) % made.draws.shape[0]
+    problem, period, starts = made.fit.problem, made.limits.period, made.draws[[chosen, other]]
+    device = device_of(problem, made.draws[chosen])
+    camera = VirtualBench(camera=period, exposure=problem.study.model.exposure)
+    tasks = []
+    for which, each in enumerate((made.winner, made.step)):
+        clean = truth(device, camera, each.candidate.command, duration=each.time, name="simulated")
+        bench = Bench(problem, each.time, period)
+        tasks += [
+            Trial(bench, clean, starts, made.names, (problem.study.seed, 9, chosen, which, k))
+            for k in range(replicas)
+        ]
+    found = list(_performed(tasks, min(jobs, replicas)))
+    winner, step = (
+        Achieved(
+            promise.candidate.name,
+            np.array([errors for errors, _ in part]),
+            np.sqrt(np.diagonal(promise.covariance[chosen])) * np.sqrt(made.repeats),
+            np.array([bound for _, bound in part]),
+        )
+        for promise, part in ((made.winner, found[:replicas]), (made.step, found[replicas:]))
+    )
+    rng = np.random.default_rng([made.fit.run.plan.seed, 10])
     factor, low, high = _factor(winner.errors, step.errors, made.determined, rng)
     columns = [made.fit.draws.table.names.index(name) for name in made.names]
-    return Confirmation(made.names, made.determined, values[columns], winner, step, factor, low, high)
+    at = made.draws[chosen, columns]
+    return Confirmation(where, made.names, made.determined, at, winner, step, factor, low, high)
 
 
-def _factor(winner: Matrix, step: Matrix, among: Flags, rng: np.random.Generator) -> tuple[float, float, float]:
+def _performed(tasks: list[Trial], jobs: int) -> Iterable[tuple[Vector, Flags]]:
+    if jobs <= 1:
+        with threadpool_limits(1):
+            yield from (task() for task in tasks)
+        return
+    with ProcessPoolExecutor(
+        jobs, mp_context=get_context("spawn"), initializer=threadpool_limits, initargs=(1,)
+    ) as pool:
+        yield from pool.map(_perform, tasks)
+
+
+def _perform(task: Trial) -> tuple[Vector, Flags]:
+    return task()
+
+
+def _factor(
+    winner: Matrix, step: Matrix, among: Flags, rng: np.random.Generator
+) -> tuple[float, float, float]:
     """Ratio of the worst standard deviations with its bootstrap interval."""
 
     def worst(errors: Array) -> Array:
@@ -180,139 +242,3 @@ def _factor(winner: Matrix, step: Matrix, among: Flags, rng: np.random.Generator
     ]
     low, high = np.quantile(drawn[0] / drawn[1], (0.5 - LEVEL / 2, 0.5 + LEVEL / 2))
     return float(worst(step) / worst(winner)), float(low), float(high)
-
-
-def _achieved(
-    made: Design,
-    promise: Promise,
-    draw: int,
-    values: Vector,
-    other: Vector,
-    replicas: int,
-    rng: np.random.Generator,
-) -> Achieved:
-    """Errors of `replicas` fits after one drive."""
-    study, period = made.fit.study, made.limits.period
-    device = device_of(made.fit.problem, values)
-    bench = VirtualBench(camera=period, exposure=study.model.exposure)
-    command = promise.candidate.command
-    clean = truth(device, bench, command, duration=promise.time, name="simulated")
-    blocks = Bench(made.fit.problem, promise.time, period).blocks
-    expected = np.sqrt(np.diagonal(promise.covariance[draw])) * np.sqrt(made.repeats)
-    errors, bound = [], []
-    for _ in range(replicas):
-        problem = _refit(made, _noisy(made, clean, values, rng), blocks)
-        found = _solve(problem, [_moved(made, problem, v) for v in (values, other)])
-        errors.append(_errors(made, problem, found, values))
-        bound.append(_leaning(made, problem, found))
-    return Achieved(promise.candidate.name, np.array(errors), expected, np.array(bound))
-
-
-def device_of(problem: Problem, values: Vector) -> Device:
-    """The plant of table values as a device of the virtual bench; terms of equal orders are added up."""
-    table, study = problem.posterior.table, problem.study
-    gains = table.gains(values[None])[0]
-    rows = []
-    for i in range(len(table.layout.responses)):
-        row = []
-        for j in range(len(table.layout.drives)):
-            e, d = table.layout.element_of[i][j], table.layout.delay_of[i][j]
-            row.append(_path(table, values, float(gains[i, j]), e, float(values[table.at("delay", d)])))
-        rows.append(tuple(row))
-    offsets = [float(table.offset(values[None], i, 0)[0]) for i in range(len(table.layout.responses))]
-    return Device(tuple(rows), study.drive_axes, study.response_axes, tuple(offsets), study.time_unit)
-
-
-def _path(table: ParameterTable, values: Vector, gain: float, element: int, delay: float) -> TransferPath:
-    etas: list[float] = []
-    orders: list[float] = []
-    for term in range(table.layout.elements[element].terms):
-        order = float(values[table.at("order", element, term)])
-        eta = float(values[table.at("time", element, term)]) ** order
-        if orders and orders[-1] - order < _SAME:
-            etas[-1] += eta
-        else:
-            etas.append(eta)
-            orders.append(order)
-    return TransferPath(gain, delay, tuple(etas), tuple(orders), 1.0)
-
-
-def _noisy(made: Design, clean: Record, values: Vector, rng: np.random.Generator) -> Record:
-    """The record with the study's noise at these values."""
-    posterior, response = made.fit.problem.posterior, clean.response.copy()
-    sampled = ~np.isnan(response[:, 0])
-    gaps = np.ones(int(sampled.sum()))
-    for axis in range(response.shape[1]):
-        parameters = posterior.noise_parameters(values[None], axis)
-        response[sampled, axis] += posterior.noise.draw(parameters, gaps, rng)[0]
-    axes = (clean.drive_axes, clean.response_axes)
-    return Record(clean.name, clean.time, clean.drive, response, *axes, clean.time_unit)
-
-
-def _refit(made: Design, record: Record, blocks: int) -> Problem:
-    """The study with the new record in place of its own, and its own priors."""
-    study, table = made.fit.study, made.fit.draws.table
-    priors = {}
-    for row in table.rows:
-        if row.kind != "offset":
-            prior = row.prior
-            priors[row.name] = (
-                PriorSettings(row.name, fixed=row.value)
-                if prior is None
-                else PriorSettings(row.name, dist=prior.dist, parameters=prior.parameters)
-            )
-    model = replace(study.model, blocks=blocks, orders="free", terms=_terms(table))
-    return problem_of(replace(study, fit=(record,), held_out=(), model=model, priors=priors))
-
-
-def _terms(table: ParameterTable) -> int | dict[str, int]:
-    elements = table.layout.elements
-    return elements[0].terms if len(elements) == 1 else {slot.name: slot.terms for slot in elements}
-
-
-def _moved(made: Design, problem: Problem, values: Vector) -> Vector:
-    """Table values of the refitted study from those of the study; offsets from its first record."""
-    old, new = made.fit.draws.table, problem.posterior.table
-    out = np.empty(len(new.rows))
-    for k, row in enumerate(new.rows):
-        if row.kind == "offset":
-            out[k] = old.offset(values[None], row.place.first, 0)[0] if row.free else row.value
-        else:
-            out[k] = values[old.names.index(row.name)]
-    return out
-
-
-def _solve(problem: Problem, starts: list[Vector]) -> Vector:
-    """The best of the local solutions, all at the noise of the first start."""
-    least = LeastSquares(problem.posterior)
-    noise = [k for k, row in enumerate(problem.posterior.table.rows) if row.kind in ("sigma", "rho", "nu")]
-    found = []
-    for start in starts:
-        at = start.copy()
-        at[noise] = starts[0][noise]
-        solved, _ = least.solve(at)
-        residual, _ = least.residual(least.coordinates(solved), solved)
-        found.append((float(residual @ residual), solved))
-    return min(found, key=lambda each: each[0])[1]
-
-
-def _errors(made: Design, problem: Problem, found: Vector, values: Vector) -> Vector:
-    table, old = problem.posterior.table, made.fit.draws.table
-    out = []
-    for name in made.names:
-        estimate, true = found[table.names.index(name)], values[old.names.index(name)]
-        if old.rows[old.names.index(name)].kind == "time":
-            out.append(np.log(estimate / true))
-        else:
-            out.append((estimate - true) / abs(true))
-    return np.array(out)
-
-
-def _leaning(made: Design, problem: Problem, found: Vector) -> Vector:
-    """Whether each parameter stands at an end of its search, (parameters,)."""
-    least, table = LeastSquares(problem.posterior), problem.posterior.table
-    low, high = least.bounds
-    at = least.coordinates(found)
-    close = np.minimum(at - low, high - at) < _AT_BOUND
-    leaning = {table.names[k]: bool(one) for k, one in zip(least.columns, close, strict=True)}
-    return np.array([leaning[name] for name in made.names])

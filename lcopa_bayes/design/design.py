@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
@@ -15,15 +15,18 @@ from lcopa_bayes.audit.structure import Structure, structure
 from lcopa_bayes.design.candidates import PLAIN, candidates
 from lcopa_bayes.design.information import Bench
 from lcopa_bayes.design.limits import Limits, bench_times, limits_of
-from lcopa_bayes.design.precision import Promise, promises, reached, within
-from lcopa_bayes.estimate import Estimate, plain
+from lcopa_bayes.design.precision import Promise, median, promises, ratios, reached, within
+from lcopa_bayes.estimate import Estimate
 from lcopa_bayes.fit import Fit
+from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.problems import InputError
 
 DRAWS = 24
 """Draws of the posterior that are averaged over."""
 WANTED = 0.1
 """Relative standard deviation that bench times are sought for [-]."""
+LINEAR = 0.5
+"""Relative standard deviation up to which a linear bound is believed [-]."""
 _PRIOR_POINTS = 12
 """Draws of the prior at which symmetries are looked for, besides those of the posterior."""
 
@@ -63,10 +66,20 @@ class Design:
         blind = np.array([name in self.structure.blind for name in self.names])
         return np.asarray(np.isfinite(best) & ~blind)
 
+    def factors(self, promise: Promise) -> Vector:
+        """How many times smaller the worst relative standard deviation is than after the plain step of equal
+        time, at every draw, (draws,) [-]; infinite where only the step leaves a parameter open."""
+        return ratios(self.step.worst(self.determined), promise.worst(self.determined))
+
     @cached_property
     def winner(self) -> Promise:
-        """Best for the worst parameter; the better on the whole where drives are equal in that."""
-        return min(self.here, key=lambda one: (one.worst(self.determined), one.typical(self.determined)))
+        """Best for the worst parameter, against the plain step at the median draw; of equals the better on
+        the whole. Draws are compared one by one because bounds differ by decades between them."""
+
+        def key(one: Promise) -> tuple[float, float]:
+            return -float(median(self.factors(one)[:, None])[0]), one.typical(self.determined)
+
+        return min(self.here, key=key)
 
     @cached_property
     def overall(self) -> Promise:
@@ -75,21 +88,30 @@ class Design:
 
     @property
     def worst(self) -> str:
-        """The parameter the winner knows least."""
-        spread = np.where(self.determined, self.winner.expected, -np.inf)
-        return self.names[int(np.argmax(spread))]
+        """The parameter the winner knows least at most draws."""
+        places = np.argmax(np.where(self.determined, self.winner.relative, -np.inf), axis=1)
+        return self.names[int(np.bincount(places).argmax())]
 
     @property
-    def factor(self) -> float:
-        """Worst expected standard deviation after the plain step over that after the winner [-]; infinite
-        when the step leaves a parameter open."""
-        return self.step.worst(self.determined) / self.winner.worst(self.determined)
+    def factor(self) -> Estimate:
+        """`factors` of the winner: median and interval over the draws."""
+        return self._over_draws("factor over the plain step", self.factors(self.winner))
+
+    @property
+    def linear(self) -> float:
+        """Share of the draws at which the winner's worst bound is small enough to be believed [-]."""
+        return float(np.mean(self.winner.worst(self.determined) <= LINEAR))
+
+    def _over_draws(self, name: str, column: Vector) -> Estimate:
+        return Estimate.of(name, "-", column, ess=float(column.size), grade=self.fit.draws.grade.level)
 
     def estimate(self, promise: Promise, name: str) -> Estimate:
         """Expected relative standard deviation of a parameter, with its spread over the draws."""
-        column = promise.relative[:, self.names.index(name)]
-        grade = self.fit.draws.grade.level
-        return Estimate.of(name, "-", column, ess=float(column.size), grade=grade)
+        return self._over_draws(name, promise.relative[:, self.names.index(name)])
+
+    def worst_of(self, promise: Promise) -> Estimate:
+        """Worst relative standard deviation over the parameters, with its spread over the draws."""
+        return self._over_draws("worst", promise.worst(self.determined))
 
     def best(self, name: str, row: tuple[Promise, ...]) -> Promise:
         """Best drive for one parameter at one bench time."""
@@ -119,15 +141,40 @@ class Design:
         unit = self.fit.study.time_unit
         if not self.determined.any():
             return f"no drive tried determines any parameter within {self.time:g} {unit}"
-        told = (
-            f"{self.winner.candidate.name} for {self.time:g} {unit}: worst expected relative standard "
-            f"deviation {self.winner.worst(self.determined):.3g} ({self.worst})"
-        )
+        told = f"{self.winner.candidate.name} for {self.time:g} {unit}"
         if self.winner is self.step:
-            return f"{told}; no drive tried is better than the plain step"
-        if not np.isfinite(self.factor):
-            return f"{told}; the plain step of equal time leaves a parameter open"
-        return f"{told}, {self.factor:.3g} times smaller than after the plain step of equal time"
+            return f"{told}: no drive tried is better for the worst parameter than the plain step"
+        factor = self.factor.value
+        gained = (
+            f"{factor:.3g} times smaller than after the plain step of equal time"
+            if np.isfinite(factor)
+            else "bounded, where the plain step of equal time leaves a parameter open"
+        )
+        few = (
+            f"; linear bounds can be believed at {100 * self.linear:.0f} % of the draws, elsewhere they say "
+            "which drive is better but not how precise it will be"
+        ) * (self.linear < 1)
+        return f"{told}: the worst relative standard deviation (mostly {self.worst}) is {gained}{few}"
+
+
+def checked(
+    problem: Problem,
+    *,
+    time: float | None = None,
+    repeats: int = 1,
+    amplitude: float | None = None,
+    refresh: float | None = None,
+) -> tuple[Limits, tuple[float, ...], float]:
+    """Limits, bench times to try and the one to design for; InputError when a design cannot be made."""
+    if repeats < 1:
+        raise InputError(f"`repeats` must be one or more; got {repeats}")
+    limits = limits_of(problem, amplitude=amplitude, refresh=refresh)
+    times, chosen = bench_times(problem, limits, time)
+    if not Bench(problem, times[0], limits.period).columns:
+        raise InputError(
+            f"{problem.study.name}: no parameter of the plant is free; there is nothing to design for"
+        )
+    return limits, times, chosen
 
 
 def design(
@@ -148,13 +195,8 @@ def design(
     `limits_of` and `bench_times`, for fewer than one repeat, and when no plant parameter is free.
     """
     problem, study = fit.problem, fit.study
-    if repeats < 1:
-        raise InputError(f"`repeats` must be one or more; got {repeats}")
-    limits = limits_of(problem, amplitude=amplitude, refresh=refresh)
-    times, chosen = bench_times(problem, limits, time)
+    limits, times, chosen = checked(problem, time=time, repeats=repeats, amplitude=amplitude, refresh=refresh)
     first = Bench(problem, times[0], limits.period)
-    if not first.columns:
-        raise InputError(f"{study.name}: no parameter of the plant is free; there is nothing to design for")
     averaged = fit.draws.thinned(draws)
     landscape = Landscape(problem.posterior)
     rng = np.random.default_rng([fit.run.plan.seed, 7])
@@ -187,109 +229,3 @@ def _symmetries(bench: Bench, limits: Limits, points: Matrix) -> Structure:
     if not slopes:
         return Structure((), 0, 0, True, np.empty(0))
     return structure(bench.names, slopes, values)
-
-
-def as_json(made: Design) -> dict[str, Any]:
-    """Every number of a design; what is infinite or undefined is None and has a reason in words."""
-    study, table = made.fit.study, made.fit.draws.table
-    determined = bool(made.determined.any())
-    told: dict[str, Any] = plain(
-        {
-            "study": study.name,
-            "verdict": made.sentence,
-            "grade": made.fit.draws.grade.level,
-            "grade_reason": made.fit.draws.grade.reason,
-            "time": made.time,
-            "time_unit": study.time_unit,
-            "repeats": made.repeats,
-            "draws": made.draws.shape[0],
-            "refresh": made.limits.refresh,
-            "period": made.limits.period,
-            "range": [
-                {"axis": axis.name, "unit": axis.unit, "rest": rest, "low": low, "high": high}
-                for axis, rest, low, high in zip(
-                    study.drive_axes, made.limits.rest, made.limits.low, made.limits.high, strict=True
-                )
-            ],
-            "winner": _row(made, made.winner) if determined else None,
-            "d_optimal": made.overall.candidate.name if determined else None,
-            "factor_over_step": {
-                "value": made.factor if determined else None,
-                "unit": "-",
-                "step": made.step.worst(made.determined) if determined else None,
-                "winner": made.winner.worst(made.determined) if determined else None,
-                "parameter": made.worst if determined else None,
-            },
-            "parameters": [_parameter(made, name, table.rows[table.names.index(name)].unit) for name in made.names],
-            "table": [_row(made, one) for one in made.here],
-            "curve": _curve(made),
-            "structure": [one.as_json() for one in made.structure.symmetries],
-        }
-    )
-    return told
-
-
-def _row(made: Design, promise: Promise) -> dict[str, Any]:
-    """One drive at one bench time."""
-    among = made.determined
-    return {
-        "drive": promise.candidate.name,
-        "family": promise.candidate.family,
-        "words": promise.candidate.words if promise.excites else "excites nothing that could be seen",
-        "changes": promise.candidate.command.times.size,
-        "time": promise.time,
-        "worst": promise.worst(among) if among.any() else None,
-        "typical": promise.typical(among) if among.any() else None,
-        "relative_sd": [
-            made.estimate(promise, name).as_json() if made.determined[k] else None
-            for k, name in enumerate(made.names)
-        ],
-    }
-
-
-def _parameter(made: Design, name: str, unit: str) -> dict[str, Any]:
-    """What becomes of one parameter."""
-    at, needed, reason = made.names.index(name), made.time_needed(name), made.reason(name)
-    best = made.best(name, made.here)
-    sizes = np.abs(made.draws[:, made.fit.draws.table.names.index(name)])
-    spread: Vector = best.relative[:, at] * sizes
-    told = "not by any drive tried"
-    if needed is not None:
-        told = f"{'at most ' * needed[1]}{needed[0]:.3g} {made.fit.study.time_unit}"
-    return {
-        "name": name,
-        "unit": unit,
-        "reason": reason,
-        "best_drive": None if reason else best.candidate.name,
-        "relative_sd": None if reason else made.estimate(best, name).as_json(),
-        "sd": None
-        if reason
-        else Estimate.of(
-            name, unit, spread, ess=float(spread.size), grade=made.fit.draws.grade.level
-        ).as_json(),
-        "relative_sd_step": None if reason else made.estimate(made.step, name).as_json(),
-        "relative_sd_winner": None if reason else made.estimate(made.winner, name).as_json(),
-        "time_for_10_percent": None if needed is None else needed[0],
-        "time_is_upper_bound": needed is not None and needed[1],
-        "time_words": told,
-    }
-
-
-def _curve(made: Design) -> list[dict[str, Any]]:
-    """Per bench time, the best drive and the plain step for every parameter."""
-    out = []
-    for row in made.tried:
-        best = {name: made.best(name, row) for name in made.names if name not in made.structure.blind}
-        out.append(
-            {
-                "time": row[0].time,
-                "best": {name: one.expected[made.names.index(name)] for name, one in best.items()},
-                "drive": {
-                    name: one.candidate.name
-                    for name, one in best.items()
-                    if np.isfinite(one.expected[made.names.index(name)])
-                },
-                "step": {name: row[0].expected[made.names.index(name)] for name in best},
-            }
-        )
-    return out

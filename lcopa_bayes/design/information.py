@@ -63,7 +63,7 @@ class Bench:
     @cached_property
     def sample_times(self) -> Vector:
         """Times of the camera's samples, the first at 0, (samples,) [time unit]."""
-        return self.period * np.arange(max(2, round(self.time / self.period)))
+        return np.asarray(self.period * np.arange(max(2, round(self.time / self.period))), dtype=float)
 
     @cached_property
     def mesh(self) -> Mesh:

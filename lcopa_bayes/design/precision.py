@@ -46,15 +46,15 @@ class Promise:
         """Whether at any draw any parameter is determined."""
         return bool(np.isfinite(self.relative).any())
 
-    def worst(self, among: Flags) -> float:
-        """Largest expected standard deviation among some parameters [-]."""
-        return float(self.expected[among].max())
+    def worst(self, among: Flags) -> Vector:
+        """Largest relative standard deviation among some parameters at every draw, (draws,) [-]."""
+        return np.asarray(self.relative[:, among].max(axis=1))
 
     def typical(self, among: Flags) -> float:
         """Median over draws of ``det(covariance)^(1 / 2p)`` among p parameters [-]: the geometric mean of
         the standard deviations along its axes, smallest for the D-optimal drive; infinite when singular."""
         chosen = self.covariance[:, among][:, :, among]
-        open_ = ~np.isfinite(chosen).all(axis=(1, 2))
+        open_ = ~np.asarray(np.isfinite(chosen).all(axis=(1, 2)))
         bare = np.where(open_[:, None, None], np.eye(int(among.sum())), chosen)
         sign, logs = np.linalg.slogdet(bare)
         sizes = np.where(open_ | (sign <= 0), np.inf, np.exp(logs / (2 * among.sum())))
@@ -65,6 +65,13 @@ def median(columns: Matrix) -> Vector:
     """Medians of columns that may hold infinite entries; between a finite and an infinite one, the latter."""
     method = "linear" if np.isfinite(columns).all() else "higher"
     return np.asarray(np.quantile(columns, 0.5, axis=0, method=method))  # type: ignore[call-overload]
+
+
+def ratios(over: Vector, under: Vector) -> Vector:
+    """Quotients of standard deviations that may be infinite; 1 where both are."""
+    both = np.isinf(over) & np.isinf(under)
+    quotient = np.where(both, 1.0, over) / np.where(both, 1.0, under)
+    return np.asarray(quotient)
 
 
 def promises(
@@ -88,9 +95,7 @@ def promises(
             if prior is not None:
                 gram[np.diag_indices_from(gram)] += prior**-2.0
             found[place].append(cramer_rao(gram * np.outer(sizes, sizes)))
-    return [
-        Promise(drive, bench.time, np.array(each)) for drive, each in zip(drives, found, strict=True)
-    ]
+    return [Promise(drive, bench.time, np.array(each)) for drive, each in zip(drives, found, strict=True)]
 
 
 def cramer_rao(gram: Matrix) -> Matrix:
