@@ -17,12 +17,10 @@ from lcopa_bayes.calibration.calibrate import calibrate
 from lcopa_bayes.calibration.summary import results as calibration_results
 from lcopa_bayes.calibration.summary import tables
 from lcopa_bayes.cores import cores
-from lcopa_bayes.design.confirmation import confirmed
-from lcopa_bayes.design.design import checked, design
-from lcopa_bayes.design.template import write_template
-from lcopa_bayes.design.told import as_json
+from lcopa_bayes.design.design import checked
+from lcopa_bayes.design.nextmeasurement import next_measurement
 from lcopa_bayes.files import writable_folder
-from lcopa_bayes.fit import fit
+from lcopa_bayes.fit import Fit, fit
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.paper.auditclaims import load_audit
 from lcopa_bayes.paper.claims import judge
@@ -32,11 +30,11 @@ from lcopa_bayes.paper.opticsplan import OpticsPlan
 from lcopa_bayes.paper.staticoptics import static_optics
 from lcopa_bayes.paper.steptable import load_posterior, step_table
 from lcopa_bayes.paper.verdict import Evidence
+from lcopa_bayes.planning import DESIGN_PAGE, plan_next
 from lcopa_bayes.provenance import provenance
 from lcopa_bayes.report import write_report
 from lcopa_bayes.report.auditpage import write_audit
 from lcopa_bayes.report.calibrationpage import is_calibration, write_calibration
-from lcopa_bayes.report.designpage import write_design
 from lcopa_bayes.report.paperpages import write_claims, write_identification, write_optics
 from lcopa_bayes.rival import integer_rival
 from lcopa_bayes.runfolder import save_fit, save_json, save_table
@@ -87,14 +85,9 @@ def _fitted(options: argparse.Namespace, command: list[str], study: Study, stage
 
 def audit_study(options: argparse.Namespace, command: list[str]) -> Told:
     """Identifiability of every parameter, after the fit it rests on, with a page of its own."""
-    study = _study(options)
-    folder, jobs = options.out or Path("reports") / study.name, options.jobs or cores()
-    made = fit(
-        study, jobs=jobs, folder=folder, resume=options.resume, quick=options.quick, quiet=options.quiet
-    )
-    save_fit(made, folder, command)
-    write_report(folder)
+    made, folder, jobs = _basis(options, command, _study(options))
     values = audit(made, jobs=jobs).as_json()
+    values["next_measurement"] = next_measurement(made, values["parameters"])
     save_json(values, folder / "audit.json")
     words = [f"{'parameter':16}{'verdict':30}why"]
     words += [f"{row['name']:16}{row['verdict']:30}{row['reason']}" for row in values["parameters"]]
@@ -104,43 +97,23 @@ def audit_study(options: argparse.Namespace, command: list[str]) -> Told:
 def design_study(options: argparse.Namespace, command: list[str]) -> Told:
     """What to measure next, after the fit it rests on: the winning drive, confirmed, and its template."""
     study = _study(options)
+    wanted = {key: getattr(options, key) for key in ("time", "repeats", "amplitude", "refresh")}
+    checked(problem_of(study), **wanted)  # before a long fit
+    made, folder, jobs = _basis(options, command, study)
+    wanted |= {"with_prior": options.with_prior, "quick": options.quick}
+    values, words = plan_next(made, folder, jobs=jobs, **wanted)
+    return _with_report(values, folder / DESIGN_PAGE, *words)
+
+
+def _basis(options: argparse.Namespace, command: list[str], study: Study) -> tuple[Fit, Path, int]:
+    """The fit that an audit or a design rests on, saved and reported; its folder, and processes to use."""
     folder, jobs = options.out or Path("reports") / study.name, options.jobs or cores()
-    checked(
-        problem_of(study),
-        time=options.time,
-        repeats=options.repeats,
-        amplitude=options.amplitude,
-        refresh=options.refresh,
-    )
     made = fit(
         study, jobs=jobs, folder=folder, resume=options.resume, quick=options.quick, quiet=options.quiet
     )
     save_fit(made, folder, command)
     write_report(folder)
-    planned = design(
-        made,
-        time=options.time,
-        repeats=options.repeats,
-        amplitude=options.amplitude,
-        refresh=options.refresh,
-        with_prior=options.with_prior,
-    )
-    values = as_json(planned) | confirmed(planned, jobs=jobs) | {"template": None}
-    if values["winner"] is not None:
-        drive = planned.winner.candidate.command
-        path = folder / "design" / "next.csv"
-        write_template(study, planned.limits, drive, planned.time, writable_folder(path.parent) / path.name)
-        values["template"] = f"{path.parent.name}/{path.name}"
-    save_json(values, folder / "design.json")
-    words = [f"{'parameter':16}{'best drive':28}{'relative sd':>12}  bench time for 10 %"]
-    for row in values["parameters"]:
-        spread = row["relative_sd"] and row["relative_sd"]["value"]
-        number = "-" if spread is None else f"{spread:.3g}"
-        told = row["reason"] or row["time_words"]
-        words.append(f"{row['name']:16}{row['best_drive'] or '-':28}{number:>12}  {told}")
-    return _with_report(
-        values, write_design(folder), *words, values["verdict"], values["confirmed"]["sentence"]
-    )
+    return made, folder, jobs
 
 
 def report(options: argparse.Namespace, command: list[str]) -> Told:

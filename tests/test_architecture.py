@@ -35,6 +35,7 @@ ORDER = (
     ("calibration",),
     ("paper",),
     ("report",),
+    ("planning",),
     ("verbs",),
     ("cli",),
 )

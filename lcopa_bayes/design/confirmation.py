@@ -149,8 +149,8 @@ def confirm(made: Design, *, replicas: int = REPLICAS, jobs: int = 1) -> tuple[C
 
     Truths are two draws of the posterior: the one with the middle factor among those where the winner's
     bounds are small enough to be believed, and the one whose worst bound is the median of all. Fits are
-    output-error least squares with the study's priors as support, started at the truth and at another draw
-    of the posterior, the better one kept. One record per fit, whatever the `repeats` of the design.
+    output-error least squares within the support of the study's priors, started at the truth. One record
+    per fit, whatever the `repeats` of the design.
     """
     if not made.determined.any() or made.winner is made.step:
         return ()
@@ -166,9 +166,9 @@ def confirm(made: Design, *, replicas: int = REPLICAS, jobs: int = 1) -> tuple[C
     return tuple(_confirmed(made, k, told, replicas, jobs) for k, told in places.items())
 
 
-def confirmed(made: Design, *, jobs: int = 1) -> dict[str, Any]:
+def confirmed(made: Design, *, jobs: int = 1, replicas: int = REPLICAS) -> dict[str, Any]:
     """`confirm` as plain values under the key `confirmed`, the trial where bounds can be believed first."""
-    trials = confirm(made, jobs=jobs)
+    trials = confirm(made, jobs=jobs, replicas=replicas)
     sentence = (
         "; ".join(one.sentence for one in trials) or "nothing to confirm: no drive beats the plain step"
     )
@@ -184,8 +184,7 @@ def confirmed(made: Design, *, jobs: int = 1) -> dict[str, Any]:
 
 def _confirmed(made: Design, chosen: int, where: str, replicas: int, jobs: int) -> Confirmation:
     """Both drives at one truth; a replica has the same noise whatever the number of processes."""
-    other = (chosen + made.draws.shape[0] // 2) % made.draws.shape[0]
-    problem, period, starts = made.fit.problem, made.limits.period, made.draws[[chosen, other]]
+    problem, period = made.fit.problem, made.limits.period
     device = device_of(problem, made.draws[chosen])
     camera = VirtualBench(camera=period, exposure=problem.study.model.exposure)
     tasks = []
@@ -193,7 +192,7 @@ def _confirmed(made: Design, chosen: int, where: str, replicas: int, jobs: int) 
         clean = truth(device, camera, each.candidate.command, duration=each.time, name="simulated")
         bench = Bench(problem, each.time, period)
         tasks += [
-            Trial(bench, clean, starts, made.names, (problem.study.seed, 9, chosen, which, k))
+            Trial(bench, clean, made.draws[chosen], made.names, (problem.study.seed, 9, chosen, which, k))
             for k in range(replicas)
         ]
     found = list(_performed(tasks, min(jobs, replicas)))

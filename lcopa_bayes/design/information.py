@@ -19,6 +19,8 @@ from lcopa_bayes.operational.transfer import TransferSlopes, transfer_slopes
 from lcopa_bayes.plant.drive import Drive
 from lcopa_bayes.plant.grid import Mesh
 
+_NOTHING = 1e-11
+"""Share of a slope that is not constant below which a resting response makes up for all of it [-]."""
 _PLANT = ("gain", "time", "order", "delay")
 
 
@@ -151,7 +153,10 @@ class Bench:
         if not any(row.free and row.place.first == axis for row in offsets):
             return np.asarray(white[:-1])
         level = white[-1] / np.linalg.norm(white[-1])
-        return np.asarray(white[:-1] - np.outer(white[:-1] @ level, level))
+        left = white[:-1] - np.outer(white[:-1] @ level, level)
+        before, after = (np.linalg.norm(part, axis=1) for part in (white[:-1], left))
+        left[after <= _NOTHING * before] = 0.0  # what is left of a constant is rounding
+        return np.asarray(left)
 
 
 def _drive(command: Command, axis: int) -> Drive:

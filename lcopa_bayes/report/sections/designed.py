@@ -90,7 +90,8 @@ def _drives(told: Mapping[str, Any]) -> Section:
     if told["winner"] is not None:
         text.append(
             f"Best for the worst parameter: {told['winner']['drive']} ({told['winner']['words']}); "
-            f"D-optimal: {told['d_optimal']}. The winning drive is in {told['template']}, its responses still empty."
+            f"D-optimal: {told['d_optimal']}. The winning drive is in "
+            f"{told['template']}, its responses still empty."
         )
     columns = (
         *(Column("drive"), Column("what it does", "prose"), Column("worst relative sd", "interval")),
@@ -106,7 +107,8 @@ def _drives(told: Mapping[str, Any]) -> Section:
     )
     caption = (
         f"All drives of {told['time']:g} {told['time_unit']}: worst over the parameters, {_SPREAD}; the "
-        "factor is the median of those at each draw; the geometric mean is along the axes of the confidence region."
+        "factor is the median of those at each draw; the geometric mean is along the axes of the confidence "
+        "region."
     )
     return Section("Drives", tuple(text), (), (Table(columns, rows, caption),))
 
