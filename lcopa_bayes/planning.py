@@ -25,7 +25,8 @@ def plan_next(
 ) -> tuple[dict[str, Any], list[str]]:
     """Write `design.json`, `design.html` and `design/next.csv`; returns the values and lines for a reader.
 
-    `options` are those of `design.design`; when `quick`, fewer draws and replicas are taken. Without a winner there is no `next.csv`.
+    `options` are those of `design.design`; when `quick`, fewer draws and replicas are taken. Without a
+    winner there is no `next.csv`.
     """
     made = design(fit, draws=DRAWS // _QUICK if quick else DRAWS, **options)
     trials = confirmed(made, jobs=jobs, replicas=REPLICAS // 2 if quick else REPLICAS)

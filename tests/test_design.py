@@ -27,6 +27,7 @@ from lcopa_bayes.design.precision import cramer_rao, promises, reached, within
 from lcopa_bayes.design.refit import device_of, refit
 from lcopa_bayes.design.template import write_template
 from lcopa_bayes.design.told import as_json
+from lcopa_bayes.planning import plan_next
 from lcopa_bayes.problems import InputError
 from lcopa_bayes.record import load_record, save_record
 
@@ -216,7 +217,7 @@ def test_the_winner_beats_the_step_as_promised_in_simulation(one):
         share = freedom * (side.spread / side.expected) ** 2
         assert (share > 0.3).all()
         assert (share < 30.0).all()
-    told = confirmed(made, replicas=3)["confirmed"]
+    told = confirmed(made, replicas=4)["confirmed"]
     assert json.dumps(told, allow_nan=False)
 
 
@@ -278,20 +279,52 @@ def test_a_filled_template_is_a_record(one, tmp_path):
     np.testing.assert_array_equal(read.drive, clean.drive)
 
 
-def test_the_verb_writes_numbers_page_and_drive(tmp_path, capsys):
-    save_record(record(camera=0.6), tmp_path / "one.csv")
-    (tmp_path / "study.toml").write_text(
-        '[records]\nfit = ["one.csv"]\n[noise]\nkind = "white"\n'
-        "[sampler]\nensembles = 2\nwalkers = 32\nsteps = 200\n"
-    )
-    words = ["design", str(tmp_path), "--quick", "--jobs", "1", "--time", "120", "--out"]
-    assert main([*words, str(tmp_path / "run"), "--json", "--quiet"]) == 0
-    told = json.loads(capsys.readouterr().out)
+def test_a_plan_is_numbers_a_page_and_a_drive(one, tmp_path):
+    values, words = plan_next(fitted(one), tmp_path, quick=True, time=60.0)
+    told = json.loads((tmp_path / "design.json").read_text())
+    assert told == values
     assert told["factor_over_step"]["value"] > 1
     assert told["confirmed"]["trials"]
-    assert (tmp_path / "run" / told["template"]).exists()
-    page = (tmp_path / "run" / "design.html").read_text()
+    assert told["verdict"] in words
+    assert load_template(tmp_path / told["template"]).shape[0] == 301  # 60 at 0.2, and one before
+    page = (tmp_path / "design.html").read_text()
     assert told["winner"]["drive"] in page
     assert "<script" not in page
-    assert main([*words, str(tmp_path / "run"), "--amplitude", "-1"]) == 2
+
+
+def load_template(path) -> np.ndarray:
+    return np.genfromtxt(path, delimiter=",", skip_header=1)
+
+
+STUDY = """[records]
+fit = ["one.csv"]
+[noise]
+kind = "white"
+[sampler]
+ensembles = 2
+walkers = 32
+steps = 200
+"""
+
+
+@pytest.fixture
+def study(tmp_path):
+    save_record(record(camera=0.6), tmp_path / "one.csv")
+    (tmp_path / "study.toml").write_text(STUDY)
+    return tmp_path
+
+
+def test_the_verb_refuses_before_it_fits(study, capsys):
+    assert main(["design", str(study), "--amplitude", "-1", "--out", str(study / "run")]) == 2
     assert "amplitude limit" in capsys.readouterr().err
+    assert not (study / "run").exists()
+
+
+@pytest.mark.slow
+def test_the_verb_from_records_to_drive(study, capsys):
+    words = ["design", study, "--quick", "--jobs", 1, "--time", 120, "--json", "--out", study / "run"]
+    assert main([str(word) for word in words]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told.pop("report") == str(study / "run" / "design.html")
+    assert told == json.loads((study / "run" / "design.json").read_text())
+    assert (study / "run" / told["template"]).exists()

@@ -239,5 +239,6 @@ def _factor(
         worst(errors[rng.integers(0, errors.shape[0], (_RESAMPLED, errors.shape[0]))])
         for errors in (step, winner)
     ]
-    low, high = np.quantile(drawn[0] / drawn[1], (0.5 - LEVEL / 2, 0.5 + LEVEL / 2))
+    told = (drawn[0] > 0) & (drawn[1] > 0)  # a resample of one record, over and over, has no spread
+    low, high = np.quantile(drawn[0][told] / drawn[1][told], (0.5 - LEVEL / 2, 0.5 + LEVEL / 2))
     return float(worst(step) / worst(winner)), float(low), float(high)
