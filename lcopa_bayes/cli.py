@@ -64,6 +64,7 @@ def _parser() -> argparse.ArgumentParser:
     add("run", verbs.run, [study, sampled, checked], "all stages the study names, then the report")
     add("fit", verbs.fit_study, [study, sampled, checked], "posterior, bands and step metrics, with a report")
     add("audit", verbs.audit_study, [study, sampled], "what the records determine, parameter by parameter")
+    _design_options(add("design", verbs.design_study, [study, sampled], "which drive to measure next"))
     _calibrate_options(
         add(
             "calibrate",
@@ -122,6 +123,16 @@ def _check_options() -> argparse.ArgumentParser:
         help="sample by a second, independent method too; where they disagree, grades are lowered",
     )
     return checked
+
+
+def _design_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--time", type=float, help="bench time [time unit of the study] (default: 40 spans)")
+    parser.add_argument("--repeats", type=int, default=1, help="records to take (default: 1)")
+    parser.add_argument(
+        "--amplitude", type=float, help="largest deviation from rest [drive unit] (default: the records')"
+    )
+    parser.add_argument("--refresh", type=float, help="time between drive changes (default: 10 samples)")
+    parser.add_argument("--with-prior", action="store_true", help="count the priors as information")
 
 
 def _calibrate_options(parser: argparse.ArgumentParser) -> None:

@@ -17,8 +17,11 @@ from lcopa_bayes.calibration.calibrate import calibrate
 from lcopa_bayes.calibration.summary import results as calibration_results
 from lcopa_bayes.calibration.summary import tables
 from lcopa_bayes.cores import cores
+from lcopa_bayes.design.design import checked
+from lcopa_bayes.design.nextmeasurement import next_measurement
 from lcopa_bayes.files import writable_folder
-from lcopa_bayes.fit import fit
+from lcopa_bayes.fit import Fit, fit
+from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.paper.auditclaims import load_audit
 from lcopa_bayes.paper.claims import judge
 from lcopa_bayes.paper.identify import identify, results, scannable
@@ -27,6 +30,7 @@ from lcopa_bayes.paper.opticsplan import OpticsPlan
 from lcopa_bayes.paper.staticoptics import static_optics
 from lcopa_bayes.paper.steptable import load_posterior, step_table
 from lcopa_bayes.paper.verdict import Evidence
+from lcopa_bayes.planning import DESIGN_PAGE, plan_next
 from lcopa_bayes.provenance import provenance
 from lcopa_bayes.report import write_report
 from lcopa_bayes.report.auditpage import write_audit
@@ -84,18 +88,35 @@ def _fitted(options: argparse.Namespace, command: list[str], study: Study, stage
 
 def audit_study(options: argparse.Namespace, command: list[str]) -> Told:
     """Identifiability of every parameter, after the fit it rests on, with a page of its own."""
+    made, folder, jobs = _basis(options, command, _study(options))
+    values = audit(made, jobs=jobs).as_json()
+    values["next_measurement"] = next_measurement(made, values["parameters"])
+    save_json(values, folder / "audit.json")
+    words = [f"{'parameter':16}{'verdict':30}why"]
+    words += [f"{row['name']:16}{row['verdict']:30}{row['reason']}" for row in values["parameters"]]
+    return _with_report(values, write_audit(folder), *words)
+
+
+def design_study(options: argparse.Namespace, command: list[str]) -> Told:
+    """What to measure next, after the fit it rests on: the winning drive, confirmed, and its template."""
     study = _study(options)
+    wanted = {key: getattr(options, key) for key in ("time", "repeats", "amplitude", "refresh")}
+    checked(problem_of(study), **wanted)  # before a long fit
+    made, folder, jobs = _basis(options, command, study)
+    wanted |= {"with_prior": options.with_prior, "quick": options.quick}
+    values, words = plan_next(made, folder, jobs=jobs, **wanted)
+    return _with_report(values, folder / DESIGN_PAGE, *words)
+
+
+def _basis(options: argparse.Namespace, command: list[str], study: Study) -> tuple[Fit, Path, int]:
+    """The fit that an audit or a design rests on, saved and reported; its folder, and processes to use."""
     folder, jobs = options.out or Path("reports") / study.name, options.jobs or cores()
     made = fit(
         study, jobs=jobs, folder=folder, resume=options.resume, quick=options.quick, quiet=options.quiet
     )
     save_fit(made, folder, command)
     write_report(folder)
-    values = audit(made, jobs=jobs).as_json()
-    save_json(values, folder / "audit.json")
-    words = [f"{'parameter':16}{'verdict':30}why"]
-    words += [f"{row['name']:16}{row['verdict']:30}{row['reason']}" for row in values["parameters"]]
-    return _with_report(values, write_audit(folder), *words)
+    return made, folder, jobs
 
 
 def report(options: argparse.Namespace, command: list[str]) -> Told:

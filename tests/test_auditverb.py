@@ -66,7 +66,10 @@ def test_audit_tells_what_other_tools_rely_on(run):
     assert rows["time_1"]["partners"][0] == "time_2"
     assert [rows[name]["verdict"] for name in ("gain", "delay", "sigma")] == ["identified"] * 3
     assert told["spectrum"][-1]["prior_knows_more"]
-    assert told["next_measurement"] is None
+    advised = {row["name"]: row for row in told["next_measurement"]["parameters"]}
+    assert set(advised) == {name for name, row in rows.items() if row["verdict"] != "identified"}
+    assert advised["time_1"]["drive"] is None  # no drive separates what only acts as a sum
+    assert "structurally unidentifiable" in advised["time_1"]["reason"]
     assert {row["name"] for row in told["functions"]} >= {"steady_state[y]", "rise_10_90[y]"}
 
 

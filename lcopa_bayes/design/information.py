@@ -1,0 +1,165 @@
+"""Fisher information of a drive about the plant, from exact derivatives by the fast algebra."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from math import ceil
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.arrays import Array, Matrix, Vector
+from lcopa_bayes.bench.command import Command
+from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.noise import GaussianNoise
+from lcopa_bayes.operational.series import Circle, Spectrum
+from lcopa_bayes.operational.transfer import TransferSlopes, transfer_slopes
+from lcopa_bayes.plant.drive import Drive
+from lcopa_bayes.plant.grid import Mesh
+
+_NOTHING = 1e-11
+"""Share of a slope that is not constant below which a resting response makes up for all of it [-]."""
+_PLANT = ("gain", "time", "order", "delay")
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """A record of `time` [time unit], sampled every `period`, that is still to be taken.
+
+    Slopes are in the logarithm of time constants and in the plain value of every other parameter, made
+    white by the study's noise; the record's resting response is unknown where the study's is, and is
+    projected out. Costs, per set of values, a transfer function and its slopes, and per drive one transform
+    for every one of them: all in O(samples log samples). Accuracy: as `operational.transfer`.
+    """
+
+    problem: Problem
+    time: float
+    """[time unit]."""
+    period: float
+    """[time unit]."""
+
+    @cached_property
+    def columns(self) -> tuple[int, ...]:
+        """Table positions of the free plant parameters, offsets left out."""
+        rows = self.problem.posterior.table.rows
+        return tuple(k for k, row in enumerate(rows) if row.free and row.kind in _PLANT)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(self.problem.posterior.table.names[k] for k in self.columns)
+
+    @cached_property
+    def step(self) -> float:
+        """Width of a block [time unit]: that of the fit."""
+        return min(one.mesh.grid.step for one in self.problem.posterior.model.experiments)
+
+    @cached_property
+    def blocks(self) -> int:
+        """Blocks at which the record resolves what the fit did."""
+        return max(2, ceil(float(self.sample_times[-1]) / self.step * (1 - 1e-6)))
+
+    @cached_property
+    def sample_times(self) -> Vector:
+        """Times of the camera's samples, the first at 0, (samples,) [time unit]."""
+        return np.asarray(self.period * np.arange(max(2, round(self.time / self.period))), dtype=float)
+
+    @cached_property
+    def mesh(self) -> Mesh:
+        """Blocks, and how samples are read from them."""
+        exposure = self.problem.study.model.exposure
+        return Mesh.of_samples(self.sample_times, 0.0, blocks=self.blocks, exposure=exposure)
+
+    @cached_property
+    def circle(self) -> Circle:
+        """Where series are evaluated."""
+        return Circle(self.mesh.grid.n)
+
+    def sizes(self, values: Vector) -> Vector:
+        """What a slope is multiplied by to be relative to the parameter's size, (parameters,)."""
+        rows = self.problem.posterior.table.rows
+        return np.array([1.0 if rows[k].kind == "time" else abs(values[k]) for k in self.columns])
+
+    def elements(self, values: Vector) -> list[tuple[Spectrum, TransferSlopes]]:
+        """Transfer functions of the elements at table values, with their slopes; shared by all drives."""
+        dynamics = self.problem.posterior.table.dynamics(values[None])
+        return [
+            transfer_slopes(times, orders, self.circle, self.mesh.grid.step)
+            for times, orders in zip(dynamics.times, dynamics.orders, strict=True)
+        ]
+
+    def gram(
+        self, values: Vector, elements: Sequence[tuple[Spectrum, TransferSlopes]], command: Command
+    ) -> Matrix:
+        """Fisher information of one record under `command`, (parameters, parameters)."""
+        out = np.zeros((len(self.columns), len(self.columns)))
+        for slopes in self.slopes(values, elements, command):
+            out += slopes @ slopes.T
+        return out
+
+    def slopes(
+        self, values: Vector, elements: Sequence[tuple[Spectrum, TransferSlopes]], command: Command
+    ) -> list[Matrix]:
+        """White derivatives of every response axis, each (parameters, samples)."""
+        table = self.problem.posterior.table
+        units = [
+            self._unit(values, elements[unit.element], unit.delay, _drive(command, unit.drive))
+            for unit in table.layout.units
+        ]
+        out = []
+        for axis in range(len(table.layout.responses)):
+            rows = np.zeros((len(table.rows), self.sample_times.size))
+            for drive, number in enumerate(table.layout.unit_of[axis]):
+                element, delay, _ = table.layout.units[number]
+                at = table.at("gain", axis, drive)
+                unit, terms = units[number], table.layout.elements[element].terms
+                rows[at] += unit[0] + command.rest[drive]
+                for i in range(terms):
+                    rows[table.at("time", element, i)] += values[at] * unit[1 + i]
+                    rows[table.at("order", element, i)] += values[at] * unit[1 + terms + i]
+                rows[table.at("delay", delay)] += values[at] * unit[1 + 2 * terms]
+            out.append(self._whitened(rows[list(self.columns)], values, axis))
+        return out
+
+    def _unit(
+        self, values: Vector, element: tuple[Spectrum, TransferSlopes], slot: int, drive: Drive
+    ) -> Matrix:
+        """A unit response and its slopes in log times, orders and delay, (2 terms + 2, samples)."""
+        value, parts = element
+        if not drive.moves:
+            return np.zeros((2 + 2 * len(parts.orders), self.sample_times.size))
+        delay = values[self.problem.posterior.table.at("delay", slot)]
+        means, by_delay = drive.block_means(self.mesh.grid.edges, np.array([delay]))
+        moving, late = self.circle.spectrum(np.concatenate([means, by_delay]))
+        shaped = [part[0] * moving for part in (value, *parts.log_times, *parts.orders)]
+        found = self.circle.coefficients(np.stack([*shaped, value[0] * late]))
+        return np.asarray(self.mesh.reading(found))
+
+    def _whitened(self, rows: Matrix, values: Vector, axis: int) -> Matrix:
+        """Rows in noise standard deviations, without what a resting response can make up for."""
+        posterior = self.problem.posterior
+        noise, parameters = posterior.noise, posterior.noise_parameters(values[None], axis)
+        stacked: Array = np.concatenate([rows, np.ones((1, rows.shape[1]))])
+        if isinstance(noise, GaussianNoise):
+            white = noise.whiten(stacked[None], parameters, np.ones(rows.shape[1]))[0][0]
+        else:  # Fisher information of a Student location: (nu + 1) / (nu + 3) that of a Gaussian
+            sigma, nu = parameters[0]
+            white = stacked * (np.sqrt((nu + 1) / (nu + 3)) / sigma)
+        table = posterior.table
+        offsets = [table.rows[k] for k in table.of_kind("offset")]
+        if not any(row.free and row.place.first == axis for row in offsets):
+            return np.asarray(white[:-1])
+        level = white[-1] / np.linalg.norm(white[-1])
+        left = white[:-1] - np.outer(white[:-1] @ level, level)
+        before, after = (np.linalg.norm(part, axis=1) for part in (white[:-1], left))
+        left[after <= _NOTHING * before] = 0.0  # what is left of a constant is rounding
+        return np.asarray(left)
+
+
+def _drive(command: Command, axis: int) -> Drive:
+    """Deviation from rest of one axis of a command."""
+    moved = command.jumps[:, axis] != 0
+    return Drive(command.times[moved], command.values[moved, axis] - command.rest[axis])
