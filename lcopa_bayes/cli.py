@@ -64,6 +64,13 @@ def _parser() -> argparse.ArgumentParser:
     add("run", verbs.run, [study, sampled, checked], "all stages the study names, then the report")
     add("fit", verbs.fit_study, [study, sampled, checked], "posterior, bands and step metrics, with a report")
     add("audit", verbs.audit_study, [study, sampled], "what the records determine, parameter by parameter")
+    compared = add(
+        "compare", verbs.compare_study, [study, sampled], "integer against fractional orders, number of terms"
+    )
+    compared.add_argument(
+        "--candidates", type=Path, metavar="FILE", help="[compare] and [[candidates]] (TOML)"
+    )
+    compared.add_argument("--pick", nargs="+", metavar="NAME", help="candidates by name")
     _calibrate_options(
         add(
             "calibrate",

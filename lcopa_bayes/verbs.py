@@ -16,6 +16,9 @@ from lcopa_bayes.bench.plan import load_plan
 from lcopa_bayes.calibration.calibrate import calibrate
 from lcopa_bayes.calibration.summary import results as calibration_results
 from lcopa_bayes.calibration.summary import tables
+from lcopa_bayes.comparison.candidatefile import load_candidates
+from lcopa_bayes.comparison.candidates import candidates_of
+from lcopa_bayes.comparison.compare import compare
 from lcopa_bayes.cores import cores
 from lcopa_bayes.files import writable_folder
 from lcopa_bayes.fit import fit
@@ -31,6 +34,7 @@ from lcopa_bayes.provenance import provenance
 from lcopa_bayes.report import write_report
 from lcopa_bayes.report.auditpage import write_audit
 from lcopa_bayes.report.calibrationpage import is_calibration, write_calibration
+from lcopa_bayes.report.comparisonpage import write_comparison
 from lcopa_bayes.report.paperpages import write_claims, write_identification, write_optics
 from lcopa_bayes.rival import integer_rival
 from lcopa_bayes.runfolder import save_fit, save_json, save_table
@@ -93,6 +97,23 @@ def audit_study(options: argparse.Namespace, command: list[str]) -> Told:
     words = [f"{'parameter':16}{'verdict':30}why"]
     words += [f"{row['name']:16}{row['verdict']:30}{row['reason']}" for row in values["parameters"]]
     return _with_report(values, write_audit(folder), *words)
+
+
+def compare_study(options: argparse.Namespace, command: list[str]) -> Told:
+    """Candidates derived from a study, scored and decided, with a page of its own."""
+    study = _study(options)
+    folder, jobs = options.out or Path("reports") / study.name, options.jobs or cores()
+    chosen, extra = load_candidates(options.candidates) if options.candidates else (None, ())
+    values = compare(
+        candidates_of(study, extra, options.pick or chosen),
+        jobs=jobs,
+        folder=folder,
+        resume=options.resume,
+        quick=options.quick,
+        quiet=options.quiet,
+    )
+    save_json(values | {"command": command}, folder / "compare.json")
+    return _with_report(values, write_comparison(folder), values["why"], values["fractional"]["sentence"])
 
 
 def report(options: argparse.Namespace, command: list[str]) -> Told:
