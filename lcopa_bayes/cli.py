@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import lcopa_bayes
-from lcopa_bayes import verbs
 from lcopa_bayes.optics.cell import Field
 from lcopa_bayes.paper.intervals import Scan
 from lcopa_bayes.problems import InputError
+from lcopa_bayes.verbs import papers, questions, runs
+from lcopa_bayes.verbs.outcome import Told
 
 USAGE_ERROR = 2
 """Exit code for input that cannot be used."""
@@ -54,32 +55,44 @@ def _parser() -> argparse.ArgumentParser:
     told.add_argument("--quiet", action="store_true", help="no progress, no closing words")
     told.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
 
-    def add(name: str, does: Callable[..., verbs.Told], parents: list[Any], text: str) -> Any:
+    def add(name: str, does: Callable[..., Told], parents: list[Any], text: str) -> Any:
         made = verb.add_parser(name, parents=[*parents, told], help=text, description=text)
         made.set_defaults(verb=does)
         return made
 
     study, sampled = _study_options(), _sampler_options()
     checked = _check_options()
-    add("run", verbs.run, [study, sampled, checked], "all stages the study names, then the report")
-    add("fit", verbs.fit_study, [study, sampled, checked], "posterior, bands and step metrics, with a report")
-    add("audit", verbs.audit_study, [study, sampled], "what the records determine, parameter by parameter")
-    _design_options(add("design", verbs.design_study, [study, sampled], "which drive to measure next"))
+    add("run", runs.run, [study, sampled, checked], "all stages the study names, then the report")
+    add("fit", runs.fit_study, [study, sampled, checked], "posterior, bands and step metrics, with a report")
+    add(
+        "audit", questions.audit_study, [study, sampled], "what the records determine, parameter by parameter"
+    )
+    _design_options(add("design", questions.design_study, [study, sampled], "which drive to measure next"))
+    compared = add(
+        "compare",
+        questions.compare_study,
+        [study, sampled],
+        "integer against fractional orders, number of terms",
+    )
+    compared.add_argument(
+        "--candidates", type=Path, metavar="FILE", help="[compare] and [[candidates]] (TOML)"
+    )
+    compared.add_argument("--pick", nargs="+", metavar="NAME", help="candidates by name")
     _calibrate_options(
         add(
             "calibrate",
-            verbs.calibrate_study,
+            runs.calibrate_study,
             [_study_options("reports/calibration/<study>"), sampled],
             "simulation-based calibration and coverage of the whole inference of a study, with a report",
         )
     )
     _identify_options(
-        add("identify", verbs.identify_study, [study], "the paper's own least-squares scan, with a report")
+        add("identify", papers.identify_study, [study], "the paper's own least-squares scan, with a report")
     )
     _optics_options(
-        add("optics", verbs.optics, [], "far field, director and the chain from volts to angle, with figures")
+        add("optics", papers.optics, [], "far field, director, the chain from volts to angle, with figures")
     )
-    claims = add("claims", verbs.claims, [], "the paper's claims, each with a computed verdict")
+    claims = add("claims", papers.claims, [], "the paper's claims, each with a computed verdict")
     claims.add_argument("--out", type=Path, default=Path("reports/claims"), help="folder for the page")
     claims.add_argument(
         "--audit",
@@ -88,9 +101,9 @@ def _parser() -> argparse.ArgumentParser:
         metavar="RUNFOLDER",
         help="run folders of audits, to decide I1-I6 (default: those of the bundled studies)",
     )
-    report = add("report", verbs.report, [], "render the report of a run folder again")
+    report = add("report", runs.report, [], "render the report of a run folder again")
     report.add_argument("folder", type=Path, help="run folder")
-    bench = add("simulate", verbs.simulate, [], "measure a campaign file on the virtual bench")
+    bench = add("simulate", runs.simulate, [], "measure a campaign file on the virtual bench")
     bench.add_argument("campaign", type=Path, help="campaign file (TOML)")
     bench.add_argument("--out", type=Path, required=True, help="folder for the records and their study")
     bench.add_argument("--seed", type=int, help="seed in place of the campaign's")

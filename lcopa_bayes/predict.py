@@ -96,7 +96,7 @@ def bands(
                 continue
             response = plant[axis][:, observed.index]
             parameters = values[:, [draws.table.at(name, axis) for name in noise.names]]
-            offset, source = _offset(
+            offset, source = offset_draws(
                 draws.table, values, axis, r, record, response, noise, held_out=held_out, rng=rng
             )
             response = response + offset[:, None]
@@ -119,7 +119,7 @@ def bands(
     return out
 
 
-def _offset(
+def offset_draws(
     table: ParameterTable,
     values: Matrix,
     axis: int,

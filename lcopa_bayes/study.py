@@ -11,6 +11,7 @@ from typing import final
 
 import numpy as np
 
+from lcopa_bayes.candidatesettings import CandidateSettings, CompareSettings
 from lcopa_bayes.checks import rebuilt
 from lcopa_bayes.problems import InputError
 from lcopa_bayes.record import Axis, Record
@@ -53,6 +54,9 @@ class Study:
     """Settings of every stage to run, by name."""
     inputs: Mapping[str, str] = field(default_factory=dict)
     """SHA-256 of each input file, by file name."""
+    compare: CompareSettings = field(default_factory=CompareSettings)
+    candidates: tuple[CandidateSettings, ...] = ()
+    """Models to compare besides those any study has."""
 
     def __post_init__(self) -> None:
         records = (*self.fit, *self.held_out)

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from lcopa_bayes.candidatesettings import compare_settings
 from lcopa_bayes.cells import SUFFIXES
 from lcopa_bayes.problems import InputError, nearest
 from lcopa_bayes.record import Record, in_time_unit, load_record
@@ -25,6 +26,7 @@ from lcopa_bayes.settings import (
 from lcopa_bayes.study import DEFAULT_STAGES, Study, together
 
 _TABLES = ("study", "records", "model", "priors", "noise", "sampler", "stages")
+_COMPARED = ("compare", "candidates")
 
 
 def _read(
@@ -108,7 +110,9 @@ def _priors(table: Mapping[str, Any], where: str, problems: list[str]) -> dict[s
 def _from_file(path: Path, held_out: list[Path]) -> Study:
     document, folder = _document(path), path.parent
     problems = [
-        f"{path}: unknown table [{key}]{nearest(key, _TABLES)}" for key in document if key not in _TABLES
+        f"{path}: unknown table [{key}]{nearest(key, (*_TABLES, *_COMPARED))}"
+        for key in document
+        if key not in (*_TABLES, *_COMPARED)
     ]
     where = {name: f"{path}, [{name}]" for name in _TABLES}
     tables: dict[str, Any] = {name: document.get(name, {}) for name in _TABLES}
@@ -127,6 +131,7 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
     )
     priors = _priors(tables["priors"], where["priors"], problems)
     stages = _stages(tables["stages"], where["stages"], problems)
+    compare, candidates = compare_settings(document, str(path), problems)
     fit, apart = [], held_out
     if named:
         apart = [*(folder / name for name in named.held_out), *held_out]
@@ -153,6 +158,8 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
         sampler,
         stages,
         _hashes([path, *fit, *apart]),
+        compare,
+        candidates,
     )
 
 

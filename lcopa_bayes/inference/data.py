@@ -28,6 +28,8 @@ class Observed:
     @cached_property
     def chosen(self) -> Index | slice:
         """`index`, as a slice where it is one: taking a slice copies nothing."""
+        if not self.index.size:
+            return self.index
         first, last = int(self.index[0]), int(self.index[-1]) + 1
         return slice(first, last) if last - first == self.index.size else self.index
 

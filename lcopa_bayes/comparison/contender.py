@@ -1,0 +1,202 @@
+"""One candidate fitted and scored, as plain values that its folder keeps."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+import pandas as pd
+from threadpoolctl import threadpool_limits
+
+from lcopa_bayes.comparison.candidates import Candidate
+from lcopa_bayes.comparison.integerorder import integer_orders
+from lcopa_bayes.comparison.likelihood import criteria
+from lcopa_bayes.comparison.prediction import Predicted, predictions
+from lcopa_bayes.comparison.priorwidth import widths
+from lcopa_bayes.estimate import plain
+from lcopa_bayes.files import writable_folder
+from lcopa_bayes.fit import Fit, fit, plan_of
+from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.inference.grade import Grade
+from lcopa_bayes.problems import InputError
+from lcopa_bayes.provenance import fingerprint, settings_of
+from lcopa_bayes.results import residual_rms, scores
+from lcopa_bayes.runfolder import save_json, save_table
+from lcopa_bayes.settings import SamplerSettings
+
+CARD = "candidate.json"
+"""File of a candidate's scores inside its folder."""
+ENSEMBLES, WALKERS, TARGET_ESS = 3, 24, 100
+"""How a comparison samples what the study leaves open [-]: an evidence is wanted to a tenth of a nat or
+two, not a marginal to a percent."""
+_VERSION = 1
+"""Raised when what a card holds changes."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Contender:
+    """A candidate and how it is to be fitted."""
+
+    candidate: Candidate
+    folder: Path | None
+    quick: bool
+    resume: bool
+
+    @property
+    def fingerprint(self) -> str:
+        """Hash of everything the scores depend on."""
+        study = self.candidate.study
+        told = (
+            fingerprint(study, plan_of(problem_of(study), quick=self.quick)),
+            self.candidate.improper,
+            _VERSION,
+            [record.name for record in study.held_out],
+            [record.response.tobytes().hex()[:4096] for record in study.held_out],
+        )
+        return hashlib.sha256(json.dumps(told).encode()).hexdigest()
+
+    def stored(self) -> Mapping[str, Any] | None:
+        """The card of an earlier run of the same candidate; None when there is none."""
+        path = None if self.folder is None else self.folder / CARD
+        if not self.resume or path is None or not path.is_file():
+            return None
+        try:
+            told: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+            own = told["fingerprint"] == self.fingerprint
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(
+                f"{path}: not a candidate this program wrote, or damaged ({error}); leave out --resume to "
+                "start anew, or choose another --out"
+            ) from None
+        return told if own else None
+
+    def __call__(self) -> Mapping[str, Any]:
+        """The card: from the folder where it is complete, else by fitting. Deterministic given the study."""
+        found = self.stored()
+        if found is not None:
+            return found
+        with threadpool_limits(1):
+            began = time.perf_counter()
+            made = fit(
+                self.candidate.study, folder=self.folder, resume=self.resume, quick=self.quick, quiet=True
+            )
+            told, found_parts = card(self.candidate, made)
+            told = told | {
+                "fingerprint": self.fingerprint,
+                "seconds": time.perf_counter() - began,
+                "pointwise": _pointwise(found_parts),
+                "curves": _curves(made),
+            }
+        if self.folder is not None:
+            tables = writable_folder(self.folder / "tables")
+            save_table(pd.DataFrame(told["curves"]), tables / "curves.csv")
+            save_table(pd.DataFrame(told["pointwise"]), tables / "pointwise.csv")
+            save_json(told, self.folder / CARD)
+        return told
+
+
+def contender(candidate: Candidate, folder: Path | None, *, quick: bool, resume: bool) -> Contender:
+    """A candidate with a plan shorter than that of a fit; what the study's ``[sampler]`` states is kept."""
+    study, own, free = candidate.study, candidate.study.sampler, SamplerSettings()
+    sampler = replace(
+        own,
+        ensembles=ENSEMBLES if own.ensembles == free.ensembles else own.ensembles,
+        walkers=own.walkers or WALKERS,
+        target_ess=min(own.target_ess, TARGET_ESS),
+    )
+    # the study file may name candidates that say nothing of this one
+    return Contender(
+        replace(candidate, study=replace(study, sampler=sampler, inputs={})), folder, quick, resume
+    )
+
+
+def card(candidate: Candidate, made: Fit) -> tuple[dict[str, Any], tuple[Predicted, ...]]:
+    """Everything a comparison needs of a fitted candidate, as plain values, and its predictions."""
+    grade = made.draws.grade
+    usable = grade.level != "unusable"
+    weighed = None if candidate.improper else made.evidence
+    parts = predictions(made) if usable else ()
+    told: dict[str, Any] = plain(
+        {
+            "name": candidate.name,
+            "about": candidate.about,
+            "notes": candidate.notes,
+            "integer": candidate.integer,
+            "terms": candidate.terms,
+            "settings": settings_of(candidate.study),
+            "time_unit": made.study.time_unit,
+            "grade": grade.level,
+            "grade_reason": grade.reason,
+            "usable": usable,
+            "log_evidence": weighed.value if weighed else None,
+            "log_evidence_sd": weighed.sd if weighed else None,
+            "log_evidence_grade": Grade.worst([weighed.grade, grade]).level if weighed else None,
+            "evidence_undefined": (
+                f"improper prior of {', '.join(candidate.improper)}" if candidate.improper else ""
+            ),
+            "prior_widths": [one.as_json() for one in widths(made)] if usable and weighed else [],
+            **criteria(made).as_json(),
+            "residual_rms": residual_rms(made),
+            "fit_scores": scores(made, held_out=False),
+            "held_out": scores(made, held_out=True),
+            "predictions": [one.as_json() for one in parts],
+            "order_is_integer": [one.as_json() for one in integer_orders(made)],
+            "parameters_told": [one.as_json() for one in made.draws.estimates()],
+            "step_metrics": [one.as_json() for one in made.metrics],
+            "residual_tests": [
+                {
+                    "record": one.record,
+                    "axis": one.axis,
+                    "held_out": one.held_out,
+                    "p_white": one.p_white,
+                    "rms": one.rms,
+                    "lag_1": float(one.autocorrelation[0]) if one.autocorrelation.size else None,
+                }
+                for one in made.residuals
+            ],
+            "ess": made.draws.ess,
+        }
+    )
+    return told, parts
+
+
+def _pointwise(parts: tuple[Predicted, ...]) -> dict[str, list[Any]]:
+    """Log predictive density of every sample predicted, one list per column."""
+    told: dict[str, list[Any]] = {"part": [], "kind": [], "axis": [], "time": [], "log_density": []}
+    for one in parts:
+        told["part"] += [one.part.name] * one.time.size
+        told["kind"] += [one.part.kind] * one.time.size
+        told["axis"] += list(one.axis)
+        told["time"] += one.time.tolist()
+        told["log_density"] += one.log_density.tolist()
+    return told
+
+
+def _curves(made: Fit) -> dict[str, list[Any]]:
+    """Observed, median and 90 % band of every record, one list per column."""
+    told: dict[str, list[Any]] = {
+        name: []
+        for name in ("record", "axis", "unit", "held_out", "time", "observed", "middle", "low", "high")
+    }
+    for band in made.bands:
+        size = band.time.size
+        told["record"] += [band.record] * size
+        told["axis"] += [band.axis] * size
+        told["unit"] += [band.unit] * size
+        told["held_out"] += [band.held_out] * size
+        for name, values in (
+            ("time", band.time),
+            ("observed", band.observed),
+            ("middle", band.plant[2]),
+            ("low", band.noisy[0]),
+            ("high", band.noisy[4]),
+        ):
+            told[name] += np.asarray(values).tolist()
+    return told

@@ -1,0 +1,114 @@
+"""Which candidate is preferred, why, and whether fractional orders are warranted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from lcopa_bayes.comparison.flags import flags
+from lcopa_bayes.comparison.fractional import fractional, undecided
+from lcopa_bayes.comparison.gains import Gain, Row, by_evidence, by_prediction
+
+
+def decided(rows: Sequence[Row]) -> dict[str, Any]:
+    """Preferred candidate with the reason, the flag of disagreement, and the verdict on fractional orders."""
+    unranked = [
+        {"name": row["name"], "reason": f"its posterior is unusable: {row['grade_reason']}"}
+        for row in rows
+        if not row["usable"]
+    ]
+    undefined = [
+        {"name": row["name"], "reason": f"its evidence is undefined: {row['evidence_undefined']}"}
+        for row in rows
+        if row["usable"] and row["log_evidence"] is None
+    ]
+    usable = [row for row in rows if row["usable"]]
+    weighed = [row for row in usable if row["log_evidence"] is not None]
+    told = {"unranked": unranked, "evidence_undefined": undefined, "flags": flags(rows)}
+    if len(usable) < 2:
+        why = "fewer than two candidates have a usable posterior: nothing can be compared"
+        return told | {
+            "preferred": None,
+            "why": why,
+            "agreement": {"agree": None, "sentence": why},
+            "fractional": undecided(why),
+            "by_evidence": None,
+            "by_prediction": None,
+        }
+    evident = _simplest(weighed, by_evidence, "log_evidence") if weighed else None
+    predictive = _simplest([row for row in usable if row["elpd"] is not None], by_prediction, "elpd")
+    agree, sentence = _agreement(evident, predictive, usable)
+    preferred = evident or predictive
+    unseen = any(row["held_out"] for row in usable)
+    if agree is False and unseen and predictive is not None:
+        preferred = predictive
+    why = _why(preferred, evident, usable, agree, sentence, unseen)
+    return told | {
+        "preferred": None if preferred is None else preferred["name"],
+        "why": why,
+        "agreement": {"agree": agree, "sentence": sentence},
+        "fractional": fractional(usable),
+        "by_evidence": None if evident is None else evident["name"],
+        "by_prediction": None if predictive is None else predictive["name"],
+    }
+
+
+def _simplest(rows: Sequence[Row], score: Any, key: str) -> Row | None:
+    """The candidate of fewest parameters among those that the best one does not beat beyond chance."""
+    if not rows:
+        return None
+    best = max(rows, key=lambda row: row[key])
+    level = [row for row in rows if row is best or not score(best, row).counts]
+    return min(level, key=lambda row: (row["parameters"], -row[key]))
+
+
+def _agreement(evident: Row | None, predictive: Row | None, usable: Sequence[Row]) -> tuple[bool | None, str]:
+    """Whether the records left out contradict the evidence, in words."""
+    if evident is None or predictive is None or evident["elpd"] is None:
+        return None, "Either evidence or prediction is missing; one stands alone."
+    best = max((row for row in usable if row["elpd"] is not None), key=lambda row: row["elpd"])
+    lost = by_prediction(best, evident)
+    assert lost is not None
+    if best is evident or not lost.counts:
+        return True, (
+            f"Evidence and prediction agree: {evident['name']} is not predicted worse than any other beyond "
+            f"chance (best: {best['name']}, {lost})."
+        )
+    last = min((row for row in usable if row["elpd"] is not None), key=lambda row: row["elpd"])
+    worst = " and predicts worst of all" if last is evident else ""
+    return False, (
+        f"Fit and prediction disagree: {evident['name']} has the evidence{worst}, but {best['name']} "
+        f"predicts what was left out better by {lost}. The models leave something out that both notice "
+        "differently."
+    )
+
+
+def _why(
+    preferred: Row | None,
+    evident: Row | None,
+    usable: Sequence[Row],
+    agree: bool | None,
+    sentence: str,
+    unseen: bool,
+) -> str:
+    """The decision with its reason."""
+    if preferred is None:
+        return "No candidate has a score to be ranked by."
+    name = preferred["name"]
+    if evident is None:
+        return f"{name} is preferred by prediction alone: no candidate has an evidence."
+    if preferred is not evident or agree is False:
+        reason = "records that were not fitted decide" if unseen else "no whole record was held out to decide"
+        return f"{name} is preferred, with a warning: {sentence} Here {reason}."
+    richer = [row for row in usable if row["parameters"] > preferred["parameters"]]
+    others = [row for row in usable if row is not preferred and row not in richer]
+    parts = [f"{row['name']}, with more parameters, gains {gain}" for row, gain in _gains(richer, preferred)]
+    parts += [f"{row['name']} stands at {gain}" for row, gain in _gains(others, preferred)]
+    word = "suffices" if richer else "is preferred"
+    return f"{name} {word}: in log evidence {'; '.join(parts)}. {sentence}"
+
+
+def _gains(rows: Sequence[Row], against: Row) -> list[tuple[Row, Gain]]:
+    """Rows with what they gain over another, the best first; those without evidence are left out."""
+    told = [(row, by_evidence(row, against)) for row in rows]
+    return sorted(((row, gain) for row, gain in told if gain is not None), key=lambda pair: -pair[1].nats)

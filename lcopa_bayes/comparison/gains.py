@@ -1,0 +1,55 @@
+"""What one candidate gains over another, and when a gain counts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import hypot, log
+from typing import Any, final
+
+from lcopa_bayes.comparison.differences import difference
+
+TIE = log(3)
+"""Difference of log evidence not worth more than a bare mention [nat] (Jeffreys 1961, App. B)."""
+STRONG = log(20)
+"""Difference of log evidence from which a fractional order is claimed [nat] (Kass and Raftery 1995)."""
+ERRORS = 2.0
+"""Standard errors that a difference must exceed to count [-]."""
+Row = Mapping[str, Any]
+
+
+@final
+@dataclass(frozen=True)
+class Gain:
+    """What one candidate gains over another."""
+
+    nats: float
+    """Difference of log evidence, or of log predictive density [nat]."""
+    sd: float
+    """Its standard error [nat]."""
+
+    @property
+    def counts(self) -> bool:
+        """Whether it is beyond chance and worth more than a bare mention."""
+        return self.nats > max(TIE, ERRORS * self.sd)
+
+    def __str__(self) -> str:
+        digits = 1 if self.sd >= 0.05 else 2
+        return f"{self.nats:+.{digits}f} ± {self.sd:.{digits}f} nats"
+
+
+def by_evidence(one: Row, other: Row) -> Gain | None:
+    """Difference of log evidence; None where either has none."""
+    if one["log_evidence"] is None or other["log_evidence"] is None:
+        return None
+    return Gain(
+        one["log_evidence"] - other["log_evidence"], hypot(one["log_evidence_sd"], other["log_evidence_sd"])
+    )
+
+
+def by_prediction(one: Row, other: Row) -> Gain | None:
+    """Difference of log predictive density; None where nothing was predicted."""
+    if one["elpd"] is None or other["elpd"] is None:
+        return None
+    nats, sd = difference(one, other)
+    return Gain(nats, hypot(sd, one["elpd_monte_carlo_sd"], other["elpd_monte_carlo_sd"]))

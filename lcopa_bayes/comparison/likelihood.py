@@ -1,0 +1,64 @@
+"""The maximum of the likelihood and the criteria that count parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import log
+from typing import Any, final
+
+import numpy as np
+
+from lcopa_bayes.audit.landscape import Landscape, Peak
+from lcopa_bayes.estimate import plain
+from lcopa_bayes.fit import Fit
+
+_CLIMBED = 4
+"""Draws the maximum is sought from."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Criteria:
+    """AIC and BIC, for those who want them: they know neither priors nor ridges."""
+
+    log_likelihood: float
+    """Maximum [nat]."""
+    parameters: int
+    """Free parameters, noise and offsets included [-]."""
+    samples: int
+    """Observed samples [-]."""
+
+    @property
+    def aic(self) -> float:
+        """``2 k - 2 log L`` (Akaike 1974) [-]."""
+        return 2 * self.parameters - 2 * self.log_likelihood
+
+    @property
+    def bic(self) -> float:
+        """``k log n - 2 log L`` (Schwarz 1978) [-]; n counts samples as if they were independent."""
+        return self.parameters * log(self.samples) - 2 * self.log_likelihood
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        told: dict[str, Any] = plain(
+            {
+                "max_log_likelihood": self.log_likelihood,
+                "parameters": self.parameters,
+                "samples": self.samples,
+                "aic": self.aic,
+                "bic": self.bic,
+            }
+        )
+        return told
+
+
+def criteria(fit: Fit) -> Criteria:
+    """From the highest of a few draws, climbed."""
+    posterior = fit.problem.posterior
+    landscape = Landscape(posterior)
+    values = fit.draws.thinned(200)
+    heights = landscape.log_likelihood(values)
+    starts = values[np.argsort(-heights)[:_CLIMBED]]
+    peak: Peak = max((landscape.climb(start) for start in starts), key=lambda one: one.log_likelihood)
+    best = max(peak.log_likelihood, float(heights.max()))
+    return Criteria(best, len(landscape.free), posterior.size)

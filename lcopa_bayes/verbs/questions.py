@@ -1,0 +1,72 @@
+"""Verbs that ask more of a study: audit, design, compare."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from lcopa_bayes.audit.audit import audit
+from lcopa_bayes.comparison.candidatefile import load_candidates
+from lcopa_bayes.comparison.candidates import candidates_of
+from lcopa_bayes.comparison.compare import compare
+from lcopa_bayes.design.design import checked
+from lcopa_bayes.design.nextmeasurement import next_measurement
+from lcopa_bayes.fit import Fit, fit
+from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.planning import DESIGN_PAGE, plan_next
+from lcopa_bayes.report import write_report
+from lcopa_bayes.report.auditpage import write_audit
+from lcopa_bayes.report.comparisonpage import write_comparison
+from lcopa_bayes.runfolder import save_fit, save_json
+from lcopa_bayes.study import Study
+from lcopa_bayes.verbs.outcome import Told, place_of, study_of, with_report
+
+
+def audit_study(options: argparse.Namespace, command: list[str]) -> Told:
+    """Identifiability of every parameter, after the fit it rests on, with a page of its own."""
+    made, folder, jobs = _basis(options, command, study_of(options))
+    values = audit(made, jobs=jobs).as_json()
+    values["next_measurement"] = next_measurement(made, values["parameters"])
+    save_json(values, folder / "audit.json")
+    words = [f"{'parameter':16}{'verdict':30}why"]
+    words += [f"{row['name']:16}{row['verdict']:30}{row['reason']}" for row in values["parameters"]]
+    return with_report(values, write_audit(folder), *words)
+
+
+def design_study(options: argparse.Namespace, command: list[str]) -> Told:
+    """What to measure next, after the fit it rests on: the winning drive, confirmed, and its template."""
+    study = study_of(options)
+    wanted = {key: getattr(options, key) for key in ("time", "repeats", "amplitude", "refresh")}
+    checked(problem_of(study), **wanted)  # before a long fit
+    made, folder, jobs = _basis(options, command, study)
+    wanted |= {"with_prior": options.with_prior, "quick": options.quick}
+    values, words = plan_next(made, folder, jobs=jobs, **wanted)
+    return with_report(values, folder / DESIGN_PAGE, *words)
+
+
+def _basis(options: argparse.Namespace, command: list[str], study: Study) -> tuple[Fit, Path, int]:
+    """The fit that an audit or a design rests on, saved and reported; its folder, and processes to use."""
+    folder, jobs = place_of(options, study)
+    made = fit(
+        study, jobs=jobs, folder=folder, resume=options.resume, quick=options.quick, quiet=options.quiet
+    )
+    save_fit(made, folder, command)
+    write_report(folder)
+    return made, folder, jobs
+
+
+def compare_study(options: argparse.Namespace, command: list[str]) -> Told:
+    """Candidates derived from a study, scored and decided, with a page of its own."""
+    study = study_of(options)
+    folder, jobs = place_of(options, study)
+    chosen, extra = load_candidates(options.candidates) if options.candidates else (None, ())
+    values = compare(
+        candidates_of(study, extra, options.pick or chosen),
+        jobs=jobs,
+        folder=folder,
+        resume=options.resume,
+        quick=options.quick,
+        quiet=options.quiet,
+    )
+    save_json(values | {"command": command}, folder / "compare.json")
+    return with_report(values, write_comparison(folder), values["why"], values["fractional"]["sentence"])

@@ -1,0 +1,101 @@
+"""Verbs that make numbers from a study or records from a bench: fit, calibrate, simulate, report."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from lcopa_bayes.bench.campaign import write_campaign
+from lcopa_bayes.bench.plan import load_plan
+from lcopa_bayes.calibration.calibrate import calibrate
+from lcopa_bayes.calibration.summary import results as calibration_results
+from lcopa_bayes.calibration.summary import tables
+from lcopa_bayes.cores import cores
+from lcopa_bayes.files import writable_folder
+from lcopa_bayes.fit import fit
+from lcopa_bayes.provenance import provenance
+from lcopa_bayes.report import write_report
+from lcopa_bayes.report.calibrationpage import is_calibration, write_calibration
+from lcopa_bayes.rival import integer_rival
+from lcopa_bayes.runfolder import save_fit, save_json, save_table
+from lcopa_bayes.study import Study
+from lcopa_bayes.verbs.outcome import Told, place_of, study_of, with_report
+
+
+def run(options: argparse.Namespace, command: list[str]) -> Told:
+    """All stages of a study; the fit comes first and feeds the others."""
+    study = study_of(options)
+    return _fitted(options, command, study, frozenset(study.stages))
+
+
+def fit_study(options: argparse.Namespace, command: list[str]) -> Told:
+    """Posterior, bands and step metrics, with a report."""
+    return _fitted(options, command, study_of(options), frozenset({"fit"}))
+
+
+def _fitted(options: argparse.Namespace, command: list[str], study: Study, stages: frozenset[str]) -> Told:
+    """A fit and what the stages add to it, saved and reported."""
+    folder, jobs = place_of(options, study)
+    made = fit(
+        study,
+        jobs=jobs,
+        folder=folder,
+        resume=options.resume,
+        quick=options.quick,
+        cross_check=options.cross_check,
+        quiet=options.quiet,
+    )
+    rival = None
+    if "rival" in stages:
+        rival = integer_rival(made, jobs=jobs, quick=options.quick, quiet=options.quiet)
+    told = save_fit(made, folder, command, rival=rival)
+    return with_report(told, write_report(folder), told["verdict"])
+
+
+def report(options: argparse.Namespace, command: list[str]) -> Told:
+    """The report of a run folder, drawn again."""
+    folder = options.folder
+    return with_report({}, write_calibration(folder) if is_calibration(folder) else write_report(folder))
+
+
+def simulate(options: argparse.Namespace, command: list[str]) -> Told:
+    """Records of a campaign file, measured on the virtual bench."""
+    plan = load_plan(options.campaign)
+    seed = plan.seed if options.seed is None else options.seed
+    records = plan.run(np.random.default_rng(seed))
+    paths = write_campaign(
+        options.out,
+        records,
+        held_out=plan.held_out,
+        name=plan.name,
+        seed=seed,
+        overwrite=options.overwrite,
+    )
+    verdict = f"{len(records)} records in {options.out}"
+    return Told({"verdict": verdict, "files": [str(path) for path in paths]}, (verdict,))
+
+
+def calibrate_study(options: argparse.Namespace, command: list[str]) -> Told:
+    """Coverage and ranks of truths over many simulated replicas of a study, with a report."""
+    study = study_of(options)
+    folder = options.out or Path("reports/calibration") / study.name
+    made = calibrate(
+        study,
+        replicas=options.replicas,
+        around=options.around,
+        jobs=options.jobs or cores(),
+        dask=options.dask,
+        folder=folder,
+        resume=options.resume,
+        quick=options.quick,
+        quiet=options.quiet,
+    )
+    values = calibration_results(made)
+    writable_folder(folder / "tables")
+    for name, table in tables(made).items():
+        save_table(table, folder / "tables" / f"{name}.csv")
+    save_json(provenance(study, command), folder / "provenance.json")
+    save_json(values, folder / "results.json")
+    return with_report(values, write_calibration(folder), values["verdict"])
