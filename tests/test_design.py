@@ -221,6 +221,20 @@ def test_the_winner_beats_the_step_as_promised_in_simulation(one):
     assert json.dumps(told, allow_nan=False)
 
 
+def test_a_sum_is_recognised_at_draws_of_the_prior_under_drives_that_change_often():
+    made = problem(record(camera=0.6), terms=2, orders=(0.8, 0.8))
+    table, draws = made.posterior.table, made.posterior.table.draw(48, np.random.default_rng(1))
+    believed = SimpleNamespace(
+        problem=made,
+        study=made.study,
+        draws=draws_of(table, draws),
+        run=SimpleNamespace(plan=SimpleNamespace(seed=1)),
+    )
+    found = design(believed, time=48.0, ladder=False, draws=6)
+    assert found.structure.blind == {"time_1", "time_2"}
+    assert "time_1" in found.reason("time_2")
+
+
 def test_what_only_acts_as_a_sum_gets_words_and_no_number():
     made = problem(terms=2, orders=(0.8, 0.8))
     rows = TRUTH | {"time_1": 1.5, "time_2": 0.7, "order_1": 0.8, "order_2": 0.8}

@@ -84,12 +84,19 @@ class Structure:
         return tuple(dict.fromkeys(other for group in found for other in group if other != name))
 
 
-def structure(names: Sequence[str], slopes: Sequence[Matrix], values: Sequence[Vector]) -> Structure:
+def structure(
+    names: Sequence[str],
+    slopes: Sequence[Matrix],
+    values: Sequence[Vector],
+    *,
+    tolerances: tuple[float, float, float] = TOLERANCES,
+) -> Structure:
     """Symmetries of a model from its sensitivities at several points.
 
     Parameters: `slopes`, per point, derivatives of all samples in the logarithm of each parameter's size
     (samples, parameters); `values`, per point, the parameters (parameters,), none zero. A direction is
-    blind when it is so at every point: full rank at one point proves that there is none nearby.
+    blind when it is so at every point: full rank at one point proves that there is none nearby. All of the
+    `tolerances` [-] must agree on the rank.
     """
     names = tuple(names)
     largest = [max(float(np.linalg.norm(m, axis=0).max()), 1e-300) for m in slopes]
@@ -106,8 +113,8 @@ def structure(names: Sequence[str], slopes: Sequence[Matrix], values: Sequence[V
     if not points or not kept:
         return Structure(tuple(found), len(names), 0, True, np.empty(0))
     spectra = [_spectrum(m) for m in points]
-    ranks = {t: max(int(np.sum(s > t)) for s in spectra) for t in TOLERANCES}
-    rank = ranks[TOLERANCES[1]]
+    ranks = {t: max(int(np.sum(s > t)) for s in spectra) for t in tolerances}
+    rank = ranks[tolerances[1]]
     certain = len(set(ranks.values())) == 1
     if rank < len(kept) and certain:
         clear = np.argsort([-s[rank - 1] for s in spectra], kind="stable")[:_CLEAR]

@@ -167,14 +167,17 @@ def confirm(made: Design, *, replicas: int = REPLICAS, jobs: int = 1) -> tuple[C
 
 
 def confirmed(made: Design, *, jobs: int = 1, replicas: int = REPLICAS) -> dict[str, Any]:
-    """`confirm` as plain values under the key `confirmed`, the trial where bounds can be believed first."""
+    """`confirm` as plain values under the key `confirmed`: the verdict and factor of the first trial, where
+    bounds can be believed if they can anywhere, and whether every trial agrees."""
     trials = confirm(made, jobs=jobs, replicas=replicas)
     sentence = (
         "; ".join(one.sentence for one in trials) or "nothing to confirm: no drive beats the plain step"
     )
     return {
         "confirmed": {
-            "confirmed": bool(trials) and all(one.confirmed for one in trials),
+            "confirmed": bool(trials) and trials[0].confirmed,
+            "where": trials[0].where if trials else None,
+            "everywhere": bool(trials) and all(one.confirmed for one in trials),
             "factor": trials[0].as_json()["factor"] if trials else None,
             "sentence": sentence,
             "trials": [one.as_json() for one in trials],
