@@ -90,6 +90,16 @@ def _parser() -> argparse.ArgumentParser:
     claims.add_argument(
         "--audit", type=Path, metavar="RUNFOLDER", help="run folder of an audit, to decide I1-I6"
     )
+    claims.add_argument(
+        "--compare",
+        type=Path,
+        metavar="RUNFOLDER",
+        help="run folder of a comparison, for M1, M2, M4, I5",
+    )
+    claims.add_argument(
+        "--no-compare", action="store_true", help="leave open what a comparison decides: no models are fitted"
+    )
+    claims.add_argument("--jobs", type=int, default=None, help="processes (default: all cores)")
     report = add("report", verbs.report, [], "render the report of a run folder again")
     report.add_argument("folder", type=Path, help="run folder")
     bench = add("simulate", verbs.simulate, [], "measure a campaign file on the virtual bench")

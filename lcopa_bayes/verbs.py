@@ -24,12 +24,14 @@ from lcopa_bayes.files import writable_folder
 from lcopa_bayes.fit import fit
 from lcopa_bayes.paper.auditclaims import load_audit
 from lcopa_bayes.paper.claims import judge
-from lcopa_bayes.paper.identify import identify, results, scannable
+from lcopa_bayes.paper.comparisonclaims import load_comparison
+from lcopa_bayes.paper.identify import identify, results, scannable, words_of
 from lcopa_bayes.paper.intervals import MOST_TERMS, Interval, Scan
 from lcopa_bayes.paper.opticsplan import OpticsPlan
 from lcopa_bayes.paper.staticoptics import static_optics
 from lcopa_bayes.paper.steptable import load_posterior, step_table
 from lcopa_bayes.paper.verdict import Evidence
+from lcopa_bayes.paper.virtualcomparison import virtual_comparison
 from lcopa_bayes.provenance import provenance
 from lcopa_bayes.report import write_report
 from lcopa_bayes.report.auditpage import write_audit
@@ -195,22 +197,18 @@ def identify_study(options: argparse.Namespace, command: list[str]) -> Told:
     rows = step_table(study, found, posterior=posterior)
     values = results(study, found, plan) | {"step_metrics": [row.as_json() for row in rows]}
     save_json(values, folder / "identify.json")
-    words = [f"{'path':8}{'model':30}{'orders':24}{'delay':>8}{'steady':>12}{'RMSE':>11}  unit"]
-    for path in values["paths"]:
-        for model in path["models"]:
-            orders = ", ".join(f"{order:.3g}" for order in model["orders"])
-            words.append(
-                f"{path['path']:8}{model['method']:30}{orders:24}{model['delay']:8.4g}{model['steady']:12.5g}"
-                f"{model['output_rmse']:11.3g}  {path['response_unit']}"
-            )
-    return _with_report(values, write_identification(folder, study, found, rows), *words)
+    return _with_report(values, write_identification(folder, study, found, rows), *words_of(values))
 
 
 def claims(options: argparse.Namespace, command: list[str]) -> Told:
     """Every claim of the paper with its computed verdict."""
-    at_hand = Evidence(audit=load_audit(options.audit)) if options.audit else None
-    judged = judge(evidence=at_hand)
+    audited = load_audit(options.audit) if options.audit else None
+    compared = load_comparison(options.compare) if options.compare else None
     folder = writable_folder(options.out)
+    if compared is None and not options.no_compare:
+        jobs = options.jobs or cores()
+        compared = virtual_comparison(folder / "comparison", jobs=jobs, quiet=options.quiet)
+    judged = judge(evidence=Evidence(audited, compared))
     values = {"claims": [each.as_json() for each in judged]}
     save_json(values, folder / "results.json")
     words = [f"{'claim':6}{'verdict':14}{'number':>12}  unit"]

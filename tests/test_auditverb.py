@@ -93,7 +93,7 @@ def test_resumed_and_in_two_processes_it_says_the_same(study, run, capsys):
 
 
 def test_claims_read_an_audit(run, tmp_path, capsys):
-    assert main(["claims", "--audit", str(run), "--out", str(tmp_path), "--json"]) == 0
+    assert main(["claims", "--no-compare", "--audit", str(run), "--out", str(tmp_path), "--json"]) == 0
     rows = {row["id"]: row for row in json.loads(capsys.readouterr().out)["claims"]}
     assert rows["I1"]["verdict"] == "undecided"  # orders are fixed: there is no printed form to look at
     assert [rows[claim]["verdict"] for claim in ("I2", "I3", "I4")] == ["contradicted"] * 3
