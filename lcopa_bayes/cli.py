@@ -101,6 +101,12 @@ def _parser() -> argparse.ArgumentParser:
         metavar="RUNFOLDER",
         help="run folders of audits, to decide I1-I6 (default: those of the bundled studies)",
     )
+    claims.add_argument(
+        "--compare",
+        type=Path,
+        metavar="RUNFOLDER",
+        help="run folder of a comparison, to decide M1, M2, M4 and I5 (default: of a bundled study)",
+    )
     report = add("report", runs.report, [], "render the report of a run folder again")
     report.add_argument("folder", type=Path, help="run folder")
     bench = add("simulate", runs.simulate, [], "measure a campaign file on the virtual bench")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from math import log, sqrt
 from typing import Any, Literal, final
 
 import numpy as np
@@ -10,16 +11,18 @@ import numpy as np
 from lcopa_bayes.arrays import Vector
 from lcopa_bayes.estimate import Estimate, plain
 from lcopa_bayes.fit import Fit
-from lcopa_bayes.inference.grade import Level
 
 DECISIVE = 3.0
 """Bayes factor from which it counts as more than worth a bare mention [-] (Jeffreys 1961, App. B)."""
 _WIDEST = 0.1
-"""Widest distance from the integer that counts as at it [-]: an order no audit tells from an integer."""
-_NARROWEST = 0.01
+"""Widest distance from the integer that counts as at it [-]: no record tells such an order from it."""
+_NARROWEST = 0.005
+_FEWEST = 10.0
+"""Effective draws at the integer below which the tail is extrapolated [-]."""
 _PRIOR_DRAWS = 200_000
 
 Answer = Literal["integer", "not an integer", "undecided"]
+Road = Literal["draws at the integer", "normal tail", "undefined"]
 
 
 @final
@@ -30,23 +33,40 @@ class IntegerOrder:
     parameter: str
     nearest: int
     """Integer next to the median, 1 or 2."""
-    bayes_factor: float
-    """Of the integer against a free order [-]; above 1 favours the integer. An upper bound when no draw
-    is at the integer."""
-    relative_sd: float
-    """Monte Carlo standard error over the ratio [-]; infinite for a bound."""
-    bound: bool
-    """Whether `bayes_factor` is only an upper bound."""
+    log_bayes_factor: float
+    """Of the integer against a free order [nat]; above 0 favours the integer."""
+    log_sd: float
+    """Its Monte Carlo standard error [nat]."""
+    road: Road
     window: float
     """Distance from the integer within which draws are counted [-]."""
     estimate: Estimate
-    answer: Answer
+
+    @property
+    def bayes_factor(self) -> float:
+        """Of the integer against a free order [-]."""
+        return float(np.exp(self.log_bayes_factor))
+
+    @property
+    def answer(self) -> Answer:
+        """By two standard errors about a Bayes factor of 3, or of a third."""
+        low, high = (self.log_bayes_factor + side * 2 * self.log_sd for side in (-1, 1))
+        if self.estimate.grade == "unusable" or np.isnan(low):
+            return "undecided"
+        return (
+            "integer" if low > log(DECISIVE) else "not an integer" if high < -log(DECISIVE) else "undecided"
+        )
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
         told: dict[str, Any] = plain(
             {key: value for key, value in asdict(self).items() if key != "estimate"}
-            | {"grade": self.estimate.grade, "estimate": self.estimate.as_json()}
+            | {
+                "bayes_factor": self.bayes_factor,
+                "answer": self.answer,
+                "grade": self.estimate.grade,
+                "estimate": self.estimate.as_json(),
+            }
         )
         return told
 
@@ -59,59 +79,33 @@ def integer_orders(fit: Fit) -> tuple[IntegerOrder, ...]:
         return ()
     prior = table.draw(_PRIOR_DRAWS, rng)
     estimates = {one.name: one for one in fit.draws.estimates()}
-    return tuple(
-        savage_dickey(
-            fit.draws.flat[:, k], prior[:, k], estimates[table.names[k]], terms=_independent(prior.shape[0])
-        )
-        for k in free
-    )
+    return tuple(savage_dickey(fit.draws.flat[:, k], prior[:, k], estimates[table.names[k]]) for k in free)
 
 
-def _independent(count: int) -> float:
-    return float(count)
-
-
-def savage_dickey(
-    posterior: Vector, prior: Vector, estimate: Estimate, *, terms: float | None = None
-) -> IntegerOrder:
+def savage_dickey(posterior: Vector, prior: Vector, estimate: Estimate) -> IntegerOrder:
     """Ratio of posterior to prior density at the integer nearest to the median.
 
-    ``B = p(order | y) / p(order)`` there (Dickey 1971, Ann. Math. Statist. 42), both by the share of draws
-    within a window of it: exact for the question whether the order lies in the window, and tending to the
-    point's ratio with its width, half a posterior standard deviation within 0.01 to 0.1. The relative error
-    is binomial, at the effective sample size of `estimate` and `terms` independent prior draws.
+    ``B = p(order | y) / p(order)`` there (Dickey 1971, Ann. Math. Statist. 42). Densities are shares of
+    draws within a window of half a posterior standard deviation, 0.005 to 0.1. Where fewer than ten
+    effective draws stand in it, the posterior density is that of a normal distribution of the draws' mean
+    and standard deviation: good enough to say that the integer lies far out, and its error grows with the
+    distance as that of both moments does. `prior` draws are independent; those of the posterior are worth
+    the effective sample size of `estimate`.
     """
     nearest = max(1, round(float(np.median(posterior))))
-    window = float(np.clip(0.5 * posterior.std(), _NARROWEST, _WIDEST))
+    mean, sd, ess = float(posterior.mean()), float(posterior.std()), max(float(estimate.ess), 2.0)
+    window = float(np.clip(0.5 * sd, _NARROWEST, _WIDEST))
     after, before = (float(np.mean(np.abs(draws - nearest) <= window)) for draws in (posterior, prior))
-    size = prior.size if terms is None else terms
-    ess = max(estimate.ess, 1.0)
     if before == 0.0:
-        return IntegerOrder(estimate.name, nearest, np.nan, np.inf, False, window, estimate, "undecided")
-    if after == 0.0:
-        # three in as many draws: the 95 % limit of a share of which none was seen
-        ratio, relative, bound = 3.0 / ess / before, np.inf, True
-    else:
-        ratio, bound = after / before, False
-        relative = float(np.sqrt((1 - after) / (after * ess) + (1 - before) / (before * size)))
-    return IntegerOrder(
-        estimate.name,
-        nearest,
-        ratio,
-        relative,
-        bound,
-        window,
-        estimate,
-        _answer(ratio, relative, bound, estimate.grade),
-    )
-
-
-def _answer(ratio: float, relative: float, bound: bool, grade: str) -> Answer:
-    level: Level | str = grade
-    if level == "unusable":
-        return "undecided"
-    if bound:
-        return "not an integer" if ratio < 1 / DECISIVE else "undecided"
-    if ratio / (1 + 2 * relative) > DECISIVE:
-        return "integer"
-    return "not an integer" if ratio * (1 + 2 * relative) < 1 / DECISIVE else "undecided"
+        return IntegerOrder(estimate.name, nearest, np.nan, np.nan, "undefined", window, estimate)
+    prior_error = (1 - before) / (before * prior.size)
+    if after * ess >= _FEWEST:
+        error = sqrt((1 - after) / (after * ess) + prior_error)
+        value = log(after / before)
+        return IntegerOrder(estimate.name, nearest, value, error, "draws at the integer", window, estimate)
+    beyond = (nearest - mean) / sd
+    width = min(nearest + window, 2.0) - (nearest - window)  # an order has nothing beyond 2
+    density = -0.5 * beyond**2 - log(sd * sqrt(2 * np.pi))
+    value = density + log(width / before)
+    error = sqrt(beyond**2 / ess + (beyond**2 - 1) ** 2 / (2 * ess) + prior_error)
+    return IntegerOrder(estimate.name, nearest, value, error, "normal tail", window, estimate)

@@ -54,7 +54,8 @@ class Width:
 
 
 def widths(fit: Fit) -> tuple[Width, ...]:
-    """Log evidence under priors half and twice as wide, about the same centre on their own scale.
+    """Log evidence under priors half and twice as wide, about the same centre on their own scale; times are
+    widened upwards alone.
 
     ``Z' / Z = E[p'(theta) / p(theta)]`` over the draws where the new support lies inside the old one and
     the weights are usable; else walkers are carried to the new posterior and bridged anew (`evidence`).
@@ -129,8 +130,10 @@ def _scaled(row: Parameter, factor: float) -> Parameter:
         return row
     told = dict(row.prior.parameters)
     if row.prior.dist == "loguniform":
-        middle, half = 0.5 * log(told["a"] * told["b"]), 0.5 * log(told["b"] / told["a"]) * factor
-        told |= {"a": exp(middle - half), "b": exp(middle + half)}
+        ends, extra = (log(told["a"]), log(told["b"])), (factor - 1) * log(told["b"] / told["a"])
+        # the lower end of a time is what sampling resolves: below it the model is not computed well
+        low, high = (0.0, extra) if factor > 1 and row.kind == "time" else (-0.5 * extra, 0.5 * extra)
+        told |= {"a": exp(ends[0] + low), "b": exp(ends[1] + high)}
     elif row.prior.dist == "uniform" and row.kind == "delay" and told.get("loc", 0.0) == 0.0:
         told["scale"] = told.get("scale", 1.0) * factor  # a delay is counted from zero
     elif row.prior.dist == "uniform":

@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
-from lcopa_bayes.paper import auditclaims, crosstalkclaims, dynamicclaims, numericsclaims, opticsclaims
+from lcopa_bayes.paper import (
+    auditclaims,
+    comparisonclaims,
+    crosstalkclaims,
+    dynamicclaims,
+    numericsclaims,
+    opticsclaims,
+)
 from lcopa_bayes.paper.auditclaims import from_audit
-from lcopa_bayes.paper.posteriorclaims import fractional_against_integer, needs_comparison
+from lcopa_bayes.paper.comparisonclaims import from_comparison, jointly
+from lcopa_bayes.paper.posteriorclaims import uncompared
 from lcopa_bayes.paper.verdict import Claim, Evidence, Judged
 from lcopa_bayes.stated import PAPER, Stated
 
@@ -45,8 +53,13 @@ CLAIMS: tuple[Claim, ...] = (
         "I5",
         "The dominant order is 1.8, set by the data.",
         "Section 4.3",
-        from_audit(
-            auditclaims.dominant_order, "what interval of the largest order does such a record leave?"
+        jointly(
+            from_audit(
+                auditclaims.dominant_order, "what interval of the largest order does such a record leave?"
+            ),
+            from_comparison(
+                comparisonclaims.dominant_order, "do models of other numbers of terms give the same order?"
+            ),
         ),
     ),
     Claim(
@@ -62,13 +75,21 @@ CLAIMS: tuple[Claim, ...] = (
         "M1",
         "Fractional beats integer order: RMSE up to 2e-4 against more than 1.1e-3 rad.",
         "Section 5.2",
-        fractional_against_integer,
+        from_comparison(
+            comparisonclaims.fractional_against_integer,
+            "do held-out scores and evidence prefer fractional orders, and by how much?",
+            none=uncompared,
+        ),
     ),
     Claim(
         "M2",
         "Both orders reach the same, true steady state; steady-state error below 0.15 %.",
         "Section 5.2, abstract",
-        dynamicclaims.steady_state,
+        from_comparison(
+            comparisonclaims.same_steady_state,
+            "do both models tend to the same value?",
+            otherwise=dynamicclaims.steady_state,
+        ),
     ),
     Claim(
         "M3",
@@ -80,7 +101,10 @@ CLAIMS: tuple[Claim, ...] = (
         "M4",
         "Three viscous elements are needed.",
         "Section 3.1",
-        needs_comparison("how do evidence and held-out scores rank one, two and three viscous elements?"),
+        from_comparison(
+            comparisonclaims.three_needed,
+            "how do evidence and held-out scores rank one, two and three viscous elements?",
+        ),
     ),
     Claim(
         "X1",

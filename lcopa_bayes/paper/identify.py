@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
@@ -104,6 +105,19 @@ def scannable(study: Study, plan: Scan | None = None) -> tuple[PathData, ...]:
     if problems:
         raise InputError(problems)
     return paths
+
+
+def words_of(values: Mapping[str, Any]) -> list[str]:
+    """Lines for a reader: a row per model of each path."""
+    words = [f"{'path':8}{'model':30}{'orders':24}{'delay':>8}{'steady':>12}{'RMSE':>11}  unit"]
+    for path in values["paths"]:
+        for model in path["models"]:
+            orders = ", ".join(f"{order:.3g}" for order in model["orders"])
+            words.append(
+                f"{path['path']:8}{model['method']:30}{orders:24}{model['delay']:8.4g}{model['steady']:12.5g}"
+                f"{model['output_rmse']:11.3g}  {path['response_unit']}"
+            )
+    return words
 
 
 def integer_orders(terms: int) -> tuple[float, ...]:

@@ -1,4 +1,4 @@
-"""Claims that wait for evidence, and M1 and M4: what a comparison of models must decide."""
+"""Claims that wait for evidence, and what is known of M1 without any."""
 
 from __future__ import annotations
 
@@ -25,17 +25,13 @@ def needs_comparison(question: str) -> Test:
     """A test that waits for a comparison of models, with what the comparison has to answer."""
 
     def test(stated: Stated, evidence: Evidence) -> Verdict:
-        missing = (
-            "No comparison is among the evidence"
-            if evidence.compare is None
-            else "No rule reads the comparison yet"
-        )
+        missing = "No comparison is among the evidence"
         return Verdict(Kind.UNDECIDED, None, "-", f"{missing}; it has to answer: {question}")
 
     return test
 
 
-def fractional_against_integer(stated: Stated, evidence: Evidence) -> Verdict:
+def uncompared(stated: Stated, evidence: Evidence) -> Verdict:
     """M1: undecided until a comparison; the number is what integer orders miss of Eq. 65 itself."""
     waiting = needs_comparison("do held-out scores and evidence prefer fractional orders, and by how much?")
     rmse = integer_rival(stated).rmse

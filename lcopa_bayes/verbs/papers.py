@@ -9,7 +9,8 @@ from pathlib import Path
 from lcopa_bayes.files import writable_folder
 from lcopa_bayes.paper.auditclaims import load_audit
 from lcopa_bayes.paper.claims import judge
-from lcopa_bayes.paper.identify import identify, results, scannable
+from lcopa_bayes.paper.comparisonclaims import load_comparison
+from lcopa_bayes.paper.identify import identify, results, scannable, words_of
 from lcopa_bayes.paper.intervals import MOST_TERMS, Interval, Scan
 from lcopa_bayes.paper.opticsplan import OpticsPlan
 from lcopa_bayes.paper.staticoptics import static_optics
@@ -55,20 +56,19 @@ def identify_study(options: argparse.Namespace, command: list[str]) -> Told:
     rows = step_table(study, found, posterior=posterior)
     values = results(study, found, plan) | {"step_metrics": [row.as_json() for row in rows]}
     save_json(values, folder / "identify.json")
-    words = [f"{'path':8}{'model':30}{'orders':24}{'delay':>8}{'steady':>12}{'RMSE':>11}  unit"]
-    for path in values["paths"]:
-        for model in path["models"]:
-            orders = ", ".join(f"{order:.3g}" for order in model["orders"])
-            words.append(
-                f"{path['path']:8}{model['method']:30}{orders:24}{model['delay']:8.4g}{model['steady']:12.5g}"
-                f"{model['output_rmse']:11.3g}  {path['response_unit']}"
-            )
-    return with_report(values, write_identification(folder, study, found, rows), *words)
+    return with_report(values, write_identification(folder, study, found, rows), *words_of(values))
 
 
 def claims(options: argparse.Namespace, command: list[str]) -> Told:
     """Every claim of the paper with its computed verdict."""
-    judged = judge(evidence=Evidence(tuple(map(load_audit, _run_folders(options.audit, "audit.json")))))
+    audits = _run_folders(options.audit, "audit.json")
+    compared = _run_folders([options.compare] if options.compare else None, "compare.json")
+    judged = judge(
+        evidence=Evidence(
+            tuple(load_audit(folder) for folder in audits),
+            next((load_comparison(folder) for folder in reversed(compared)), None),
+        )
+    )
     folder = writable_folder(options.out)
     values = {"claims": [each.as_json() for each in judged]}
     save_json(values, folder / "results.json")

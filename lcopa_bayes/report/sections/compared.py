@@ -127,26 +127,29 @@ def _orders(told: Mapping[str, Any]) -> Section:
     columns = (
         *(Column("model", "code"), Column("order", "code"), Column("median", "number")),
         *(Column("90 % interval", "interval"), Column("nearest", "number")),
-        *(Column("Bayes factor of the integer", "number"), Column("answer"), Column("grade", "grade")),
+        *(
+            Column("log Bayes factor of the integer", "number"),
+            Column("by"),
+            Column("answer"),
+            Column("grade", "grade"),
+        ),
     )
     rows = []
     for one in told["order_is_integer"]:
         estimate, spread = one["estimate"], one["estimate"]["sd"]
-        factor = figures(one["bayes_factor"], 2)
-        said = f"below {factor}" if one["bound"] else factor
-        if one["relative_sd"] is not None and one["bayes_factor"] is not None:
-            said = f"{factor} ± {figures(one['bayes_factor'] * one['relative_sd'], 1)}"
+        said = _with_error(one["log_bayes_factor"], one["log_sd"])
         rows.append(
             (
                 *(str(one["model"]), str(one["parameter"]), to_spread(estimate["value"], spread)),
                 interval(estimate["lower"], estimate["upper"], spread),
-                *(str(one["nearest"]), said, str(one["answer"]), str(one["grade"])),
+                *(str(one["nearest"]), said, str(one["road"]), str(one["answer"]), str(one["grade"])),
             )
         )
     text = (
-        "The Savage-Dickey ratio: posterior over prior density at the nearest integer. Above 3 the integer "
-        "is favoured, below a third it is not; a bound is given where no draw came near. Intervals are "
-        "equal-tailed credible.",
+        "The Savage-Dickey ratio: posterior over prior density at the nearest integer, as a logarithm "
+        "[nat] with its Monte Carlo error. Two errors above log 3 the integer is favoured, two below log "
+        "1/3 it is not. Where too few draws are at the integer its density is that of a normal tail. "
+        "Intervals are equal-tailed credible.",
     )
     tables = (Table(columns, tuple(rows)),) if rows else ()
     return Section("Is this order an integer?", text, (), tables)

@@ -1,0 +1,229 @@
+"""Claims M1, M2, M4 and I5: what a comparison of models on a record like the paper's says of them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from math import hypot, log
+from pathlib import Path
+from typing import Any
+
+from lcopa_bayes.paper.posteriorclaims import needs_comparison
+from lcopa_bayes.paper.printedmodel import integer_rival
+from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict
+from lcopa_bayes.problems import InputError
+from lcopa_bayes.stated import Stated
+
+STRONG = log(20)
+"""Difference of log evidence from which a term is needed [nat] (Kass and Raftery 1995)."""
+ERRORS = 2.0
+"""Standard errors by which a difference must clear a limit [-]."""
+_NEEDS = ("study", "models", "fractional", "order_is_integer", "preferred")
+_LARGEST = ("order_1", "order_1_direct")
+_STEADY = ("steady_state[x_x]", "steady_state[x]")
+
+Test = Callable[[Stated, Evidence], Verdict]
+Model = Mapping[str, Any]
+
+
+def load_comparison(folder: Path) -> Mapping[str, Any]:
+    """`compare.json` of a run folder; InputError when there is none or it cannot be used."""
+    path = folder / "compare.json"
+    try:
+        told: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: cannot be read ({error}); give the run folder that `compare` wrote"
+        ) from None
+    absent = [key for key in _NEEDS if key not in told] if isinstance(told, dict) else list(_NEEDS)
+    if absent:
+        raise InputError(f"{path}: lacks {', '.join(absent)}; run `compare` again with --resume")
+    return told
+
+
+def from_comparison(
+    reading: Callable[[Stated, Mapping[str, Any]], Verdict],
+    question: str,
+    *,
+    none: Test | None = None,
+    otherwise: Test | None = None,
+) -> Test:
+    """A test that reads the comparison.
+
+    Without a comparison the verdict is that of `none`. `otherwise` is a second road to the claim: it must
+    bear it out too, and decides alone where the comparison leaves it open or is absent.
+    """
+
+    def test(stated: Stated, evidence: Evidence) -> Verdict:
+        if evidence.compare is None:
+            return (none or otherwise or needs_comparison(question))(stated, evidence)
+        found = reading(stated, evidence.compare)
+        how = f"Comparison on the study {evidence.compare['study']}: {found.how}"
+        if otherwise is None:
+            return Verdict(found.kind, found.number, found.unit, how)
+        other = otherwise(stated, evidence)
+        if found.kind is Kind.UNDECIDED:
+            return Verdict(other.kind, other.number, other.unit, f"{other.how} {how}")
+        if other.kind is Kind.CONTRADICTED:  # both roads must bear the claim out
+            return Verdict(other.kind, other.number, other.unit, f"{other.how} {how}")
+        return Verdict(found.kind, found.number, found.unit, f"{how} {other.how}")
+
+    return test
+
+
+def fractional_against_integer(stated: Stated, compare: Mapping[str, Any]) -> Verdict:
+    """M1: both errors on the stated sides of their limits, and fractional orders warranted."""
+    pair = _rivals(compare)
+    if pair is None:
+        return Verdict(Kind.UNDECIDED, None, "-", "no usable fractional and integer model is in it.")
+    free, whole = pair
+    records, errors = stated.records, [_rmse(model) for model in pair]
+    if None in errors:
+        return Verdict(Kind.UNDECIDED, None, "-", "its responses are not in rad.")
+    ours, theirs = (float(error or 0.0) for error in errors)
+    holds = (
+        ours <= records.fractional_rmse_two_axes
+        and theirs > records.integer_rmse
+        and compare["fractional"]["verdict"] == "warranted"
+    )
+    closest = integer_rival(stated).rmse
+    how = (
+        f"RMSE {ours:.3g} rad of {free['name']} and {theirs:.3g} rad of the fair integer rival "
+        f"({whole['about']}), a ratio of {theirs / ours:.2f} where more than {records.integer_rmse:g} over "
+        f"{records.fractional_rmse_two_axes:g} rad is stated; {compare['fractional']['sentence']} "
+        "Without noise the integer model closest to Eq. 65 "
+        f"misses it by {closest:.2g} rad. The claim holds when both errors are as stated and fractional "
+        "orders are warranted. Number: the integer rival's error."
+    )
+    return Verdict(Kind.of(holds), theirs, "rad", how)
+
+
+def same_steady_state(stated: Stated, compare: Mapping[str, Any]) -> Verdict:
+    """M2: whether the credible intervals of both steady states lie within the stated error of each other."""
+    pair = _rivals(compare)
+    found = [] if pair is None else [_metric(model, _STEADY) for model in pair]
+    if len(found) < 2 or None in found:
+        return Verdict(Kind.UNDECIDED, None, "-", "no steady state of both kinds of model is in it.")
+    free, whole = (one for one in found if one is not None)
+    ends = [free["lower"], free["upper"], whole["lower"], whole["upper"]]
+    if None in ends or free["value"] == 0:
+        return Verdict(Kind.UNDECIDED, None, "-", "a steady state has an open interval.")
+    limit = stated.records.steady_state_error
+    low, high = ends[2] / ends[1] - 1, ends[3] / ends[0] - 1
+    apart = whole["value"] / free["value"] - 1
+    kind = (
+        Kind.SUPPORTED
+        if -limit < low and high < limit
+        else Kind.CONTRADICTED
+        if low > limit or high < -limit
+        else Kind.UNDECIDED
+    )
+    how = (
+        f"the integer model tends to {whole['value']:.4g}, the fractional one to {free['value']:.4g} "
+        f"{free['unit']}: {100 * apart:+.2g} % apart ({100 * low:+.2g} to {100 * high:+.2g} % by their "
+        f"{100 * free['level']:g} % intervals), stated within {100 * limit:g} %. Number: this distance."
+    )
+    return Verdict(kind, abs(apart), "-", how)
+
+
+def three_needed(stated: Stated, compare: Mapping[str, Any]) -> Verdict:
+    """M4: by the log evidence of three terms over the best of fewer."""
+    fractional = [model for model in _ranked(compare) if not model["integer"]]
+    many = [model for model in fractional if model["terms"] >= 3]
+    few = [model for model in fractional if model["terms"] < 3]
+    if not many or not few:
+        return Verdict(Kind.UNDECIDED, None, "nat", "it lacks usable models of three terms or of fewer.")
+    best, other = (max(models, key=lambda one: float(one["log_evidence"])) for models in (many, few))
+    gain = best["log_evidence"] - other["log_evidence"]
+    sd = hypot(best["log_evidence_sd"], other["log_evidence_sd"])
+    kind = (
+        Kind.SUPPORTED
+        if gain - ERRORS * sd > STRONG
+        else Kind.CONTRADICTED
+        if gain + ERRORS * sd < STRONG
+        else Kind.UNDECIDED
+    )
+    how = (
+        f"{best['name']} gains {gain:+.2f} ± {sd:.2f} nats of log evidence over {other['name']} "
+        f"({other['terms']} term{'s' if other['terms'] > 1 else ''}){_predicted(best, other)}. "
+        "Three elements "
+        f"are needed from {STRONG:.1f} nats on. Number: this gain."
+    )
+    return Verdict(kind, gain, "nat", how)
+
+
+def dominant_order(stated: Stated, compare: Mapping[str, Any]) -> Verdict:
+    """I5: the largest order of every model that the evidence leaves standing."""
+    ranked = [model for model in _ranked(compare) if not model["integer"]]
+    best = max((model["log_evidence"] for model in ranked), default=None)
+    names = [model["name"] for model in ranked if best is not None and best - model["log_evidence"] < STRONG]
+    rows = [
+        one
+        for one in compare["order_is_integer"]
+        if one["model"] in names and one["parameter"] in _LARGEST and one["grade"] != "unusable"
+    ]
+    if not rows:
+        return Verdict(Kind.UNDECIDED, None, "-", "no usable largest order is in it.")
+    wanted = stated.records.dominant_order
+    inside = [one["estimate"]["lower"] <= wanted <= one["estimate"]["upper"] for one in rows]
+    settled = [one["answer"] == "not an integer" for one in rows]
+    width = max(one["estimate"]["upper"] for one in rows) - min(one["estimate"]["lower"] for one in rows)
+    said = ", ".join(
+        f"{one['estimate']['lower']:.3g} to {one['estimate']['upper']:.3g} in {one['model']} "
+        f"({one['answer']})"
+        for one in rows
+    )
+    how = (
+        f"{100 * rows[0]['estimate']['level']:g} % intervals of the largest order in the models the evidence "
+        f"leaves standing: {said}; stated {wanted:g}. The data set it when every interval holds the stated "
+        "order and the nearest integer is excluded. Number: the width of all intervals together."
+    )
+    return Verdict(Kind.of(all(inside) and all(settled)), width, "-", how)
+
+
+def jointly(first: Test, second: Test) -> Test:
+    """A claim that both tests must bear out; one that cannot decide leaves it to the other."""
+
+    def test(stated: Stated, evidence: Evidence) -> Verdict:
+        found = [first(stated, evidence), second(stated, evidence)]
+        decided = [one for one in found if one.kind is not Kind.UNDECIDED]
+        if not decided:
+            return found[0]
+        worst = next((one for one in decided if one.kind is Kind.CONTRADICTED), decided[0])
+        others = [one.how for one in decided if one is not worst]
+        return Verdict(worst.kind, worst.number, worst.unit, " ".join([worst.how, *others]))
+
+    return test
+
+
+def _ranked(compare: Mapping[str, Any]) -> list[Model]:
+    return [one for one in compare["models"] if one["usable"] and one["log_evidence"] is not None]
+
+
+def _rivals(compare: Mapping[str, Any]) -> tuple[Model, Model] | None:
+    """The best fractional and the best integer model by evidence."""
+    ranked = _ranked(compare)
+    kinds = [[one for one in ranked if one["integer"] is kind] for kind in (False, True)]
+    if not all(kinds):
+        return None
+    free, whole = (max(models, key=lambda one: float(one["log_evidence"])) for models in kinds)
+    return free, whole
+
+
+def _rmse(model: Model) -> float | None:
+    """Root mean square error over all records, fitted and held out [rad]; None in another unit."""
+    rows: Sequence[Mapping[str, Any]] = [*model["fit_scores"], *model["held_out"]]
+    if not rows or any(one["unit"] != "rad" for one in rows):
+        return None
+    total = sum(one["rmse"] ** 2 * one["samples"] for one in rows)
+    return float((total / sum(one["samples"] for one in rows)) ** 0.5)
+
+
+def _metric(model: Model, names: Sequence[str]) -> Mapping[str, Any] | None:
+    return next((one for one in model["step_metrics"] if one["name"] in names), None)
+
+
+def _predicted(best: Model, other: Model) -> str:
+    if best["elpd"] is None or other["elpd"] is None:
+        return ""
+    return f", and predicts what was left out better by {best['elpd'] - other['elpd']:+.2f} nats"
