@@ -11,7 +11,7 @@ from lcopa_bayes.report.wording import NONE, figures, interval, percent
 
 def sections(told: Mapping[str, Any]) -> list[Section]:
     """Everything of an audit that is words and numbers."""
-    return [_verdicts(told), _symmetries(told), _functions(told), _delays(told)]
+    return [_verdicts(told), _next(told), _symmetries(told), _functions(told), _delays(told)]
 
 
 def _verdicts(told: Mapping[str, Any]) -> Section:
@@ -54,6 +54,40 @@ def _verdicts(told: Mapping[str, Any]) -> Section:
     )
     tables = (Table(columns, tuple(rows), caption), why, *((contrary,) if against else ()))
     return Section("Verdicts", (), (), tables)
+
+
+def _next(told: Mapping[str, Any]) -> Section:
+    advice = told["next_measurement"]
+    if advice is None:
+        return Section("What to measure next", ("Every parameter is identified: nothing more is needed.",))
+    sentence = str(advice["reason"])
+    text = (f"{sentence[0].upper()}{sentence[1:]}.",)
+    if not advice["parameters"]:
+        return Section("What to measure next", text)
+    columns = (
+        *(Column("name", "code"), Column("best drive"), Column("relative sd", "number")),
+        *(Column("after a plain step", "number"), Column("why none", "prose")),
+    )
+    rows = tuple(
+        (
+            *(row["name"], row["drive"] or NONE, *(_promised(row, key) for key in ("", "_step"))),
+            row["reason"] or NONE,
+        )
+        for row in advice["parameters"]
+    )
+    caption = (
+        f"Parameters that are not identified and what one more record of {advice['time']:g} "
+        f"{advice['time_unit']} promises for each by the drive that is best for it: median Cramer-Rao bounds "
+        "over draws of the posterior; above 1 it is still not determined. The verb design tries "
+        "other times and confirms by simulation."
+    )
+    return Section("What to measure next", text, (), (Table(columns, rows, caption),))
+
+
+def _promised(row: Mapping[str, Any], which: str) -> str:
+    """Expected relative standard deviation after the best drive or after the plain step."""
+    found = row.get(f"expected_relative_sd{which}")
+    return NONE if found is None else figures(found["value"], 2)
 
 
 def _symmetries(told: Mapping[str, Any]) -> Section:
