@@ -56,10 +56,10 @@ class Effort:
     plan: SamplePlan
     nested: NestedPlan
     """Of one run alone."""
-    ours: int = 2
-    nested_runs: int = 3
-    emcee: int = 3
-    dynesty: int = 2
+    ours: int = 1
+    nested_runs: int = 2
+    emcee: int = 2
+    dynesty: int = 1
     cap: float = 12.0
     """Most CPU time of a run of plain dynesty, in runs of this package's sampler [-]."""
     live: int = LIVE
