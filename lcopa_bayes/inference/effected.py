@@ -1,7 +1,7 @@
 """A posterior's model with effects: responses, signatures and Jacobians in the table's values.
 
     made = effected(problem.posterior, values, [OddCurvature(), Vibration(frequency=0.1)])
-    made.responses(values, psi)    # list per record, (samples, axes); psi = made.vanishing gives the base model
+    made.responses(values, psi)    # list per record, (samples, axes); at made.vanishing the base model's
     made.signature(values)         # list per record, (samples, axes, psi): derivative at psi = 0
     made.jacobian(values, psi)     # list per record, (samples, axes, rows of the table)
     made.coefficients              # name, unit, prior scale, sign, effect and record of every psi

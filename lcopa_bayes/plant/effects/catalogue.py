@@ -9,16 +9,17 @@ from __future__ import annotations
 import importlib.util
 import inspect
 from collections.abc import Sequence
+from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
 
-from lcopa_bayes.plant.effects import commands, dynamics, response
+from lcopa_bayes.plant.effects import commands, dynamics, generic, parallel, records, response, sensor
 from lcopa_bayes.plant.effects.effect import Card, Effect
 from lcopa_bayes.problems import InputError, nearest
 
 GROUP = "lcopa_bayes.effects"
 """Entry point group of effects in installed packages."""
-_MODULES = (commands, dynamics, response)
+_MODULES = (commands, dynamics, parallel, response, sensor, records, generic)
 
 
 def bundled() -> dict[str, type[Effect]]:
@@ -38,7 +39,7 @@ def catalogue(add: Sequence[str] = (), folder: Path | None = None) -> dict[str, 
     """
     found, problems = bundled(), []
     told = [(f"entry point {point.name}", point.load) for point in entry_points(group=GROUP)]
-    told += [(f"[effects] add = {text!r}", lambda text=text: _from_file(text, folder)) for text in add]
+    told += [(f"[effects] add = {text!r}", partial(_from_file, text, folder)) for text in add]
     for where, load in told:
         try:
             kind = load()
@@ -69,7 +70,8 @@ def _from_file(text: str, folder: Path | None) -> object:
     if not path.is_file():
         raise InputError(f"{path} is not a file")
     spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     if not hasattr(module, wanted):

@@ -13,6 +13,7 @@ Deflection always means the response without its offset, so that it is 0 at zero
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Self, final
 
@@ -52,11 +53,18 @@ class Ranges:
     """Time from 0 to half of the final deflection after a step, delay excluded [time unit]."""
     direct: Index
     """Drive that each response axis belongs to [-]."""
+    names: tuple[str, ...]
+    """Names of the response axes."""
 
     @property
     def axes(self) -> int:
         """Number of response axes."""
         return self.response.size
+
+    @property
+    def column(self) -> Matrix:
+        """`response` as a column, (axes, 1)."""
+        return self.response[:, None]
 
 
 @final
@@ -213,6 +221,17 @@ class ScatterEffect(Effect):
 def single(name: str, scale: float, unit: str = "-", *, one_signed: bool = False) -> tuple[Coefficient, ...]:
     """One coefficient."""
     return (Coefficient(name, unit, scale, one_signed),)
+
+
+def per_axis(
+    ranges: Ranges, names: Sequence[str], part: float, *, one_signed: bool = False
+) -> tuple[Coefficient, ...]:
+    """Coefficients [response unit] for every axis in turn; their scale is a `part` of its deflection."""
+    return tuple(
+        Coefficient(f"{name}_{axis}" if ranges.axes > 1 else name, "response", part * float(size), one_signed)
+        for axis, size in zip(ranges.names, ranges.response, strict=True)
+        for name in names
+    )
 
 
 def sorted_jumps(times: Vector, jumps: Vector) -> Drive:

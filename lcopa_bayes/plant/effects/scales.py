@@ -43,6 +43,7 @@ def ranges_of(model: ForwardModel, plant: Plant) -> Ranges:
         span,
         _speed(plant, model.layout.element_of[0][int(direct[0])], span),
         direct,
+        tuple(axis.name for axis in model.layout.responses),
     )
 
 

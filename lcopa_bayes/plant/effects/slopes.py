@@ -101,15 +101,10 @@ def plant_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[PlantS
             ]
             return simulator.finished(moved, psi)
 
-        for r, slope in enumerate(
-            difference(at, step, upward=kind == "delays" and _at_zero(plant, place, step))
-        ):
+        upward = kind == "delays" and bool(plant.dynamics.delays[0, place[0]] < step)
+        for r, slope in enumerate(difference(at, step, upward=upward)):
             _entry(out[r], kind, place)[...] = slope
     return out
-
-
-def _at_zero(plant: Plant, place: tuple[int, ...], step: float) -> bool:
-    return bool(plant.dynamics.delays[0, place[0]] < step)
 
 
 def _entries(simulator: Simulator, plant: Plant) -> Iterator[tuple[str, tuple[int, ...], float]]:
