@@ -26,8 +26,9 @@ from lcopa_bayes.inference.data import Samples
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.plant.effects.effect import Coefficient, Effect, Ranges
+from lcopa_bayes.plant.effects.passage import Plant
 from lcopa_bayes.plant.effects.scales import ranges_of
-from lcopa_bayes.plant.effects.simulator import Plant, Simulator
+from lcopa_bayes.plant.effects.simulator import Simulator
 from lcopa_bayes.plant.effects.slopes import coefficient_slopes, plant_slopes
 from lcopa_bayes.plant.forward import ForwardModel
 
@@ -119,7 +120,7 @@ class Effected:
     def jacobian(self, values: Vector, psi: Vector | None = None) -> list[Matrix]:
         """Derivative in the table's values, per record (samples, axes, rows); 0 for noise parameters.
 
-        Exact where no effect acts before the reading, a central difference otherwise.
+        Exact without effects; see `plant.effects.slopes.plant_slopes` for what is differenced.
         """
         at, table = self.vanishing if psi is None else psi, self.table
         slopes = plant_slopes(self.simulator, self.plant(values), at)

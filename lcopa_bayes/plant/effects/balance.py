@@ -93,7 +93,7 @@ def _iterate(
     y = history
     steps: list[Vector] = []
     points: list[Vector] = []
-    first = np.inf
+    sizes: list[float] = []
     for sweep in range(_LONG_SWEEPS if short else _SWEEPS):
         with np.errstate(over="ignore", invalid="ignore"):
             target, v = swept(y)
@@ -103,10 +103,11 @@ def _iterate(
             return None
         if size < _TOLERANCE:
             return target, v
-        if sweep == 3:
-            first = size
-        if sweep > 6 and size > first and not short:
-            return None
+        sizes.append(size)
+        if sweep >= 8 and not short:  # give up early where the pace of the last sweeps would not do
+            pace = np.log(size / sizes[-6]) / 5
+            if pace >= 0 or np.log(_TOLERANCE / size) / pace > _SWEEPS - sweep:
+                return None
         steps.append(change.ravel())
         points.append((target / scale).ravel())
         del steps[: -_DEPTH - 1], points[: -_DEPTH - 1]
@@ -123,18 +124,18 @@ def _iterate(
 
 def resting(force: Callable[[Matrix], Matrix], start: Matrix, scale: Vector) -> Matrix:
     """Level at which ``force(y) = y``, (axes, 1), by the secant method from `start`; raises RunawayError."""
-    y = start
-    ahead = force(y) - y
-    step = np.where(ahead == 0.0, 1e-6 * scale[:, None], ahead)
-    for _ in range(_LONG_SWEEPS):
-        if np.all(np.abs(ahead) <= _TOLERANCE * scale[:, None]):
-            return y
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+    y, small, size = start, _TOLERANCE * scale[:, None], scale[:, None]
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        ahead = force(y) - y
+        step = np.full(y.shape, 1e-6) * size
+        for _ in range(_LONG_SWEEPS):
+            done = np.abs(ahead) <= small
+            if done.all():
+                return y
             slope = (force(y + step) - (y + step) - ahead) / step
-            step = np.where(np.abs(ahead) <= _TOLERANCE * scale[:, None], 0.0, -ahead / slope)
-            y = y + step
-            ahead = force(y) - y
-        if not np.all(np.abs(y) < _RUNAWAY * scale[:, None]):
-            break
-        step = np.where(step == 0.0, 1e-6 * scale[:, None], 1e-3 * step)
+            move = np.where(done, 0.0, -ahead / slope)
+            y, ahead = y + move, force(y + move) - (y + move)
+            if not np.all(np.abs(y) < _RUNAWAY * size):  # NaN too
+                break
+            step = np.where(done, 1e-6 * size, 1e-3 * move)
     raise RunawayError(0)

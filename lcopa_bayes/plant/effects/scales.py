@@ -8,7 +8,7 @@ from lcopa_bayes.arrays import Index, Vector
 from lcopa_bayes.operational.series import Circle
 from lcopa_bayes.operational.transfer import transfer
 from lcopa_bayes.plant.effects.effect import Ranges
-from lcopa_bayes.plant.effects.simulator import Plant
+from lcopa_bayes.plant.effects.passage import Plant
 from lcopa_bayes.plant.forward import Experiment, ForwardModel
 
 _BLOCKS = 2048

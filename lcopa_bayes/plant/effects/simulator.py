@@ -6,14 +6,11 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple, final
+from typing import final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Array, Matrix, Vector
-from lcopa_bayes.operational.series import Spectrum
-from lcopa_bayes.operational.transfer import transfer
-from lcopa_bayes.plant.effects.balance import RunawayError, balanced, resting
+from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.plant.effects.effect import (
     DriveEffect,
     Effect,
@@ -24,42 +21,14 @@ from lcopa_bayes.plant.effects.effect import (
     ReadoutEffect,
     Scene,
     SensorEffect,
-    UnstableError,
 )
-from lcopa_bayes.plant.forward import Dynamics, Experiment, ForwardModel
+from lcopa_bayes.plant.effects.passage import Moved, Plant, linear, passed
+from lcopa_bayes.plant.forward import ForwardModel
 
 UPSTREAM = (DriveEffect, ElementEffect, ForceEffect, SensorEffect)
 """Places before the reading."""
 _KEPT = 3
 """Simulations kept, so that what acts after the plant is evaluated without simulating it again."""
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Plant:
-    """One plant as numbers."""
-
-    gains: Matrix
-    """(responses, drives) [response unit per drive unit]."""
-    dynamics: Dynamics
-    """A batch of one."""
-    offsets: Matrix
-    """(records, responses) [response unit]."""
-
-    @property
-    def key(self) -> bytes:
-        """Equal for plants that move alike."""
-        parts = (self.gains, *self.dynamics.times, *self.dynamics.orders, self.dynamics.delays)
-        return b"".join(part.tobytes() for part in parts)
-
-
-class Moved(NamedTuple):
-    """A record up to its reading."""
-
-    scene: Scene
-    """With the commands as they act."""
-    deflection: Matrix
-    """(samples, axes) [response unit]."""
 
 
 @final
@@ -133,34 +102,68 @@ class Simulator:
         return out
 
     def moved(self, plant: Plant, psi: Vector) -> list[Moved]:
-        """Every record up to its reading; the latest few are kept."""
-        upstream = [psi[self._slices[e]] for e, f in enumerate(self.effects) if isinstance(f, UPSTREAM)]
-        key = plant.key + b"".join(part.tobytes() for part in upstream)
+        """Every record up to its reading; the latest few are kept.
+
+        Effects whose coefficients are all 0 are left out, and what only changes commands is simulated by
+        the forward model itself.
+        """
+        parts = [psi[self._slices[e]] for e, f in enumerate(self.effects) if isinstance(f, UPSTREAM)]
+        key = plant.key + b"".join(part.tobytes() for part in parts)
         if key in self._kept:
             self._kept.move_to_end(key)
         else:
-            if upstream:
-                spectra: dict[tuple[int, int, float, float], Spectrum] = {}
-                records = range(len(self.model.experiments))
-                self._kept[key] = [self._moved_record(r, plant, psi, spectra) for r in records]
-            else:
-                self._kept[key] = self.linear(plant)
+            acting = self._bending(psi)
+            scenes = self.scenes(plant, psi)
+            model = self.driven(scenes)
+            made = (
+                passed(model, scenes, plant, [self._acting(acting, psi, r) for r in range(len(scenes))])
+                if any(acting)
+                else linear(model, scenes, plant)
+            )
+            self._kept[key] = made
             while len(self._kept) > _KEPT:
                 self._kept.popitem(last=False)
         return self._kept[key]
 
-    def linear(self, plant: Plant) -> list[Moved]:
-        """Every record of the linear plant, by the forward model."""
+    def _bending(self, psi: Vector) -> list[bool]:
+        """Of each effect, whether it acts between commands and reading."""
+        return [
+            isinstance(effect, (ElementEffect, ForceEffect, SensorEffect)) and bool(psi[part].any())
+            for effect, part in zip(self.effects, self._slices, strict=True)
+        ]
+
+    def bends(self, psi: Vector) -> bool:
+        """Whether anything acts between commands and reading, so that the forward model does not hold."""
+        return any(self._bending(psi))
+
+    def _acting(self, acting: Sequence[bool], psi: Vector, record: int) -> list[tuple[Effect, Vector]]:
+        """Effects that act before the reading, with their coefficients on a record."""
+        return [(self.effects[e], self.part(psi, e, record)) for e, acts in enumerate(acting) if acts]
+
+    def scenes(self, plant: Plant, psi: Vector) -> list[Scene]:
+        """Every record with the commands as they act."""
         out = []
-        for r, units in enumerate(self.model.unit_responses(plant.dynamics)):
-            scene = self.scene(r, plant)
-            at_rest = plant.gains @ scene.rest
-            rows = [
-                sum(plant.gains[i, j] * units[unit, 0] for j, unit in enumerate(row)) + at_rest[i]
-                for i, row in enumerate(self.model.layout.unit_of)
-            ]
-            out.append(Moved(scene, np.stack(rows, axis=1)))
+        for record in range(len(self.model.experiments)):
+            scene = self.scene(record, plant)
+            for e, effect in enumerate(self.effects):
+                own = self.part(psi, e, record)
+                if isinstance(effect, DriveEffect) and own.any():
+                    pairs = [
+                        effect.commands(drive, float(scene.rest[j]), j, scene, own)
+                        for j, drive in enumerate(scene.drives)
+                    ]
+                    drives, rest = tuple(drive for drive, _ in pairs), np.array([at for _, at in pairs])
+                    scene = replace(scene, drives=drives, rest=rest)
+            out.append(scene)
         return out
+
+    def driven(self, scenes: Sequence[Scene]) -> ForwardModel:
+        """The forward model under the commands of the scenes."""
+        pairs = list(zip(self.model.experiments, scenes, strict=True))
+        if all(experiment.drives is scene.drives for experiment, scene in pairs):
+            return self.model
+        changed = (replace(each, drives=scene.drives, rest=scene.rest) for each, scene in pairs)
+        return replace(self.model, experiments=tuple(changed))
 
     def scene(self, record: int, plant: Plant) -> Scene:
         """A record as commanded."""
@@ -177,122 +180,3 @@ class Simulator:
             plant.gains,
             plant.dynamics.delays[0][np.array(layout.delay_of)],
         )
-
-    def _moved_record(
-        self, record: int, plant: Plant, psi: Vector, spectra: dict[tuple[int, int, float, float], Spectrum]
-    ) -> Moved:
-        """One record up to its reading, on its grid."""
-        experiment = self.model.experiments[record]
-        scene = self.scene(record, plant)
-        mine = [self.part(psi, e, record) for e in range(len(self.effects))]
-        stretch = 1.0
-        for effect, own in zip(self.effects, mine, strict=True):
-            if isinstance(effect, DriveEffect):
-                pairs = [
-                    effect.commands(drive, float(scene.rest[j]), j, scene, own)
-                    for j, drive in enumerate(scene.drives)
-                ]
-                rest = np.array([level for _, level in pairs])
-                scene = replace(scene, drives=tuple(drive for drive, _ in pairs), rest=rest)
-            elif isinstance(effect, ElementEffect):
-                stretch *= effect.stretch(scene, own)
-        if not 0 < stretch < np.inf:
-            raise self._unstable(record, f"its time constants would be multiplied by {stretch:.3g}")
-        units = self._units(experiment, scene, plant, stretch, spectra)
-        bent = [(e, own) for e, own in zip(self.effects, mine, strict=True) if isinstance(e, ForceEffect)]
-        at_rest = plant.gains @ scene.rest
-        change = np.zeros((self.ranges.axes, experiment.mesh.grid.n))
-        for i, row in enumerate(self.model.layout.unit_of):
-            for j, unit in enumerate(row):
-                if not (bent and j == self.ranges.direct[i]):
-                    change[i] += plant.gains[i, j] * units[1][unit]
-        if bent:
-            level, moving = self._balance(experiment, scene, plant, stretch, units[0], bent, spectra)
-            own = np.array([plant.gains[i, j] * scene.rest[j] for i, j in enumerate(self.ranges.direct)])
-            at_rest, change = at_rest - own + level, change + moving
-        for effect, own in zip(self.effects, mine, strict=True):
-            if isinstance(effect, SensorEffect):
-                change = effect.filtered(change, scene, own)
-        return Moved(scene, experiment.mesh.reading(change).T + at_rest)
-
-    def _spectrum(
-        self,
-        element: int,
-        plant: Plant,
-        stretch: float,
-        experiment: Experiment,
-        spectra: dict[tuple[int, int, float, float], Spectrum],
-    ) -> Spectrum:
-        grid = experiment.mesh.grid
-        key = (element, grid.n, grid.step, stretch)
-        if key not in spectra:
-            times, orders = plant.dynamics.times[element], plant.dynamics.orders[element]
-            spectra[key] = transfer(stretch * times, orders, experiment.circle, grid.step)[0]
-        return spectra[key]
-
-    def _units(
-        self,
-        experiment: Experiment,
-        scene: Scene,
-        plant: Plant,
-        stretch: float,
-        spectra: dict[tuple[int, int, float, float], Spectrum],
-    ) -> tuple[list[Vector], list[Array]]:
-        """Block means of the delayed drive and of the unit response, per unit."""
-        drives, responses = [], []
-        for element, delay, axis in self.model.layout.units:
-            means, _ = scene.drives[axis].block_means(experiment.edges, plant.dynamics.delays[:, delay])
-            spectrum = self._spectrum(element, plant, stretch, experiment, spectra)
-            drives.append(means[0])
-            moves = scene.drives[axis].moves
-            circle = experiment.circle
-            responses.append(
-                circle.coefficients(spectrum * circle.spectrum(means[0]))
-                if moves
-                else np.zeros(means[0].size)
-            )
-        return drives, responses
-
-    def _balance(
-        self,
-        experiment: Experiment,
-        scene: Scene,
-        plant: Plant,
-        stretch: float,
-        drives: list[Vector],
-        bent: list[tuple[ForceEffect, Vector]],
-        spectra: dict[tuple[int, int, float, float], Spectrum],
-    ) -> tuple[Vector, Matrix]:
-        """Deflection of the direct paths at rest, (axes,), and deviation from it, (axes, blocks)."""
-        layout, direct = self.model.layout, self.ranges.direct
-        gains = np.array([plant.gains[i, j] for i, j in enumerate(direct)])
-        f0 = gains[:, None] * scene.rest[direct][:, None]
-        f = f0 + gains[:, None] * np.stack([drives[layout.unit_of[i][j]] for i, j in enumerate(direct)])
-        kernel = np.stack(
-            [
-                experiment.circle.coefficients(
-                    self._spectrum(layout.element_of[i][j], plant, stretch, experiment, spectra)
-                )
-                for i, j in enumerate(direct)
-            ]
-        )
-
-        def acting(f: Matrix, y: Matrix, rate: Matrix) -> Matrix:
-            for effect, own in bent:
-                f = effect.force(f, y, rate, scene, own)
-            return f
-
-        try:
-            level = resting(lambda y: acting(f0, y, np.zeros_like(y)), f0, self.ranges.response)
-
-            def deviation(blocks: slice, y: Matrix, before: Matrix) -> Matrix:
-                rate = (y - before) / experiment.mesh.grid.step
-                return acting(f[:, blocks], level + y, rate) - level
-
-            return level[:, 0], balanced(kernel, deviation, self.ranges.response)
-        except RunawayError as error:
-            raise self._unstable(scene.record, str(error)) from error
-
-    def _unstable(self, record: int, why: str) -> UnstableError:
-        names = tuple(effect.name for effect in self.effects)
-        return UnstableError(names, self.model.experiments[record].name, why)

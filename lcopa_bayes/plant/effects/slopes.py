@@ -9,7 +9,9 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.arrays import Array, Index, Matrix, Vector
-from lcopa_bayes.plant.effects.simulator import UPSTREAM, Moved, Plant, Simulator
+from lcopa_bayes.plant.effects.effect import DriveEffect
+from lcopa_bayes.plant.effects.passage import Moved, Plant
+from lcopa_bayes.plant.effects.simulator import Simulator
 from lcopa_bayes.plant.forward import Dynamics
 
 COEFFICIENT_STEP = 1e-3
@@ -80,30 +82,29 @@ _RELATIVE = 1e-5
 def plant_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[PlantSlopes]:
     """Derivatives of the responses in gains, times, orders and delays, per record.
 
-    Without effects they are exact. Otherwise they are central differences; only what acts after the
-    plant is differenced when nothing acts before the reading.
+    Exact without effects. What acts on elements, forces or before the sensor is differenced to one side
+    (1e-5 of each number); of everything else only the part that does not pass through the plant.
     """
-    exact = _linear_slopes(simulator, plant)
     if not simulator.effects:
-        return exact
-    upstream = any(isinstance(effect, UPSTREAM) for effect in simulator.effects)
+        return _linear_slopes(simulator, plant, psi)
+    upstream = simulator.bends(psi)
+    delayed = any(isinstance(effect, DriveEffect) for effect in simulator.effects)  # commands may use it
     base = simulator.moved(plant, psi)
+    here = simulator.finished(base, psi)
+    exact = _linear_slopes(simulator, plant, psi)
     out = [_like(slope) for slope in exact]
     for kind, place, step in _entries(simulator, plant):
-
-        def at(change: float, kind: str = kind, place: tuple[int, ...] = place) -> list[Matrix]:
-            other = _shifted(plant, kind, place, change)
-            if upstream:
-                return simulator.finished(simulator.moved(other, psi), psi)
+        other = _shifted(plant, kind, place, step)
+        if upstream or (kind == "delays" and delayed):
+            moved = simulator.moved(other, psi)
+        else:
+            scenes = simulator.scenes(other, psi)
             moved = [
-                Moved(simulator.scene(r, other), y.deflection + change * _entry(exact[r], kind, place))
-                for r, y in enumerate(base)
+                Moved(scene, y.deflection + step * _entry(slope, kind, place))
+                for scene, y, slope in zip(scenes, base, exact, strict=True)
             ]
-            return simulator.finished(moved, psi)
-
-        upward = kind == "delays" and bool(plant.dynamics.delays[0, place[0]] < step)
-        for r, slope in enumerate(difference(at, step, upward=upward)):
-            _entry(out[r], kind, place)[...] = slope
+        for r, there in enumerate(simulator.finished(moved, psi)):
+            _entry(out[r], kind, place)[...] = (there - here[r]) / step
     return out
 
 
@@ -156,12 +157,11 @@ def _like(slope: PlantSlopes) -> PlantSlopes:
     )
 
 
-def _linear_slopes(simulator: Simulator, plant: Plant) -> list[PlantSlopes]:
-    """Exact derivatives of the linear plant."""
-    layout, out = simulator.model.layout, []
-    for experiment, (units, slopes) in zip(
-        simulator.model.experiments, simulator.model.unit_slopes(plant.dynamics), strict=True
-    ):
+def _linear_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[PlantSlopes]:
+    """Exact derivatives of the linear plant under the commands that act."""
+    model = simulator.driven(simulator.scenes(plant, psi))
+    layout, out = model.layout, []
+    for experiment, (units, slopes) in zip(model.experiments, model.unit_slopes(plant.dynamics), strict=True):
         axes, drives = plant.gains.shape
         head = (units.shape[2], axes)
         counts = [slot.terms for slot in layout.elements]
