@@ -76,22 +76,28 @@ def cross_fade(rng: np.random.Generator) -> Hidden:
     strength = float(rng.uniform(0.3, 1.0))
 
     def seen(y: Matrix, times: Vector, command: Command, shot: Shot) -> Matrix:
-        out = y.copy()
         begins = np.append(command.times + shot.delay, np.inf)
-        targets = command.values @ shot.steady.T
         path = CubicSpline(times, y)
-        for k, target in enumerate(targets):
+        late = np.zeros((times.size, y.shape[1]))
+        owed = np.zeros(y.shape[1])
+        for k, target in enumerate(command.values @ shot.steady.T):
+            origin = path(np.clip(begins[k], times[0], times[-1]))
+            end = path(np.clip(begins[k + 1], times[0], times[-1]))[None]
             rows = (times >= begins[k]) & (times < begins[k + 1])
-            origin = path(max(begins[k], times[0]))
-            for axis, (start, end) in enumerate(zip(origin, target, strict=True)):
-                a = (y[rows, axis] - start) / (end - start) if end != start else np.zeros(rows.sum())
-                on, off = np.sinc(1 - a) ** 2, np.sinc(a) ** 2
-                faded = start + (end - start) * on / (on + off)
-                mixed = y[rows, axis] + strength * (faded - y[rows, axis])
-                out[rows, axis] = np.where((a > 0) & (a < 1), mixed, y[rows, axis])
-        return out
+            for axis in range(y.shape[1]):
+                way = target[axis] - origin[axis]
+                late[rows, axis] = _late(y[rows, axis] - origin[axis], way, owed[axis], strength)
+                owed[axis] = _late(end[:, axis] - origin[axis], way, owed[axis], strength)[0]
+        return y + late
 
     return Hidden("cross_fade", {"strength": strength}, seen=seen)
+
+
+def _late(done: Vector, way: float, owed: float, strength: float) -> Vector:
+    """How far the centroid is from the director, part of the way done; what it owed at the start fades."""
+    part = np.full(done.shape, 1.0) if way == 0 else np.minimum(np.maximum(done / way, 0.0), 1.0)
+    new, old = np.sinc(1 - part) ** 2, np.sinc(part) ** 2
+    return np.asarray(owed * (1 - part) + strength * way * (new / (new + old) - part))
 
 
 def sensor_lag(rng: np.random.Generator) -> Hidden:
