@@ -72,19 +72,8 @@ def waves(size: float, phases: np.ndarray) -> list[float]:
     return [part * size for phase in phases for part in (np.cos(phase), -np.sin(phase))]
 
 
-CONSTANTS = ("frame", "refresh", "phase", "levels", "width", "time", "cycles")
-CONSTANTS += ("frequency", "damping", "level")
-    "frame",
-    "refresh",
-    "phase",
-    "levels",
-    "width",
-    "time",
-    "cycles",
-    "frequency",
-    "damping",
-    "level",
-)
+CONSTANTS = {"frame", "refresh", "phase", "levels", "width", "time", "cycles"}
+CONSTANTS |= {"frequency", "damping", "level"}
 WHOLE = ("refresh_hold", "grey_quantisation", "clipping")
 """Their formula at a strength of 1 is the bench's."""
 

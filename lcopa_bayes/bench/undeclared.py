@@ -6,14 +6,13 @@ import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Literal, final
+from typing import ClassVar, Literal, final
 
 import numpy as np
 
 from lcopa_bayes.arrays import Matrix
 from lcopa_bayes.bench import drivekinds, outsiders, plantkinds, readkinds
 from lcopa_bayes.bench.acquisition import Bench, truth
-from lcopa_bayes.bench.command import Command
 from lcopa_bayes.bench.device import Device, TransferPath
 from lcopa_bayes.bench.hidden import STEPS, Hidden, HiddenDevice, Shot
 from lcopa_bayes.bench.schedules import LARGEST, Schedule, plain_schedules, rich_schedules
@@ -29,7 +28,7 @@ Maker = Callable[[np.random.Generator], Hidden]
 
 def _makers(*modules: ModuleType) -> dict[str, Maker]:
     """Functions of one Generator that make a hidden effect, by name."""
-    found = {}
+    found: dict[str, Maker] = {}
     for module in modules:
         for name, made in inspect.getmembers(module, inspect.isfunction):
             told = inspect.signature(made)
@@ -114,7 +113,9 @@ def campaign(
     device = device or steerer(rng)
     schedules = rich_schedules(rng) if drives == "rich" else plain_schedules(rng)
     bench = Bench(refresh=0.0, camera=CAMERA, noise_sd=noise_sd, noise_correlation=correlation)
-    fit, held_out, exact = [], [], {}
+    fit: list[Record] = []
+    held_out: list[Record] = []
+    exact: dict[str, Matrix] = {}
     plant = tuple(effect for effect in hidden if not effect.disturbance)
     for number, schedule in enumerate(schedules):
         shot = _shot(device, (number + 0.5) / len(schedules) - 0.5, rng)
@@ -160,7 +161,40 @@ def _shot(device: Device, epoch: float, rng: np.random.Generator) -> Shot:
     return Shot(epoch, drive, np.abs(np.diag(steady)) * drive, device.paths[0][0].delay, steady, rng)
 
 
-def command_of(record: Record) -> Command:
-    """The drive of a record: a value holds from its row to the next."""
-    changed = np.flatnonzero((record.drive[1:] != record.drive[:-1]).any(axis=1)) + 1
-    return Command(record.time[changed], record.drive[changed], record.drive[0])
+@final
+@dataclass(frozen=True)
+class UndeclaredPlan:
+    """A campaign file with a table ``[undeclared]``: effects by name, at sizes drawn from the seed.
+
+    Raises InputError for an unknown effect, unknown drives or a correlation out of range.
+    """
+
+    name: str
+    seed: int
+    effects: tuple[str, ...] = ()
+    """Names among `NAMED` and `OUTSIDE`; none for a control."""
+    drives: Literal["rich", "plain"] = "rich"
+    correlation: float = 0.0
+    """Of successive noise samples [-]."""
+    noise_sd: float = NOISE
+    """[rad]."""
+
+    held_out: ClassVar[tuple[str, ...]] = ("run04", "run07", "run10")
+    settings: ClassVar[str] = '[model]\nterms = { direct = 2, cross = 1 }\nshare = "paper"'
+    """What the study file says of the model: nothing of any effect."""
+
+    def __post_init__(self) -> None:
+        drawn(self.effects, np.random.default_rng(0))
+        if self.drives not in ("rich", "plain"):
+            raise InputError(f'[undeclared] drives must be "rich" or "plain"; got {self.drives!r}')
+        Bench(noise_sd=self.noise_sd, noise_correlation=self.correlation)
+
+    def made(self, rng: np.random.Generator) -> Campaign:
+        """The campaign with what only the judge may see."""
+        hidden = drawn(self.effects, rng)
+        return campaign(hidden, rng, drives=self.drives, correlation=self.correlation, noise_sd=self.noise_sd)
+
+    def run(self, rng: np.random.Generator) -> tuple[Record, ...]:
+        """All records in the order taken."""
+        made = self.made(rng)
+        return tuple(sorted((*made.fit, *made.held_out), key=lambda record: record.name))

@@ -136,7 +136,8 @@ class _Passage:
         """Block means of the delayed drive of a unit [drive unit]."""
         _, delay, axis = self.layout.units[unit]
         late = self.plant.dynamics.delays[:, delay]
-        return self.scene.drives[axis].block_means(self.experiment.edges, late)[0][0]
+        means, _ = self.scene.drives[axis].block_means(self.experiment.edges, late)
+        return np.asarray(means[0])
 
     def _unit(self, unit: int) -> Array:
         """Block means of a unit response [drive unit]."""
