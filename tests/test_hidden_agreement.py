@@ -12,7 +12,7 @@ from small import study
 from lcopa_bayes.bench.acquisition import Bench, truth
 from lcopa_bayes.bench.hidden import HiddenDevice
 from lcopa_bayes.bench.schedules import rich_schedules
-from lcopa_bayes.bench.undeclared import NAMED, NOISE, _shot, drawn, steerer
+from lcopa_bayes.bench.undeclared import NAMED, NOISE, shot_of, drawn, steerer
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.effected import Effected, effected
 from lcopa_bayes.plant.effects.catalogue import bundled
@@ -50,7 +50,7 @@ def base() -> tuple[Effected, np.ndarray, tuple]:
         elif row.kind == "offset":
             values[k] = DEVICE.offsets[first]
     made = effected(posterior, values)
-    shot = _shot(DEVICE, 0.0, np.random.default_rng(0))
+    shot = shot_of(DEVICE, 0.0, np.random.default_rng(0))
     ranges = replace(made.ranges, drive=shot.drive, response=shot.deflection)
     made = replace(made, simulator=replace(made.simulator, ranges=ranges))
     return made, values, tuple(schedules[k].command for k, _ in CHOSEN)
@@ -62,7 +62,7 @@ def from_bench(name: str, seed: int) -> tuple[dict, list]:
     hidden = drawn([name], np.random.default_rng(seed))
     out = []
     for r, command in enumerate(commands):
-        shot = _shot(DEVICE, float(made.simulator.epochs[r]), np.random.default_rng(r))
+        shot = shot_of(DEVICE, float(made.simulator.epochs[r]), np.random.default_rng(r))
         out.append(HiddenDevice(DEVICE, hidden, shot).response(command, made.simulator.times[r]))
     return dict(hidden[0].numbers), out
 

@@ -118,7 +118,7 @@ def campaign(
     exact: dict[str, Matrix] = {}
     plant = tuple(effect for effect in hidden if not effect.disturbance)
     for number, schedule in enumerate(schedules):
-        shot = _shot(device, (number + 0.5) / len(schedules) - 0.5, rng)
+        shot = shot_of(device, (number + 0.5) / len(schedules) - 0.5, rng)
         name = f"run{number + 1:02d}"
         clean = _taken(device, plant, shot, bench, schedule, name, steps)
         exact[name] = clean.response
@@ -154,7 +154,7 @@ def _taken(
     return truth(made, bench, schedule.command, duration=schedule.duration, name=name)
 
 
-def _shot(device: Device, epoch: float, rng: np.random.Generator) -> Shot:
+def shot_of(device: Device, epoch: float, rng: np.random.Generator) -> Shot:
     """What effects may know, for drives up to the largest of the schedules."""
     steady = np.array([[path.steady for path in row] for row in device.paths])
     drive = np.full(steady.shape[1], LARGEST)
