@@ -267,7 +267,7 @@ def test_balance_of_a_linear_force_is_a_geometric_series():
     f = rng.normal(size=(1, n)).cumsum(axis=1)
     matrix = np.array([[kernel[0, i - j] if i >= j else 0.0 for j in range(n)] for i in range(n)])
     exact = np.linalg.solve(np.eye(n) + a * matrix, matrix @ f[0])
-    told = balance.balanced(kernel, lambda blocks, y, before: f[:, blocks] - a * y, np.ones(1))
+    told = balance.balanced(kernel, lambda blocks, y, one, two: f[:, blocks] - a * y, np.ones(1))
     assert_allclose(told[0], exact, atol=1e-9)
 
 

@@ -12,7 +12,7 @@ from small import study
 from lcopa_bayes.bench.acquisition import Bench, truth
 from lcopa_bayes.bench.hidden import HiddenDevice
 from lcopa_bayes.bench.schedules import rich_schedules
-from lcopa_bayes.bench.undeclared import NAMED, NOISE, shot_of, drawn, steerer
+from lcopa_bayes.bench.undeclared import NAMED, NOISE, drawn, shot_of, steerer
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.effected import Effected, effected
 from lcopa_bayes.plant.effects.catalogue import bundled

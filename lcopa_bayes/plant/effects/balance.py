@@ -11,8 +11,8 @@ from scipy.linalg import solve_triangular, toeplitz
 
 from lcopa_bayes.arrays import Matrix, Vector
 
-Force: TypeAlias = Callable[[slice, Matrix, Matrix], Matrix]
-"""(blocks, deviation of y, its value a block earlier) -> deviation of the force, (axes, blocks)."""
+Force: TypeAlias = Callable[[slice, Matrix, Matrix, Matrix], Matrix]
+"""(blocks, deviation of y, its values one and two blocks before) -> deviation of the force, (axes, blocks)."""
 
 _TOLERANCE = 1e-12
 """Change of y in the last iteration over the largest y [-]."""
@@ -63,7 +63,7 @@ def _solve(
     """
     n = b - a
     if n <= max(limit, _LEAST):
-        before = y[:, a - 1 : a] if a else np.zeros((y.shape[0], 1))
+        before = np.concatenate((np.zeros((y.shape[0], 2)), y[:, max(a - 2, 0) : a]), axis=1)[:, -2:]
         method = _newton if _LEAST < n <= _DENSE else _iterate
         found = method(kernel[:, :n], force, y[:, a:b].copy(), before, scale, slice(a, b))
         if found is not None:
@@ -83,7 +83,7 @@ def _newton(
 ) -> tuple[Matrix, Matrix] | None:
     """Fixed point as in `_iterate`, by Newton's method.
 
-    Slopes of the force, in y and in its value a block earlier, are differences over 1e-6 of the scale; that
+    Slopes of the force, in y and in its two earlier values, are differences over 1e-6 of the scale; that
     of one axis in another is left to the iteration.
     """
     n = kernel.shape[1]
@@ -91,26 +91,36 @@ def _newton(
     y = history
     for _ in range(_NEWTON):
         with np.errstate(over="ignore", invalid="ignore"):
-            earlier = np.concatenate((before, y[:, :-1]), axis=1)
-            v = force(blocks, y, earlier)
+            one, two = _earlier(before, y)
+            v = force(blocks, y, one, two)
             nudge = _NUDGE * scale
-            now = (force(blocks, y + nudge, earlier) - v) / nudge
-            then = (force(blocks, y, earlier + nudge) - v) / nudge
+            slopes = [
+                (force(blocks, y + nudge, one, two) - v) / nudge,
+                (force(blocks, y, one + nudge, two) - v) / nudge,
+                (force(blocks, y, one, two + nudge) - v) / nudge,
+            ]
             left = history + np.stack([k @ row for k, row in zip(operators, v, strict=True)]) - y
         size = float(np.abs(left / scale).max())
-        if not (size < _RUNAWAY and np.isfinite(now + then).all()):  # NaN too
+        if not (size < _RUNAWAY and np.isfinite(sum(slopes)).all()):  # NaN too
             return None
         if size < _TOLERANCE:
             return y + left, v
         step = np.empty_like(y)
         for i, operator in enumerate(operators):
-            matrix = np.eye(n) - operator * now[i]
-            matrix[:, :-1] -= operator[:, 1:] * then[i, 1:]
+            matrix = np.eye(n)
+            for back, slope in enumerate(slopes):
+                matrix[:, : n - back] -= operator[:, back:] * slope[i, back:]
             if not np.all(np.abs(np.diag(matrix)) > _SINGULAR):
                 return None
             step[i] = solve_triangular(matrix, left[i], lower=True, check_finite=False)
         y = y + step
     return None
+
+
+def _earlier(before: Matrix, y: Matrix) -> tuple[Matrix, Matrix]:
+    """Values one and two blocks before those of `y`, from the two blocks before its first."""
+    joined = np.concatenate((before, y), axis=1)
+    return joined[:, 1:-1], joined[:, :-2]
 
 
 def convolved(kernel: Matrix, v: Matrix) -> Matrix:
@@ -136,7 +146,7 @@ def _iterate(
     spectrum = None if n <= 32 else fft.rfft(kernel, length)
 
     def swept(y: Matrix) -> tuple[Matrix, Matrix]:
-        v = force(blocks, y, np.concatenate((before, y[:, :-1]), axis=1))
+        v = force(blocks, y, *_earlier(before, y))
         if spectrum is None:
             return history + convolved(kernel, v), v
         return history + fft.irfft(spectrum * fft.rfft(v, length), length)[:, :n], v

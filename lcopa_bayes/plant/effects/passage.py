@@ -163,8 +163,8 @@ class _Passage:
                 f = effect.force(f, y, rate, scene, own)
             return f
 
-        def deviation(blocks: slice, y: Matrix, before: Matrix) -> Matrix:
-            rate = (y - before) / self.experiment.mesh.grid.step
+        def deviation(blocks: slice, y: Matrix, one: Matrix, two: Matrix) -> Matrix:
+            rate = (1.5 * y - 2.0 * one + 0.5 * two) / self.experiment.mesh.grid.step
             return acting(f[:, blocks], level + y, rate) - level
 
         try:
