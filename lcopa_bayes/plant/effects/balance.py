@@ -12,11 +12,14 @@ from scipy.linalg import solve_triangular, toeplitz
 from lcopa_bayes.arrays import Matrix, Vector
 
 Force: TypeAlias = Callable[[slice, Matrix, Matrix, Matrix], Matrix]
-"""(blocks, deviation of y, its values one and two blocks before) -> deviation of the force, (axes, blocks)."""
+"""(blocks, deviation of y, its values one and two blocks before) -> deviation of the force, each of
+(axes, blocks)."""
 
 _TOLERANCE = 1e-12
 """Change of y in the last iteration over the largest y [-]."""
-_SWEEPS = 24
+_SWEEPS = 32
+_PATIENCE = 2.5
+"""How far the pace of the last sweeps may fall short: acceleration grows [-]."""
 _DEPTH = 4
 """Earlier iterates that the acceleration combines (Anderson 1965, J. ACM 12)."""
 _DENSE = 128
@@ -167,7 +170,7 @@ def _iterate(
         sizes.append(size)
         if sweep >= 8 and not short:  # give up early where the pace of the last sweeps would not do
             pace = np.log(size / sizes[-6]) / 5
-            if pace >= 0 or np.log(_TOLERANCE / size) / pace > _SWEEPS - sweep:
+            if pace >= 0 or np.log(_TOLERANCE / size) / pace > _PATIENCE * (_SWEEPS - sweep):
                 return None
         steps.append(change.ravel())
         points.append((target / scale).ravel())
