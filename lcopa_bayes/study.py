@@ -17,6 +17,7 @@ from lcopa_bayes.problems import InputError
 from lcopa_bayes.record import Axis, Record
 from lcopa_bayes.settings import (
     STAGES,
+    EffectsSettings,
     ModelSettings,
     NoiseSettings,
     PriorSettings,
@@ -57,6 +58,7 @@ class Study:
     compare: CompareSettings = field(default_factory=CompareSettings)
     candidates: tuple[CandidateSettings, ...] = ()
     """Models to compare besides those any study has."""
+    effects: EffectsSettings = field(default_factory=EffectsSettings)
 
     def __post_init__(self) -> None:
         records = (*self.fit, *self.held_out)

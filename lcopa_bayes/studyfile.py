@@ -15,6 +15,7 @@ from lcopa_bayes.problems import InputError, nearest
 from lcopa_bayes.record import Record, in_time_unit, load_record
 from lcopa_bayes.settings import (
     STAGES,
+    EffectsSettings,
     HeadingSettings,
     ModelSettings,
     NoiseSettings,
@@ -25,7 +26,7 @@ from lcopa_bayes.settings import (
 )
 from lcopa_bayes.study import DEFAULT_STAGES, Study, together
 
-_TABLES = ("study", "records", "model", "priors", "noise", "sampler", "stages")
+_TABLES = ("study", "records", "model", "priors", "noise", "sampler", "effects", "stages")
 _COMPARED = ("compare", "candidates")
 
 
@@ -129,6 +130,9 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
     sampler = (
         settings_from(SamplerSettings, tables["sampler"], where["sampler"], problems) or SamplerSettings()
     )
+    effects = (
+        settings_from(EffectsSettings, tables["effects"], where["effects"], problems) or EffectsSettings()
+    )
     priors = _priors(tables["priors"], where["priors"], problems)
     stages = _stages(tables["stages"], where["stages"], problems)
     compare, candidates = compare_settings(document, str(path), problems)
@@ -160,6 +164,7 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
         _hashes([path, *fit, *apart]),
         compare,
         candidates,
+        effects,
     )
 
 
