@@ -107,7 +107,9 @@ def derived(study: Study, settings: CandidateSettings) -> Candidate:
             "default prior in its place"
         )
     made = replace(made, priors=priors | dict(settings.priors) | fixed)
-    return Candidate(settings.name, made, _about(model, settings.cross), tuple(notes), settings.improper)
+    return Candidate(
+        settings.name, made, _about(study, model, settings.cross), tuple(notes), settings.improper
+    )
 
 
 def candidates_of(
@@ -215,7 +217,7 @@ def _direct_terms(model: ModelSettings) -> int:
     return model.terms
 
 
-def _about(model: ModelSettings, cross: bool) -> str:
+def _about(study: Study, model: ModelSettings, cross: bool) -> str:
     if isinstance(model.terms, Mapping):
         terms = ", ".join(f"{name} {count}" for name, count in model.terms.items()) + " terms"
     else:
@@ -227,5 +229,7 @@ def _about(model: ModelSettings, cross: bool) -> str:
     )
     shared = {"paper": "direct and cross elements", "all": "one element", "none": "an element per path"}
     delays = {"shared": "one delay", "element": "a delay per element", "path": "a delay per path"}
+    if len(study.drive_axes) == len(study.response_axes) == 1:
+        return f"{terms}, {orders}"
     parts = [terms, orders, shared[model.share], delays[model.delay], *([] if cross else ["no cross paths"])]
     return ", ".join(parts)

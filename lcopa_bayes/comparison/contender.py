@@ -32,7 +32,7 @@ from lcopa_bayes.settings import SamplerSettings
 
 CARD = "candidate.json"
 """File of a candidate's scores inside its folder."""
-ENSEMBLES, WALKERS, TARGET_ESS = 3, 24, 100
+ENSEMBLES, WALKERS, TARGET_ESS = 2, 32, 100
 """How a comparison samples what the study leaves open [-]: an evidence is wanted to a tenth of a nat or
 two, not a marginal to a percent."""
 _VERSION = 1

@@ -67,11 +67,13 @@ def _agreement(evident: Row | None, predictive: Row | None, usable: Sequence[Row
     if evident is None or predictive is None or evident["elpd"] is None:
         return None, "Either evidence or prediction is missing; one stands alone."
     best = max((row for row in usable if row["elpd"] is not None), key=lambda row: row["elpd"])
+    if best is evident:
+        return True, f"Evidence and prediction agree: {evident['name']} also predicts best."
     lost = by_prediction(best, evident)
     assert lost is not None
-    if best is evident or not lost.counts:
+    if not lost.counts:
         return True, (
-            f"Evidence and prediction agree: {evident['name']} is not predicted worse than any other beyond "
+            f"Evidence and prediction agree: no candidate predicts better than {evident['name']} beyond "
             f"chance (best: {best['name']}, {lost})."
         )
     last = min((row for row in usable if row["elpd"] is not None), key=lambda row: row["elpd"])

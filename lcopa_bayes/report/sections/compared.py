@@ -18,31 +18,33 @@ def _scores(told: Mapping[str, Any]) -> Section:
     columns = (
         *(Column("model", "code"), Column("what it is", "prose"), Column("parameters", "number")),
         *(Column("log evidence [nat]", "number"), Column("log Bayes factor", "number")),
-        *(
-            Column("probability", "number"),
-            Column("elpd [nat]", "number"),
-            Column("less than best", "number"),
-        ),
-        *(Column("stacking", "number"), Column("max log L", "number"), Column("AIC", "number")),
-        *(Column("BIC", "number"), Column("grade", "grade")),
+        *(Column("probability", "number"), Column("grade", "grade")),
     )
-    rows = []
-    for row in told["models"]:
-        aside = (row["aic"], row["bic"])
-        rows.append(
-            (
-                *(str(row["name"]), str(row["about"]), str(row["parameters"])),
-                _with_error(row["log_evidence"], row["log_evidence_sd"]),
-                _with_error(row["log_bayes_factor"], row["log_bayes_factor_sd"]),
-                _with_error(row["probability"], row["probability_sd"], 3),
-                _with_error(row["elpd"], row["elpd_sd"], 1),
-                _with_error(row["elpd_difference"], row["elpd_difference_sd"], 1),
-                NONE if row["stacking"] is None else f"{row['stacking']:.2f}",
-                NONE if row["max_log_likelihood"] is None else f"{row['max_log_likelihood']:.1f}",
-                *(NONE if one is None else f"{one:.1f}" for one in aside),
-                str(row["grade"]),
-            )
+    rows = tuple(
+        (
+            *(str(row["name"]), str(row["about"]), str(row["parameters"])),
+            _with_error(row["log_evidence"], row["log_evidence_sd"]),
+            _with_error(row["log_bayes_factor"], row["log_bayes_factor_sd"]),
+            _with_error(row["probability"], row["probability_sd"], 3),
+            str(row["grade"]),
         )
+        for row in told["models"]
+    )
+    other_columns = (
+        *(Column("model", "code"), Column("elpd [nat]", "number"), Column("less than best", "number")),
+        *(Column("stacking weight", "number"), Column("max log likelihood", "number")),
+        *(Column("AIC", "number"), Column("BIC", "number")),
+    )
+    others = tuple(
+        (
+            str(row["name"]),
+            _with_error(row["elpd"], row["elpd_sd"], 1),
+            _with_error(row["elpd_difference"], row["elpd_difference_sd"], 1),
+            _plain(row["stacking"], 2),
+            *(_plain(row[key], 1) for key in ("max_log_likelihood", "aic", "bic")),
+        )
+        for row in told["models"]
+    )
     caption = (
         "± is a standard error: of the evidence by bridge sampling, of predictive densities by the spread "
         "over stretches of the records. The Bayes factor is against the best, the probability among these "
@@ -53,7 +55,7 @@ def _scores(told: Mapping[str, Any]) -> Section:
     text += [f"{one['name']} is ranked nowhere: {one['reason']}." for one in told["unranked"]]
     text += [f"{one['name']}: {one['reason']}; the other scores stand." for one in told["evidence_undefined"]]
     text += [f"{row['name']} {note}." for row in told["models"] for note in row["notes"]]
-    return Section("Scores", tuple(text), (), (Table(columns, tuple(rows), caption),))
+    return Section("Scores", tuple(text), (), (Table(columns, rows), Table(other_columns, others, caption)))
 
 
 def _priors(told: Mapping[str, Any]) -> Section:
@@ -80,7 +82,8 @@ def _priors(told: Mapping[str, Any]) -> Section:
     text = (
         "An evidence moves with the width of the priors. Here gains, times and delays have priors half and "
         "twice as wide; orders keep theirs, which are the ends of their domain. Importance weights use the "
-        "draws that are there; a refit carries them to the new posterior and bridges anew."
+        "draws that are there; a refit carries them to the new posterior and bridges anew; undefined are "
+        "narrower priors that exclude what the data show."
     )
     tables = (Table(columns, tuple(rows)),) if rows else ()
     return Section("The prior's part", (text,), (), tables)
@@ -128,8 +131,8 @@ def _orders(told: Mapping[str, Any]) -> Section:
         *(Column("model", "code"), Column("order", "code"), Column("median", "number")),
         *(Column("90 % interval", "interval"), Column("nearest", "number")),
         *(
-            Column("log Bayes factor of the integer", "number"),
-            Column("by"),
+            Column("log Bayes factor", "number"),
+            Column("density from", "prose"),
             Column("answer"),
             Column("grade", "grade"),
         ),
@@ -165,3 +168,7 @@ def _with_error(value: float | None, error: float | None, places: int = 2) -> st
     if value is None:
         return NONE
     return f"{value:.{places}f}" if error is None else f"{value:.{places}f} ± {error:.{places}f}"
+
+
+def _plain(value: float | None, places: int) -> str:
+    return NONE if value is None else f"{value:.{places}f}"
