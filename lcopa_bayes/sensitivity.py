@@ -15,6 +15,7 @@ from lcopa_bayes.arrays import Array, Matrix, Vector
 from lcopa_bayes.estimate import plain
 from lcopa_bayes.inference.draws import Draws
 from lcopa_bayes.inference.grade import Level
+from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.inference.posterior import Posterior
 
 Diagnosis = Literal["prior-data conflict", "weak likelihood: the prior decides", "-", "not trusted"]
@@ -73,13 +74,14 @@ class Sensitivity:
 def sensitivity(draws: Draws, posterior: Posterior) -> tuple[Sensitivity, ...]:
     """Sensitivity of every free parameter, the most affected by the prior first.
 
-    The joint prior density of all free parameters, each in its own unit as in `posterior.nc`, and the
-    full likelihood are raised to powers near 1; distances are taken on the scale on which a parameter is
-    sampled. Source: Kallioinen, Paananen, Buerkner and Vehtari 2024, Statistics and Computing 34, 57.
+    The joint prior density of all free parameters and the full likelihood are raised to powers near 1.
+    Densities and distances are taken on the scale on which a parameter is sampled: per natural logarithm
+    of time constants and noise scales, so that a log-uniform prior is flat and not ``1/x`` over decades.
+    Source: Kallioinen, Paananen, Buerkner and Vehtari 2024, Statistics and Computing 34, 57.
     """
     rows = [(k, row) for k, row in enumerate(posterior.table.rows) if row.free]
     shape, flat = draws.values.shape[:2], draws.flat
-    log_prior = np.sum([row.log_prior(flat[:, k]) for k, row in rows], axis=0)
+    log_prior = np.sum([row.log_prior(flat[:, k]) + _log_stretch(row, flat[:, k]) for k, row in rows], axis=0)
     log_likelihood = np.concatenate(
         [_log_likelihood(posterior, flat[k : k + _PORTION]) for k in range(0, flat.shape[0], _PORTION)]
     )
@@ -96,6 +98,13 @@ def sensitivity(draws: Draws, posterior: Posterior) -> tuple[Sensitivity, ...]:
         log_likelihood.reshape(shape),
         [grades[name] for name in names],  # type: ignore[misc]
     )
+
+
+def _log_stretch(row: Parameter, x: Vector) -> Vector:
+    """Log of the derivative of a parameter in its sampled coordinate, (draws,)."""
+    if row.log_scale:
+        return np.asarray(np.log(x))
+    return np.asarray(np.log(x) + np.log1p(-x)) if row.logit_scale else np.zeros(x.size)
 
 
 def power_scaled(

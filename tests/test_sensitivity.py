@@ -162,7 +162,10 @@ def test_agrees_with_arviz_on_the_same_groups(caplog):
     tree = arviz_base.from_dict(
         {
             "posterior": scaled,
-            "log_prior": {r.name: r.log_prior(draws.flat[:, k]).reshape(shape) for k, r in rows},
+            "log_prior": {
+                r.name: (r.log_prior(x) + (np.log(x) if r.log_scale else 0.0)).reshape(shape)
+                for r, x in ((r, draws.flat[:, k]) for k, r in rows)
+            },
             "log_likelihood": {"y": density[0][0].reshape(*shape, -1)},
         }
     )

@@ -15,9 +15,9 @@ _HOW = (
     "Sensitivity says how fast the posterior moves when the prior of all parameters, or the likelihood, is "
     "raised to a power near 1 (Kallioinen et al. 2024). From {threshold} on it counts. Both counting is a "
     "prior-data conflict, or a prior that was meant to be informative; the prior alone counting means that "
-    "the record says little about this parameter. Prior densities are per unit of their parameter: a "
-    "log-uniform one counts as 1/x, and a uniform one has no power to scale, so what its bounds do is not "
-    "seen here."
+    "the record says little about this parameter. Densities are on the scale a parameter is sampled on: "
+    "a uniform prior, and a log-uniform one of a time constant, has no power to scale, so what its bounds "
+    "do is not seen here."
 )
 
 
