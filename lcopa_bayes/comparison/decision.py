@@ -35,8 +35,8 @@ def decided(rows: Sequence[Row]) -> dict[str, Any]:
             "by_evidence": None,
             "by_prediction": None,
         }
-    evident = _simplest(weighed, by_evidence, "log_evidence") if weighed else None
-    predictive = _simplest([row for row in usable if row["elpd"] is not None], by_prediction, "elpd")
+    evident = simplest(weighed, by_evidence, "log_evidence") if weighed else None
+    predictive = simplest([row for row in usable if row["elpd"] is not None], by_prediction, "elpd")
     agree, sentence = _agreement(evident, predictive, usable)
     preferred = evident or predictive
     unseen = any(row["held_out"] for row in usable)
@@ -53,7 +53,7 @@ def decided(rows: Sequence[Row]) -> dict[str, Any]:
     }
 
 
-def _simplest(rows: Sequence[Row], score: Any, key: str) -> Row | None:
+def simplest(rows: Sequence[Row], score: Any, key: str) -> Row | None:
     """The candidate of fewest parameters among those that the best one does not beat beyond chance."""
     if not rows:
         return None
