@@ -16,6 +16,8 @@ from lcopa_bayes.arrays import Array, Matrix, Vector, frozen
 _LARGEST_ORDER = 8
 _PER_COEFFICIENT = 15
 """Samples that one coefficient needs at least [-]."""
+_PATIENCE = 3
+"""Orders tried beyond the best so far [-]."""
 _UNIT_GAP = 1e-2
 """Gaps this close to one sampling period are one [sampling periods]."""
 
@@ -68,8 +70,10 @@ class Autoregression:
     def whiten(self, columns: Array) -> Array:
         """Standardised prediction errors of columns (..., n), same shape [-]."""
         n, p = columns.shape[-1], self.order
-        weights = np.concatenate([[1.0], -self.predictors[p]])
-        out = np.asarray(lfilter(weights, [1.0], columns, axis=-1)) / self.innovation_sd
+        out = np.array(columns, dtype=float)
+        for j, weight in enumerate(self.predictors[p], start=1):
+            out[..., p:] -= weight * columns[..., p - j : n - j]
+        out /= self.innovation_sd
         for k in range(min(p, n)):
             past = columns[..., :k][..., ::-1] @ self.predictors[k] if k else 0.0
             out[..., k] = (columns[..., k] - past) / self.scales[k]
@@ -142,6 +146,8 @@ def estimated(pieces: Sequence[Vector], *, largest: int = _LARGEST_ORDER) -> Aut
         criterion = 2 * cost + 2 * count * total / max(total - count - 1, 1)
         if criterion < best[0] - 1e-9:
             best = (criterion, np.tanh(start), sd)
+        elif order >= best[1].size + _PATIENCE:
+            break
     return Autoregression(best[1], best[2])
 
 

@@ -9,15 +9,16 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.arrays import Vector
-from lcopa_bayes.loop.autoregression import unbroken
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.loop.autoregression import Autoregression, unbroken
 from lcopa_bayes.loop.basemodel import BaseModel
 from lcopa_bayes.loop.quiet import AxisNoise, axis_noise, joint_noise, quiet_pieces
 from lcopa_bayes.loop.regression import Optimum, Regression
 from lcopa_bayes.loop.starts import screened
 from lcopa_bayes.loop.whitening import Whitening
 
-_STARTS = 4
-_DELAYS = (0.6, 0.85, 1.15, 1.4)
+_STARTS = 3
+_DELAYS = (0.7, 0.85, 1.15, 1.3)
 """Factors on the fitted delays from which the descent is started again: delays can jump [-]."""
 _EXPLAINED = 0.5
 """Share of the response variance that a usable base fit explains at least [-]."""
@@ -52,31 +53,44 @@ def base_fit(model: BaseModel, rng: np.random.Generator, *, starts: int = _START
     posterior = model.posterior
     delays = [posterior.table.at("delay", k) for k in range(len(posterior.table.layout.delays))]
     seeds = [model.coordinates(values) for values in screened(posterior, rng, count=starts)]
-    noise = measured(model, seeds[0], 0.0)  # no delay is known yet
-    regression = Regression(model, whitening(model, noise))
-    optimum = regression.best(seeds)
-    optimum = regression.best([optimum.x, *_other_delays(model, optimum.x)])
+    white = Whitening(posterior.samples, _guessed(posterior))
+    optimum = Regression(model, white).best(seeds)
+    optimum = Regression(model, white).best([optimum.x, *_other_delays(model, optimum.x)])
+    noise: tuple[AxisNoise, ...] = ()
     for _ in range(_ROUNDS):
-        values = model.values(optimum.x)
-        again = measured(model, optimum.x, min(float(values[k]) for k in delays))
-        if all(_alike(a, b) for a, b in zip(noise, again, strict=True)):
+        delay = min(float(model.values(optimum.x)[k]) for k in delays)
+        again = measured(posterior, optimum.residual, delay)
+        if noise and all(_alike(a, b) for a, b in zip(noise, again, strict=True)):
             break
         noise = again
         regression = Regression(model, whitening(model, noise))
         optimum = regression.descend(optimum.x)
+        if all(one.known for one in noise) and not _delay_moved(model, optimum, delays, delay):
+            break
     return BaseFit(model, noise, regression, optimum, _failure(model, optimum), _cautions(noise, optimum))
 
 
-def measured(model: BaseModel, x: Vector, delay: float) -> tuple[AxisNoise, ...]:
-    """Noise of every axis; from the residual at `x` where nothing else gives it."""
-    posterior, out = model.posterior, []
-    left: Vector | None = None
+def _guessed(posterior: Posterior) -> tuple[Autoregression, ...]:
+    """White noise of a hundredth of each response's spread, to find the hill with."""
+    axes = range(len(posterior.table.layout.responses))
+    pooled = [np.concatenate([s.axes[axis].values for s in posterior.samples]) for axis in axes]
+    return tuple(Autoregression(np.empty(0), 0.01 * (float(values.std()) or 1.0)) for values in pooled)
+
+
+def _delay_moved(model: BaseModel, optimum: Optimum, delays: Sequence[int], before: float) -> bool:
+    """Whether the dead time is another one than that the noise was measured in."""
+    now = min(float(model.values(optimum.x)[k]) for k in delays)
+    return abs(now - before) > 0.05 * max(before, 1e-300)
+
+
+def measured(posterior: Posterior, residual: Vector, delay: float) -> tuple[AxisNoise, ...]:
+    """Noise of every axis; from the stacked `residual` [response unit] where nothing else gives it."""
+    out = []
     for axis, response in enumerate(posterior.table.layout.responses):
         found = axis_noise(posterior.samples, axis, delay, response.name)
         if found is None:
-            left = model.observed - model.predict(x) if left is None else left
             quiet = sum(p.size for p in quiet_pieces(posterior.samples, axis, delay))
-            found = joint_noise(axis_pieces(model, left, axis), response.name, quiet)
+            found = joint_noise(axis_pieces(posterior, residual, axis), response.name, quiet)
         out.append(found)
     return tuple(out)
 
@@ -86,10 +100,10 @@ def whitening(model: BaseModel, noise: Sequence[AxisNoise]) -> Whitening:
     return Whitening(model.posterior.samples, tuple(one.process for one in noise))
 
 
-def axis_pieces(model: BaseModel, stacked: Vector, axis: int) -> list[Vector]:
+def axis_pieces(posterior: Posterior, stacked: Vector, axis: int) -> list[Vector]:
     """Unbroken stretches of one axis of stacked values."""
     out, start = [], 0
-    for record in model.posterior.samples:
+    for record in posterior.samples:
         for number, observed in enumerate(record.axes):
             part = stacked[start : start + observed.values.size]
             start += observed.values.size
@@ -121,8 +135,8 @@ def _failure(model: BaseModel, optimum: Optimum) -> str:
         return "the base fit did not converge within its steps"
     responses = model.posterior.table.layout.responses
     for axis, response in enumerate(responses):
-        seen = axis_pieces(model, model.observed, axis)
-        left = axis_pieces(model, optimum.residual, axis)
+        seen = axis_pieces(model.posterior, model.observed, axis)
+        left = axis_pieces(model.posterior, optimum.residual, axis)
         spread = sum(float(((piece - piece.mean()) ** 2).sum()) for piece in seen)
         missed = sum(float((piece**2).sum()) for piece in left)
         if missed > (1 - _EXPLAINED) * spread > 0 and len(responses) == 1:

@@ -32,8 +32,12 @@ class Optimum:
     """Observed minus modelled, stacked, (n,) [response unit]."""
     white: Vector
     """Whitened residual, (n,) [-]."""
+    settled: Vector
+    """The same after one more linear step, so that the gradient vanishes to rounding, (n,) [-]."""
     jacobian: Matrix
     """Whitened tangents, (n, k) [1 / coordinate]."""
+    tangents: Matrix
+    """Tangents before whitening, (n, k) [response unit / coordinate]."""
     information: Matrix
     """``J' J`` plus prior precision, (k, k)."""
     cost: float
@@ -71,8 +75,11 @@ class Regression:
         return np.where(flat, 0.0, centre), np.where(flat, 0.0, 1 / self.curve.spread**2)
 
     def cost(self, x: Vector) -> float:
-        """Half the squared whitened residual and normal priors [nat]; infinite where the model is not finite."""
-        predicted = self.curve.predict(x)
+        """Half the squared whitened residual and normal priors [nat]; infinite without a bounded response."""
+        try:
+            predicted = self.curve.predict(x)
+        except ArithmeticError:  # an effect of this size leaves no bounded response
+            return np.inf
         if not np.isfinite(predicted).all():
             return np.inf
         return self._cost(x, self.whitening(self.whitening.observed - predicted))
@@ -84,12 +91,12 @@ class Regression:
     def descend(self, start: Vector, *, most: int = 40, gain: float = _GAIN) -> Optimum:
         """From a start to a local optimum within the support.
 
-        FloatingPointError when the response at the start is not finite.
+        ArithmeticError when the response at the start is not finite or not bounded.
         """
         low, high = self.curve.bounds
         x = np.clip(start, low, high)  # a start only
         damping, converged = 1e-4, False
-        predicted, white, jacobian = self._rows(x)
+        predicted, white, jacobian, tangents = self._rows(x)
         cost = self._cost(x, white)
         for _ in range(most):
             mean, precision = self._prior
@@ -122,24 +129,30 @@ class Regression:
                 continue
             damping = max(damping * (0.2 if share == 1.0 else 3.0), 1e-8)
             x = new
-            predicted, white, jacobian = self._rows(x)
+            predicted, white, jacobian, tangents = self._rows(x)
             cost = self._cost(x, white)
-        return self._described(x, predicted, white, jacobian, converged)
+        return self._described(x, predicted, white, jacobian, tangents, converged)
 
     def at(self, x: Vector) -> Optimum:
         """The description of a point, without moving."""
         return self._described(x, *self._rows(x), converged=True)
 
-    def _rows(self, x: Vector) -> tuple[Vector, Vector, Matrix]:
+    def _rows(self, x: Vector) -> tuple[Vector, Vector, Matrix, Matrix]:
         predicted, tangents = self.curve.tangents(x)
         if not (np.isfinite(predicted).all() and np.isfinite(tangents).all()):
             raise FloatingPointError("the simulated response is not finite")
         residual = self.whitening.observed - predicted
         both = self.whitening(np.vstack([residual, tangents.T]))
-        return predicted, both[0], np.ascontiguousarray(both[1:].T)
+        return predicted, both[0], np.ascontiguousarray(both[1:].T), tangents
 
     def _described(
-        self, x: Vector, predicted: Vector, white: Vector, jacobian: Matrix, converged: bool
+        self,
+        x: Vector,
+        predicted: Vector,
+        white: Vector,
+        jacobian: Matrix,
+        tangents: Matrix,
+        converged: bool,
     ) -> Optimum:
         low, high = self.curve.bounds
         with np.errstate(invalid="ignore"):
@@ -147,6 +160,8 @@ class Regression:
                 np.isfinite(high - low), high - low, 0.0
             )
         spread, cost = self.curve.spread, self._cost(x, white)
+        mean, precision = self._prior
+        slope = jacobian.T @ white - precision * (x - mean)
         information = jacobian.T @ jacobian + np.diag(1 / spread**2)
         level = cost + 0.5 * white.size * _LOG_2PI + self.whitening.log_scale
         scaled = np.linalg.slogdet(information * np.outer(spread, spread))[1]
@@ -154,7 +169,9 @@ class Regression:
             x,
             self.whitening.observed - predicted,
             white,
+            white - jacobian @ _solved(information, slope),
             jacobian,
+            tangents,
             information,
             cost,
             float(-level - 0.5 * scaled),
@@ -162,16 +179,16 @@ class Regression:
             converged,
         )
 
-    def best(self, starts: Sequence[Vector], *, glance: int = 6) -> Optimum:
+    def best(self, starts: Sequence[Vector], *, glance: int = 5) -> Optimum:
         """The lowest optimum from several starts: a few steps from each, the best two taken to the end.
 
-        FloatingPointError when no start has a finite response.
+        ArithmeticError when no start has a finite response.
         """
         looked: list[Optimum] = []
         for start in starts:
             try:
                 looked.append(self.descend(start, most=glance if len(starts) > 1 else 40))
-            except FloatingPointError:
+            except ArithmeticError:
                 continue
         if not looked:
             raise FloatingPointError("the simulated response is not finite at any start")

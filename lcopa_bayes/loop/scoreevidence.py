@@ -29,14 +29,15 @@ class Projection:
     """(n, k) [-]."""
 
     @cached_property
-    def _parts(self) -> tuple[Matrix, Vector]:
+    def parts(self) -> tuple[Matrix, Vector]:
+        """Directions of the tangents, (n, rank), and the share of each that is removed, (rank,) [-]."""
         left, scale, _ = np.linalg.svd(self.tangents, full_matrices=False)
         kept = scale > _RANK * max(float(scale.max(initial=0.0)), 1.0)
         return left[:, kept], 1.0 - 1.0 / np.sqrt(1.0 + scale[kept] ** 2)
 
     def __call__(self, columns: Array) -> Array:
         """Projected columns (n,) or (n, m)."""
-        left, removed = self._parts
+        left, removed = self.parts
         inner = left.T @ columns
         return np.asarray(columns - left @ (inner.T * removed).T)
 
@@ -56,13 +57,6 @@ def log_bayes_factors(signature: Matrix, residuals: Matrix) -> Vector:
     return np.asarray(gain - 0.5 * np.log1p(power).sum())
 
 
-def amplitude(signature: Matrix, residual: Vector) -> tuple[Vector, Matrix]:
-    """Mean and covariance of the standardised parameters of `signature` given the residual."""
-    precision = np.eye(signature.shape[1]) + signature.T @ signature
-    covariance = np.linalg.inv(precision)
-    return covariance @ (signature.T @ residual), covariance
-
-
 def cosine(first: Matrix, second: Matrix) -> float:
     """Cosine of the smallest angle between the spans [-]; 0 when either vanishes."""
     spans = []
@@ -72,12 +66,3 @@ def cosine(first: Matrix, second: Matrix) -> float:
     if 0 in (spans[0].shape[1], spans[1].shape[1]):
         return 0.0
     return float(min(np.linalg.svd(spans[0].T @ spans[1], compute_uv=False).max(), 1.0))
-
-
-def expected_margin(shift: Vector, rival: Matrix) -> float:
-    """Log evidence by which an effect that shifts the residual by `shift` is expected to beat a rival that
-    spans `rival`: half the power of the shift outside the rival's span [nat]."""
-    left, scale, _ = np.linalg.svd(rival, full_matrices=False)
-    left = left[:, scale > _RANK * max(float(scale.max(initial=0.0)), 1e-300)]
-    outside = shift - left @ (left.T @ shift)
-    return 0.5 * float(outside @ outside)

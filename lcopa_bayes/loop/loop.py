@@ -1,0 +1,136 @@
+"""The loop: find what the residual of a fit holds, trace it to an effect, add the effect, look again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.loop.basefit import BaseFit, base_fit
+from lcopa_bayes.loop.basemodel import BaseModel
+from lcopa_bayes.loop.extended import ExtendedModel
+from lcopa_bayes.loop.rounds import Round, search
+from lcopa_bayes.loop.scores import Score, State, fit_scores, held_out_scores, left_out_scores
+from lcopa_bayes.loop.trace import Trace
+from lcopa_bayes.loop.verdict import Found, Verdict, decide
+from lcopa_bayes.loop.widening import Widening
+from lcopa_bayes.plant.effects.catalogue import catalogue
+from lcopa_bayes.plant.effects.effect import Effect
+from lcopa_bayes.study import Study
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Side:
+    """Model and errors before or after."""
+
+    state: State
+    fit: tuple[Score, ...]
+    unseen: tuple[Score, ...]
+    """On held-out records, or with each fit record left out in turn."""
+    log_evidence: float
+    """Laplace approximation, noise held at its estimate [nat]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """What the loop found in a study."""
+
+    problem: Problem
+    base: BaseFit
+    rounds: tuple[Round, ...]
+    effects: tuple[Effect, ...]
+    """Named effects of the final model; none when the verdict is `unexplained` or `clean`."""
+    groups: tuple[tuple[str, ...], ...]
+    """For each effect, the names it cannot be told apart from, its own first."""
+    verdict: Verdict
+    before: Side
+    after: Side
+    left_out: bool
+    """Whether unseen errors come from leaving fit records out in turn, for want of held-out records."""
+
+    @property
+    def study(self) -> Study:
+        """The study."""
+        return self.problem.study
+
+    @property
+    def trace(self) -> Trace | None:
+        """Evidence of every effect in the first residual; None when the base fit failed."""
+        return self.rounds[0].trace if self.rounds else None
+
+
+def loop(
+    study: Study,
+    *,
+    library: Sequence[type[Effect]] | None = None,
+    quick: bool = False,
+) -> Loop:
+    """Trace what a study's base model lacks; deterministic given the study's seed.
+
+    With `quick` fewer chance residuals are drawn. InputError when the study does not fit its records.
+    """
+    problem = problem_of(study)
+    kinds = list(catalogue().values()) if library is None else list(library)
+    base = base_fit(BaseModel(problem.posterior), np.random.default_rng([study.seed, 10]))
+    model = ExtendedModel.of(base.model, base.optimum.x)
+    start = State(model, base.optimum, base.regression.whitening, base.optimum.covariance)
+    before = _side(problem, start)
+    if base.failed:
+        found = Found(base.failed, base.caution, False, np.nan, np.nan, (), (), 0, 0, "", 0, 0, "", np.nan)
+        verdict = decide(found)
+        return Loop(problem, base, (), (), (), verdict, before, before, not study.held_out)
+    searched = search(start, base, kinds, np.random.default_rng([study.seed, 11]), draws=200 if quick else 400)
+    first, last = searched.rounds[0].trace, searched.rounds[-1].trace
+    generic = max(
+        (one for one in first.traced if one.card.place == "generic"),
+        key=lambda one: one.log_bayes_factor,
+        default=None,
+    )
+    names = tuple(effect.name for effect in searched.state.model.effects)
+    verdict = decide(
+        Found(
+            "",
+            base.caution,
+            first.alarmed,
+            first.largest,
+            first.threshold,
+            names,
+            tuple(effect.name for effect in searched.state.model.effects if effect.card.disturbance),
+            searched.gained,
+            generic.log_bayes_factor if generic else -np.inf,
+            generic.name if generic else "",
+            last.largest,
+            last.threshold,
+            last.traced[0].name if last.traced else "",
+            searched.gained / (searched.gained + last.largest) if searched.gained > 0 and last.alarmed else 1.0,
+        )
+    )
+    if verdict.kind in ("clean", "unexplained"):
+        final_state = start
+        if verdict.kind == "unexplained":
+            samples, noise = start.whitening.samples, start.whitening.noise
+            final_state = replace(start, widening=Widening.of(samples, start.optimum.residual, noise))
+        after = before if verdict.kind == "clean" else _side(problem, final_state)
+        return Loop(problem, base, searched.rounds, (), (), verdict, before, after, not study.held_out)
+    after = _side(problem, searched.state)
+    return Loop(
+        problem,
+        base,
+        searched.rounds,
+        searched.state.model.effects,
+        searched.groups,
+        verdict,
+        before,
+        after,
+        not study.held_out,
+    )
+
+
+def _side(problem: Problem, state: State) -> Side:
+    unseen = held_out_scores(state, problem) if problem.study.held_out else left_out_scores(state)
+    return Side(state, tuple(fit_scores(state)), tuple(unseen), state.optimum.log_evidence)
