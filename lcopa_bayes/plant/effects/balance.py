@@ -1,0 +1,141 @@
+"""Response of linear paths under a force that depends on the response itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+import numpy as np
+from scipy import fft
+
+from lcopa_bayes.arrays import Matrix, Vector
+
+Force: TypeAlias = Callable[[slice, Matrix, Matrix], Matrix]
+"""(blocks, deviation of y, its value a block earlier) -> deviation of the force, (axes, blocks)."""
+
+_TOLERANCE = 1e-12
+"""Change of y in the last iteration over the largest y [-]."""
+_SWEEPS = 24
+_DEPTH = 4
+"""Earlier iterates that the acceleration combines (Anderson 1965, J. ACM 12)."""
+_LEAST = 2
+"""Windows this short are iterated to the end."""
+_LONG_SWEEPS = 400
+_RUNAWAY = 1e6
+"""A response this many times its scale has run away [-]."""
+
+
+class RunawayError(ArithmeticError):
+    """No bounded solution; carries the `block` where it was lost."""
+
+    def __init__(self, block: int) -> None:
+        self.block = block
+        super().__init__(f"the response runs away at block {block}")
+
+
+def balanced(kernel: Matrix, force: Force, scale: Vector) -> Matrix:
+    """``y = kernel * force(y)``, causal convolution, (axes, n).
+
+    Parameters: kernel (axes, n), the impulse response in block means; scale (axes,), typical size of y.
+    Whole stretches are iterated with acceleration; one that does not converge is halved, its
+    first half solved and its convolution carried into the second, down to two blocks, where the direct
+    feed-through of a block is small. Raises RunawayError. Accuracy: 1e-12 of the scale per iteration.
+    """
+    y = np.zeros(kernel.shape)
+    _solve(kernel, force, y, np.zeros(kernel.shape), scale[:, None], 0, kernel.shape[1])
+    return y
+
+
+def _solve(kernel: Matrix, force: Force, y: Matrix, v: Matrix, scale: Matrix, a: int, b: int) -> None:
+    """Solve blocks a to b in place; `y` holds there what earlier forces leave, on return the response."""
+    history = y[:, a:b].copy()
+    before = y[:, a - 1 : a] if a else np.zeros((y.shape[0], 1))
+    found = _iterate(kernel[:, : b - a], force, history, before, scale, slice(a, b))
+    if found is not None:
+        y[:, a:b], v[:, a:b] = found
+        return
+    if b - a <= _LEAST:
+        raise RunawayError(a)
+    middle = (a + b) // 2
+    _solve(kernel, force, y, v, scale, a, middle)
+    y[:, middle:b] += convolved(kernel[:, : b - a], v[:, a:middle])[:, middle - a :]
+    _solve(kernel, force, y, v, scale, middle, b)
+
+
+def convolved(kernel: Matrix, v: Matrix) -> Matrix:
+    """Causal convolution along the last axis, as long as the kernel."""
+    n, m = kernel.shape[1], v.shape[1]
+    if n <= 32:
+        out = np.zeros(kernel.shape)
+        for k in range(m):
+            out[:, k:] += v[:, k : k + 1] * kernel[:, : n - k]
+        return out
+    length = fft.next_fast_len(n + m - 1, real=True)
+    product = fft.rfft(kernel, length) * fft.rfft(v, length)
+    return np.asarray(fft.irfft(product, length)[:, :n])
+
+
+def _iterate(
+    kernel: Matrix, force: Force, history: Matrix, before: Matrix, scale: Matrix, blocks: slice
+) -> tuple[Matrix, Matrix] | None:
+    """Fixed point of ``y = history + kernel * force(y)``, or None."""
+    n = kernel.shape[1]
+    short = n <= _LEAST
+    length = fft.next_fast_len(2 * n - 1, real=True)
+    spectrum = None if n <= 32 else fft.rfft(kernel, length)
+
+    def swept(y: Matrix) -> tuple[Matrix, Matrix]:
+        v = force(blocks, y, np.concatenate((before, y[:, :-1]), axis=1))
+        if spectrum is None:
+            return history + convolved(kernel, v), v
+        return history + fft.irfft(spectrum * fft.rfft(v, length), length)[:, :n], v
+
+    y = history
+    steps: list[Vector] = []
+    points: list[Vector] = []
+    sizes: list[float] = []
+    for sweep in range(_LONG_SWEEPS if short else _SWEEPS):
+        with np.errstate(over="ignore", invalid="ignore"):
+            target, v = swept(y)
+            change = (target - y) / scale
+        size = float(np.abs(change).max())
+        if not size < _RUNAWAY:  # NaN too
+            return None
+        if size < _TOLERANCE:
+            return target, v
+        sizes.append(size)
+        if sweep >= 8 and not short:  # give up early where the pace of the last sweeps would not do
+            pace = np.log(size / sizes[-6]) / 5
+            if pace >= 0 or np.log(_TOLERANCE / size) / pace > _SWEEPS - sweep:
+                return None
+        steps.append(change.ravel())
+        points.append((target / scale).ravel())
+        del steps[: -_DEPTH - 1], points[: -_DEPTH - 1]
+        if sweep < 1:
+            y = target
+            continue
+        last = steps[-1]
+        differences = np.stack([last - step for step in steps[:-1]], axis=1)
+        weights = np.linalg.lstsq(differences, last, rcond=1e-12)[0]
+        mixed = points[-1] - np.stack([points[-1] - p for p in points[:-1]], axis=1) @ weights
+        y = mixed.reshape(y.shape) * scale
+    return None
+
+
+def resting(force: Callable[[Matrix], Matrix], start: Matrix, scale: Vector) -> Matrix:
+    """Level at which ``force(y) = y``, (axes, 1), by the secant method from `start`; raises RunawayError."""
+    y, small, size = start, _TOLERANCE * scale[:, None], scale[:, None]
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        ahead = force(y) - y
+        step = np.full(y.shape, 1e-6) * size
+        for _ in range(_LONG_SWEEPS):
+            done = np.abs(ahead) <= small
+            if done.all():
+                return y
+            slope = (force(y + step) - (y + step) - ahead) / step
+            move = np.where(done, 0.0, -ahead / slope)
+            y, ahead = y + move, force(y + move) - (y + move)
+            if not np.all(np.abs(y) < _RUNAWAY * size):  # NaN too
+                break
+            step = np.where(done, 1e-6 * size, 1e-3 * move)
+    raise RunawayError(0)

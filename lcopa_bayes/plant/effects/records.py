@@ -1,0 +1,248 @@
+"""Effects that differ from record to record, and disturbances that the drive does not cause."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Self, final
+
+import numpy as np
+
+from lcopa_bayes.arrays import Matrix, Vector
+from lcopa_bayes.plant.drive import Drive
+from lcopa_bayes.plant.effects.effect import (
+    Card,
+    Coefficient,
+    DriveEffect,
+    ParallelEffect,
+    Ranges,
+    ReadoutEffect,
+    ScatterEffect,
+    Scene,
+    per_axis,
+    single,
+)
+
+
+@final
+@dataclass(frozen=True)
+class GainDrift(ReadoutEffect):
+    """Deflection that changes in size through the campaign."""
+
+    card: ClassVar[Card] = Card(
+        name="gain_drift",
+        place="noise",
+        formula="y -> (1 + d epoch) y, epoch -1/2 for the first and 1/2 for the last record",
+        source="birefringence against temperature, 0.2 to 0.5 % per kelvin",
+        reveals="repeats over time",
+        mistaken_for="pointing_offset",
+    )
+
+    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
+        """d [-]."""
+        return single("d", 0.03)
+
+    def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
+        """Pointwise."""
+        return np.asarray((1 + psi[0] * scene.epoch) * y)
+
+
+@final
+@dataclass(frozen=True)
+class ClockSkew(DriveEffect):
+    """Driver and camera clocks that run at different speeds."""
+
+    card: ClassVar[Card] = Card(
+        name="clock_skew",
+        place="noise",
+        formula="command times t -> t0 + (1 + e) (t - t0), t0 the first sample",
+        source="free-running oscillators, up to 1e-3 between unlocked devices",
+        reveals="commands late in long records",
+        mistaken_for="time constants, delay",
+    )
+
+    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
+        """e [-]."""
+        return single("e", 2 * ranges.period / ranges.span)
+
+    def commands(
+        self, drive: Drive, rest: float, axis: int, scene: Scene, psi: Vector
+    ) -> tuple[Drive, float]:
+        """All changes are stretched."""
+        start = scene.times[0]
+        return Drive(drive.times + psi[0] * (drive.times - start), drive.values), rest
+
+
+@final
+@dataclass(frozen=True)
+class TriggerJitter(DriveEffect):
+    """A record whose drive starts late or early as a whole."""
+
+    card: ClassVar[Card] = Card(
+        name="trigger_jitter",
+        place="noise",
+        formula="command times t -> t + dt, dt one per record",
+        source="software trigger, up to one refresh",
+        reveals="repeats",
+        mistaken_for="viscosity_drift; noise at the edges",
+        per_record=True,
+        disturbance=True,
+    )
+
+    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
+        """dt [time unit]."""
+        return single("dt", 2 * ranges.period, "time")
+
+    def commands(
+        self, drive: Drive, rest: float, axis: int, scene: Scene, psi: Vector
+    ) -> tuple[Drive, float]:
+        """All changes are shifted alike."""
+        return Drive(drive.times + psi[0], drive.values), rest
+
+
+@final
+@dataclass(frozen=True)
+class PointingOffset(ParallelEffect):
+    """A record whose response is shifted as a whole."""
+
+    card: ClassVar[Card] = Card(
+        name="pointing_offset",
+        place="noise",
+        formula="y += a, one per record and axis",
+        source="laser pointing, 1e-5 to 1e-4 rad on an open bench",
+        reveals="quiet stretches, repeats",
+        mistaken_for="gain; the model's own offset when that is one per record",
+        per_record=True,
+        disturbance=True,
+    )
+
+    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
+        """a [response unit]."""
+        return per_axis(ranges, ("a",), 0.01)
+
+    def added(self, scene: Scene, psi: Vector) -> Matrix:
+        """A constant."""
+        return np.tile(psi, (scene.times.size, 1))
+
+
+@final
+@dataclass(frozen=True)
+class PointingDrift(ParallelEffect):
+    """A record whose response drifts."""
+
+    card: ClassVar[Card] = Card(
+        name="pointing_drift",
+        place="noise",
+        formula="y += d (t - middle) / span, one per record and axis",
+        source="air turbulence, thermal drift of mounts",
+        reveals="quiet stretches",
+        mistaken_for="ion_creep, fractional tail",
+        per_record=True,
+        disturbance=True,
+    )
+
+    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
+        """d [response unit]."""
+        return per_axis(ranges, ("d",), 0.01)
+
+    def added(self, scene: Scene, psi: Vector) -> Matrix:
+        """A straight line."""
+        middle = 0.5 * (scene.times[0] + scene.times[-1])
+        return np.outer((scene.times - middle) / scene.ranges.span, psi)
+
+
+def _frequencies(ranges: Ranges) -> Vector:
+    """Half a cycle per record apart, up to 40 cycles or a quarter of the sampling rate."""
+    highest = min(40.0, ranges.span / (4 * ranges.period))
+    return np.arange(1.0, max(highest, 1.5), 0.5) / ranges.span
+
+
+def _wave(scene: Scene, frequency: float) -> Matrix:
+    """Cosine and sine, (2, samples)."""
+    phase = 2 * np.pi * frequency * scene.times
+    return np.stack((np.cos(phase), np.sin(phase)))
+
+
+@final
+@dataclass(frozen=True)
+class Vibration(ParallelEffect):
+    """A vibration of the mount, with a phase of its own in every record."""
+
+    frequency: float
+    """[cycles per time unit]."""
+
+    card: ClassVar[Card] = Card(
+        name="vibration",
+        place="noise",
+        formula="y += a cos(2 pi f t) + b sin(2 pi f t), a and b per record and axis",
+        source="optical tables, 20 to 300 Hz, 1e-5 to 2e-4 rad",
+        reveals="quiet stretches, repeats",
+        mistaken_for="pointing_drift at a low frequency; flicker",
+        per_record=True,
+        disturbance=True,
+    )
+
+    @classmethod
+    def grid(cls, ranges: Ranges) -> tuple[Self, ...]:
+        """See `_frequencies`."""
+        return tuple(cls(float(f)) for f in _frequencies(ranges))
+
+    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
+        """a and b [response unit] per axis."""
+        return per_axis(ranges, ("a", "b"), 0.005)
+
+    def added(self, scene: Scene, psi: Vector) -> Matrix:
+        """Linear in a and b."""
+        return np.asarray((psi.reshape(-1, 2) @ _wave(scene, self.frequency)).T)
+
+
+@final
+@dataclass(frozen=True)
+class Flicker(ReadoutEffect):
+    """A ripple in proportion to the deflection, with a phase of its own in every record."""
+
+    frequency: float
+    """[cycles per time unit]."""
+
+    card: ClassVar[Card] = Card(
+        name="flicker",
+        place="noise",
+        formula="y += (a cos(2 pi f t) + b sin(2 pi f t)) |y|, a and b per record",
+        source="Balondrade and Popoff: modulator fluctuation, usually 100 to 400 Hz",
+        reveals="holds at several deflections",
+        mistaken_for="vibration (which does not scale with the deflection)",
+        per_record=True,
+        disturbance=True,
+    )
+
+    @classmethod
+    def grid(cls, ranges: Ranges) -> tuple[Self, ...]:
+        """See `_frequencies`."""
+        return tuple(cls(float(f)) for f in _frequencies(ranges))
+
+    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
+        """a and b [-]."""
+        return (*single("a", 0.005), *single("b", 0.005))
+
+    def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
+        """Pointwise."""
+        return np.asarray(y + (psi @ _wave(scene, self.frequency))[:, None] * np.abs(y))
+
+
+@final
+@dataclass(frozen=True)
+class Outliers(ScatterEffect):
+    """Noise with heavy tails: Student's t instead of the normal distribution."""
+
+    card: ClassVar[Card] = Card(
+        name="outliers",
+        place="noise",
+        formula="noise ~ sigma t_nu, psi = 1 / nu",
+        source="lost centroids, cosmic hits; Juarez and Steel 2010",
+        reveals="any record",
+        mistaken_for="nothing",
+        disturbance=True,
+    )
+
+    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
+        """1 / nu [-]."""
+        return single("inverse_nu", 0.2, one_signed=True)
