@@ -54,6 +54,11 @@ class BaseModel:
         return LeastSquares(replace(self.posterior, noise=White()))
 
     @property
+    def time_unit(self) -> str:
+        """Unit of all times."""
+        return self.posterior.samples[0].record.time_unit
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of the free plant parameters."""
         return tuple(self.posterior.table.names[k] for k in self.least.columns)

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
+from lcopa_bayes.estimate import LEVEL
 from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.inference.grade import Grade
 from lcopa_bayes.loop.basefit import BaseFit, base_fit
 from lcopa_bayes.loop.basemodel import BaseModel
 from lcopa_bayes.loop.extended import ExtendedModel
+from lcopa_bayes.loop.density import LoopDensity
+from lcopa_bayes.loop.draws import LoopDraws, sample_loop, unit_of
 from lcopa_bayes.loop.rounds import Round, search
 from lcopa_bayes.loop.scores import Score, State, fit_scores, held_out_scores, left_out_scores
 from lcopa_bayes.loop.trace import Trace
@@ -20,6 +24,9 @@ from lcopa_bayes.loop.widening import Widening
 from lcopa_bayes.plant.effects.catalogue import catalogue
 from lcopa_bayes.plant.effects.effect import Effect
 from lcopa_bayes.study import Study
+
+Z90 = 1.6448536269514722
+"""Half width of a central 90 % interval of a normal distribution [sd]."""
 
 
 @final
@@ -53,6 +60,37 @@ class Loop:
     left_out: bool
     """Whether unseen errors come from leaving fit records out in turn, for want of held-out records."""
 
+    draws: LoopDraws | None = None
+    """Draws of base plus effects; None when none were asked for."""
+
+    @property
+    def grade(self) -> Grade:
+        """How far the numbers can be trusted; without draws they rest on a Laplace approximation."""
+        if self.draws is not None:
+            return self.draws.grade
+        return Grade("tentative", "intervals are those of a Laplace approximation at the mode; nothing was sampled")
+
+    def estimate(self, k: int) -> dict[str, Any]:
+        """A coordinate of the final model with unit, 90 % interval and grade."""
+        state = self.after.state
+        if self.draws is not None:
+            return self.draws.estimate(k).as_json()
+        name, unit, factor = unit_of(state.model, k)
+        middle, sd = float(state.optimum.x[k]) * factor, float(np.sqrt(state.covariance[k, k])) * factor
+        return {
+            "name": name,
+            "value": middle,
+            "unit": unit,
+            "mean": middle,
+            "sd": sd,
+            "lower": middle - Z90 * sd,
+            "upper": middle + Z90 * sd,
+            "level": LEVEL,
+            "interval": "Laplace",
+            "ess": None,
+            "grade": "tentative",
+        }
+
     @property
     def study(self) -> Study:
         """The study."""
@@ -68,11 +106,14 @@ def loop(
     study: Study,
     *,
     library: Sequence[type[Effect]] | None = None,
+    jobs: int = 1,
+    sample: bool = True,
     quick: bool = False,
 ) -> Loop:
     """Trace what a study's base model lacks; deterministic given the study's seed.
 
-    With `quick` fewer chance residuals are drawn. InputError when the study does not fit its records.
+    Without `sample` intervals and bands are those of a Laplace approximation. With `quick` fewer chance residuals
+    are drawn and ensembles are half as long. InputError when the study does not fit its records.
     """
     problem = problem_of(study)
     kinds = list(catalogue().values()) if library is None else list(library)
@@ -117,7 +158,12 @@ def loop(
             final_state = replace(start, widening=Widening.of(samples, start.optimum.residual, noise))
         after = before if verdict.kind == "clean" else _side(problem, final_state)
         return Loop(problem, base, searched.rounds, (), (), verdict, before, after, not study.held_out)
-    after = _side(problem, searched.state)
+    final_state, draws = searched.state, None
+    if sample:
+        quiet = float(sum(one.samples for one in base.noise if one.known))
+        draws = sample_loop(LoopDensity(final_state, quiet), study.seed, jobs=jobs, quick=quick)
+        final_state = replace(final_state, covariance=draws.covariance)
+    after = _side(problem, final_state)
     return Loop(
         problem,
         base,
@@ -128,6 +174,7 @@ def loop(
         before,
         after,
         not study.held_out,
+        draws,
     )
 
 

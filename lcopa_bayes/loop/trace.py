@@ -24,6 +24,8 @@ _QUANTILE = 0.99
 _DRAWS = 400
 _NONE = 0.5
 """Prior probability that nothing is missing [-]; the effects share the rest evenly."""
+_LEAST_POWER = 1e-10
+"""Power of a direction of a signature at one prior sd below which it is nothing [-]."""
 SEEN = 0.1
 """Below this survival the records cannot see an effect [-]."""
 
@@ -57,42 +59,51 @@ class Signature:
     """One instance of an effect, whitened and projected off what the base model can imitate."""
 
     effect: Effect
-    columns: Matrix
-    """Projected signatures over the prior sd of their coefficients, (n, k) [-]."""
+    span: Matrix
+    """Orthonormal columns that span the projected signatures, (n, rank); single precision, there are hundreds."""
+    scale: Vector
+    """Length of each direction at one prior sd of its combination of coefficients, (rank,) [-]."""
+    turned: Matrix
+    """Combination of coefficients behind each direction, (rank, k) [-]."""
     survival: float
     """Share of the signature that is left [-]."""
     one_signed: bool
     """Whether its single coefficient cannot be negative."""
 
-    @cached_property
-    def _svd(self) -> tuple[Matrix, Vector, Matrix]:
-        left, scale, right = np.linalg.svd(self.columns, full_matrices=False)
-        kept = scale > 1e-9 * max(float(scale.max(initial=0.0)), 1e-300)
-        return left[:, kept], scale[kept], right[kept]
+    @classmethod
+    def of(cls, effect: Effect, columns: Matrix, survival: float, one_signed: bool) -> Signature:
+        """From projected signatures over the prior sd of their coefficients, (n, k) [-].
+
+        By the small Gram matrix: ten times faster than of the tall one, and exact enough for weights of order 1.
+        """
+        power, turned = np.linalg.eigh(columns.T @ columns)
+        kept = power > max(_LEAST_POWER, 1e-12 * float(power.max(initial=0.0)))
+        scale = np.sqrt(power[kept])
+        span = (columns @ turned[:, kept] / scale).astype(np.float32)
+        return cls(effect, span, scale, turned[:, kept].T, survival, one_signed)
 
     @property
-    def span(self) -> Matrix:
-        """Orthonormal columns that span the projected signatures."""
-        return self._svd[0]
+    def columns(self) -> Matrix:
+        """Projected signatures over the prior sd of their coefficients, (n, k) [-]."""
+        return np.asarray(self.span @ (self.scale[:, None] * self.turned), dtype=float)
 
     def evidence(self, inner: Matrix, scale_of: Scale) -> Vector:
         """Log Bayes factors against no effect from ``span.T @ r``, (k, draws) -> (draws,) [nat].
 
         A coefficient of one sign has a half-normal prior: the factor is 2 Phi(mean / sd) of the normal one.
         """
-        scale = self._svd[1]
-        power = scale**2
+        scale, power = self.scale, self.scale**2
         gain = scale_of.gain(0.5 * np.einsum("k,kd->d", power / (1 + power), inner**2))
         gain = gain - 0.5 * np.log1p(power).sum()
         if self.one_signed and scale.size == 1:
-            sign = np.sign(self._svd[2][0, 0])
+            sign = np.sign(self.turned[0, 0])
             gain = gain + np.log(2) + log_ndtr(sign * scale[0] * inner[0] / np.sqrt(1 + power[0]))
         return np.asarray(gain)
 
     def amplitude(self, residual: Vector) -> Vector:
         """Posterior mean of the coefficients over their prior sd; the normal part of a one-signed one."""
-        left, scale, right = self._svd
-        return np.asarray(right.T @ (scale / (1 + scale**2) * (left.T @ residual)))
+        weight = self.scale / (1 + self.scale**2)
+        return np.asarray(self.turned.T @ (weight * (self.span.T @ residual)))
 
 
 @final
@@ -240,7 +251,7 @@ def signature_of(
     white = whitening(raw.T).T
     left = project(white)
     one_signed = len(told) == 1 and told[0].coefficient.one_signed
-    return Signature(effect, left, survival(white, left), one_signed)
+    return Signature.of(effect, left, survival(white, left), one_signed)
 
 
 def _chance(
@@ -256,7 +267,7 @@ def _chance(
     listed = [one for traced in found for one in traced.signatures]
     if not listed:
         return np.zeros(0)
-    spans = [project(one.span) for one in listed]
+    spans = [one.span for one in listed]
     edges = np.cumsum([0, *(span.shape[1] for span in spans)])
     every = np.concatenate(spans, axis=1).T
     maxima = []
@@ -267,7 +278,7 @@ def _chance(
             for part in whitening.parts:
                 if part.axis == axis:
                     z[part.rows] *= factor
-        inner = every @ z
+        inner = (every @ z.astype(np.float32)).astype(float)
         left, _ = project.parts
         power = np.einsum("nd,nd->d", z, z) - np.einsum("kd,kd->d", left.T @ z, left.T @ z)
         known = Scale(scale.quiet, scale.freedom, power)
@@ -292,7 +303,7 @@ def _scatters(found: Sequence[Traced]) -> bool:
 def expected_margin(truth: Signature, amplitude: Vector, rival: Signature, scale: Scale) -> float:
     """Log evidence by which `truth` of that size is expected to beat `rival` [nat]: the difference of their
     closed-form evidences on the noise-free residual it leaves."""
-    shift = (truth.columns @ amplitude)[:, None]
+    shift = (truth.span @ (truth.scale * (truth.turned @ amplitude)))[:, None]
     size = Scale(scale.quiet, scale.freedom, scale.freedom + (shift**2).sum(axis=0))
     own = float(truth.evidence(truth.span.T @ shift, size)[0])
     return own - float(rival.evidence(rival.span.T @ shift, size)[0])
