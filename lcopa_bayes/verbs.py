@@ -19,6 +19,9 @@ from lcopa_bayes.calibration.summary import tables
 from lcopa_bayes.cores import cores
 from lcopa_bayes.files import writable_folder
 from lcopa_bayes.fit import fit
+from lcopa_bayes.loop.loop import loop
+from lcopa_bayes.loop.told import drawn, words
+from lcopa_bayes.loop.told import results as loop_results
 from lcopa_bayes.paper.auditclaims import load_audit
 from lcopa_bayes.paper.claims import judge
 from lcopa_bayes.paper.identify import identify, results, scannable
@@ -31,6 +34,7 @@ from lcopa_bayes.provenance import provenance
 from lcopa_bayes.report import write_report
 from lcopa_bayes.report.auditpage import write_audit
 from lcopa_bayes.report.calibrationpage import is_calibration, write_calibration
+from lcopa_bayes.report.looppage import write_loop
 from lcopa_bayes.report.paperpages import write_claims, write_identification, write_optics
 from lcopa_bayes.rival import integer_rival
 from lcopa_bayes.runfolder import save_fit, save_json, save_table
@@ -93,6 +97,18 @@ def audit_study(options: argparse.Namespace, command: list[str]) -> Told:
     words = [f"{'parameter':16}{'verdict':30}why"]
     words += [f"{row['name']:16}{row['verdict']:30}{row['reason']}" for row in values["parameters"]]
     return _with_report(values, write_audit(folder), *words)
+
+
+def loop_study(options: argparse.Namespace, command: list[str]) -> Told:
+    """What the base model lacks, traced to an effect, with errors before and after, and a page of its own."""
+    study = _study(options)
+    folder = writable_folder(options.out or Path("reports") / study.name)
+    found = loop(study, jobs=options.jobs or cores(), quick=options.quick, as_stated=options.as_stated)
+    values = loop_results(found)
+    save_json(provenance(study, command), folder / "provenance.json")
+    save_json(drawn(found), folder / "loop_curves.json")
+    save_json(values, folder / "loop.json")
+    return _with_report(values, write_loop(folder), *words(values))
 
 
 def report(options: argparse.Namespace, command: list[str]) -> Told:

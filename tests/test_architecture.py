@@ -28,6 +28,7 @@ ORDER = (
     ("bench",),
     ("fit",),
     ("audit",),
+    ("loop",),
     ("results",),
     ("tables", "rival"),
     ("runfolder",),

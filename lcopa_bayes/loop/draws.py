@@ -21,13 +21,15 @@ from lcopa_bayes.loop.extended import ExtendedModel
 from lcopa_bayes.plant.effects.simulator import UPSTREAM
 
 ENSEMBLES = 4
-_FREEDOM = 5.0
+_FREEDOM = 12.0
 """Degrees of freedom of the jump's t distribution [-]: heavier tails than any posterior it is used on."""
 _BURN = 0.3
 """Share of the steps that is discarded [-]."""
 _STEPS = 120
 _STEPS_DEAR = 60
 """Steps where an effect bends the dynamics: a density costs thirty times as much."""
+_KEPT = 400
+"""Draws whose integrated coordinates are drawn [-]."""
 TARGET_ESS = 400.0
 
 
@@ -100,7 +102,7 @@ def sample_loop(density: LoopDensity, seed: int, *, jobs: int = 1, quick: bool =
     names = [unit_of(density.state.model, int(k))[0] for k in density.sampled]
     found = qualities(names, chains)
     rng = np.random.default_rng([seed, 21])
-    stride = max(1, chains.shape[0] * chains.shape[1] * chains.shape[2] // 1000)
+    stride = max(1, chains.shape[0] * chains.shape[1] * chains.shape[2] // _KEPT)
     kept = chains[:, :, ::-1][:, :, ::stride]
     full = np.array([density.completed(z, rng) for z in kept.reshape(-1, kept.shape[-1])])
     return LoopDraws(
@@ -123,11 +125,17 @@ def _ensemble(task: tuple[LoopDensity, int, int, int]) -> tuple[Array, float]:
     start = _started(density, centre, covariance, walkers, random)
     moves = [(emcee.moves.MHMove(_jump(centre, covariance)), 0.6), (emcee.moves.DEMove(), 0.25)]
     moves.append((emcee.moves.StretchMove(), 0.15))
+    burn = int(_BURN * steps)
+    first = emcee.EnsembleSampler(walkers, centre.size, density, moves=moves)
+    first.random_state = random.get_state()
+    reached = first.run_mcmc(start, burn, skip_initial_state_check=True)
+    learnt = first.get_chain(discard=burn // 2, flat=True)
+    # jumps learnt from what is discarded are fixed from here on, so the kept draws are of one Markov chain
+    moves[0] = (emcee.moves.MHMove(_jump(learnt.mean(axis=0), np.cov(learnt.T))), 0.6)
     sampler = emcee.EnsembleSampler(walkers, centre.size, density, moves=moves)
-    sampler.random_state = random.get_state()
-    sampler.run_mcmc(start, steps, skip_initial_state_check=True)
-    chain = sampler.get_chain(discard=int(_BURN * steps))
-    return np.asarray(chain.swapaxes(0, 1)), float(np.mean(sampler.acceptance_fraction))
+    sampler.random_state = reached.random_state
+    sampler.run_mcmc(reached, steps - burn, skip_initial_state_check=True)
+    return np.asarray(sampler.get_chain().swapaxes(0, 1)), float(np.mean(sampler.acceptance_fraction))
 
 
 def _started(

@@ -9,15 +9,15 @@ from typing import Any, final
 import numpy as np
 
 from lcopa_bayes.estimate import LEVEL
-from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.grade import Grade
-from lcopa_bayes.loop.basefit import BaseFit, base_fit
-from lcopa_bayes.loop.basemodel import BaseModel
+from lcopa_bayes.loop.basefit import BaseFit
 from lcopa_bayes.loop.extended import ExtendedModel
 from lcopa_bayes.loop.density import LoopDensity
 from lcopa_bayes.loop.draws import LoopDraws, sample_loop, unit_of
 from lcopa_bayes.loop.rounds import Round, search
 from lcopa_bayes.loop.scores import Score, State, fit_scores, held_out_scores, left_out_scores
+from lcopa_bayes.loop.terms import fitted_base
 from lcopa_bayes.loop.trace import Trace
 from lcopa_bayes.loop.verdict import Found, Verdict, decide
 from lcopa_bayes.loop.widening import Widening
@@ -49,6 +49,8 @@ class Loop:
 
     problem: Problem
     base: BaseFit
+    enlarged: str
+    """What was changed in the base model before anything was traced; empty when nothing was."""
     rounds: tuple[Round, ...]
     effects: tuple[Effect, ...]
     """Named effects of the final model; none when the verdict is `unexplained` or `clean`."""
@@ -109,22 +111,23 @@ def loop(
     jobs: int = 1,
     sample: bool = True,
     quick: bool = False,
+    as_stated: bool = False,
 ) -> Loop:
     """Trace what a study's base model lacks; deterministic given the study's seed.
 
-    Without `sample` intervals and bands are those of a Laplace approximation. With `quick` fewer chance residuals
+    Unless `as_stated`, a study with one viscous term gets as many as the evidence asks for. Without
+    `sample` intervals and bands are those of a Laplace approximation. With `quick` fewer chance residuals
     are drawn and ensembles are half as long. InputError when the study does not fit its records.
     """
-    problem = problem_of(study)
     kinds = list(catalogue().values()) if library is None else list(library)
-    base = base_fit(BaseModel(problem.posterior), np.random.default_rng([study.seed, 10]))
+    problem, base, enlarged = fitted_base(study, as_stated=as_stated)
     model = ExtendedModel.of(base.model, base.optimum.x)
     start = State(model, base.optimum, base.regression.whitening, base.optimum.covariance)
     before = _side(problem, start)
     if base.failed:
         found = Found(base.failed, base.caution, False, np.nan, np.nan, (), (), 0, 0, "", 0, 0, "", np.nan)
         verdict = decide(found)
-        return Loop(problem, base, (), (), (), verdict, before, before, not study.held_out)
+        return Loop(problem, base, enlarged, (), (), (), verdict, before, before, not study.held_out)
     searched = search(start, base, kinds, np.random.default_rng([study.seed, 11]), draws=200 if quick else 400)
     first, last = searched.rounds[0].trace, searched.rounds[-1].trace
     generic = max(
@@ -151,28 +154,25 @@ def loop(
             searched.gained / (searched.gained + last.largest) if searched.gained > 0 and last.alarmed else 1.0,
         )
     )
-    if verdict.kind in ("clean", "unexplained"):
-        final_state = start
-        if verdict.kind == "unexplained":
-            samples, noise = start.whitening.samples, start.whitening.noise
-            final_state = replace(start, widening=Widening.of(samples, start.optimum.residual, noise))
-        after = before if verdict.kind == "clean" else _side(problem, final_state)
-        return Loop(problem, base, searched.rounds, (), (), verdict, before, after, not study.held_out)
-    final_state, draws = searched.state, None
+    named = verdict.kind in ("explained", "disturbance")
+    last_state, draws = searched.state if named else start, None
+    if verdict.kind == "unexplained":
+        samples, noise = start.whitening.samples, start.whitening.noise
+        last_state = replace(start, widening=Widening.of(samples, start.optimum.residual, noise))
     if sample:
         quiet = float(sum(one.samples for one in base.noise if one.known))
-        draws = sample_loop(LoopDensity(final_state, quiet), study.seed, jobs=jobs, quick=quick)
-        final_state = replace(final_state, covariance=draws.covariance)
-    after = _side(problem, final_state)
+        draws = sample_loop(LoopDensity(last_state, quiet), study.seed, jobs=jobs, quick=quick)
+        last_state = replace(last_state, covariance=draws.covariance)
     return Loop(
         problem,
         base,
+        enlarged,
         searched.rounds,
-        searched.state.model.effects,
-        searched.groups,
+        last_state.model.effects,
+        searched.groups if named else (),
         verdict,
         before,
-        after,
+        _side(problem, last_state),
         not study.held_out,
         draws,
     )

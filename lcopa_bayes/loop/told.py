@@ -11,7 +11,7 @@ from lcopa_bayes.estimate import plain
 from lcopa_bayes.loop.loop import Loop, Side
 from lcopa_bayes.loop.moved import moved
 from lcopa_bayes.loop.nextmeasurement import next_measurement
-from lcopa_bayes.loop.residualview import views
+from lcopa_bayes.loop.residualview import View, views
 from lcopa_bayes.loop.rounds import Round
 from lcopa_bayes.loop.scores import Score, pooled_coverage, pooled_rmse
 from lcopa_bayes.loop.trace import SEEN
@@ -28,6 +28,7 @@ def results(found: Loop) -> dict[str, Any]:
         "sentence": found.verdict.sentence,
         "cautions": found.base.caution,
         "base_failed": found.base.failed,
+        "base_enlarged": found.enlarged,
         "time_unit": unit,
         "grade": found.grade.level,
         "grade_reason": found.grade.reason,
@@ -55,16 +56,28 @@ def results(found: Loop) -> dict[str, Any]:
         "rounds": [_round(one) for one in found.rounds],
         "moved": moved(found),
         "next_measurement": next_measurement(found),
-        "residual_views": {
-            "before": [view.as_json() for view in views(found.before.state, unit)],
-            "after": [view.as_json() for view in views(found.after.state, unit)],
+        "parameters": [found.estimate(k) for k in range(found.after.state.model.plant_size)],
+        "acceptance": found.draws.acceptance if found.draws else None,
+        "residual": {
+            when: [{"name": view.name, "axis": view.axis, "sentence": view.sentence} for view in shown]
+            for when, shown in _views(found).items()
         },
-        "curves": [curve for score in found.before.fit + found.before.unseen for curve in [score.record]],
         "seed": found.study.seed,
     }
-    told["curves"] = _curves(found)
     values: dict[str, Any] = plain(told)
     return values
+
+
+def drawn(found: Loop) -> dict[str, Any]:
+    """What the figures need beyond `results`: residual views and residuals before and after."""
+    shown = {when: [view.as_json() for view in each] for when, each in _views(found).items()}
+    values: dict[str, Any] = plain({"views": shown, "curves": _curves(found)})
+    return values
+
+
+def _views(found: Loop) -> dict[str, list[View]]:
+    unit = found.study.time_unit
+    return {"before": views(found.before.state, unit), "after": views(found.after.state, unit)}
 
 
 def side(one: Side, found: Loop) -> dict[str, Any]:
@@ -189,6 +202,7 @@ def _curve(before: Score, after: Score, most: int = 1500) -> dict[str, Any]:
 def words(told: dict[str, Any]) -> Sequence[str]:
     """Lines for a reader."""
     out = [f"{told['verdict']} ({told['confidence']}): {told['sentence']}"]
+    out += [told["base_enlarged"]] if told["base_enlarged"] else []
     out += [f"caution: {one}" for one in told["cautions"]]
     for effect in told["effects"]:
         group = f" (cannot be told from {', '.join(effect['group'][1:])})" if len(effect["group"]) > 1 else ""
