@@ -153,6 +153,19 @@ class SamplerSettings:
         refuse_if([problem for key in stated for problem in whole_number(key, chosen[key], least[key])])
 
 
+@final
+@dataclass(frozen=True)
+class EffectsSettings:
+    """Table ``[effects]``."""
+
+    add: tuple[str, ...] = ()
+    """Effects of the user's own, ``file.py:Class``, relative to the study file."""
+
+    def __post_init__(self) -> None:
+        wrong = [one for one in self.add if not (isinstance(one, str) and ".py:" in one)]
+        refuse_if([f'`add` must list "file.py:Class"; got {one!r}' for one in wrong])
+
+
 @cache
 def _distributions() -> Mapping[str, stats.rv_continuous]:
     return {name: value for name, value in vars(stats).items() if isinstance(value, stats.rv_continuous)}

@@ -16,6 +16,7 @@ from lcopa_bayes.problems import InputError
 from lcopa_bayes.record import Axis, Record
 from lcopa_bayes.settings import (
     STAGES,
+    EffectsSettings,
     ModelSettings,
     NoiseSettings,
     PriorSettings,
@@ -53,6 +54,7 @@ class Study:
     """Settings of every stage to run, by name."""
     inputs: Mapping[str, str] = field(default_factory=dict)
     """SHA-256 of each input file, by file name."""
+    effects: EffectsSettings = field(default_factory=EffectsSettings)
 
     def __post_init__(self) -> None:
         records = (*self.fit, *self.held_out)

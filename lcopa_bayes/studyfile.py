@@ -14,6 +14,7 @@ from lcopa_bayes.problems import InputError, nearest
 from lcopa_bayes.record import Record, in_time_unit, load_record
 from lcopa_bayes.settings import (
     STAGES,
+    EffectsSettings,
     HeadingSettings,
     ModelSettings,
     NoiseSettings,
@@ -24,7 +25,7 @@ from lcopa_bayes.settings import (
 )
 from lcopa_bayes.study import DEFAULT_STAGES, Study, together
 
-_TABLES = ("study", "records", "model", "priors", "noise", "sampler", "stages")
+_TABLES = ("study", "records", "model", "priors", "noise", "sampler", "effects", "stages")
 
 
 def _read(
@@ -125,6 +126,9 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
     sampler = (
         settings_from(SamplerSettings, tables["sampler"], where["sampler"], problems) or SamplerSettings()
     )
+    effects = (
+        settings_from(EffectsSettings, tables["effects"], where["effects"], problems) or EffectsSettings()
+    )
     priors = _priors(tables["priors"], where["priors"], problems)
     stages = _stages(tables["stages"], where["stages"], problems)
     fit, apart = [], held_out
@@ -153,6 +157,7 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
         sampler,
         stages,
         _hashes([path, *fit, *apart]),
+        effects,
     )
 
 

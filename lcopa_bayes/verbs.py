@@ -152,6 +152,7 @@ def simulate(options: argparse.Namespace, command: list[str]) -> Told:
         held_out=plan.held_out,
         name=plan.name,
         seed=seed,
+        settings=plan.settings,
         overwrite=options.overwrite,
     )
     verdict = f"{len(records)} records in {options.out}"

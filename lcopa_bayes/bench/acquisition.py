@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 
 from lcopa_bayes.arrays import Array, Matrix, Vector
 from lcopa_bayes.bench.command import Command
-from lcopa_bayes.bench.device import Device
+from lcopa_bayes.bench.device import Responsive
 from lcopa_bayes.problems import InputError
 from lcopa_bayes.record import Record
 from lcopa_bayes.stated import PAPER
@@ -78,7 +78,7 @@ PAPER_BENCH = Bench(
 """Ta et al. 2026, Section 5.1: refresh 1 kHz, camera 10 kHz; noise as large as the fit error reported."""
 
 
-def truth(device: Device, bench: Bench, command: Command, *, duration: float, name: str) -> Record:
+def truth(device: Responsive, bench: Bench, command: Command, *, duration: float, name: str) -> Record:
     """The record without noise.
 
     Rows: one before everything, a camera period before time 0 or before the first change if that is
@@ -105,7 +105,13 @@ def truth(device: Device, bench: Bench, command: Command, *, duration: float, na
 
 
 def simulate(
-    device: Device, bench: Bench, command: Command, *, duration: float, name: str, rng: np.random.Generator
+    device: Responsive,
+    bench: Bench,
+    command: Command,
+    *,
+    duration: float,
+    name: str,
+    rng: np.random.Generator,
 ) -> Record:
     """`truth` with the noise of the bench on every camera sample; rows and errors as there."""
     clean = truth(device, bench, command, duration=duration, name=name)

@@ -55,12 +55,14 @@ def write_campaign(
     name: str | None = None,
     seed: int | None = None,
     note: str = "",
+    settings: str = "",
     overwrite: bool = False,
 ) -> tuple[Path, ...]:
     """Write one CSV per record and a ``study.toml`` that names them; return the paths, study last.
 
     Parameters: `held_out`, names of records not for fitting; `name` of the study, by default that of
-    the folder; `seed` of the study, left out when None; `note`, a comment at the head of the study.
+    the folder; `seed` of the study, left out when None; `note`, a comment at the head of the study;
+    `settings`, further tables of the study file.
     Everything is written beside its place first and then renamed, the study last: a campaign cut
     short leaves no file half written and no new study without its records. Raises InputError when a file
     is there already (unless `overwrite`), names repeat or cannot be file names, time units differ, a
@@ -108,6 +110,7 @@ def write_campaign(
     lines += (
         [f"held_out = {_toml([f'{each}.csv' for each in names if each in held_out])}"] if held_out else []
     )
+    lines += ["", settings] if settings else []
     writable_folder(folder)
     with told_as(folder), tempfile.TemporaryDirectory(prefix=".campaign-", dir=folder) as beside:
         try:

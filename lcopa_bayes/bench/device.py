@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from math import inf, isfinite
-from typing import final
+from typing import Protocol, final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,6 +20,18 @@ from lcopa_bayes.stated import PAPER, StatedPath
 
 ACCURACY = 1e-9
 """Error of a response [-], of the steady deflection per unit drive and per unit jump."""
+
+
+class Responsive(Protocol):
+    """Anything that answers a command: a device, or one with something hidden in it."""
+
+    @property
+    def drive_axes(self) -> tuple[Axis, ...]: ...  # noqa: D102
+    @property
+    def response_axes(self) -> tuple[Axis, ...]: ...  # noqa: D102
+    @property
+    def time_unit(self) -> str: ...  # noqa: D102
+    def response(self, command: Command, time: ArrayLike, *, exposure: float = 0.0) -> Matrix: ...  # noqa: D102
 
 
 @final

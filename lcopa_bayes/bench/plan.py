@@ -20,7 +20,8 @@
                                  # { prbs = [0, 1.5], hold = 1 }; each with `at` and `rest`
     held_out = false
 
-Times are milliseconds, angles radians.
+Times are milliseconds, angles radians. A table ``[undeclared]`` with `effects`, `drives`, `correlation` and
+`noise_sd` stands for bench, paths and records: see `undeclared.UndeclaredPlan`.
 """
 
 from __future__ import annotations
@@ -29,17 +30,19 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, final
+from typing import Any, ClassVar, final
 
 import numpy as np
 
 from lcopa_bayes.bench.acquisition import PAPER_BENCH, Bench, simulate
 from lcopa_bayes.bench.command import Command, on_off, prbs, quiet, staircase, step
 from lcopa_bayes.bench.device import PAPER_DEVICE, Device, TransferPath
+from lcopa_bayes.bench.undeclared import UndeclaredPlan
 from lcopa_bayes.problems import InputError, nearest
 from lcopa_bayes.record import Axis, Record
 
-_TABLES = {"campaign", "bench", "path", "record"}
+_TABLES = {"campaign", "bench", "path", "record", "undeclared"}
+_MEASURED = ("bench", "path", "record")
 _KINDS = {"step", "on_off", "staircase", "prbs"}
 _COMMAND_KEYS = _KINDS | {"at", "rest", "hold"}
 _PATH_KEYS = {"response", "drive"} | {field.name for field in fields(TransferPath)}
@@ -55,6 +58,9 @@ class Plan:
     device: Device
     bench: Bench
     records: tuple[Mapping[str, Any], ...]
+
+    settings: ClassVar[str] = ""
+    """What the study file says beside the records."""
 
     @property
     def held_out(self) -> tuple[str, ...]:
@@ -76,7 +82,7 @@ class Plan:
         )
 
 
-def load_plan(path: Path) -> Plan:
+def load_plan(path: Path) -> Plan | UndeclaredPlan:
     """Read a campaign file; InputError with everything wrong in it."""
     try:
         told = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -87,6 +93,8 @@ def load_plan(path: Path) -> Plan:
     problems = [f"{path}: unknown table [{key}]{nearest(key, _TABLES)}" for key in told if key not in _TABLES]
     heading = told.get("campaign", {})
     problems += _unknown(path, "[campaign]", heading, {"name", "seed"})
+    if "undeclared" in told and not problems:
+        return _undeclared(path, told)
     bench_keys = {field.name for field in fields(Bench)}
     problems += _unknown(path, "[bench]", told.get("bench", {}), bench_keys)
     for number, entry in enumerate(told.get("path", []), start=1):
@@ -110,6 +118,21 @@ def load_plan(path: Path) -> Plan:
     sd = settings["noise_sd"]
     bench = Bench(**settings | {"noise_sd": tuple(sd) if isinstance(sd, list) else sd})
     return Plan(heading.get("name", path.stem), int(heading.get("seed", 0)), device, bench, tuple(records))
+
+
+def _undeclared(path: Path, told: Mapping[str, Any]) -> UndeclaredPlan:
+    """A campaign with hidden effects."""
+    heading, table = told.get("campaign", {}), told["undeclared"]
+    known = {field.name for field in fields(UndeclaredPlan)} - {"name", "seed"}
+    problems = _unknown(path, "[undeclared]", table, known)
+    problems += [f"{path}: [{k}] is not used beside [undeclared]; remove it" for k in told if k in _MEASURED]
+    if problems:
+        raise InputError(problems)
+    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table.items()}
+    try:
+        return UndeclaredPlan(heading.get("name", path.stem), int(heading.get("seed", 0)), **values)
+    except InputError as error:
+        raise InputError([f"{path}: {problem}" for problem in error.problems]) from None
 
 
 def _unknown(path: Path, where: str, table: Mapping[str, Any], known: set[str]) -> list[str]:

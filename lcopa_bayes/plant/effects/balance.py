@@ -7,17 +7,24 @@ from typing import TypeAlias
 
 import numpy as np
 from scipy import fft
+from scipy.linalg import solve_triangular, toeplitz
 
 from lcopa_bayes.arrays import Matrix, Vector
 
-Force: TypeAlias = Callable[[slice, Matrix, Matrix], Matrix]
-"""(blocks, deviation of y, its value a block earlier) -> deviation of the force, (axes, blocks)."""
+Force: TypeAlias = Callable[[slice, Matrix, Matrix, Matrix], Matrix]
+"""(blocks, deviation of y, its values one and two blocks before) -> deviation of the force, (axes, blocks)."""
 
 _TOLERANCE = 1e-12
 """Change of y in the last iteration over the largest y [-]."""
 _SWEEPS = 24
 _DEPTH = 4
 """Earlier iterates that the acceleration combines (Anderson 1965, J. ACM 12)."""
+_DENSE = 128
+"""Longest stretch for a dense matrix [blocks]."""
+_NEWTON = 12
+_NUDGE = 1e-6
+_SINGULAR = 1e-3
+"""Below this a block's own feed-through leaves Newton's step undetermined [-]."""
 _LEAST = 2
 """Windows this short are iterated to the end."""
 _LONG_SWEEPS = 400
@@ -37,29 +44,83 @@ def balanced(kernel: Matrix, force: Force, scale: Vector) -> Matrix:
     """``y = kernel * force(y)``, causal convolution, (axes, n).
 
     Parameters: kernel (axes, n), the impulse response in block means; scale (axes,), typical size of y.
-    Whole stretches are iterated with acceleration; one that does not converge is halved, its
-    first half solved and its convolution carried into the second, down to two blocks, where the direct
-    feed-through of a block is small. Raises RunawayError. Accuracy: 1e-12 of the scale per iteration.
+    The whole is iterated with acceleration. When that does not converge it is halved, the first half
+    solved and its convolution carried into the second; stretches of up to 128 blocks are solved by
+    Newton's method, or halved further, down to two blocks, where the direct feed-through is small.
+    Raises RunawayError. Accuracy: 1e-12 of the scale per iteration.
     """
-    y = np.zeros(kernel.shape)
-    _solve(kernel, force, y, np.zeros(kernel.shape), scale[:, None], 0, kernel.shape[1])
+    y, v = np.zeros(kernel.shape), np.zeros(kernel.shape)
+    _solve(kernel, force, y, v, scale[:, None], 0, kernel.shape[1], kernel.shape[1])
     return y
 
 
-def _solve(kernel: Matrix, force: Force, y: Matrix, v: Matrix, scale: Matrix, a: int, b: int) -> None:
-    """Solve blocks a to b in place; `y` holds there what earlier forces leave, on return the response."""
-    history = y[:, a:b].copy()
-    before = y[:, a - 1 : a] if a else np.zeros((y.shape[0], 1))
-    found = _iterate(kernel[:, : b - a], force, history, before, scale, slice(a, b))
-    if found is not None:
-        y[:, a:b], v[:, a:b] = found
-        return
-    if b - a <= _LEAST:
-        raise RunawayError(a)
+def _solve(
+    kernel: Matrix, force: Force, y: Matrix, v: Matrix, scale: Matrix, a: int, b: int, limit: int
+) -> int:
+    """Solve blocks a to b in place; `y` holds there what earlier forces leave, on return the response.
+
+    A stretch longer than `limit` is halved untried. Returns the limit that experience suggests.
+    """
+    n = b - a
+    if n <= max(limit, _LEAST):
+        before = np.concatenate((np.zeros((y.shape[0], 2)), y[:, max(a - 2, 0) : a]), axis=1)[:, -2:]
+        method = _newton if _LEAST < n <= _DENSE else _iterate
+        found = method(kernel[:, :n], force, y[:, a:b].copy(), before, scale, slice(a, b))
+        if found is not None:
+            y[:, a:b], v[:, a:b] = found
+            return limit if limit > _DENSE else min(_DENSE, max(limit, 2 * n))
+        if n <= _LEAST:
+            raise RunawayError(a)
+        limit = min(n // 2, _DENSE)
     middle = (a + b) // 2
-    _solve(kernel, force, y, v, scale, a, middle)
-    y[:, middle:b] += convolved(kernel[:, : b - a], v[:, a:middle])[:, middle - a :]
-    _solve(kernel, force, y, v, scale, middle, b)
+    limit = _solve(kernel, force, y, v, scale, a, middle, limit)
+    y[:, middle:b] += convolved(kernel[:, :n], v[:, a:middle])[:, middle - a :]
+    return _solve(kernel, force, y, v, scale, middle, b, limit)
+
+
+def _newton(
+    kernel: Matrix, force: Force, history: Matrix, before: Matrix, scale: Matrix, blocks: slice
+) -> tuple[Matrix, Matrix] | None:
+    """Fixed point as in `_iterate`, by Newton's method.
+
+    Slopes of the force, in y and in its two earlier values, are differences over 1e-6 of the scale; that
+    of one axis in another is left to the iteration.
+    """
+    n = kernel.shape[1]
+    operators = [toeplitz(row, np.zeros(n)) for row in kernel]
+    y = history
+    for _ in range(_NEWTON):
+        with np.errstate(over="ignore", invalid="ignore"):
+            one, two = _earlier(before, y)
+            v = force(blocks, y, one, two)
+            nudge = _NUDGE * scale
+            slopes = [
+                (force(blocks, y + nudge, one, two) - v) / nudge,
+                (force(blocks, y, one + nudge, two) - v) / nudge,
+                (force(blocks, y, one, two + nudge) - v) / nudge,
+            ]
+            left = history + np.stack([k @ row for k, row in zip(operators, v, strict=True)]) - y
+        size = float(np.abs(left / scale).max())
+        if not (size < _RUNAWAY and np.isfinite(sum(slopes)).all()):  # NaN too
+            return None
+        if size < _TOLERANCE:
+            return y + left, v
+        step = np.empty_like(y)
+        for i, operator in enumerate(operators):
+            matrix = np.eye(n)
+            for back, slope in enumerate(slopes):
+                matrix[:, : n - back] -= operator[:, back:] * slope[i, back:]
+            if not np.all(np.abs(np.diag(matrix)) > _SINGULAR):
+                return None
+            step[i] = solve_triangular(matrix, left[i], lower=True, check_finite=False)
+        y = y + step
+    return None
+
+
+def _earlier(before: Matrix, y: Matrix) -> tuple[Matrix, Matrix]:
+    """Values one and two blocks before those of `y`, from the two blocks before its first."""
+    joined = np.concatenate((before, y), axis=1)
+    return joined[:, 1:-1], joined[:, :-2]
 
 
 def convolved(kernel: Matrix, v: Matrix) -> Matrix:
@@ -85,7 +146,7 @@ def _iterate(
     spectrum = None if n <= 32 else fft.rfft(kernel, length)
 
     def swept(y: Matrix) -> tuple[Matrix, Matrix]:
-        v = force(blocks, y, np.concatenate((before, y[:, :-1]), axis=1))
+        v = force(blocks, y, *_earlier(before, y))
         if spectrum is None:
             return history + convolved(kernel, v), v
         return history + fft.irfft(spectrum * fft.rfft(v, length), length)[:, :n], v

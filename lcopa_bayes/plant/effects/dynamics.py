@@ -18,7 +18,7 @@ from lcopa_bayes.plant.effects.effect import (
     single,
 )
 
-_SHARP = 1e-5
+_SHARP = 3e-4
 """Width of the switch between rise and fall, of ``ymax^2 / speed`` [-]: a jump would not converge."""
 
 

@@ -136,7 +136,8 @@ class _Passage:
         """Block means of the delayed drive of a unit [drive unit]."""
         _, delay, axis = self.layout.units[unit]
         late = self.plant.dynamics.delays[:, delay]
-        return self.scene.drives[axis].block_means(self.experiment.edges, late)[0][0]
+        means, _ = self.scene.drives[axis].block_means(self.experiment.edges, late)
+        return np.asarray(means[0])
 
     def _unit(self, unit: int) -> Array:
         """Block means of a unit response [drive unit]."""
@@ -162,8 +163,8 @@ class _Passage:
                 f = effect.force(f, y, rate, scene, own)
             return f
 
-        def deviation(blocks: slice, y: Matrix, before: Matrix) -> Matrix:
-            rate = (y - before) / self.experiment.mesh.grid.step
+        def deviation(blocks: slice, y: Matrix, one: Matrix, two: Matrix) -> Matrix:
+            rate = (1.5 * y - 2.0 * one + 0.5 * two) / self.experiment.mesh.grid.step
             return acting(f[:, blocks], level + y, rate) - level
 
         try:

@@ -188,8 +188,8 @@ class CentroidLocking(ReadoutEffect):
 class CrossFade(ReadoutEffect):
     """The far field passes from one diffraction order to the next: the centroid waits, then hurries.
 
-    Homogeneous of degree 1, so that an amplitude series does not show it; a transition that is
-    interrupted starts anew from where the centroid is.
+    Homogeneous of degree 1, so that an amplitude series does not show it. A transition that is
+    interrupted starts anew from the director's deflection; what the centroid lacks then fades with it.
     """
 
     card: ClassVar[Card] = Card(
@@ -212,24 +212,37 @@ class CrossFade(ReadoutEffect):
         changes = np.unique(np.concatenate([drive.times for drive in scene.drives]))
         for axis in range(y.shape[1]):
             starts = changes + scene.direct(axis)[3]
-            targets = np.zeros(changes.size)
-            for j, drive in enumerate(scene.drives):
-                held = np.searchsorted(drive.times, changes, side="right")
-                levels = scene.rest[j] + np.concatenate(([0.0], drive.values))[held]
-                targets += scene.gains[axis, j] * levels
-            segment = np.searchsorted(starts, scene.times, side="right") - 1
-            after = segment >= 0
-            before = np.interp(starts, scene.times, y[:, axis])[segment[after]]
-            way = targets[segment[after]] - before
-            out[after, axis] += psi[0] * way * _delay_of_fade(y[after, axis] - before, way)
+            origins = np.interp(starts, scene.times, y[:, axis])
+            firsts = np.searchsorted(scene.times, starts)
+            lasts = np.append(firsts[1:], scene.times.size)
+            left = 0.0  # what the centroid still lacks of the director's deflection when a segment begins
+            for start, origin, change, first, last in zip(
+                starts, origins, changes, firsts, lasts, strict=True
+            ):
+                way = _target(scene, axis, float(change)) - origin
+                out[first:last, axis] += _lack(y[first:last, axis] - origin, way, left, float(psi[0]))
+                later = starts[starts > start]
+                if later.size:
+                    there = np.interp(later[:1], scene.times, y[:, axis]) - origin
+                    left = float(_lack(there, way, left, float(psi[0]))[0])
         return out
 
 
-def _delay_of_fade(moved: Array, way: Array) -> Array:
-    """``q / (q + q') - a`` where ``0 < a = moved / way < 1``, else 0."""
-    inside = (moved * way > 0) & (np.abs(moved) < np.abs(way))
-    a = moved[inside] / way[inside]
-    out = np.zeros(moved.shape)
-    q, other = np.sinc(1 - a) ** 2, np.sinc(a) ** 2
-    out[inside] = q / (q + other) - a
-    return out
+def _target(scene: Scene, axis: int, change: float) -> float:
+    """Deflection that the commands from `change` on lead to."""
+    total = 0.0
+    for j, drive in enumerate(scene.drives):
+        held = int(np.searchsorted(drive.times, change, side="right"))
+        level = scene.rest[j] + (drive.values[held - 1] if held else 0.0)
+        total += float(scene.gains[axis, j] * level)
+    return total
+
+
+def _lack(moved: Array, way: float, left: float, strength: float) -> Array:
+    """Centroid minus director after `moved` of a `way`; `left` at its begin."""
+    a = moved / way if way != 0.0 else np.ones(moved.shape)
+    inside = (a > 0) & (a < 1)
+    q, other = np.sinc(1 - a[inside]) ** 2, np.sinc(a[inside]) ** 2
+    out = left * (1 - np.clip(a, 0.0, 1.0))
+    out[inside] += strength * way * (q / (q + other) - a[inside])
+    return np.asarray(out)

@@ -1,0 +1,200 @@
+"""Campaigns with undeclared effects: rich and plain drives, records, and the truth for scoring."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from types import ModuleType
+from typing import ClassVar, Literal, final
+
+import numpy as np
+
+from lcopa_bayes.arrays import Matrix
+from lcopa_bayes.bench import drivekinds, outsiders, plantkinds, readkinds
+from lcopa_bayes.bench.acquisition import Bench, truth
+from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.bench.hidden import STEPS, Hidden, HiddenDevice, Shot
+from lcopa_bayes.bench.schedules import LARGEST, Schedule, plain_schedules, rich_schedules
+from lcopa_bayes.problems import InputError, nearest
+from lcopa_bayes.record import Axis, Record
+
+NOISE = 1.8e-4
+"""Standard deviation of the noise of a sample [rad], Ta et al. 2026, Figs. 13 to 16."""
+CAMERA = 0.1
+"""Camera period [ms]."""
+Maker = Callable[[np.random.Generator], Hidden]
+
+
+def _makers(*modules: ModuleType) -> dict[str, Maker]:
+    """Functions of one Generator that make a hidden effect, by name."""
+    found: dict[str, Maker] = {}
+    for module in modules:
+        for name, made in inspect.getmembers(module, inspect.isfunction):
+            told = inspect.signature(made)
+            if told.return_annotation == "Hidden" and made.__module__ == module.__name__:
+                found[name] = made
+    return found
+
+
+NAMED: dict[str, Maker] = _makers(drivekinds, plantkinds, readkinds)
+"""Effects that a catalogue may name."""
+OUTSIDE: dict[str, Maker] = _makers(outsiders)
+"""Effects that none names."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Campaign:
+    """Records of one device with hidden effects, and what only the judge may see."""
+
+    fit: tuple[Record, ...]
+    held_out: tuple[Record, ...]
+    truth: dict[str, Matrix]
+    """Response of the plant without noise and disturbances, (rows of the record, axes), by record."""
+    hidden: tuple[Hidden, ...]
+    device: Device
+    correlation: float
+    """Of successive noise samples [-]."""
+
+
+def steerer(rng: np.random.Generator) -> Device:
+    """A two-axis steerer near that of Ta et al. 2026, Eq. 65: two direct terms, one cross term, one delay.
+
+    Every number is drawn within 15 % of its middle (orders within 4 %).
+    """
+
+    def near(value: float, part: float = 0.15) -> float:
+        return float(value * rng.uniform(1 - part, 1 + part))
+
+    def path(gain: float, terms: Sequence[tuple[float, float]]) -> TransferPath:
+        etas = tuple(time**order for time, order in terms)
+        return TransferPath(gain, delay, etas, tuple(order for _, order in terms), 1.0)
+
+    delay = near(3.0)
+    direct = ((near(1.8), near(1.75, 0.04)), (near(2.4), near(0.88, 0.04)))
+    cross = ((near(2.2), near(0.9, 0.04)),)
+    paths = (
+        (path(near(0.0174), direct), path(near(0.0012), cross)),
+        (path(near(0.0010), cross), path(near(0.0160), direct)),
+    )
+    axes = (Axis("x", "rad"), Axis("y", "rad"))
+    offsets = tuple(float(v) for v in rng.normal(0.0, 2e-4, 2))
+    return Device(paths, axes, axes, offsets)
+
+
+def drawn(names: Sequence[str], rng: np.random.Generator) -> tuple[Hidden, ...]:
+    """Effects of these names at sizes drawn at random; InputError for a name that is not known."""
+    known = NAMED | OUTSIDE
+    wrong = [
+        f"no hidden effect is called {name!r}{nearest(name, known)}" for name in names if name not in known
+    ]
+    if wrong:
+        raise InputError(wrong)
+    return tuple(known[name](rng) for name in names)
+
+
+def campaign(
+    hidden: Sequence[Hidden],
+    rng: np.random.Generator,
+    *,
+    drives: Literal["rich", "plain"] = "rich",
+    correlation: float = 0.0,
+    noise_sd: float = NOISE,
+    device: Device | None = None,
+    steps: int = STEPS,
+) -> Campaign:
+    """Eight records to fit and three held out, named by the order in which they were taken.
+
+    Parameters: hidden effects, none for a control; `correlation` [-] of successive noise samples (AR(1));
+    `noise_sd` [rad]; `device`, by default a `steerer` drawn at random; `steps` per camera period where
+    forces are changed. Records have 30 to 100 ms at 10 kHz and, when rich, quiet stretches before the drive.
+    """
+    device = device or steerer(rng)
+    schedules = rich_schedules(rng) if drives == "rich" else plain_schedules(rng)
+    bench = Bench(refresh=0.0, camera=CAMERA, noise_sd=noise_sd, noise_correlation=correlation)
+    fit: list[Record] = []
+    held_out: list[Record] = []
+    exact: dict[str, Matrix] = {}
+    plant = tuple(effect for effect in hidden if not effect.disturbance)
+    for number, schedule in enumerate(schedules):
+        shot = shot_of(device, (number + 0.5) / len(schedules) - 0.5, rng)
+        name = f"run{number + 1:02d}"
+        clean = _taken(device, plant, shot, bench, schedule, name, steps)
+        exact[name] = clean.response
+        shaken = (
+            clean
+            if len(plant) == len(hidden)
+            else _taken(device, tuple(hidden), shot, bench, schedule, name, steps)
+        )
+        response = np.array(shaken.response)
+        sampled = ~np.isnan(response[:, 0])
+        noise = bench.noise(int(sampled.sum()), response.shape[1], rng)
+        for effect in hidden:
+            if effect.noise is not None:
+                noise = effect.noise(noise, rng)
+        response[sampled] += noise
+        axes = (clean.drive_axes, clean.response_axes)
+        record = Record(name, clean.time, clean.drive, response, *axes, clean.time_unit)
+        (held_out if schedule.held_out else fit).append(record)
+    return Campaign(tuple(fit), tuple(held_out), exact, tuple(hidden), device, correlation)
+
+
+def _taken(
+    device: Device,
+    hidden: tuple[Hidden, ...],
+    shot: Shot,
+    bench: Bench,
+    schedule: Schedule,
+    name: str,
+    steps: int,
+) -> Record:
+    """A record without noise."""
+    made = HiddenDevice(device, hidden, shot, steps)
+    return truth(made, bench, schedule.command, duration=schedule.duration, name=name)
+
+
+def shot_of(device: Device, epoch: float, rng: np.random.Generator) -> Shot:
+    """What effects may know, for drives up to the largest of the schedules."""
+    steady = np.array([[path.steady for path in row] for row in device.paths])
+    drive = np.full(steady.shape[1], LARGEST)
+    return Shot(epoch, drive, np.abs(np.diag(steady)) * drive, device.paths[0][0].delay, steady, rng)
+
+
+@final
+@dataclass(frozen=True)
+class UndeclaredPlan:
+    """A campaign file with a table ``[undeclared]``: effects by name, at sizes drawn from the seed.
+
+    Raises InputError for an unknown effect, unknown drives or a correlation out of range.
+    """
+
+    name: str
+    seed: int
+    effects: tuple[str, ...] = ()
+    """Names among `NAMED` and `OUTSIDE`; none for a control."""
+    drives: Literal["rich", "plain"] = "rich"
+    correlation: float = 0.0
+    """Of successive noise samples [-]."""
+    noise_sd: float = NOISE
+    """[rad]."""
+
+    held_out: ClassVar[tuple[str, ...]] = ("run04", "run07", "run10")
+    settings: ClassVar[str] = '[model]\nterms = { direct = 2, cross = 1 }\nshare = "paper"'
+    """What the study file says of the model: nothing of any effect."""
+
+    def __post_init__(self) -> None:
+        drawn(self.effects, np.random.default_rng(0))
+        if self.drives not in ("rich", "plain"):
+            raise InputError(f'[undeclared] drives must be "rich" or "plain"; got {self.drives!r}')
+        Bench(noise_sd=self.noise_sd, noise_correlation=self.correlation)
+
+    def made(self, rng: np.random.Generator) -> Campaign:
+        """The campaign with what only the judge may see."""
+        hidden = drawn(self.effects, rng)
+        return campaign(hidden, rng, drives=self.drives, correlation=self.correlation, noise_sd=self.noise_sd)
+
+    def run(self, rng: np.random.Generator) -> tuple[Record, ...]:
+        """All records in the order taken."""
+        made = self.made(rng)
+        return tuple(sorted((*made.fit, *made.held_out), key=lambda record: record.name))
