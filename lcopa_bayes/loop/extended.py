@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import final
@@ -27,9 +28,14 @@ class ExtendedModel:
     fifty times cheaper and good enough to descend with."""
 
     @classmethod
-    def of(cls, base: BaseModel, x: Vector, effects: tuple[Effect, ...] = ()) -> ExtendedModel:
-        """With the effects' scales taken from the base fit at `x`."""
-        return cls(base, effected(base.posterior, base.values(x), effects))
+    def of(
+        cls, base: BaseModel, x: Vector, effects: tuple[Effect, ...] = (), *, taken: Mapping[str, float] | None = None
+    ) -> ExtendedModel:
+        """With the effects' scales taken from the base fit at `x`; `taken` gives each record's place in the campaign
+        [-], by default evenly from -1/2 to 1/2."""
+        names = [one.record.name for one in base.posterior.samples]
+        epochs = np.array([taken[name] for name in names]) if taken else None
+        return cls(base, effected(base.posterior, base.values(x), effects, epochs))
 
     def having(self, *effects: Effect) -> ExtendedModel:
         """The same plant and scales with these effects."""

@@ -15,6 +15,7 @@ from lcopa_bayes.loop.basefit import BaseFit
 from lcopa_bayes.loop.extended import ExtendedModel
 from lcopa_bayes.loop.density import LoopDensity
 from lcopa_bayes.loop.draws import LoopDraws, sample_loop, unit_of
+from lcopa_bayes.loop.prediction import taken
 from lcopa_bayes.loop.rounds import Round, search
 from lcopa_bayes.loop.scores import Score, State, fit_scores, held_out_scores, left_out_scores
 from lcopa_bayes.loop.terms import fitted_base
@@ -119,9 +120,9 @@ def loop(
     `sample` intervals and bands are those of a Laplace approximation. With `quick` fewer chance residuals
     are drawn and ensembles are half as long. InputError when the study does not fit its records.
     """
-    kinds = list(catalogue().values()) if library is None else list(library)
+    kinds = list(catalogue(study.effects.add, study.folder).values()) if library is None else list(library)
     problem, base, enlarged = fitted_base(study, as_stated=as_stated)
-    model = ExtendedModel.of(base.model, base.optimum.x)
+    model = ExtendedModel.of(base.model, base.optimum.x, taken=taken(study))
     start = State(model, base.optimum, base.regression.whitening, base.optimum.covariance)
     before = _side(problem, start)
     if base.failed:

@@ -14,7 +14,7 @@ from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.loop.autoregression import Autoregression
 from lcopa_bayes.loop.extended import ExtendedModel
 from lcopa_bayes.loop.leftout import groups, shifts
-from lcopa_bayes.loop.prediction import levelled, predicted
+from lcopa_bayes.loop.prediction import FLAT, LevelPrior, levelled, predicted
 from lcopa_bayes.loop.regression import Optimum
 from lcopa_bayes.loop.whitening import Whitening
 from lcopa_bayes.loop.widening import Widening
@@ -123,8 +123,11 @@ def held_out_scores(state: State, problem: Problem) -> list[Score]:
         state.covariance,
         state.widening,
     )
-    delay = _delay(state) if _own_levels(state) else None
-    return _scores(elsewhere, told.mean, told.variance, "the fit records", delay)
+    if not _own_levels(state):
+        return _scores(elsewhere, told.mean, told.variance, "the fit records", None)
+    axes = range(len(state.whitening.noise))
+    priors = [LevelPrior.of(state.model, state.optimum.x, state.covariance, axis) for axis in axes]
+    return _scores(elsewhere, told.mean, told.variance, "the fit records", _delay(state), priors)
 
 
 def _own_levels(state: State) -> bool:
@@ -140,7 +143,12 @@ def _delay(state: State) -> float:
 
 
 def _scores(
-    state: State, mean: Vector, variance: Vector, level_from: str, delay: float | None
+    state: State,
+    mean: Vector,
+    variance: Vector,
+    level_from: str,
+    delay: float | None,
+    priors: Sequence[LevelPrior] = (),
 ) -> list[Score]:
     """One score per record and axis; with a `delay` each record's level is found first."""
     width = float(norm.ppf(0.5 + LEVEL / 2))
@@ -153,7 +161,10 @@ def _scores(
         noise: Autoregression = whitening.noise[part.axis]
         centre, spread, source = mean[part.rows], variance[part.rows], level_from
         if delay is not None:
-            level, doubt, source = levelled(record, part.axis, observed.values - centre, noise, delay)
+            prior = priors[part.axis] if priors else FLAT
+            level, doubt, source = levelled(
+                record, part.axis, observed.values - centre, noise, delay, prior
+            )
             # what the fit did not know about the level is known now
             centre, spread = centre + level, _without_level(spread, doubt)
         if state.widening is not None:

@@ -274,6 +274,8 @@ def _chance(
     for _ in range(4):
         z = rng.standard_normal((whitening.size, draws // 4))
         for axis, count in enumerate(noise_samples):
+            if not count:  # the residual itself gave the scale
+                continue
             factor = 1.0 / np.sqrt(rng.chisquare(count, z.shape[1]) / count)
             for part in whitening.parts:
                 if part.axis == axis:
