@@ -64,7 +64,9 @@ def _parser() -> argparse.ArgumentParser:
     add("run", verbs.run, [study, sampled, checked], "all stages the study names, then the report")
     add("fit", verbs.fit_study, [study, sampled, checked], "posterior, bands and step metrics, with a report")
     add("audit", verbs.audit_study, [study, sampled], "what the records determine, parameter by parameter")
-    looped = add("loop", verbs.loop_study, [study, sampled], "what the model lacks: residual, effect, errors after")
+    looped = add(
+        "loop", verbs.loop_study, [study, sampled], "what the model lacks: residual, effect, errors after"
+    )
     looped.add_argument(
         "--as-stated", action="store_true", help="keep the number of viscous terms the study states"
     )

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from itertools import pairwise
 from typing import final
 
 import numpy as np
@@ -115,7 +116,7 @@ def unbroken(gaps: Vector) -> list[slice]:
     """Stretches of samples one sampling period apart; `gaps` (n,) in periods, the first not used."""
     breaks = np.flatnonzero(np.abs(gaps[1:] - 1.0) > _UNIT_GAP) + 1
     edges = [0, *breaks.tolist(), gaps.size]
-    return [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True) if b > a]
+    return [slice(a, b) for a, b in pairwise(edges) if b > a]
 
 
 def estimated(pieces: Sequence[Vector], *, largest: int = _LARGEST_ORDER) -> Autoregression:
@@ -135,7 +136,7 @@ def estimated(pieces: Sequence[Vector], *, largest: int = _LARGEST_ORDER) -> Aut
     for order in range(min(largest, longest - 2, total // _PER_COEFFICIENT) + 1):
         if order:
             found = minimize(
-                lambda x: _cost(np.tanh(x), alike)[0],
+                partial(_negative, alike=alike),
                 np.concatenate([start, [0.0]]),
                 method="BFGS",
                 options={"gtol": 1e-4, "maxiter": 60},
@@ -151,9 +152,14 @@ def estimated(pieces: Sequence[Vector], *, largest: int = _LARGEST_ORDER) -> Aut
     return Autoregression(best[1], best[2])
 
 
-def _cost(partial: Vector, alike: Sequence[Matrix]) -> tuple[float, float]:
+def _negative(x: Vector, alike: Sequence[Matrix]) -> float:
+    """Cost of the inverse hyperbolic tangents of partial autocorrelations."""
+    return _cost(np.tanh(x), alike)[0]
+
+
+def _cost(correlations: Vector, alike: Sequence[Matrix]) -> tuple[float, float]:
     """Negative restricted log likelihood at the best innovation sd, and that sd, of pieces by length."""
-    unit = Autoregression(np.clip(partial, -1 + 1e-9, 1 - 1e-9), 1.0)
+    unit = Autoregression(np.clip(correlations, -1 + 1e-9, 1 - 1e-9), 1.0)
     squares, levels, scales, count = 0.0, 0.0, 0.0, 0
     for pieces in alike:
         number, n = pieces.shape

@@ -148,7 +148,8 @@ def _cautions(noise: Sequence[AxisNoise], optimum: Optimum) -> tuple[str, ...]:
     out = [one.sentence for one in noise if not one.known]
     if optimum.at_bound:
         out.append(
-            f"{', '.join(optimum.at_bound)} stand(s) at the end of its prior in the base fit; widen the prior "
+            f"{', '.join(optimum.at_bound)} stand(s) at the end of its prior in the base fit; widen the "
+            "prior "
             "or take the parameter out: what a bound takes away may look like an effect"
         )
     return tuple(out)

@@ -43,7 +43,8 @@ class Curve(Protocol):
 @final
 @dataclass(frozen=True, eq=False)
 class BaseModel:
-    """The plant alone, in the search coordinates of `LeastSquares`: logarithms of time constants, plain orders,
+    """The plant alone, in the search coordinates of `LeastSquares`: logarithms of time constants, plain
+    orders,
     delays, gains and offsets."""
 
     posterior: Posterior
@@ -122,7 +123,7 @@ class BaseModel:
             for r, samples in enumerate(posterior.samples)
             for axis, observed in enumerate(samples.axes)
         ]
-        return self.observed - np.concatenate(left)
+        return np.asarray(self.observed - np.concatenate(left))
 
     def tangents(self, x: Vector) -> tuple[Vector, Matrix]:
         """Stacked responses and their exact derivatives."""

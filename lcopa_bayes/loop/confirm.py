@@ -16,7 +16,8 @@ from lcopa_bayes.loop.extended import ExtendedModel
 from lcopa_bayes.loop.leftout import groups, log_scores
 from lcopa_bayes.loop.regression import Optimum, Regression
 from lcopa_bayes.loop.scoreevidence import Projection
-from lcopa_bayes.loop.trace import Scale, Signature, Trace, Traced, signature_of
+from lcopa_bayes.loop.signature import Scale, Signature, signature_of
+from lcopa_bayes.loop.trace import Trace, Traced
 from lcopa_bayes.loop.whitening import Whitening
 from lcopa_bayes.plant.effects.effect import Effect
 
@@ -69,7 +70,8 @@ def refit(
 ) -> Refit:
     """With effects added to those of `model`, each started from zero and from its linear estimate.
 
-    `added` holds each effect with its coefficients over their prior sd; `quiet` [-] are the samples the noise scale
+    `added` holds each effect with its coefficients over their prior sd; `quiet` [-] are the samples the
+    noise scale
     is known from (`Scale`). The descent uses the plant's own tangents
     first and ends with those of the whole. ArithmeticError when no start has a bounded response.
     """
@@ -90,7 +92,8 @@ def refit(
 
 
 def log_bayes_factor(before: Optimum, after: Optimum, quiet: float) -> float:
-    """Laplace evidence of one model over another's under the same whitening, noise scale integrated out [nat]."""
+    """Laplace evidence of one model over another's under the same whitening, noise scale integrated out
+    [nat]."""
     volume = (after.log_evidence + after.cost) - (before.log_evidence + before.cost)
     known = Scale(quiet, after.white.size - after.x.size, np.array([2 * before.cost]))
     return float(volume + known.gain(np.array([before.cost - after.cost]))[0])
@@ -111,7 +114,8 @@ def tuned(
 ) -> Signature:
     """The best instance of an effect with its internal constants moved between their grid neighbours.
 
-    Each positive constant is maximised in turn over its logarithm, by the evidence in the residual that was `seen`.
+    Each positive constant is maximised in turn over its logarithm, by the evidence in the residual that was
+    `seen`.
     """
     best = traced.signatures[traced.best]
     project = Projection(optimum.jacobian * model.spread)

@@ -17,8 +17,10 @@ from lcopa_bayes.loop.scores import State
 class LoopDensity:
     """Density of the coordinates that are sampled, at the noise of a state.
 
-    Offsets, and coefficients that belong to one record, are integrated out about the optimum (exact for offsets,
-    linearised for coefficients); so is the scale of the noise under ``1 / variance`` with `quiet` further samples.
+    Offsets, and coefficients that belong to one record, are integrated out about the optimum (exact for
+    offsets,
+    linearised for coefficients); so is the scale of the noise under ``1 / variance`` with `quiet` further
+    samples.
     """
 
     state: State
@@ -49,7 +51,8 @@ class LoopDensity:
         precision = 1.0 / model.spread[self.linear] ** 2
         centre = model.centre[self.linear]
         pull = precision * (optimum.x[self.linear] - centre)
-        return columns, np.linalg.inv(columns.T @ columns + np.diag(precision)), pull
+        inverse: Matrix = np.linalg.inv(columns.T @ columns + np.diag(precision)).astype(float)
+        return columns, inverse, pull
 
     def residual(self, z: Vector) -> Vector | None:
         """Whitened residual at sampled coordinates, the others at the optimum; None without a response."""

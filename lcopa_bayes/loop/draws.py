@@ -21,7 +21,7 @@ from lcopa_bayes.loop.extended import ExtendedModel
 from lcopa_bayes.plant.effects.simulator import UPSTREAM
 
 ENSEMBLES = 4
-_FREEDOM = 12.0
+_FREEDOM = 12
 """Degrees of freedom of the jump's t distribution [-]: heavier tails than any posterior it is used on."""
 _BURN = 0.3
 """Share of the steps that is discarded [-]."""

@@ -29,9 +29,15 @@ class ExtendedModel:
 
     @classmethod
     def of(
-        cls, base: BaseModel, x: Vector, effects: tuple[Effect, ...] = (), *, taken: Mapping[str, float] | None = None
+        cls,
+        base: BaseModel,
+        x: Vector,
+        effects: tuple[Effect, ...] = (),
+        *,
+        taken: Mapping[str, float] | None = None,
     ) -> ExtendedModel:
-        """With the effects' scales taken from the base fit at `x`; `taken` gives each record's place in the campaign
+        """With the effects' scales taken from the base fit at `x`; `taken` gives each record's place in the
+        campaign
         [-], by default evenly from -1/2 to 1/2."""
         names = [one.record.name for one in base.posterior.samples]
         epochs = np.array([taken[name] for name in names]) if taken else None
@@ -84,7 +90,7 @@ class ExtendedModel:
         return self.base.values(x[:n]), x[n:] * self.scale
 
     def predict(self, x: Vector) -> Vector:
-        """Stacked responses, (n,) [response unit]; UnstableSimulation where there are none."""
+        """Stacked responses, (n,) [response unit]; UnstableError where there are none."""
         if not self.effects:
             return self.base.predict(x)
         values, psi = self.split(x)
@@ -104,7 +110,8 @@ class ExtendedModel:
         return self.predict(x), np.vstack([plant, self._coefficient_slopes(values, psi)]).T
 
     def signature(self, x: Vector, effect: Effect) -> tuple[Matrix, tuple[Placed, ...]]:
-        """Derivatives, at coordinates of this model, in the coefficients of one more effect over their prior sd
+        """Derivatives, at coordinates of this model, in the coefficients of one more effect over their
+        prior sd
         where it vanishes, (n, k) [response unit], and what the coefficients are."""
         more = self.having(*self.effects, effect)
         new = more.scale.size - self.scale.size

@@ -38,7 +38,9 @@ def groups(whitening: Whitening) -> tuple[Group, ...]:
         return tuple(
             Group(
                 whitening.samples[r].record.name,
-                np.concatenate([np.arange(p.rows.start, p.rows.stop) for p in whitening.parts if p.record == r]),
+                np.concatenate(
+                    [np.arange(p.rows.start, p.rows.stop) for p in whitening.parts if p.record == r]
+                ),
             )
             for r in sorted(records)
         )
@@ -67,6 +69,6 @@ def shifts(optimum: Optimum, chosen: Sequence[Group]) -> list[tuple[Vector, Matr
     out = []
     for group in chosen:
         tangents, residual = optimum.jacobian[group.rows], optimum.settled[group.rows]
-        covariance = np.linalg.inv(optimum.information - tangents.T @ tangents)
+        covariance: Matrix = np.linalg.inv(optimum.information - tangents.T @ tangents).astype(float)
         out.append((-covariance @ (tangents.T @ residual), covariance))
     return out

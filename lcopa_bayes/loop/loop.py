@@ -12,9 +12,9 @@ from lcopa_bayes.estimate import LEVEL
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.grade import Grade
 from lcopa_bayes.loop.basefit import BaseFit
-from lcopa_bayes.loop.extended import ExtendedModel
 from lcopa_bayes.loop.density import LoopDensity
 from lcopa_bayes.loop.draws import LoopDraws, sample_loop, unit_of
+from lcopa_bayes.loop.extended import ExtendedModel
 from lcopa_bayes.loop.prediction import taken
 from lcopa_bayes.loop.rounds import Round, search
 from lcopa_bayes.loop.scores import Score, State, fit_scores, held_out_scores, left_out_scores
@@ -71,7 +71,9 @@ class Loop:
         """How far the numbers can be trusted; without draws they rest on a Laplace approximation."""
         if self.draws is not None:
             return self.draws.grade
-        return Grade("tentative", "intervals are those of a Laplace approximation at the mode; nothing was sampled")
+        return Grade(
+            "tentative", "intervals are those of a Laplace approximation at the mode; nothing was sampled"
+        )
 
     def estimate(self, k: int) -> dict[str, Any]:
         """A coordinate of the final model with unit, 90 % interval and grade."""
@@ -129,7 +131,9 @@ def loop(
         found = Found(base.failed, base.caution, False, np.nan, np.nan, (), (), 0, 0, "", 0, 0, "", np.nan)
         verdict = decide(found)
         return Loop(problem, base, enlarged, (), (), (), verdict, before, before, not study.held_out)
-    searched = search(start, base, kinds, np.random.default_rng([study.seed, 11]), draws=200 if quick else 400)
+    searched = search(
+        start, base, kinds, np.random.default_rng([study.seed, 11]), draws=200 if quick else 400
+    )
     first, last = searched.rounds[0].trace, searched.rounds[-1].trace
     generic = max(
         (one for one in first.traced if one.card.place == "generic"),
@@ -152,7 +156,9 @@ def loop(
             last.largest,
             last.threshold,
             last.traced[0].name if last.traced else "",
-            searched.gained / (searched.gained + last.largest) if searched.gained > 0 and last.alarmed else 1.0,
+            searched.gained / (searched.gained + last.largest)
+            if searched.gained > 0 and last.alarmed
+            else 1.0,
         )
     )
     named = verdict.kind in ("explained", "disturbance")

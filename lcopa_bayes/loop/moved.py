@@ -27,6 +27,12 @@ def moved(found: Loop) -> list[dict[str, Any]]:
         if abs(shift) > FAR:
             row = rows[k]
             out.append(
-                {"name": row.name, "unit": row.unit, "before": first[k], "after": last[k], "shift_in_sd": shift}
+                {
+                    "name": row.name,
+                    "unit": row.unit,
+                    "before": first[k],
+                    "after": last[k],
+                    "shift_in_sd": shift,
+                }
             )
     return sorted(out, key=lambda row: -abs(row["shift_in_sd"]))

@@ -12,7 +12,9 @@ def next_measurement(found: Loop) -> str:
     if trace is None:
         return "Mend the base fit first: give it records in which it can follow the response."
     if not found.base.noise_known:
-        quiet = "a stretch before the first command, or a repeat, so that the noise is known apart from the fit"
+        quiet = (
+            "a stretch before the first command, or a repeat, so that the noise is known apart from the fit"
+        )
         return f"Record {quiet}."
     cards = {one.name: one.card for one in trace.traced}
     for group in found.groups:

@@ -64,7 +64,8 @@ def predicted(
 
 
 def taken(study: Study) -> dict[str, float]:
-    """Place of every record in the campaign by its name, -1/2 to 1/2 [-]: records, fitted or held out, count as
+    """Place of every record in the campaign by its name, -1/2 to 1/2 [-]: records, fitted or held out,
+    count as
     taken in the order of their names, numbers by value."""
     names = sorted((one.name for one in (*study.fit, *study.held_out)), key=_natural)
     places = np.linspace(-0.5, 0.5, len(names)) if len(names) > 1 else np.zeros(1)
@@ -121,16 +122,16 @@ class LevelPrior:
     mean: float
     """[response unit]."""
     variance: float
-    """Scatter of levels between records, and error of the mean [response unit^2]; infinite when nothing is known."""
+    """Scatter of levels between records, and error of the mean [response unit^2]; infinite when nothing is
+    known."""
 
     @classmethod
     def of(cls, model: ExtendedModel, x: Vector, covariance: Matrix, axis: int) -> LevelPrior:
-        """From the fitted offsets of an axis: their mean, and their scatter beyond their errors (DerSimonian and
+        """From the fitted offsets of an axis: their mean, and their scatter beyond their errors
+        (DerSimonian and
         Laird 1986, Control. Clin. Trials 7)."""
         rows, columns = model.base.posterior.table.rows, model.base.least.columns
-        own = [
-            p for p, k in enumerate(columns) if rows[k].kind == "offset" and rows[k].place.first == axis
-        ]
+        own = [p for p, k in enumerate(columns) if rows[k].kind == "offset" and rows[k].place.first == axis]
         if len(own) < 3:
             return cls(0.0, np.inf)
         levels, errors = x[own], np.diag(covariance)[own]
@@ -152,7 +153,8 @@ def levelled(
 ) -> tuple[float, float, str]:
     """Level of a record that is not known from the fit, its variance and where it comes from.
 
-    From the samples before the drive can have acted, else from the whole record, by generalised least squares,
+    From the samples before the drive can have acted, else from the whole record, by generalised least
+    squares,
     and from what the levels of the fit records make likely.
     """
     observed = record.axes[axis]

@@ -104,7 +104,9 @@ def axis_noise(samples: Sequence[Samples], axis: int, delay: float, name: str) -
         p = float(2 * min(stats.f.sf(ratio, again, count), stats.f.cdf(ratio, again, count)))
         if p > _ALIKE:
             both = estimated([*usable, *repeats])
-            told = f"{name}: AR({both.order}) noise of sd {both.sd:.3g} from {count} quiet samples and {again}"
+            told = (
+                f"{name}: AR({both.order}) noise of sd {both.sd:.3g} from {count} quiet samples and {again}"
+            )
             return AxisNoise(both, count + again, "quiet", f"{told} differences of repeats, which agree.")
         differ = f"repeats differ by {np.sqrt(ratio):.2f} times the quiet noise (p = {p:.1g})"
         return AxisNoise(process, count, "quiet", f"{said}; {differ}: something varies between records.")
@@ -119,8 +121,10 @@ def joint_noise(residual: Sequence[Vector], name: str, quiet: int) -> AxisNoise:
     """Noise of an axis fitted together with the plant, from its residual pieces [response unit]."""
     process = estimated(residual)
     sentence = (
-        f"{name}: {quiet} quiet samples and no repeats are too few to know the noise ({FEWEST} are needed), so "
-        f"AR({process.order}) noise of sd {process.sd:.3g} is fitted to the residual together with the plant: "
+        f"{name}: {quiet} quiet samples and no repeats are too few to know the noise ({FEWEST} are "
+        "needed), so "
+        f"AR({process.order}) noise of sd {process.sd:.3g} is fitted to the residual together with the "
+        "plant: "
         "what it takes for noise may be an effect, so no verdict is better than tentative. Record a stretch "
         "before the first command, or a repeat."
     )

@@ -88,8 +88,9 @@ def _pooled(state: State, parts: list[Part], name: str) -> _Axis:
         since.append(since_command(samples)[samples.axes[part.axis].index])
         predicted.append(deflection)
         growing.append(np.gradient(np.abs(deflection)) > 0 if deflection.size > 1 else np.array([False]))
-    joined = [np.concatenate(each) for each in (white, record, since, predicted)]
-    return _Axis(name, *joined, np.concatenate(growing))
+    pooled = (np.concatenate(each) for each in (white, record, since, predicted))
+    first, second, third, fourth = pooled
+    return _Axis(name, first, second, third, fourth, np.concatenate(growing))
 
 
 def _binned(x: Vector, y: Vector, statistic: Callable[[Vector], float]) -> tuple[Vector, Vector, Vector]:
@@ -153,9 +154,7 @@ def _by_direction(pooled: _Axis) -> View:
     error = np.array([np.sqrt(0.5 / one.size) if one.size else np.nan for one in sets])
     said = f"{rms[0]:.2f} times the noise while the deflection grows, {rms[1]:.2f} while it falls"
     across = "0 deflection grows, 1 it falls"
-    return View(
-        "by direction", pooled.name, across, "rms over noise [-]", np.arange(2.0), rms, error, said
-    )
+    return View("by direction", pooled.name, across, "rms over noise [-]", np.arange(2.0), rms, error, said)
 
 
 def _spectrum(state: State, parts: list[Part], name: str, unit: str) -> View:
@@ -173,7 +172,9 @@ def _spectrum(state: State, parts: list[Part], name: str, unit: str) -> View:
     across = f"frequency [cycles per {unit}]"
     if not frequencies:
         empty = np.zeros(0)
-        return View("spectrum", name, across, "power over noise [-]", empty, empty, empty, "records too short")
+        return View(
+            "spectrum", name, across, "power over noise [-]", empty, empty, empty, "records too short"
+        )
     f, p = np.concatenate(frequencies), np.concatenate(powers)
     edges = np.geomspace(f.min(), f.max() * (1 + 1e-12), _BANDS + 1)
     which = np.clip(np.searchsorted(edges, f, side="right") - 1, 0, _BANDS - 1)
@@ -207,7 +208,8 @@ def _drive(state: State, parts: list[Part], name: str) -> View:
     y = total / np.sqrt(norm) if norm > 0 else total
     p = float(min(1.0, lags.size * 2 * stats.norm.sf(np.abs(y).max())))
     said = (
-        f"its power goes with the commands, most {lags[int(np.argmax(np.abs(y)))]} samples after them (p = {p:.1g})"
+        f"its power goes with the commands, most {lags[int(np.argmax(np.abs(y)))]} samples after them "
+        f"(p = {p:.1g})"
         if p < _SEEN
         else f"its power does not go with the commands (p = {p:.2g})"
     )

@@ -12,17 +12,20 @@ import numpy as np
 from lcopa_bayes.loop.basefit import BaseFit, measured
 from lcopa_bayes.loop.confirm import SIGNIFICANT, Refit, log_bayes_factor, refit, tuned
 from lcopa_bayes.loop.regression import Regression
+from lcopa_bayes.loop.scoreevidence import cosine
 from lcopa_bayes.loop.scores import State
-from lcopa_bayes.loop.trace import Signature, Trace, Traced, expected_margin, pair_evidence, trace
+from lcopa_bayes.loop.signature import Signature, expected_margin, pair_evidence
+from lcopa_bayes.loop.trace import Trace, Traced, trace
 from lcopa_bayes.loop.verdict import MARGIN
 from lcopa_bayes.loop.whitening import Whitening
-from lcopa_bayes.loop.scoreevidence import cosine
 from lcopa_bayes.plant.effects.effect import Effect
 
 MOST = 3
 """Effects that are added at most [-]."""
 _CANDIDATES = 4
-_NEAR = 0.7
+_TUNED = 8
+"""Named effects whose internal constants are moved off their grid before they are ranked [-]."""
+NEAR = 0.7
 """Candidates reach this share of the best log Bayes factor [-]."""
 _PAIRED = 8
 """Single effects of which pairs are formed [-]."""
@@ -66,7 +69,9 @@ def search(
     counts = [one.samples if one.known else 0 for one in base.noise]
     state, rounds, groups = start, [], {}
     for number in range(MOST + 1):
-        seen = trace(state.model, state.optimum, state.whitening, library, rng, noise_samples=counts, draws=draws)
+        seen = trace(
+            state.model, state.optimum, state.whitening, library, rng, noise_samples=counts, draws=draws
+        )
         if not seen.alarmed or number == MOST:
             rounds.append(Round(seen, (), (), None))
             break
@@ -98,26 +103,41 @@ def _gained(start: State, state: State, quiet: float) -> float:
     if state.whitening is not start.whitening:
         plain = Regression(start.model, state.whitening).descend(start.optimum.x)
     sides = sum(one.coefficient.one_signed for one in state.model.effected.coefficients)
-    return log_bayes_factor(plain, state.optimum, quiet) + sides * np.log(2.0)
+    return log_bayes_factor(plain, state.optimum, quiet) + sides * float(np.log(2.0))
 
 
 def _refits(state: State, seen: Trace) -> tuple[list[Refit], list[str], dict[str, Signature]]:
     """Named candidates within reach of the best, refitted."""
-    named = [one for one in seen.traced if one.card.place != "generic" and one.signatures]
-    best = named[0].log_bayes_factor if named else -np.inf
-    quiet = seen.scale.quiet
-    near = [one for one in named if one.log_bayes_factor > max(_NEAR * best, 0.0)][:_CANDIDATES]
+    named = [one for one in seen.traced if one.card.place != "generic" and one.signatures][:_TUNED]
+    worth = [one for one in named if one.log_bayes_factor > 0]
     done, failures, signatures = [], [], {}
-    for one in near:
-        signature = tuned(state.model, state.optimum, state.whitening, one, seen)
-        signatures[one.name] = signature
+    for one in worth:
+        signatures[one.name] = tuned(state.model, state.optimum, state.whitening, one, seen)
+    reached = {name: _alone(signature, seen) for name, signature in signatures.items()}
+    ranked = sorted(reached, key=lambda name: -reached[name])
+    near = [name for name in ranked if reached[name] > NEAR * reached[ranked[0]]][:_CANDIDATES]
+    for name in near:
+        signature = signatures[name]
         try:
             amplitude = signature.amplitude(seen.residual)
-            done.append(refit(state.model, state.optimum, state.whitening, [(signature.effect, amplitude)], quiet))
+            done.append(
+                refit(
+                    state.model,
+                    state.optimum,
+                    state.whitening,
+                    [(signature.effect, amplitude)],
+                    seen.scale.quiet,
+                )
+            )
         except ArithmeticError as error:
-            failures.append(f"{one.name}: {error}")
+            failures.append(f"{name}: {error}")
     done.sort(key=lambda made: -made.log_bayes_factor)
     return done, failures, signatures
+
+
+def _alone(signature: Signature, seen: Trace) -> float:
+    """Log Bayes factor of one instance [nat]."""
+    return float(signature.evidence(signature.span.T @ seen.residual[:, None], seen.scale)[0])
 
 
 def _accepted(made: Refit, seen: Trace) -> bool:

@@ -162,9 +162,7 @@ def _scores(
         centre, spread, source = mean[part.rows], variance[part.rows], level_from
         if delay is not None:
             prior = priors[part.axis] if priors else FLAT
-            level, doubt, source = levelled(
-                record, part.axis, observed.values - centre, noise, delay, prior
-            )
+            level, doubt, source = levelled(record, part.axis, observed.values - centre, noise, delay, prior)
             # what the fit did not know about the level is known now
             centre, spread = centre + level, _without_level(spread, doubt)
         if state.widening is not None:
@@ -188,7 +186,8 @@ def _scores(
 
 
 def _without_level(variance: Vector, doubt: float) -> Vector:
-    """Variance once a level has been taken from data: that of the first sample, at rest, is only its level's."""
+    """Variance once a level has been taken from data: that of the first sample, at rest, is only its
+    level's."""
     rest = variance[0]
     return np.asarray(np.where(variance > rest, variance - rest, 0.0) + doubt)
 
@@ -207,4 +206,6 @@ def pooled_coverage(scores: Sequence[Score]) -> float:
     weights = np.array([score.banded * score.time.size for score in scores])
     if not weights.sum():
         return float("nan")
-    return float(np.nansum([w * s.coverage for w, s in zip(weights, scores, strict=True) if w]) / weights.sum())
+    return float(
+        np.nansum([w * s.coverage for w, s in zip(weights, scores, strict=True) if w]) / weights.sum()
+    )

@@ -16,7 +16,8 @@ from lcopa_bayes.study import Study
 
 _MOST = 3
 _GAIN = 10.0
-"""Log evidence that one more viscous term must bring [nat]: it is an assumption of the user's that changes."""
+"""Log evidence that one more viscous term must bring [nat]: it is an assumption of the user's that
+changes."""
 
 
 class Base(NamedTuple):
@@ -29,7 +30,8 @@ class Base(NamedTuple):
 
 
 def fitted_base(study: Study, *, as_stated: bool) -> Base:
-    """The base fit; with one free viscous term stated and not `as_stated`, of the number the evidence asks for.
+    """The base fit; with one free viscous term stated and not `as_stated`, of the number the evidence asks
+    for.
 
     A plant with too few terms is no undeclared effect, and would be named as one.
     """
@@ -50,5 +52,7 @@ def fitted_base(study: Study, *, as_stated: bool) -> Base:
         if other.failed or not gain > _GAIN:
             break
         problem, fit = larger, other
-        sentence = f"The base model has {terms} viscous terms: one more than {terms - 1} is worth {gain:.0f} nat."
+        sentence = (
+            f"The base model has {terms} viscous terms: one more than {terms - 1} is worth {gain:.0f} nat."
+        )
     return Base(problem, fit, sentence)

@@ -215,10 +215,14 @@ def words(told: dict[str, Any]) -> Sequence[str]:
         after = told["after"]
         out.append(
             f"axis {axis}: fit RMSE {value:.4g} -> {after['fit_rmse'][axis]:.4g}, unseen "
-            f"{told['before']['held_out_rmse'][axis]:.4g} -> {after['held_out_rmse'][axis]:.4g} ({told['unseen_by']})"
+            f"{told['before']['held_out_rmse'][axis]:.4g} -> {after['held_out_rmse'][axis]:.4g} "
+            f"({told['unseen_by']})"
         )
     coverage = [told[side]["held_out_coverage_90"] for side in ("before", "after")]
     if None not in coverage:
-        out.append(f"90 % bands hold {100 * coverage[0]:.0f} % of unseen samples before, {100 * coverage[1]:.0f} % after")
+        out.append(
+            f"90 % bands hold {100 * coverage[0]:.0f} % of unseen samples before, "
+            f"{100 * coverage[1]:.0f} % after"
+        )
     out += [f"next measurement: {told['next_measurement']}"] if told["next_measurement"] else []
     return out

@@ -8,102 +8,27 @@ from functools import cached_property
 from typing import final
 
 import numpy as np
-from scipy.special import log_ndtr, logsumexp
+from scipy.special import logsumexp
 
 from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.loop.extended import ExtendedModel
 from lcopa_bayes.loop.regression import Optimum
 from lcopa_bayes.loop.scatter import scatter_evidence
-from lcopa_bayes.loop.scoreevidence import Projection, log_bayes_factors, survival
+from lcopa_bayes.loop.scoreevidence import Projection
+from lcopa_bayes.loop.signature import Scale, Signature, signature_of
 from lcopa_bayes.loop.whitening import Whitening
 from lcopa_bayes.plant.effects.effect import Card, Effect, ScatterEffect
 
-_LEAST = 3.0
+LEAST = 3.0
 """Log Bayes factor that an effect needs at least [nat]."""
-_QUANTILE = 0.99
+QUANTILE = 0.99
 _DRAWS = 400
 _NONE = 0.5
 """Prior probability that nothing is missing [-]; the effects share the rest evenly."""
-_LEAST_POWER = 1e-10
-"""Power of a direction of a signature at one prior sd below which it is nothing [-]."""
+MOST_COMMANDS = 400
+"""Commands per record up to which effects are traced that follow each by itself [-]."""
 SEEN = 0.1
 """Below this survival the records cannot see an effect [-]."""
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Scale:
-    """What is known of the noise scale: quiet samples and, to the same rights, the residuals themselves.
-
-    With the variance integrated out under ``1 / variance`` (its scale in the whitening is only an estimate), a
-    drop of half the residual power by g is worth ``(m + n) / 2 * log((m + P) / (m + P - 2 g))`` nat, m quiet samples, n
-    degrees of freedom and power P of the residual; g itself where m is large and P = n.
-    """
-
-    quiet: float
-    """Samples the noise was known from [-]."""
-    freedom: float
-    """Degrees of freedom of the residual [-]."""
-    power: Vector
-    """Squared whitened residual, (draws,) [-]."""
-
-    def gain(self, half_power: Vector) -> Vector:
-        """Log evidence of a drop of half the residual power, (draws,) [nat]."""
-        whole = self.quiet + self.power
-        return np.asarray(-0.5 * (self.quiet + self.freedom) * np.log1p(-2 * half_power / whole))
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Signature:
-    """One instance of an effect, whitened and projected off what the base model can imitate."""
-
-    effect: Effect
-    span: Matrix
-    """Orthonormal columns that span the projected signatures, (n, rank); single precision, there are hundreds."""
-    scale: Vector
-    """Length of each direction at one prior sd of its combination of coefficients, (rank,) [-]."""
-    turned: Matrix
-    """Combination of coefficients behind each direction, (rank, k) [-]."""
-    survival: float
-    """Share of the signature that is left [-]."""
-    one_signed: bool
-    """Whether its single coefficient cannot be negative."""
-
-    @classmethod
-    def of(cls, effect: Effect, columns: Matrix, survival: float, one_signed: bool) -> Signature:
-        """From projected signatures over the prior sd of their coefficients, (n, k) [-].
-
-        By the small Gram matrix: ten times faster than of the tall one, and exact enough for weights of order 1.
-        """
-        power, turned = np.linalg.eigh(columns.T @ columns)
-        kept = power > max(_LEAST_POWER, 1e-12 * float(power.max(initial=0.0)))
-        scale = np.sqrt(power[kept])
-        span = (columns @ turned[:, kept] / scale).astype(np.float32)
-        return cls(effect, span, scale, turned[:, kept].T, survival, one_signed)
-
-    @property
-    def columns(self) -> Matrix:
-        """Projected signatures over the prior sd of their coefficients, (n, k) [-]."""
-        return np.asarray(self.span @ (self.scale[:, None] * self.turned), dtype=float)
-
-    def evidence(self, inner: Matrix, scale_of: Scale) -> Vector:
-        """Log Bayes factors against no effect from ``span.T @ r``, (k, draws) -> (draws,) [nat].
-
-        A coefficient of one sign has a half-normal prior: the factor is 2 Phi(mean / sd) of the normal one.
-        """
-        scale, power = self.scale, self.scale**2
-        gain = scale_of.gain(0.5 * np.einsum("k,kd->d", power / (1 + power), inner**2))
-        gain = gain - 0.5 * np.log1p(power).sum()
-        if self.one_signed and scale.size == 1:
-            sign = np.sign(self.turned[0, 0])
-            gain = gain + np.log(2) + log_ndtr(sign * scale[0] * inner[0] / np.sqrt(1 + power[0]))
-        return np.asarray(gain)
-
-    def amplitude(self, residual: Vector) -> Vector:
-        """Posterior mean of the coefficients over their prior sd; the normal part of a one-signed one."""
-        weight = self.scale / (1 + self.scale**2)
-        return np.asarray(self.turned.T @ (weight * (self.span.T @ residual)))
 
 
 @final
@@ -127,7 +52,8 @@ class Traced:
 
     @property
     def survival(self) -> float:
-        """Largest share of an instance's signature that is left [-]; NaN for one that changes only the noise."""
+        """Largest share of an instance's signature that is left [-]; NaN for one that changes only the
+        noise."""
         return max((one.survival for one in self.signatures), default=np.nan)
 
 
@@ -203,6 +129,11 @@ def trace(
             told = scatter_evidence(optimum.white)
             found.append(Traced(kind.card, (), told, 0))
             continue
+        commands = max(commands_of(one.record.drive) for one in whitening.samples)
+        if kind.per_command and commands > MOST_COMMANDS:
+            why = f"it follows every command by itself, and a record has {commands} (at most {MOST_COMMANDS})"
+            found.append(Traced(kind.card, (), -np.inf, 0, why))
+            continue
         found.append(_traced(model, optimum, whitening, project, residual, scale, kind))
     maxima = _chance(project, whitening, found, rng, noise_samples, draws, scale)
     found.sort(key=lambda one: -one.log_bayes_factor)
@@ -210,12 +141,17 @@ def trace(
     beaten = int(np.count_nonzero(maxima >= largest))
     return Trace(
         tuple(found),
-        max(_LEAST, float(np.quantile(maxima, _QUANTILE))) if maxima.size else _LEAST,
+        max(LEAST, float(np.quantile(maxima, QUANTILE))) if maxima.size else LEAST,
         (beaten + 1) / (draws + 1),
         draws,
         residual,
         scale,
     )
+
+
+def commands_of(drive: Matrix) -> int:
+    """Instants at which any drive changes [-]."""
+    return int((np.diff(drive, axis=0) != 0).any(axis=1).sum())
 
 
 def _traced(
@@ -239,19 +175,6 @@ def _traced(
         return Traced(kind.card, (), -np.inf, 0, failed or "it cannot be simulated")
     mean = float(logsumexp(evidence) - np.log(len(evidence)))
     return Traced(kind.card, tuple(signatures), mean, int(np.argmax(evidence)), failed)
-
-
-def signature_of(
-    model: ExtendedModel, x: Vector, whitening: Whitening, project: Projection, effect: Effect
-) -> Signature:
-    """Signature of one more effect beside those of `model`; ArithmeticError where it cannot be simulated."""
-    raw, told = model.signature(x, effect)
-    if not np.isfinite(raw).all():
-        raise FloatingPointError(f"{effect.name}: its signature is not finite")
-    white = whitening(raw.T).T
-    left = project(white)
-    one_signed = len(told) == 1 and told[0].coefficient.one_signed
-    return Signature.of(effect, left, survival(white, left), one_signed)
 
 
 def _chance(
@@ -285,7 +208,9 @@ def _chance(
         power = np.einsum("nd,nd->d", z, z) - np.einsum("kd,kd->d", left.T @ z, left.T @ z)
         known = Scale(scale.quiet, scale.freedom, power)
         scatter = [scatter_evidence(column) for column in z.T] if _scatters(found) else None
-        evidence = [one.evidence(inner[a:b], known) for one, a, b in zip(listed, edges[:-1], edges[1:], strict=True)]
+        evidence = [
+            one.evidence(inner[a:b], known) for one, a, b in zip(listed, edges[:-1], edges[1:], strict=True)
+        ]
         first, by_effect = 0, []
         for traced in found:
             count = len(traced.signatures)
@@ -300,18 +225,3 @@ def _chance(
 
 def _scatters(found: Sequence[Traced]) -> bool:
     return any(not one.signatures and not one.failed for one in found)
-
-
-def expected_margin(truth: Signature, amplitude: Vector, rival: Signature, scale: Scale) -> float:
-    """Log evidence by which `truth` of that size is expected to beat `rival` [nat]: the difference of their
-    closed-form evidences on the noise-free residual it leaves."""
-    shift = (truth.span @ (truth.scale * (truth.turned @ amplitude)))[:, None]
-    size = Scale(scale.quiet, scale.freedom, scale.freedom + (shift**2).sum(axis=0))
-    own = float(truth.evidence(truth.span.T @ shift, size)[0])
-    return own - float(rival.evidence(rival.span.T @ shift, size)[0])
-
-
-def pair_evidence(first: Signature, second: Signature, residual: Vector) -> float:
-    """Log Bayes factor of two effects at once against none [nat]."""
-    both = np.concatenate([first.columns, second.columns], axis=1)
-    return float(log_bayes_factors(both, residual[:, None])[0])

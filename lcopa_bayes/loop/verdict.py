@@ -67,15 +67,18 @@ def decide(found: Found) -> Verdict:
         return Verdict(
             "clean",
             confidence,
-            f"Nothing is missing that these records could show: the largest log Bayes factor of any effect is "
-            f"{found.largest:.1f} nat, and chance alone reaches {found.threshold:.1f} once in a hundred times.",
+            "Nothing is missing that these records could show: the largest log Bayes factor of any "
+            "effect is "
+            f"{found.largest:.1f} nat, and chance alone reaches {found.threshold:.1f} once in a hundred "
+            "times.",
         )
     named = ", ".join(found.effects)
     if not found.effects:
         return Verdict(
             "unexplained",
             confidence,
-            f"Something is missing (log Bayes factor {found.largest:.0f} nat against {found.threshold:.1f} by "
+            f"Something is missing (log Bayes factor {found.largest:.0f} nat against "
+            f"{found.threshold:.1f} by "
             "chance), but no effect of the library survives a full refit: no name is forced.",
         )
     left = found.remaining > found.remaining_threshold
@@ -84,13 +87,15 @@ def decide(found: Found) -> Verdict:
             "unexplained",
             confidence,
             f"Something is missing, and {found.generic_name} describes it better by "
-            f"{found.generic - found.gained:.0f} nat than the nearest named effect ({named}): no name is forced.",
+            f"{found.generic - found.gained:.0f} nat than the nearest named effect ({named}): no name "
+            "is forced.",
         )
     if left and not found.share >= EXPLAINED:
         return Verdict(
             "unexplained",
             confidence,
-            f"The nearest effect ({named}) accounts for {_percent(found.share)} of the evidence against the base model "
+            f"The nearest effect ({named}) accounts for {_percent(found.share)} of the evidence against "
+            "the base model "
             f"and {found.remaining_name} remains with {found.remaining:.0f} nat: no name is forced.",
         )
     rest = (

@@ -63,7 +63,7 @@ class Whitening:
     @cached_property
     def size(self) -> int:
         """Number of stacked samples [-]."""
-        return self.parts[-1].rows.stop
+        return int(self.parts[-1].rows.stop)
 
     @cached_property
     def observed(self) -> Vector:
@@ -91,7 +91,9 @@ class Whitening:
     @cached_property
     def log_scale(self) -> float:
         """Sum of log sd of the prediction errors [nat]."""
-        return float(sum(self.noise[axis].log_scale(rows.stop - rows.start) for axis, rows in self._stretches))
+        return float(
+            sum(self.noise[axis].log_scale(rows.stop - rows.start) for axis, rows in self._stretches)
+        )
 
     def draw(self, count: int, rng: np.random.Generator) -> Matrix:
         """Noise of all samples, (count, n) [response unit]."""

@@ -19,7 +19,8 @@ _INFLATION = 1.5
 
 
 def since_command(record: Samples) -> Vector:
-    """Time of each sample since the last change of any drive, (samples,) [time unit]; NaN before the first."""
+    """Time of each sample since the last change of any drive, (samples,) [time unit]; NaN before the
+    first."""
     drive, time = record.record.drive, record.record.time
     changed = time[1:][(np.diff(drive, axis=0) != 0).any(axis=1)]
     last = np.searchsorted(changed, record.times, side="right") - 1
@@ -61,7 +62,10 @@ class Widening:
             beyond = mean - process.sd**2
             excess.append(_INFLATION * np.where(beyond > 0, beyond, 0.0))
         drive = [record.record.drive for record in samples]
-        low, high = np.min([d.min(axis=0) for d in drive], axis=0), np.max([d.max(axis=0) for d in drive], axis=0)
+        low, high = (
+            np.min([d.min(axis=0) for d in drive], axis=0),
+            np.max([d.max(axis=0) for d in drive], axis=0),
+        )
         return cls(edges, tuple(excess), np.stack([low, high], axis=1))
 
     def variance(self, record: Samples, axis: int) -> Vector:

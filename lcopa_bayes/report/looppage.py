@@ -10,13 +10,23 @@ from typing import Any
 from lcopa_bayes.problems import InputError
 from lcopa_bayes.report.canvas import look
 from lcopa_bayes.report.page import Verdict, write_page
-from lcopa_bayes.report.sections import loopfigures, looped
+from lcopa_bayes.report.sections import looped, loopfigures
 
 NAME = "loop.html"
 """Name of the page inside the run folder."""
 _NEEDS = {
     "loop.json": (
-        *("study", "verdict", "confidence", "sentence", "grade", "grade_reason", "noise", "effects", "before"),
+        *(
+            "study",
+            "verdict",
+            "confidence",
+            "sentence",
+            "grade",
+            "grade_reason",
+            "noise",
+            "effects",
+            "before",
+        ),
         *("after", "evidence", "rounds", "moved", "survival", "next_measurement", "residual", "cautions"),
     ),
     "loop_curves.json": ("views", "curves"),
@@ -24,7 +34,8 @@ _NEEDS = {
 
 
 def write_loop(folder: Path) -> Path:
-    """`loop.html` with verdict, evidence, errors before and after and residuals side by side; returns its path.
+    """`loop.html` with verdict, evidence, errors before and after and residuals side by side; returns its
+    path.
 
     InputError when the folder holds no loop or it cannot be used.
     """
@@ -32,7 +43,9 @@ def write_loop(folder: Path) -> Path:
     with look():
         sections = [*looped.sections(told), *loopfigures.sections(told, shown)]
     verdict = Verdict(
-        str(told["grade"]), f"{told['verdict']} ({told['confidence']}): {told['sentence']}", str(told["grade_reason"])
+        str(told["grade"]),
+        f"{told['verdict']} ({told['confidence']}): {told['sentence']}",
+        str(told["grade_reason"]),
     )
     return write_page(folder, f"{told['study']}: what the model lacks", sections, verdict, NAME)
 

@@ -98,7 +98,8 @@ def judged(found: Loop, made: Campaign) -> dict[str, Any]:
 
 
 def errors(side: Side, made: Campaign) -> dict[str, float]:
-    """Root mean square errors, on held-out records against the response without noise or disturbances [rad]."""
+    """Root mean square errors, on held-out records against the response without noise or disturbances
+    [rad]."""
     fit = np.concatenate([score.observed - score.predicted for score in side.fit])
     apart = []
     for score in side.unseen:

@@ -45,7 +45,9 @@ def _found(told: Mapping[str, Any]) -> Section:
         for effect in told["effects"]
         if effect["constants"]
     )
-    caption = "Coefficients of the effects; all vanish at zero." + (f" Constants: {constants}." if constants else "")
+    caption = "Coefficients of the effects; all vanish at zero." + (
+        f" Constants: {constants}." if constants else ""
+    )
     return Section("What was missing", tuple(text), (), (Table(columns, rows, caption),) if rows else ())
 
 
@@ -53,7 +55,11 @@ def _errors(told: Mapping[str, Any]) -> Section:
     before, after = told["before"], told["after"]
     columns = (
         *(Column("record"), Column("axis"), Column("unseen"), Column("RMSE before", "number")),
-        *(Column("RMSE after", "number"), Column("after / noise", "number"), Column("90 % band before", "number")),
+        *(
+            Column("RMSE after", "number"),
+            Column("after / noise", "number"),
+            Column("90 % band before", "number"),
+        ),
         *(Column("90 % band after", "number"), Column("unit")),
     )
     rows = tuple(
@@ -71,7 +77,9 @@ def _errors(told: Mapping[str, Any]) -> Section:
         f"{figures(before['log_evidence'], 6)} before and {figures(after['log_evidence'], 6)} after "
         "(Laplace approximation, noise held at its estimate)."
     )
-    caption = "Root mean square of observed minus predicted, and the share of samples inside the band with noise."
+    caption = (
+        "Root mean square of observed minus predicted, and the share of samples inside the band with noise."
+    )
     return Section("Errors before and after", (text,), (), (Table(columns, rows, caption),))
 
 
@@ -97,12 +105,15 @@ def _evidence(told: Mapping[str, Any]) -> Section:
         for one in found["classes"]
     )
     text = (
-        f"Chance alone reaches {figures(found['threshold'])} nat once in a hundred times ({found['draws']} draws, "
+        f"Chance alone reaches {figures(found['threshold'])} nat once in a hundred times "
+        f"({found['draws']} draws, "
         f"no less than 3); p-value of the largest {figures(found['p_value'], 2)}, whose floor is "
-        f"{figures(1 / (found['draws'] + 1), 2)}. Probability that nothing is missing: {figures(found['none'], 2)}."
+        f"{figures(1 / (found['draws'] + 1), 2)}. Probability that nothing is missing: "
+        f"{figures(found['none'], 2)}."
     )
     caption = (
-        "Survival is the share of an effect's signature that the base model cannot imitate, known before looking "
+        "Survival is the share of an effect's signature that the base model cannot imitate, known "
+        "before looking "
         "at the residual: below 0.1 these records cannot see the effect."
     )
     return Section("Evidence of every effect", (text,), (), (Table(columns, rows, caption),))
@@ -125,7 +136,9 @@ def _rounds(told: Mapping[str, Any]) -> Section:
     if not rows:
         return Section("Refits", ("No candidate had to be refitted.",))
     failures = tuple(f"Could not be refitted: {one}." for made in told["rounds"] for one in made["failures"])
-    return Section("Refits", failures, (), (Table(columns, rows, "Candidates refitted with everything free."),))
+    return Section(
+        "Refits", failures, (), (Table(columns, rows, "Candidates refitted with everything free."),)
+    )
 
 
 def _moved(told: Mapping[str, Any]) -> Section:

@@ -29,7 +29,9 @@ def _bars(told: Mapping[str, Any]) -> Section:
     axes = figure.subplots()
     names = [plain(one["name"]) for one in listed]
     values = np.array([one["log_bayes_factor"] for one in listed])
-    axes.barh(np.arange(len(names)), values, color=[BAND if v > found["threshold"] else NOISE for v in values])
+    axes.barh(
+        np.arange(len(names)), values, color=[BAND if v > found["threshold"] else NOISE for v in values]
+    )
     axes.axvline(found["threshold"], color=HELD_OUT, lw=1.0, ls="--")
     axes.set_yticks(np.arange(len(names)), names)
     axes.invert_yaxis()
@@ -38,7 +40,8 @@ def _bars(told: Mapping[str, Any]) -> Section:
     top = listed[0]
     above = int((values > found["threshold"]).sum())
     caption = (
-        f"Of {len(found['classes'])} classes {above} stand above what chance reaches (dashed); the largest is "
+        f"Of {len(found['classes'])} classes {above} stand above what chance reaches (dashed); the "
+        "largest is "
         f"{top['name']}. Linear below 10 nat, logarithmic above."
     )
     return Section("Evidence", (), (Drawing("loop_evidence", svg_of(figure), caption),))
@@ -57,7 +60,8 @@ def _residuals(told: Mapping[str, Any], curves: Sequence[Mapping[str, Any]]) -> 
         panels[0].set_ylabel(label("residual", one["unit"]))
         before, after = (np.sqrt(np.mean(np.square(one[when]))) for when in ("before", "after"))
         caption = (
-            f"{one['record']}, {one['axis']}: root mean square {before:.3g} before and {after:.3g} after, noise "
+            f"{one['record']}, {one['axis']}: root mean square {before:.3g} before and {after:.3g} "
+            "after, noise "
             f"{one['noise_sd']:.3g} {one['unit']}. Grey: 90 % band with noise."
         )
         stem = f"loop_residual_{number:02d}_{one['record']}_{one['axis']}"
