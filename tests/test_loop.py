@@ -195,7 +195,7 @@ def test_repeats_measure_the_noise():
         Study("twin", None, "ms", 6, (made[0], twin), (), ModelSettings(offset="shared"))
     ).posterior
     pieces = repeat_pieces(posterior.samples, 0)
-    assert sum(piece.size for piece in pieces) == made[0].response.shape[0]
+    assert sum(piece.size for piece in pieces) == np.isfinite(made[0].response).sum()
     noise = axis_noise(posterior.samples, 0, 0.0, "x")
     assert noise is not None
     assert noise.known
