@@ -78,6 +78,12 @@ def _parser() -> argparse.ArgumentParser:
         "--candidates", type=Path, metavar="FILE", help="[compare] and [[candidates]] (TOML)"
     )
     compared.add_argument("--pick", nargs="+", metavar="NAME", help="candidates by name")
+    looped = add(
+        "loop", questions.loop_study, [study, sampled], "what the model lacks: residual, effect, errors after"
+    )
+    looped.add_argument(
+        "--as-stated", action="store_true", help="keep the number of viscous terms the study states"
+    )
     _calibrate_options(
         add(
             "calibrate",

@@ -30,6 +30,7 @@ ORDER = (
     ("fit",),
     ("audit",),
     ("design",),
+    ("loop",),
     ("results",),
     ("tables", "rival"),
     ("runfolder",),

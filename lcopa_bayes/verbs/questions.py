@@ -1,4 +1,4 @@
-"""Verbs that ask more of a study: audit, design, compare."""
+"""Verbs that ask more of a study: audit, design, compare, loop."""
 
 from __future__ import annotations
 
@@ -11,12 +11,18 @@ from lcopa_bayes.comparison.candidates import candidates_of
 from lcopa_bayes.comparison.compare import compare
 from lcopa_bayes.design.design import checked
 from lcopa_bayes.design.nextmeasurement import next_measurement
+from lcopa_bayes.files import writable_folder
 from lcopa_bayes.fit import Fit, fit
 from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.loop.loop import loop
+from lcopa_bayes.loop.told import drawn, words
+from lcopa_bayes.loop.told import results as loop_results
 from lcopa_bayes.planning import DESIGN_PAGE, plan_next
+from lcopa_bayes.provenance import provenance
 from lcopa_bayes.report import write_report
 from lcopa_bayes.report.auditpage import write_audit
 from lcopa_bayes.report.comparisonpage import write_comparison
+from lcopa_bayes.report.looppage import write_loop
 from lcopa_bayes.runfolder import save_fit, save_json
 from lcopa_bayes.study import Study
 from lcopa_bayes.verbs.outcome import Told, place_of, study_of, with_report
@@ -70,3 +76,16 @@ def compare_study(options: argparse.Namespace, command: list[str]) -> Told:
     )
     save_json(values | {"command": command}, folder / "compare.json")
     return with_report(values, write_comparison(folder), values["why"], values["fractional"]["sentence"])
+
+
+def loop_study(options: argparse.Namespace, command: list[str]) -> Told:
+    """What the base model lacks, traced to an effect, with errors before and after, and a page of its own."""
+    study = study_of(options)
+    folder, jobs = place_of(options, study)
+    writable_folder(folder)
+    found = loop(study, jobs=jobs, quick=options.quick, as_stated=options.as_stated)
+    values = loop_results(found)
+    save_json(provenance(study, command), folder / "provenance.json")
+    save_json(drawn(found), folder / "loop_curves.json")
+    save_json(values, folder / "loop.json")
+    return with_report(values, write_loop(folder), *words(values))

@@ -134,6 +134,8 @@ class Effect(ABC):
     """An addition to the linear plant; concrete effects subclass one of the classes below."""
 
     card: ClassVar[Card]
+    per_command: ClassVar[bool] = False
+    """Whether it is computed command by command, which takes long on records of thousands."""
 
     @classmethod
     def grid(cls, ranges: Ranges) -> tuple[Self, ...]:

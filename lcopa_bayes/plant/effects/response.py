@@ -192,6 +192,7 @@ class CrossFade(ReadoutEffect):
     interrupted starts anew from the director's deflection; what the centroid lacks then fades with it.
     """
 
+    per_command: ClassVar[bool] = True
     card: ClassVar[Card] = Card(
         name="cross_fade",
         place="output",

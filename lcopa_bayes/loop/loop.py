@@ -1,0 +1,190 @@
+"""The loop: find what the residual of a fit holds, trace it to an effect, add the effect, look again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, final
+
+import numpy as np
+
+from lcopa_bayes.estimate import LEVEL
+from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.grade import Grade
+from lcopa_bayes.loop.basefit import BaseFit
+from lcopa_bayes.loop.density import LoopDensity
+from lcopa_bayes.loop.draws import LoopDraws, sample_loop, unit_of
+from lcopa_bayes.loop.extended import ExtendedModel
+from lcopa_bayes.loop.prediction import taken
+from lcopa_bayes.loop.rounds import Round, search
+from lcopa_bayes.loop.scores import Score, State, fit_scores, held_out_scores, left_out_scores
+from lcopa_bayes.loop.terms import fitted_base
+from lcopa_bayes.loop.trace import Trace
+from lcopa_bayes.loop.verdict import Found, Verdict, decide
+from lcopa_bayes.loop.widening import Widening
+from lcopa_bayes.plant.effects.catalogue import catalogue
+from lcopa_bayes.plant.effects.effect import Effect
+from lcopa_bayes.study import Study
+
+Z90 = 1.6448536269514722
+"""Half width of a central 90 % interval of a normal distribution [sd]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Side:
+    """Model and errors before or after."""
+
+    state: State
+    fit: tuple[Score, ...]
+    unseen: tuple[Score, ...]
+    """On held-out records, or with each fit record left out in turn."""
+    log_evidence: float
+    """Laplace approximation, noise held at its estimate [nat]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """What the loop found in a study."""
+
+    problem: Problem
+    base: BaseFit
+    enlarged: str
+    """What was changed in the base model before anything was traced; empty when nothing was."""
+    rounds: tuple[Round, ...]
+    effects: tuple[Effect, ...]
+    """Named effects of the final model; none when the verdict is `unexplained` or `clean`."""
+    groups: tuple[tuple[str, ...], ...]
+    """For each effect, the names it cannot be told apart from, its own first."""
+    verdict: Verdict
+    before: Side
+    after: Side
+    left_out: bool
+    """Whether unseen errors come from leaving fit records out in turn, for want of held-out records."""
+
+    draws: LoopDraws | None = None
+    """Draws of base plus effects; None when none were asked for."""
+
+    @property
+    def grade(self) -> Grade:
+        """How far the numbers can be trusted; without draws they rest on a Laplace approximation."""
+        if self.draws is not None:
+            return self.draws.grade
+        return Grade(
+            "tentative", "intervals are those of a Laplace approximation at the mode; nothing was sampled"
+        )
+
+    def estimate(self, k: int) -> dict[str, Any]:
+        """A coordinate of the final model with unit, 90 % interval and grade."""
+        state = self.after.state
+        if self.draws is not None:
+            return self.draws.estimate(k).as_json()
+        name, unit, factor = unit_of(state.model, k)
+        middle, sd = float(state.optimum.x[k]) * factor, float(np.sqrt(state.covariance[k, k])) * factor
+        return {
+            "name": name,
+            "value": middle,
+            "unit": unit,
+            "mean": middle,
+            "sd": sd,
+            "lower": middle - Z90 * sd,
+            "upper": middle + Z90 * sd,
+            "level": LEVEL,
+            "interval": "Laplace",
+            "ess": None,
+            "grade": "tentative",
+        }
+
+    @property
+    def study(self) -> Study:
+        """The study."""
+        return self.problem.study
+
+    @property
+    def trace(self) -> Trace | None:
+        """Evidence of every effect in the first residual; None when the base fit failed."""
+        return self.rounds[0].trace if self.rounds else None
+
+
+def loop(
+    study: Study,
+    *,
+    library: Sequence[type[Effect]] | None = None,
+    jobs: int = 1,
+    sample: bool = True,
+    quick: bool = False,
+    as_stated: bool = False,
+) -> Loop:
+    """Trace what a study's base model lacks; deterministic given the study's seed.
+
+    Unless `as_stated`, a study with one viscous term gets as many as the evidence asks for. Without
+    `sample` intervals and bands are those of a Laplace approximation. With `quick` fewer chance residuals
+    are drawn and ensembles are half as long. InputError when the study does not fit its records.
+    """
+    kinds = list(catalogue(study.effects.add, study.folder).values()) if library is None else list(library)
+    problem, base, enlarged = fitted_base(study, as_stated=as_stated)
+    model = ExtendedModel.of(base.model, base.optimum.x, taken=taken(study))
+    start = State(model, base.optimum, base.regression.whitening, base.optimum.covariance)
+    before = _side(problem, start)
+    if base.failed:
+        found = Found(base.failed, base.caution, False, np.nan, np.nan, (), (), 0, 0, "", 0, 0, "", np.nan)
+        verdict = decide(found)
+        return Loop(problem, base, enlarged, (), (), (), verdict, before, before, not study.held_out)
+    searched = search(
+        start, base, kinds, np.random.default_rng([study.seed, 11]), draws=200 if quick else 400
+    )
+    first, last = searched.rounds[0].trace, searched.rounds[-1].trace
+    generic = max(
+        (one for one in first.traced if one.card.place == "generic"),
+        key=lambda one: one.log_bayes_factor,
+        default=None,
+    )
+    names = tuple(effect.name for effect in searched.state.model.effects)
+    verdict = decide(
+        Found(
+            "",
+            base.caution,
+            first.alarmed,
+            first.largest,
+            first.threshold,
+            names,
+            tuple(effect.name for effect in searched.state.model.effects if effect.card.disturbance),
+            searched.gained,
+            generic.log_bayes_factor if generic else -np.inf,
+            generic.name if generic else "",
+            last.largest,
+            last.threshold,
+            last.traced[0].name if last.traced else "",
+            searched.gained / (searched.gained + last.largest)
+            if searched.gained > 0 and last.alarmed
+            else 1.0,
+        )
+    )
+    named = verdict.kind in ("explained", "disturbance")
+    last_state, draws = searched.state if named else start, None
+    if verdict.kind == "unexplained":
+        samples, noise = start.whitening.samples, start.whitening.noise
+        last_state = replace(start, widening=Widening.of(samples, start.optimum.residual, noise))
+    if sample:
+        quiet = float(sum(one.samples for one in base.noise if one.known))
+        draws = sample_loop(LoopDensity(last_state, quiet), study.seed, jobs=jobs, quick=quick)
+        last_state = replace(last_state, covariance=draws.covariance)
+    return Loop(
+        problem,
+        base,
+        enlarged,
+        searched.rounds,
+        last_state.model.effects,
+        searched.groups if named else (),
+        verdict,
+        before,
+        _side(problem, last_state),
+        not study.held_out,
+        draws,
+    )
+
+
+def _side(problem: Problem, state: State) -> Side:
+    unseen = held_out_scores(state, problem) if problem.study.held_out else left_out_scores(state)
+    return Side(state, tuple(fit_scores(state)), tuple(unseen), state.optimum.log_evidence)

@@ -1,0 +1,141 @@
+"""Samples that hold no signal: before the drive moves, inside the delay, and differences of repeats."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+from scipy import stats
+
+from lcopa_bayes.arrays import Vector
+from lcopa_bayes.inference.data import Samples
+from lcopa_bayes.loop.autoregression import Autoregression, estimated, unbroken
+
+FEWEST = 50
+"""Fewer quiet samples than this know the noise scale to worse than a tenth [-]."""
+_SAFE = 0.8
+"""Share of the fitted delay inside which a response is surely at rest [-]."""
+_ALIKE = 1e-3
+"""p-value below which repeats differ by more than the quiet noise [-]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class AxisNoise:
+    """Noise of one response axis and where it is known from."""
+
+    process: Autoregression
+    samples: int
+    """Samples it was estimated from [-]."""
+    source: str
+    """One of "quiet", "repeats", "joint"."""
+    sentence: str
+
+    @property
+    def known(self) -> bool:
+        """Whether it was measured apart from the fit."""
+        return self.source != "joint"
+
+
+def first_change(samples: Samples) -> float:
+    """Time of the first drive change of a record, infinite when there is none [time unit]."""
+    drive = samples.record.drive
+    moved = np.flatnonzero((drive != drive[0]).any(axis=1))
+    return float(samples.record.time[moved[0]]) if moved.size else np.inf
+
+
+def quiet_pieces(samples: Sequence[Samples], axis: int, delay: float) -> list[Vector]:
+    """Unbroken stretches of an axis before anything can have arrived [response unit].
+
+    `delay` is the shortest fitted delay [time unit]; 0.8 of it counts as dead time.
+    """
+    out = []
+    for record in samples:
+        observed = record.axes[axis]
+        until = first_change(record) + _SAFE * delay
+        count = int(np.searchsorted(record.times[observed.index], until))
+        gaps = observed.gaps[:count]
+        out += [observed.values[:count][piece] for piece in unbroken(gaps)] if count > 1 else []
+    return [piece for piece in out if piece.size > 1]
+
+
+def repeat_pieces(samples: Sequence[Samples], axis: int) -> list[Vector]:
+    """Differences over sqrt(2) of records with the same drive and sample times [response unit]."""
+    out, taken = [], set()
+    for k, one in enumerate(samples):
+        for j in range(k + 1, len(samples)):
+            other = samples[j]
+            if k in taken or j in taken or not _repeats(one, other, axis):
+                continue
+            taken |= {k, j}
+            difference = (one.axes[axis].values - other.axes[axis].values) / np.sqrt(2)
+            out += [difference[piece] for piece in unbroken(one.axes[axis].gaps)]
+    return [piece for piece in out if piece.size > 1]
+
+
+def _repeats(one: Samples, other: Samples, axis: int) -> bool:
+    first, second = one.record, other.record
+    return (
+        first.time.shape == second.time.shape
+        and np.array_equal(first.drive, second.drive)
+        and np.allclose(first.time, second.time)
+        and np.array_equal(one.axes[axis].index, other.axes[axis].index)
+    )
+
+
+def axis_noise(samples: Sequence[Samples], axis: int, delay: float, name: str) -> AxisNoise | None:
+    """Noise of an axis from quiet samples, and from repeats where these agree; None when too few.
+
+    Repeats that differ by more than the quiet noise hold a disturbance from record to record (a trigger that
+    jitters, a mount that shakes): then they are no measure of the noise, and the sentence says so.
+    """
+    quiet, repeats = quiet_pieces(samples, axis, delay), repeat_pieces(samples, axis)
+    count = sum(piece.size - 1 for piece in quiet)
+    again = sum(piece.size - 1 for piece in repeats)
+    usable = [piece for piece in quiet if np.ptp(piece) > 0]
+    if count >= FEWEST and usable:
+        process = estimated(usable)
+        said = f"{name}: AR({process.order}) noise of sd {process.sd:.3g} from {count} quiet samples"
+        if not again:
+            return AxisNoise(process, count, "quiet", f"{said}.")
+        ratio = _power(process, repeats)
+        p = float(2 * min(stats.f.sf(ratio, again, count), stats.f.cdf(ratio, again, count)))
+        if p > _ALIKE:
+            both = estimated([*usable, *repeats])
+            told = (
+                f"{name}: AR({both.order}) noise of sd {both.sd:.3g} from {count} quiet samples and {again}"
+            )
+            return AxisNoise(both, count + again, "quiet", f"{told} differences of repeats, which agree.")
+        differ = f"repeats differ by {np.sqrt(ratio):.2f} times the quiet noise (p = {p:.1g})"
+        return AxisNoise(process, count, "quiet", f"{said}; {differ}: something varies between records.")
+    if again >= FEWEST:
+        process = estimated([piece for piece in repeats if np.ptp(piece) > 0])
+        told = f"{name}: AR({process.order}) noise of sd {process.sd:.3g} from {again} differences of repeats"
+        return AxisNoise(process, again, "repeats", f"{told}; {count} quiet samples are too few.")
+    return None
+
+
+def joint_noise(residual: Sequence[Vector], name: str, quiet: int) -> AxisNoise:
+    """Noise of an axis fitted together with the plant, from its residual pieces [response unit]."""
+    process = estimated(residual)
+    sentence = (
+        f"{name}: {quiet} quiet samples and no repeats are too few to know the noise ({FEWEST} are "
+        "needed), so "
+        f"AR({process.order}) noise of sd {process.sd:.3g} is fitted to the residual together with the "
+        "plant: "
+        "what it takes for noise may be an effect, so no verdict is better than tentative. Record a stretch "
+        "before the first command, or a repeat."
+    )
+    return AxisNoise(process, sum(piece.size for piece in residual), "joint", sentence)
+
+
+def _power(process: Autoregression, pieces: Sequence[Vector]) -> float:
+    """Mean square of whitened pieces about their own levels [-]."""
+    squares, count = 0.0, 0
+    for piece in pieces:
+        white, ones = process.whiten(np.stack([piece, np.ones_like(piece)]))
+        squares += float(white @ white) - float(ones @ white) ** 2 / float(ones @ ones)
+        count += piece.size - 1
+    return squares / count

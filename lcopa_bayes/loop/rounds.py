@@ -1,0 +1,243 @@
+"""Rounds of the loop: trace, refit the leading candidates, add the best, until nothing is left to find."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.loop.basefit import BaseFit, measured
+from lcopa_bayes.loop.confirm import SIGNIFICANT, Refit, log_bayes_factor, refit, tuned
+from lcopa_bayes.loop.regression import Regression
+from lcopa_bayes.loop.scoreevidence import cosine
+from lcopa_bayes.loop.scores import State
+from lcopa_bayes.loop.signature import Signature, expected_margin, pair_evidence
+from lcopa_bayes.loop.trace import Trace, Traced, trace
+from lcopa_bayes.loop.verdict import MARGIN
+from lcopa_bayes.loop.whitening import Whitening
+from lcopa_bayes.plant.effects.effect import Effect
+
+MOST = 3
+"""Effects that are added at most [-]."""
+_CANDIDATES = 4
+_TUNED = 8
+"""Named effects whose internal constants are moved off their grid before they are ranked [-]."""
+NEAR = 0.7
+"""Candidates reach this share of the best log Bayes factor [-]."""
+_PAIRED = 8
+"""Single effects of which pairs are formed [-]."""
+_PAIRS = 2
+"""Pairs refitted [-]."""
+_CLOSE = 0.9
+"""Cosine above which two signatures are hardly told apart [-]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Round:
+    """One look at a residual."""
+
+    trace: Trace
+    refits: tuple[Refit, ...]
+    """Leading candidates with everything free, by falling evidence."""
+    failures: tuple[str, ...]
+    """Candidates that could not be refitted, and why."""
+    chosen: Refit | None
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Search:
+    """All rounds and the model they end with."""
+
+    rounds: tuple[Round, ...]
+    state: State
+    groups: tuple[tuple[str, ...], ...]
+    """For each effect of the state, the names it cannot be told apart from, its own first."""
+    gained: float
+    """Log evidence of the final model over the base model [nat]."""
+
+
+def search(
+    start: State, base: BaseFit, library: Sequence[type[Effect]], rng: np.random.Generator, *, draws: int
+) -> Search:
+    """Add effects one at a time while evidence, records left out and significance all speak for it; then try
+    pairs where something remains, and take back what is no longer significant."""
+    counts = [one.samples if one.known else 0 for one in base.noise]
+    state, rounds, groups = start, [], {}
+    for number in range(MOST + 1):
+        seen = trace(
+            state.model, state.optimum, state.whitening, library, rng, noise_samples=counts, draws=draws
+        )
+        if not seen.alarmed or number == MOST:
+            rounds.append(Round(seen, (), (), None))
+            break
+        refits, failures, tuned_best = _refits(state, seen)
+        chosen = next((one for one in refits if _accepted(one, seen)), None)
+        rounds.append(Round(seen, tuple(refits), tuple(failures), chosen))
+        if chosen is None:
+            break
+        groups[chosen.added[0]] = _group(chosen, refits, seen, tuned_best)
+        state = _settled(_kept(chosen, state.whitening), base)
+    if rounds[-1].trace.alarmed and rounds[0].trace.alarmed:
+        paired = _paired(start, state, rounds[0].trace)
+        if paired is not None:
+            state = _settled(_state(paired, start.whitening), base)
+            seen = trace(
+                state.model, state.optimum, state.whitening, library, rng, noise_samples=counts, draws=draws
+            )
+            rounds += [Round(rounds[0].trace, (paired,), (), paired), Round(seen, (), (), None)]
+    names = [effect.name for effect in state.model.effects]
+    told = tuple(groups.get(name, (name,)) for name in names)
+    return Search(tuple(rounds), state, told, _gained(start, state, float(sum(counts))))
+
+
+def _gained(start: State, state: State, quiet: float) -> float:
+    """Log evidence over the base model's under one whitening, that of the final noise [nat]."""
+    if not state.model.effects:
+        return 0.0
+    plain = start.optimum
+    if state.whitening is not start.whitening:
+        plain = Regression(start.model, state.whitening).descend(start.optimum.x)
+    sides = sum(one.coefficient.one_signed for one in state.model.effected.coefficients)
+    return log_bayes_factor(plain, state.optimum, quiet) + sides * float(np.log(2.0))
+
+
+def _refits(state: State, seen: Trace) -> tuple[list[Refit], list[str], dict[str, Signature]]:
+    """Named candidates within reach of the best, refitted."""
+    named = [one for one in seen.traced if one.card.place != "generic" and one.signatures][:_TUNED]
+    worth = [one for one in named if one.log_bayes_factor > 0]
+    done, failures, signatures = [], [], {}
+    for one in worth:
+        signatures[one.name] = tuned(state.model, state.optimum, state.whitening, one, seen)
+    reached = {name: _alone(signature, seen) for name, signature in signatures.items()}
+    ranked = sorted(reached, key=lambda name: -reached[name])
+    near = [name for name in ranked if reached[name] > NEAR * reached[ranked[0]]][:_CANDIDATES]
+    for name in near:
+        signature = signatures[name]
+        try:
+            amplitude = signature.amplitude(seen.residual)
+            done.append(
+                refit(
+                    state.model,
+                    state.optimum,
+                    state.whitening,
+                    [(signature.effect, amplitude)],
+                    seen.scale.quiet,
+                )
+            )
+        except ArithmeticError as error:
+            failures.append(f"{name}: {error}")
+    done.sort(key=lambda made: -made.log_bayes_factor)
+    return done, failures, signatures
+
+
+def _alone(signature: Signature, seen: Trace) -> float:
+    """Log Bayes factor of one instance [nat]."""
+    return float(signature.evidence(signature.span.T @ seen.residual[:, None], seen.scale)[0])
+
+
+def _accepted(made: Refit, seen: Trace) -> bool:
+    return made.log_bayes_factor > seen.threshold and made.left_out > 0 and made.significant
+
+
+def _group(
+    chosen: Refit, refits: Sequence[Refit], seen: Trace, signatures: dict[str, Signature]
+) -> tuple[str, ...]:
+    """Names that these records cannot tell from the chosen one.
+
+    A rival that was refitted belongs to the group when it lost by less than 3 nat; one that was not, when its
+    projected signature lies within cos 0.9 or the expected margin at the fitted size is below 3 nat.
+    """
+    name = chosen.added[0]
+    own = signatures[name]
+    amplitude = chosen.optimum.x[chosen.places(name)]
+    out = [name]
+    fitted = {one.added[0]: one for one in refits}
+    for one in seen.traced:
+        if one.name == name or one.card.place == "generic" or not one.signatures:
+            continue
+        if one.name in fitted:
+            if chosen.log_bayes_factor - fitted[one.name].log_bayes_factor < MARGIN:
+                out.append(one.name)
+            continue
+        margin = min(expected_margin(own, amplitude, rival, seen.scale) for rival in one.signatures)
+        if margin < MARGIN:
+            out.append(one.name)
+    return tuple(out)
+
+
+def closeness(seen: Trace, name: str) -> dict[str, float]:
+    """Largest cosine between the best instance of an effect and any of each other effect [-]."""
+    own = seen.of(name).signatures[seen.of(name).best]
+    return {
+        one.name: max(cosine(own.columns, rival.columns) for rival in one.signatures)
+        for one in seen.traced
+        if one.name != name and one.signatures
+    }
+
+
+def _state(made: Refit, whitening: Whitening) -> State:
+    return State(made.model, made.optimum, whitening, made.optimum.covariance)
+
+
+def _kept(made: Refit, whitening: Whitening) -> State:
+    """Without effects that are no longer significant beside the new one."""
+    idle = [
+        effect.name
+        for effect in made.model.effects
+        if effect.name not in made.added and made.wald(effect.name) > SIGNIFICANT
+    ]
+    if not idle:
+        return _state(made, whitening)
+    kept = tuple(effect for effect in made.model.effects if effect.name not in idle)
+    model = made.model.having(*kept)
+    gone = {k for name in idle for k in made.places(name)}
+    x = np.array([value for k, value in enumerate(made.optimum.x) if k not in gone])
+    optimum = Regression(model, whitening).descend(x, most=12, gain=0.02)
+    return State(model, optimum, whitening, optimum.covariance)
+
+
+def _settled(state: State, base: BaseFit) -> State:
+    """With the noise estimated anew from the new residual, where it had to be fitted jointly."""
+    if base.noise_known:
+        return state
+    posterior = base.model.posterior
+    values, _ = state.model.split(state.optimum.x)
+    delays = [posterior.table.at("delay", k) for k in range(len(posterior.table.layout.delays))]
+    noise = measured(posterior, state.optimum.residual, min(float(values[k]) for k in delays))
+    whitening = Whitening(posterior.samples, tuple(one.process for one in noise))
+    optimum = Regression(state.model, whitening).descend(state.optimum.x, most=12, gain=0.02)
+    return State(state.model, optimum, whitening, optimum.covariance)
+
+
+def _paired(start: State, state: State, seen: Trace) -> Refit | None:
+    """The best pair of effects, when its evidence beats what was found one by one; else None."""
+    named = [one for one in seen.traced if one.card.place != "generic" and one.signatures][:_PAIRED]
+    ranked = sorted(
+        combinations(named, 2),
+        key=lambda pair: -pair_evidence(_best(pair[0]), _best(pair[1]), seen.residual),
+    )
+    have = {effect.name for effect in state.model.effects}
+    bar, best = _gained(start, state, seen.scale.quiet) + MARGIN, None
+    for pair in ranked[:_PAIRS]:
+        if {one.name for one in pair} <= have:
+            continue
+        columns = np.concatenate([_best(one).columns for one in pair], axis=1)
+        inner = np.linalg.solve(np.eye(columns.shape[1]) + columns.T @ columns, columns.T @ seen.residual)
+        size = _best(pair[0]).columns.shape[1]
+        added = [(_best(pair[0]).effect, inner[:size]), (_best(pair[1]).effect, inner[size:])]
+        try:
+            made = refit(start.model, start.optimum, start.whitening, added, seen.scale.quiet)
+        except ArithmeticError:
+            continue
+        if made.log_bayes_factor > bar and made.significant and made.left_out > 0:
+            bar, best = made.log_bayes_factor, made
+    return best
+
+
+def _best(one: Traced) -> Signature:
+    return one.signatures[one.best]

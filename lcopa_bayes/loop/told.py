@@ -1,0 +1,228 @@
+"""What a loop found, as plain JSON values and in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from lcopa_bayes.estimate import plain
+from lcopa_bayes.loop.loop import Loop, Side
+from lcopa_bayes.loop.moved import moved
+from lcopa_bayes.loop.nextmeasurement import next_measurement
+from lcopa_bayes.loop.residualview import View, views
+from lcopa_bayes.loop.rounds import Round
+from lcopa_bayes.loop.scores import Score, pooled_coverage, pooled_rmse
+from lcopa_bayes.loop.trace import SEEN
+
+
+def results(found: Loop) -> dict[str, Any]:
+    """Every number of the loop; `None` is open or undefined."""
+    trace, unit = found.trace, found.study.time_unit
+    chances = trace.probabilities if trace else {}
+    told: dict[str, Any] = {
+        "study": found.study.name,
+        "verdict": found.verdict.kind,
+        "confidence": found.verdict.confidence,
+        "sentence": found.verdict.sentence,
+        "cautions": found.base.caution,
+        "base_failed": found.base.failed,
+        "base_enlarged": found.enlarged,
+        "time_unit": unit,
+        "grade": found.grade.level,
+        "grade_reason": found.grade.reason,
+        "noise": [
+            {
+                "axis": axis.name,
+                "unit": axis.unit,
+                "order": one.process.order,
+                "partial": one.process.partial,
+                "innovation_sd": one.process.innovation_sd,
+                "sd": one.process.sd,
+                "samples": one.samples,
+                "source": one.source,
+                "sentence": one.sentence,
+            }
+            for axis, one in zip(found.study.response_axes, found.base.noise, strict=True)
+        ],
+        "effects": _effects(found, chances),
+        "before": side(found.before, found),
+        "after": side(found.after, found),
+        "unseen_by": "leaving records out in turn" if found.left_out else "held-out records",
+        "survival": {one.name: one.survival for one in trace.traced} if trace else {},
+        "invisible": [one.name for one in trace.traced if one.survival < SEEN] if trace else [],
+        "evidence": _evidence(found),
+        "rounds": [_round(one) for one in found.rounds],
+        "moved": moved(found),
+        "next_measurement": next_measurement(found),
+        "parameters": [found.estimate(k) for k in range(found.after.state.model.plant_size)],
+        "acceptance": found.draws.acceptance if found.draws else None,
+        "residual": {
+            when: [{"name": view.name, "axis": view.axis, "sentence": view.sentence} for view in shown]
+            for when, shown in _views(found).items()
+        },
+        "seed": found.study.seed,
+    }
+    values: dict[str, Any] = plain(told)
+    return values
+
+
+def drawn(found: Loop) -> dict[str, Any]:
+    """What the figures need beyond `results`: residual views and residuals before and after."""
+    shown = {when: [view.as_json() for view in each] for when, each in _views(found).items()}
+    values: dict[str, Any] = plain({"views": shown, "curves": _curves(found)})
+    return values
+
+
+def _views(found: Loop) -> dict[str, list[View]]:
+    unit = found.study.time_unit
+    return {"before": views(found.before.state, unit), "after": views(found.after.state, unit)}
+
+
+def side(one: Side, found: Loop) -> dict[str, Any]:
+    """Errors before or after, pooled per axis and for each record."""
+    axes = [axis.name for axis in found.study.response_axes]
+    noise = {score.axis: score.noise_sd for score in one.fit}
+    fit = {axis: pooled_rmse(one.fit, axis) for axis in axes}
+    unseen = {axis: pooled_rmse(one.unseen, axis) for axis in axes}
+    return {
+        "fit_rmse": fit,
+        "held_out_rmse": unseen,
+        "fit_rmse_over_noise": {axis: fit[axis] / noise[axis] for axis in axes if axis in noise},
+        "held_out_rmse_over_noise": {axis: unseen[axis] / noise[axis] for axis in axes if axis in noise},
+        "fit_coverage_90": pooled_coverage(one.fit),
+        "held_out_coverage_90": pooled_coverage(one.unseen),
+        "log_evidence": one.log_evidence,
+        "scores": [score.as_json() for score in (*one.fit, *one.unseen)],
+    }
+
+
+def _effects(found: Loop, chances: dict[str, float]) -> list[dict[str, Any]]:
+    model, optimum = found.after.state.model, found.after.state.optimum
+    first, out = model.plant_size, []
+    for number, effect in enumerate(found.effects):
+        told = [(k, one) for k, one in enumerate(model.effected.coefficients) if one.effect == number]
+        out.append(
+            {
+                "name": effect.name,
+                "place": effect.card.place,
+                "formula": effect.card.formula,
+                "source": effect.card.source,
+                "group": list(found.groups[number]),
+                "probability": chances.get(effect.name),
+                "constants": effect.constants,
+                "parameters": [
+                    found.estimate(first + k)
+                    | {"prior_sd": one.coefficient.scale, "one_signed": one.coefficient.one_signed}
+                    for k, one in told
+                ],
+                "disturbance": effect.card.disturbance,
+                "significance": float(np.abs(optimum.x[first + told[0][0]] / optimum.sd[first + told[0][0]])),
+            }
+        )
+    return out
+
+
+def _evidence(found: Loop) -> dict[str, Any]:
+    trace = found.trace
+    if trace is None:
+        return {"threshold": None, "p_value": None, "draws": 0, "classes": []}
+    chances = trace.probabilities
+    return {
+        "threshold": trace.threshold,
+        "p_value": trace.p_value,
+        "draws": trace.draws,
+        "none": chances["none"],
+        "classes": [
+            {
+                "name": one.name,
+                "place": one.card.place,
+                "log_bayes_factor": one.log_bayes_factor,
+                "probability": chances[one.name],
+                "survival": one.survival,
+                "instances": len(one.signatures),
+                "reveals": one.card.reveals,
+                "mistaken_for": one.card.mistaken_for,
+                "failed": one.failed,
+            }
+            for one in trace.traced
+        ],
+    }
+
+
+def _round(one: Round) -> dict[str, Any]:
+    return {
+        "largest": one.trace.largest,
+        "threshold": one.trace.threshold,
+        "p_value": one.trace.p_value,
+        "leading": [
+            {"name": each.name, "log_bayes_factor": each.log_bayes_factor} for each in one.trace.traced[:6]
+        ],
+        "refits": [
+            {
+                "added": list(made.added),
+                "log_bayes_factor": made.log_bayes_factor,
+                "left_out_gain": made.left_out,
+                "significant": made.significant,
+                "converged": made.optimum.converged,
+            }
+            for made in one.refits
+        ],
+        "failures": list(one.failures),
+        "chosen": list(one.chosen.added) if one.chosen else [],
+    }
+
+
+def _curves(found: Loop) -> list[dict[str, Any]]:
+    """Residuals before and after, thinned for drawing."""
+    pairs = [*zip(found.before.fit, found.after.fit, strict=True)]
+    if not found.left_out:
+        pairs += [*zip(found.before.unseen, found.after.unseen, strict=True)]
+    return [_curve(before, after) for before, after in pairs]
+
+
+def _curve(before: Score, after: Score, most: int = 1500) -> dict[str, Any]:
+    step = max(1, -(-before.time.size // most))
+    return {
+        "record": before.record,
+        "axis": before.axis,
+        "unit": before.unit,
+        "held_out": before.held_out,
+        "time": before.time[::step],
+        "observed": before.observed[::step],
+        "noise_sd": before.noise_sd,
+        "before": (before.observed - before.predicted)[::step],
+        "after": (after.observed - after.predicted)[::step],
+        "half_width_before": before.half_width[::step],
+        "half_width_after": after.half_width[::step],
+    }
+
+
+def words(told: dict[str, Any]) -> Sequence[str]:
+    """Lines for a reader."""
+    out = [f"{told['verdict']} ({told['confidence']}): {told['sentence']}"]
+    out += [told["base_enlarged"]] if told["base_enlarged"] else []
+    out += [f"caution: {one}" for one in told["cautions"]]
+    for effect in told["effects"]:
+        group = f" (cannot be told from {', '.join(effect['group'][1:])})" if len(effect["group"]) > 1 else ""
+        out.append(f"effect {effect['name']}, acts on the {effect['place']}{group}")
+        out += [
+            f"  {p['name']} = {p['value']:.4g} [{p['lower']:.4g}, {p['upper']:.4g}] {p['unit']}, {p['grade']}"
+            for p in effect["parameters"][:6]
+        ]
+    for axis, value in told["before"]["fit_rmse"].items():
+        after = told["after"]
+        out.append(
+            f"axis {axis}: fit RMSE {value:.4g} -> {after['fit_rmse'][axis]:.4g}, unseen "
+            f"{told['before']['held_out_rmse'][axis]:.4g} -> {after['held_out_rmse'][axis]:.4g} "
+            f"({told['unseen_by']})"
+        )
+    coverage = [told[side]["held_out_coverage_90"] for side in ("before", "after")]
+    if None not in coverage:
+        out.append(
+            f"90 % bands hold {100 * coverage[0]:.0f} % of unseen samples before, "
+            f"{100 * coverage[1]:.0f} % after"
+        )
+    out += [f"next measurement: {told['next_measurement']}"] if told["next_measurement"] else []
+    return out

@@ -1,0 +1,227 @@
+"""Signatures of every effect of a library held against the residual of a fit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import final
+
+import numpy as np
+from scipy.special import logsumexp
+
+from lcopa_bayes.arrays import Matrix, Vector
+from lcopa_bayes.loop.extended import ExtendedModel
+from lcopa_bayes.loop.regression import Optimum
+from lcopa_bayes.loop.scatter import scatter_evidence
+from lcopa_bayes.loop.scoreevidence import Projection
+from lcopa_bayes.loop.signature import Scale, Signature, signature_of
+from lcopa_bayes.loop.whitening import Whitening
+from lcopa_bayes.plant.effects.effect import Card, Effect, ScatterEffect
+
+LEAST = 3.0
+"""Log Bayes factor that an effect needs at least [nat]."""
+QUANTILE = 0.99
+_DRAWS = 400
+_NONE = 0.5
+"""Prior probability that nothing is missing [-]; the effects share the rest evenly."""
+MOST_COMMANDS = 400
+"""Commands per record up to which effects are traced that follow each by itself [-]."""
+SEEN = 0.1
+"""Below this survival the records cannot see an effect [-]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Traced:
+    """An effect with all its instances against one residual."""
+
+    card: Card
+    signatures: tuple[Signature, ...]
+    log_bayes_factor: float
+    """Against no effect, averaged over the instances [nat]."""
+    best: int
+    """Instance with the largest evidence."""
+    failed: str = ""
+    """Why it could not be simulated."""
+
+    @property
+    def name(self) -> str:
+        """Name of the effect."""
+        return self.card.name
+
+    @property
+    def survival(self) -> float:
+        """Largest share of an instance's signature that is left [-]; NaN for one that changes only the
+        noise."""
+        return max((one.survival for one in self.signatures), default=np.nan)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """All effects against one residual, and what chance alone gives."""
+
+    traced: tuple[Traced, ...]
+    """By falling evidence."""
+    threshold: float
+    """Largest of 3 and the 99 % quantile of the largest log Bayes factor by chance [nat]."""
+    p_value: float
+    """Share of chance maxima at or above the largest found, no less than 1 / (draws + 1) [-]."""
+    draws: int
+    """Chance maxima drawn [-]."""
+    residual: Vector
+    """Whitened, projected residual, (n,) [-]."""
+    scale: Scale
+    """What is known of the noise scale."""
+
+    @property
+    def largest(self) -> float:
+        """Largest log Bayes factor [nat]; -inf without effects."""
+        return max((one.log_bayes_factor for one in self.traced), default=-np.inf)
+
+    @property
+    def alarmed(self) -> bool:
+        """Whether anything is above the threshold."""
+        return self.largest > self.threshold
+
+    @cached_property
+    def probabilities(self) -> dict[str, float]:
+        """Posterior probability of each effect and of "none", if exactly one of them is there [-]."""
+        share = np.log((1 - _NONE) / max(len(self.traced), 1))
+        logs = np.array([np.log(_NONE), *(one.log_bayes_factor + share for one in self.traced)])
+        chances = np.exp(logs - logsumexp(logs))
+        return dict(zip(("none", *(one.name for one in self.traced)), chances.tolist(), strict=True))
+
+    def of(self, name: str) -> Traced:
+        """The effect of that name; KeyError when it was not traced."""
+        for one in self.traced:
+            if one.name == name:
+                return one
+        raise KeyError(name)
+
+
+def trace(
+    model: ExtendedModel,
+    optimum: Optimum,
+    whitening: Whitening,
+    library: Sequence[type[Effect]],
+    rng: np.random.Generator,
+    *,
+    noise_samples: Sequence[int] = (),
+    draws: int = _DRAWS,
+) -> Trace:
+    """Evidence of every effect of `library` in the residual of `optimum`, and the threshold of chance.
+
+    `noise_samples`: samples each axis' noise was known from; the scale of a chance residual is uncertain by
+    as much. Effects the model already has are left out.
+    """
+    project = Projection(optimum.jacobian * model.spread)
+    residual = project(optimum.settled)
+    quiet, freedom = float(sum(noise_samples)), float(residual.size - optimum.x.size)
+    scale = Scale(quiet, freedom, np.array([residual @ residual]))
+    present = {effect.name for effect in model.effects}
+    found: list[Traced] = []
+    for kind in library:
+        if kind.card.name in present or not kind.applies(model.base.posterior.table.layout):
+            continue
+        if issubclass(kind, ScatterEffect):
+            told = scatter_evidence(optimum.white)
+            found.append(Traced(kind.card, (), told, 0))
+            continue
+        commands = max(commands_of(one.record.drive) for one in whitening.samples)
+        if kind.per_command and commands > MOST_COMMANDS:
+            why = f"it follows every command by itself, and a record has {commands} (at most {MOST_COMMANDS})"
+            found.append(Traced(kind.card, (), -np.inf, 0, why))
+            continue
+        found.append(_traced(model, optimum, whitening, project, residual, scale, kind))
+    maxima = _chance(project, whitening, found, rng, noise_samples, draws, scale)
+    found.sort(key=lambda one: -one.log_bayes_factor)
+    largest = found[0].log_bayes_factor if found else -np.inf
+    beaten = int(np.count_nonzero(maxima >= largest))
+    return Trace(
+        tuple(found),
+        max(LEAST, float(np.quantile(maxima, QUANTILE))) if maxima.size else LEAST,
+        (beaten + 1) / (draws + 1),
+        draws,
+        residual,
+        scale,
+    )
+
+
+def commands_of(drive: Matrix) -> int:
+    """Instants at which any drive changes [-]."""
+    return int((np.diff(drive, axis=0) != 0).any(axis=1).sum())
+
+
+def _traced(
+    model: ExtendedModel,
+    optimum: Optimum,
+    whitening: Whitening,
+    project: Projection,
+    residual: Vector,
+    scale: Scale,
+    kind: type[Effect],
+) -> Traced:
+    signatures, evidence, failed = [], [], ""
+    for instance in kind.grid(model.effected.ranges):
+        try:
+            signatures.append(signature_of(model, optimum.x, whitening, project, instance))
+        except ArithmeticError as error:
+            failed = str(error)
+            continue
+        evidence.append(float(signatures[-1].evidence(signatures[-1].span.T @ residual[:, None], scale)[0]))
+    if not signatures:
+        return Traced(kind.card, (), -np.inf, 0, failed or "it cannot be simulated")
+    mean = float(logsumexp(evidence) - np.log(len(evidence)))
+    return Traced(kind.card, tuple(signatures), mean, int(np.argmax(evidence)), failed)
+
+
+def _chance(
+    project: Projection,
+    whitening: Whitening,
+    found: Sequence[Traced],
+    rng: np.random.Generator,
+    noise_samples: Sequence[int],
+    draws: int,
+    scale: Scale,
+) -> Vector:
+    """Largest log Bayes factor of each of `draws` residuals of the base model alone, (draws,) [nat]."""
+    listed = [one for traced in found for one in traced.signatures]
+    if not listed:
+        return np.zeros(0)
+    spans = [one.span for one in listed]
+    edges = np.cumsum([0, *(span.shape[1] for span in spans)])
+    every = np.concatenate(spans, axis=1).T
+    maxima = []
+    for _ in range(4):
+        z = rng.standard_normal((whitening.size, draws // 4))
+        for axis, count in enumerate(noise_samples):
+            if not count:  # the residual itself gave the scale
+                continue
+            factor = 1.0 / np.sqrt(rng.chisquare(count, z.shape[1]) / count)
+            for part in whitening.parts:
+                if part.axis == axis:
+                    z[part.rows] *= factor
+        inner = (every @ z.astype(np.float32)).astype(float)
+        left, _ = project.parts
+        power = np.einsum("nd,nd->d", z, z) - np.einsum("kd,kd->d", left.T @ z, left.T @ z)
+        known = Scale(scale.quiet, scale.freedom, power)
+        scatter = [scatter_evidence(column) for column in z.T] if _scatters(found) else None
+        evidence = [
+            one.evidence(inner[a:b], known) for one, a, b in zip(listed, edges[:-1], edges[1:], strict=True)
+        ]
+        first, by_effect = 0, []
+        for traced in found:
+            count = len(traced.signatures)
+            if count:
+                by_effect.append(logsumexp(evidence[first : first + count], axis=0) - np.log(count))
+            first += count
+        if scatter is not None:
+            by_effect.append(np.array(scatter))
+        maxima.append(np.max(by_effect, axis=0))
+    return np.concatenate(maxima)
+
+
+def _scatters(found: Sequence[Traced]) -> bool:
+    return any(not one.signatures and not one.failed for one in found)

@@ -1,0 +1,122 @@
+"""What the loop concludes, and in which words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, final
+
+Kind = Literal["clean", "explained", "disturbance", "unexplained"]
+Confidence = Literal["firm", "tentative"]
+
+EXPLAINED = 0.9
+"""Share of all log evidence against the base model that named effects must account for when something
+significant remains [-]."""
+MARGIN = 3.0
+"""Log evidence by which a generic class or another set must win [nat]."""
+
+
+@final
+@dataclass(frozen=True)
+class Verdict:
+    """Conclusion of a loop."""
+
+    kind: Kind
+    confidence: Confidence
+    sentence: str
+
+
+@final
+@dataclass(frozen=True)
+class Found:
+    """What a loop found, as far as the verdict depends on it."""
+
+    failed: str
+    """Why the base fit cannot be used; empty when it can."""
+    cautions: tuple[str, ...]
+    alarmed: bool
+    """Whether any class of effect was above the threshold in the first residual."""
+    largest: float
+    """Largest log Bayes factor there [nat]."""
+    threshold: float
+    """[nat]."""
+    effects: tuple[str, ...]
+    """Named effects that were added, refitted and kept."""
+    disturbances: tuple[str, ...]
+    """Those of them that belong to the noise."""
+    gained: float
+    """Log evidence they gained together [nat]."""
+    generic: float
+    """Largest log Bayes factor of a generic class in the first residual [nat]; -inf without any."""
+    generic_name: str
+    remaining: float
+    """Largest log Bayes factor of any class in the last residual [nat]."""
+    remaining_threshold: float
+    """[nat]."""
+    remaining_name: str
+    share: float
+    """Log evidence gained over that gained and remaining [-]."""
+
+
+def decide(found: Found) -> Verdict:
+    """The verdict; an effect is never named from a base fit that failed."""
+    confidence: Confidence = "tentative" if found.cautions or found.failed else "firm"
+    if found.failed:
+        return Verdict("unexplained", "tentative", f"No effect is named, because {found.failed}.")
+    if not found.alarmed:
+        return Verdict(
+            "clean",
+            confidence,
+            "Nothing is missing that these records could show: the largest log Bayes factor of any "
+            "effect is "
+            f"{found.largest:.1f} nat, and chance alone reaches {found.threshold:.1f} once in a hundred "
+            "times.",
+        )
+    named = ", ".join(found.effects)
+    if not found.effects:
+        return Verdict(
+            "unexplained",
+            confidence,
+            f"Something is missing (log Bayes factor {found.largest:.0f} nat against "
+            f"{found.threshold:.1f} by "
+            "chance), but no effect of the library survives a full refit: no name is forced.",
+        )
+    left = found.remaining > found.remaining_threshold
+    if left and found.generic > found.gained + MARGIN:
+        return Verdict(
+            "unexplained",
+            confidence,
+            f"Something is missing, and {found.generic_name} describes it better by "
+            f"{found.generic - found.gained:.0f} nat than the nearest named effect ({named}): no name "
+            "is forced.",
+        )
+    if left and not found.share >= EXPLAINED:
+        return Verdict(
+            "unexplained",
+            confidence,
+            f"The nearest effect ({named}) accounts for {_percent(found.share)} of the evidence against "
+            "the base model "
+            f"and {found.remaining_name} remains with {found.remaining:.0f} nat: no name is forced.",
+        )
+    rest = (
+        f" What remains is significant ({found.remaining_name}, {found.remaining:.0f} nat) but small: "
+        f"{_percent(found.share)} of the evidence against the base model is accounted for."
+        if left
+        else " Nothing significant remains."
+    )
+    if set(found.effects) <= set(found.disturbances):
+        return Verdict(
+            "disturbance",
+            confidence,
+            f"{named} disturb(s) the records; the plant stays as it is, the noise model changes." + rest,
+        )
+    return Verdict("explained", confidence, f"{named} was missing, worth {found.gained:.0f} nat." + rest)
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"
+
+
+def joined(names: Sequence[str]) -> str:
+    """`a, b or c`."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"

@@ -1,0 +1,103 @@
+"""The whitening operator of a set of records: every sample divided by what its past does not predict."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.arrays import Array, Matrix, Vector
+from lcopa_bayes.inference.data import Samples
+from lcopa_bayes.loop.autoregression import Autoregression, unbroken
+
+
+@final
+@dataclass(frozen=True)
+class Part:
+    """Samples of one response axis of one record inside the stacked samples of all."""
+
+    record: int
+    axis: int
+    rows: slice
+
+
+def parts(samples: Sequence[Samples]) -> tuple[Part, ...]:
+    """Where each record's axes stand in the stack: records in their order, axes within."""
+    out, start = [], 0
+    for r, record in enumerate(samples):
+        for axis, observed in enumerate(record.axes):
+            out.append(Part(r, axis, slice(start, start + observed.values.size)))
+            start = out[-1].rows.stop
+    return tuple(out)
+
+
+def stacked(samples: Sequence[Samples], responses: Sequence[Array]) -> Matrix:
+    """Responses per record (..., samples, axes) at the observed samples, (..., n) in the order of `parts`."""
+    return np.concatenate(
+        [
+            response[..., observed.index, axis]
+            for record, response in zip(samples, responses, strict=True)
+            for axis, observed in enumerate(record.axes)
+        ],
+        axis=-1,
+    )
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Whitening:
+    """Noise of every axis applied to stacked samples; stretches apart by missing samples are independent."""
+
+    samples: tuple[Samples, ...]
+    noise: tuple[Autoregression, ...]
+    """One per response axis."""
+
+    @cached_property
+    def parts(self) -> tuple[Part, ...]:
+        """Places of the records' axes in the stack."""
+        return parts(self.samples)
+
+    @cached_property
+    def size(self) -> int:
+        """Number of stacked samples [-]."""
+        return int(self.parts[-1].rows.stop)
+
+    @cached_property
+    def observed(self) -> Vector:
+        """Observed samples, stacked [response unit]."""
+        return np.concatenate([one.values for record in self.samples for one in record.axes])
+
+    @cached_property
+    def _stretches(self) -> list[tuple[int, slice]]:
+        """Axis and rows of every unbroken stretch."""
+        out = []
+        for part in self.parts:
+            gaps = self.samples[part.record].axes[part.axis].gaps
+            if gaps.size:
+                first = part.rows.start
+                out += [(part.axis, slice(first + s.start, first + s.stop)) for s in unbroken(gaps)]
+        return out
+
+    def __call__(self, columns: Array) -> Array:
+        """Whitened columns (..., n), same shape [-]."""
+        out = np.empty_like(columns, dtype=float)
+        for axis, rows in self._stretches:
+            out[..., rows] = self.noise[axis].whiten(columns[..., rows])
+        return out
+
+    @cached_property
+    def log_scale(self) -> float:
+        """Sum of log sd of the prediction errors [nat]."""
+        return float(
+            sum(self.noise[axis].log_scale(rows.stop - rows.start) for axis, rows in self._stretches)
+        )
+
+    def draw(self, count: int, rng: np.random.Generator) -> Matrix:
+        """Noise of all samples, (count, n) [response unit]."""
+        out = np.empty((count, self.size))
+        for axis, rows in self._stretches:
+            out[:, rows] = self.noise[axis].draw(count, rows.stop - rows.start, rng)
+        return out

@@ -1,0 +1,130 @@
+"""One hidden-effect campaign: made on the virtual bench, looped, and judged against its truth."""
+
+import json
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from lcopa_bayes.bench.undeclared import NOISE, Campaign, campaign, drawn
+from lcopa_bayes.files import write_text
+from lcopa_bayes.loop.loop import Loop, Side, loop
+from lcopa_bayes.loop.scores import pooled_coverage
+from lcopa_bayes.settings import ModelSettings
+from lcopa_bayes.study import Study
+
+TERMS = {"direct": 2, "cross": 1}
+"""What the study of a campaign says of its model: the truth's, without any effect."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What one campaign hides."""
+
+    kind: str
+    """clean, coloured, named, plain, outside or pair."""
+    effects: tuple[str, ...]
+    drives: str
+    correlation: float
+    seed: int
+    sampled: bool = False
+    """Whether the final posterior is drawn too."""
+
+    @property
+    def name(self) -> str:
+        return "_".join([self.kind, *self.effects, str(self.seed)])
+
+
+def study_of(made: Campaign, seed: int) -> Study:
+    """The records alone, as a user has them."""
+    return Study("hidden", None, "ms", seed, made.fit, made.held_out, ModelSettings(terms=TERMS))
+
+
+def play(task: Task, folder: Path) -> dict[str, Any]:
+    """Make, loop and judge; the row is kept in `folder`, and read back when it is there."""
+    path = folder / f"{task.name}.json"
+    if path.exists():
+        return json.loads(path.read_text(encoding="utf-8"))
+    with threadpool_limits(1):
+        rng = np.random.default_rng([task.seed, 77])
+        made = campaign(drawn(task.effects, rng), rng, drives=task.drives, correlation=task.correlation)
+        begun, cpu = time.perf_counter(), time.process_time()
+        try:
+            found = loop(study_of(made, task.seed), sample=task.sampled, as_stated=True)
+            row = asdict(task) | judged(found, made)
+        except Exception as error:  # a crash is a result too, and must not end the others
+            row = asdict(task) | {"crashed": f"{type(error).__name__}: {error}"}
+    row |= {"seconds": time.perf_counter() - begun, "cpu_seconds": time.process_time() - cpu}
+    write_text(path, json.dumps(row, indent=1))
+    return row
+
+
+def judged(found: Loop, made: Campaign) -> dict[str, Any]:
+    """What the loop said, beside the truth that only the judge sees."""
+    trace = found.trace
+    truth = [one.name for one in made.hidden]
+    refits = [
+        [[list(one.added), one.log_bayes_factor, one.left_out] for one in made_round.refits]
+        for made_round in found.rounds
+    ]
+    return {
+        "crashed": "",
+        "truth": truth,
+        "sizes": {one.name: dict(one.numbers) for one in made.hidden},
+        "disturbance": all(one.disturbance for one in made.hidden) if made.hidden else False,
+        "verdict": found.verdict.kind,
+        "confidence": found.verdict.confidence,
+        "sentence": found.verdict.sentence,
+        "named": [effect.name for effect in found.effects],
+        "groups": [list(group) for group in found.groups],
+        "alarmed": bool(trace and trace.alarmed),
+        "threshold": trace.threshold if trace else None,
+        "survival": {name: _survival(found, name) for name in truth},
+        "leading": [[one.name, one.log_bayes_factor] for one in trace.traced[:6]] if trace else [],
+        "of_truth": {name: _evidence(found, name) for name in truth},
+        "refits": refits,
+        "orders": [one.process.order for one in found.base.noise],
+        "base_failed": found.base.failed,
+        "before": errors(found.before, made),
+        "after": errors(found.after, made),
+        "coverage_before": pooled_coverage(found.before.unseen),
+        "coverage_after": pooled_coverage(found.after.unseen),
+        "share_with_band": float(np.mean([score.banded for score in found.after.unseen])),
+        "grade": found.grade.level if found.draws else None,
+    }
+
+
+def errors(side: Side, made: Campaign) -> dict[str, float]:
+    """Root mean square errors, on held-out records against the response without noise or disturbances
+    [rad]."""
+    fit = np.concatenate([score.observed - score.predicted for score in side.fit])
+    apart = []
+    for score in side.unseen:
+        record = next(one for one in made.held_out if one.name == score.record)
+        axis = [one.name for one in record.response_axes].index(score.axis)
+        exact = made.truth[score.record][np.searchsorted(record.time, score.time), axis]
+        apart.append(score.predicted - exact)
+    both = np.concatenate(apart)
+    return {
+        "fit_rmse": float(np.sqrt(np.mean(fit**2))),
+        "fit_over_noise": float(np.sqrt(np.mean(fit**2)) / NOISE),
+        "held_out_truth_rmse": float(np.sqrt(np.mean(both**2))),
+    }
+
+
+def _survival(found: Loop, name: str) -> float | None:
+    try:
+        value = found.trace.of(name).survival if found.trace else np.nan
+    except KeyError:
+        return None
+    return float(value) if np.isfinite(value) else None
+
+
+def _evidence(found: Loop, name: str) -> float | None:
+    try:
+        return found.trace.of(name).log_bayes_factor if found.trace else None
+    except KeyError:
+        return None

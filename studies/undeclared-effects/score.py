@@ -1,0 +1,170 @@
+"""Score sheet of the loop: hidden effects on the virtual bench, judged by thresholds frozen beforehand.
+
+    python studies/undeclared-effects/score.py [--seed 1000] [--each 4] [--controls 60] [--outsiders 10]
+        [--pairs 30] [--sampled 6] [--jobs N] [--out reports/undeclared-effects] [--limit N]
+
+Every campaign is a task of its own, kept in OUT/rows: a killed run goes on where it stopped. Seeds below 1000
+were used in development and are refused unless --trial is given.
+"""
+
+import argparse
+import json
+import sys
+import tomllib
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from itertools import combinations
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from campaigns import Task, play
+from scoresheet import bounds, matrix, sheet
+from tqdm import tqdm
+
+from lcopa_bayes.bench.undeclared import NAMED, OUTSIDE
+from lcopa_bayes.files import writable_folder, write_text
+from lcopa_bayes.loop import rounds, trace, verdict
+from lcopa_bayes.report.canvas import look
+from lcopa_bayes.report.page import Verdict, write_page
+from lcopa_bayes.report.section import Column, Section, Table
+from lcopa_bayes.report.wording import figures
+
+HERE = Path(__file__).parent
+FIRST_TEST_SEED = 1000
+COLOURED = 0.6
+"""Correlation of successive samples of coloured noise [-]."""
+
+
+def tasks(options: argparse.Namespace) -> list[Task]:
+    """All campaigns, each with a seed of its own drawn from the seed of the sheet."""
+    made: list[tuple[str, tuple[str, ...], str, float]] = []
+    made += [("clean", (), "rich", 0.0)] * options.controls
+    made += [("coloured", (), "rich", COLOURED)] * options.controls
+    made += [("named", (name,), "rich", 0.0) for name in NAMED for _ in range(options.each)]
+    made += [("plain", (name,), "plain", 0.0) for name in NAMED for _ in range(max(1, options.each // 4))]
+    made += [("outside", (name,), "rich", 0.0) for name in OUTSIDE for _ in range(options.outsiders)]
+    rng = np.random.default_rng([options.seed, 1])
+    plant = sorted(NAMED)
+    pairs = list(combinations(plant, 2))
+    picked = rng.choice(len(pairs), size=min(options.pairs, len(pairs)), replace=False)
+    made += [("pair", pairs[k], "rich", 0.0) for k in picked]
+    sampled = set(rng.choice(len(made), size=min(options.sampled, len(made)), replace=False).tolist())
+    first = options.seed * 100_000
+    return [
+        Task(kind, names, drives, rho, first + k, k in sampled)
+        for k, (kind, names, drives, rho) in enumerate(made)
+    ]
+
+
+def frozen() -> dict[str, Any]:
+    """Thresholds and targets; ends the run when the package's are others."""
+    told = tomllib.loads((HERE / "thresholds.toml").read_text(encoding="utf-8"))
+    held = {
+        "explained": verdict.EXPLAINED,
+        "margin": verdict.MARGIN,
+        "least": trace.LEAST,
+        "quantile": trace.QUANTILE,
+        "seen": trace.SEEN,
+        "near": rounds.NEAR,
+        "most_effects": rounds.MOST,
+    }
+    wrong = [key for key in held if told["package"][key] != held[key]]
+    if wrong:
+        sys.exit(f"thresholds.toml and the package differ in {', '.join(wrong)}: thresholds are frozen")
+    return told
+
+
+def main() -> None:
+    options = _options()
+    told = frozen()
+    if options.seed < FIRST_TEST_SEED and not options.trial:
+        sys.exit(f"seeds below {FIRST_TEST_SEED} were used in development; give --trial to use one")
+    listed = tasks(options)[:: options.every][: options.limit]
+    folder = writable_folder(options.out / "rows")
+    if options.jobs == 1:
+        rows = [play(task, folder) for task in tqdm(listed, disable=options.quiet)]
+    else:
+        with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
+            waiting = [pool.submit(play, task, folder) for task in listed]
+            done = tqdm(as_completed(waiting), total=len(waiting), disable=options.quiet)
+            rows = [each.result() for each in done]
+    rows.sort(key=lambda row: (row["kind"], row["effects"], row["seed"]))
+    lines = sheet(rows, told["targets"], told["package"]["seen"])
+    values = {
+        "seed": options.seed,
+        "campaigns": len(rows),
+        "cpu_seconds_each": float(np.median([row["cpu_seconds"] for row in rows])),
+        "sheet": lines,
+        "matrix": matrix(rows),
+        "crashes": [
+            [row[key] for key in ("kind", "effects", "seed", "crashed")] for row in rows if row["crashed"]
+        ],
+        "grades": [row["grade"] for row in rows if row.get("grade")],
+        "thresholds": told,
+        "command": " ".join(["python", "studies/undeclared-effects/score.py", *sys.argv[1:]]),
+    }
+    write_text(options.out / "results.json", json.dumps(values, indent=1) + "\n")
+    with look():
+        path = write_page(
+            options.out, "Undeclared effects: the score sheet", sections(values), _verdict(values)
+        )
+    print(path)
+
+
+def sections(values: dict[str, Any]) -> list[Section]:
+    """Score sheet and tracing matrix."""
+    columns = (
+        *(Column("measure", "prose"), Column("found", "number"), Column("target", "number")),
+        *(Column("95 % interval or quartiles", "interval"), Column("campaigns", "number"), Column("reached")),
+    )
+    rows = []
+    for line in values["sheet"]:
+        ends = [line["lower"], line["upper"]] if "lower" in line else line.get("quartiles", [None, None])
+        sign = {"most": "at most", "least": "at least", "within": "within"}[line["side"]]
+        reached = "–" if line["value"] is None else "yes" if line["reached"] else "no"  # noqa: RUF001
+        spread = " to ".join(figures(end, 2) for end in ends)
+        target = f"{sign} {line['target']}"
+        rows.append((line["measure"], figures(line["value"]), target, spread, str(line["trials"]), reached))
+    counts = tuple(
+        (hidden, ", ".join(f"{name} {count}" for name, count in said.items()))
+        for hidden, said in values["matrix"].items()
+    )
+    text = (
+        f"{values['campaigns']} campaigns from seed {values['seed']}, median "
+        f"{values['cpu_seconds_each']:.0f} s of one "
+        f"core each. Made again by: {values['command']}"
+    )
+    found = Table((Column("hidden", "code"), Column("put down to", "prose")), counts, "Counts of campaigns.")
+    return [
+        Section("Score sheet", (text,), (), (Table(columns, tuple(rows)),)),
+        Section("What was put down to what", (), (), (found,)),
+    ]
+
+
+def _verdict(values: dict[str, Any]) -> Verdict:
+    missed = [
+        line["measure"] for line in values["sheet"] if line["value"] is not None and not line["reached"]
+    ]
+    said = f"Not reached: {'; '.join(missed)}." if missed else "Every target is reached."
+    grade = "tentative" if missed or bounds(0, values["campaigns"])[1] > 0.02 else "reliable"
+    return Verdict(
+        grade, said, "targets of the table below; thresholds were frozen before the seeds were drawn"
+    )
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    numbers = {"seed": FIRST_TEST_SEED, "each": 4, "controls": 60, "outsiders": 10, "pairs": 30, "sampled": 6}
+    for name, default in (numbers | {"jobs": 1, "limit": None, "every": 1}).items():
+        parser.add_argument(f"--{name}", type=int, default=default)
+    parser.add_argument("--out", type=Path, default=Path("reports/undeclared-effects"))
+    parser.add_argument("--trial", action="store_true", help="allow a seed that development may have used")
+    parser.add_argument("--quiet", action="store_true")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    main()

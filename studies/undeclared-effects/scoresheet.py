@@ -1,0 +1,181 @@
+"""What the rows of many campaigns add up to, each number beside its target and its error."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.stats import beta
+
+Row = Mapping[str, Any]
+EQUIVALENT = {"duffing_with_memory": {"cubic_stiffness"}}
+"""Outsiders whose leading term the catalogue has: naming it counts as right."""
+
+
+def bounds(hits: int, trials: int, level: float = 0.95) -> tuple[float, float]:
+    """Two-sided Clopper-Pearson interval of a share [-]."""
+    tail = (1 - level) / 2
+    low = float(beta.ppf(tail, hits, trials - hits + 1)) if hits else 0.0
+    high = float(beta.ppf(1 - tail, hits + 1, trials - hits)) if hits < trials else 1.0
+    return low, high
+
+
+def first_of(row: Row) -> str:
+    """The effect put first: the first named, else the best refit, else the leading named class; or
+    nothing."""
+    if row["named"]:
+        return str(row["named"][0])
+    for made in row["refits"]:
+        if made:
+            return str(made[0][0][0])
+    return ""
+
+
+def share(
+    name: str, rows: Sequence[Row], right: Callable[[Row], bool], target: float, side: str
+) -> dict[str, Any]:
+    """One line of the sheet: a share with its interval; `side` says whether it must be "least" or "most"."""
+    hits, trials = sum(map(right, rows)), len(rows)
+    if not trials:
+        return {"measure": name, "target": target, "side": side, "value": None, "trials": 0}
+    low, high = bounds(hits, trials)
+    value = hits / trials
+    reached = value <= target if side == "most" else value >= target
+    line = {"measure": name, "target": target, "side": side, "value": value, "lower": low, "upper": high}
+    return line | {"trials": trials, "reached": reached}
+
+
+def number(
+    name: str, values: Sequence[float], reduce: Callable[..., Any], target: Any, side: str
+) -> dict[str, Any]:
+    """One line of the sheet: a summary of many numbers."""
+    finite = [value for value in values if value is not None and np.isfinite(value)]
+    if not finite:
+        return {"measure": name, "target": target, "side": side, "value": None, "trials": 0}
+    value = float(reduce(finite))
+    if side == "within":
+        reached = target[0] <= value <= target[1]
+    else:
+        reached = value <= target if side == "most" else value >= target
+    return {
+        "measure": name,
+        "target": target,
+        "side": side,
+        "value": value,
+        "trials": len(finite),
+        "reached": reached,
+        "quartiles": [float(q) for q in np.quantile(finite, [0.25, 0.75])],
+    }
+
+
+def sheet(rows: Sequence[Row], targets: Mapping[str, Any], seen: float) -> list[dict[str, Any]]:
+    """Every measure of "What to hold ourselves to"."""
+    usable = [row for row in rows if not row["crashed"]]
+    by = {kind: [row for row in usable if row["kind"] == kind] for kind in ("clean", "coloured", "named")}
+    by |= {kind: [row for row in usable if row["kind"] == kind] for kind in ("plain", "outside", "pair")}
+    visible = [row for row in by["named"] if (_survival(row) or 0.0) > seen or _survival(row) is None]
+    alarmed = [row for row in visible if row["alarmed"]]
+    hidden = [row for row in [*by["named"], *by["plain"]] if (_survival(row) or 1.0) <= seen and row["named"]]
+    single = [*by["named"], *by["plain"]]
+    saying = [row for row in single if row["named"]]
+    corrected = [row for row in by["named"] if row["verdict"] in ("explained", "disturbance")]
+    widened = [row for row in [*by["named"], *by["outside"]] if row["verdict"] == "unexplained"]
+    plants = [row for row in corrected if not row["disturbance"]]
+    ratio = [row["after"]["held_out_truth_rmse"] / row["before"]["held_out_truth_rmse"] for row in plants]
+    over = [row["after"]["fit_over_noise"] for row in [*by["clean"], *plants]]
+    inside = targets["coverage"]
+    return [
+        share(
+            "false alarms, white noise",
+            by["clean"],
+            lambda r: r["verdict"] != "clean",
+            targets["false_alarms"],
+            "most",
+        ),
+        share(
+            "false alarms, coloured noise",
+            by["coloured"],
+            lambda r: r["verdict"] != "clean",
+            targets["false_alarms"],
+            "most",
+        ),
+        share("noticed, where it survives", visible, lambda r: r["alarmed"], 0.0, "least"),
+        share(
+            "right effect first, where it survives",
+            visible,
+            lambda r: first_of(r) in r["truth"],
+            targets["right_first"],
+            "least",
+        ),
+        share(
+            "the same among those noticed",
+            alarmed,
+            lambda r: first_of(r) in r["truth"],
+            targets["right_first"],
+            "least",
+        ),
+        share("elsewhere the group holds the truth", hidden, _grouped, targets["right_when_named"], "least"),
+        share("right when it says anything", saying, _grouped, targets["right_when_named"], "least"),
+        share(
+            "outsiders left unexplained",
+            [r for r in by["outside"] if r["alarmed"]],
+            _outside,
+            targets["outsiders_unexplained"],
+            "least",
+        ),
+        number(
+            "held-out error after / before, median",
+            ratio,
+            np.median,
+            targets["held_out_ratio_median"],
+            "most",
+        ),
+        number(
+            "held-out error after / before, largest", ratio, np.max, targets["held_out_ratio_largest"], "most"
+        ),
+        number("fit RMSE after / noise, median", over, np.median, targets["fit_over_noise"], "most"),
+        number("90 % bands, clean", [r["coverage_after"] for r in by["clean"]], np.mean, inside, "within"),
+        number("90 % bands, corrected", [r["coverage_after"] for r in corrected], np.mean, inside, "within"),
+        number(
+            "90 % bands, widened",
+            [r["coverage_after"] for r in widened],
+            np.mean,
+            targets["coverage_widened"],
+            "least",
+        ),
+        number(
+            "90 % bands before correction", [r["coverage_before"] for r in corrected], np.mean, 0.0, "least"
+        ),
+        share("two effects, both found", by["pair"], _both, targets["two_effects"], "least"),
+        share("crashed", list(rows), lambda r: bool(r["crashed"]), 0.0, "most"),
+    ]
+
+
+def matrix(rows: Sequence[Row]) -> dict[str, dict[str, int]]:
+    """How often each hidden effect was put down to which name, over single effects and outsiders."""
+    out: dict[str, Counter[str]] = {}
+    for row in rows:
+        if row["crashed"] or len(row["effects"]) > 1:
+            continue
+        hidden = f"{row['effects'][0]} ({row['drives']})" if row["effects"] else f"nothing ({row['kind']})"
+        said = row["named"][0] if row["named"] else row["verdict"]
+        out.setdefault(hidden, Counter())[said] += 1
+    return {hidden: dict(said.most_common()) for hidden, said in sorted(out.items())}
+
+
+def _survival(row: Row) -> float | None:
+    values = list(row["survival"].values())
+    return values[0] if values else None
+
+
+def _grouped(row: Row) -> bool:
+    return any(row["truth"][0] in group for group in row["groups"])
+
+
+def _outside(row: Row) -> bool:
+    allowed = EQUIVALENT.get(row["truth"][0], set())
+    return row["verdict"] == "unexplained" or (bool(row["named"]) and set(row["named"]) <= allowed)
+
+
+def _both(row: Row) -> bool:
+    return set(row["truth"]) <= {name for group in row["groups"] for name in group}
