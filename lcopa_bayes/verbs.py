@@ -36,7 +36,7 @@ from lcopa_bayes.provenance import provenance
 from lcopa_bayes.report import write_report
 from lcopa_bayes.report.auditpage import write_audit
 from lcopa_bayes.report.calibrationpage import is_calibration, write_calibration
-from lcopa_bayes.report.comparisonpage import write_comparison
+from lcopa_bayes.report.comparisonpage import is_comparison, write_comparison
 from lcopa_bayes.report.paperpages import write_claims, write_identification, write_optics
 from lcopa_bayes.rival import integer_rival
 from lcopa_bayes.runfolder import save_fit, save_json, save_table
@@ -114,13 +114,15 @@ def compare_study(options: argparse.Namespace, command: list[str]) -> Told:
         quick=options.quick,
         quiet=options.quiet,
     )
-    save_json(values | {"command": command}, folder / "compare.json")
+    save_json(values | {"provenance": provenance(study, command)}, folder / "compare.json")
     return _with_report(values, write_comparison(folder), values["why"], values["fractional"]["sentence"])
 
 
 def report(options: argparse.Namespace, command: list[str]) -> Told:
     """The report of a run folder, drawn again."""
     folder = options.folder
+    if is_comparison(folder):
+        return _with_report({}, write_comparison(folder))
     return _with_report({}, write_calibration(folder) if is_calibration(folder) else write_report(folder))
 
 

@@ -20,6 +20,11 @@ NAME = "compare.html"
 _NEEDS = ("study", "models", "preferred", "why", "agreement", "fractional", "order_is_integer", "flags")
 
 
+def is_comparison(folder: Path) -> bool:
+    """Whether a run folder holds a comparison and no fit."""
+    return (folder / "compare.json").is_file() and not (folder / "results.json").is_file()
+
+
 def write_comparison(folder: Path) -> Path:
     """`compare.html` with scores, orders, fits and residuals; returns its path.
 
