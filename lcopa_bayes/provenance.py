@@ -49,7 +49,7 @@ def fingerprint(study: Study, plan: SamplePlan) -> str:
     """Hash of everything the draws depend on: inputs, settings, plan and this package's version."""
     told = {
         "inputs": dict(study.inputs),
-        "records": [_digest(record) for record in study.fit],
+        "records": [digest(record) for record in study.fit],
         "settings": settings_of(study),
         "plan": asdict(plan),
         "version": version("lcopa-bayes"),
@@ -57,7 +57,7 @@ def fingerprint(study: Study, plan: SamplePlan) -> str:
     return hashlib.sha256(json.dumps(told, sort_keys=True, default=str).encode()).hexdigest()
 
 
-def _digest(record: Record) -> str:
+def digest(record: Record) -> str:
     """Hash of what a record holds: a study made in Python names no input files."""
     held = hashlib.sha256(repr((record.drive_axes, record.response_axes, record.time_unit)).encode())
     for array in (record.time, record.drive, record.response):

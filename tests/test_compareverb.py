@@ -96,8 +96,12 @@ def test_a_damaged_card_is_refused_not_used(folder, told, tmp_path):
         compare(candidates_of(study(record()), pick=PICK), folder=tmp_path, resume=True)
 
 
-def test_the_page_shows_all_of_it(folder, told):
-    page = (folder / "run" / "compare.html").read_text()
+def test_the_page_shows_all_of_it_and_is_drawn_again_the_same(folder, told):
+    path = folder / "run" / "compare.html"
+    page = path.read_text()
+    path.unlink()
+    assert main(["report", str(folder / "run"), "--quiet"]) == 0
+    assert path.read_text() == page
     assert not re.search(r'(?:src|href)="(?:http|//)', page)
     assert page.count("<svg") == 3  # evidence, the fitted record, the held-out one
     for words in (*PICK, "The prior", "Is this order an integer?", "What to heed", "held out"):

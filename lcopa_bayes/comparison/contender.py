@@ -25,7 +25,7 @@ from lcopa_bayes.fit import Fit, fit, plan_of
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.grade import Grade
 from lcopa_bayes.problems import InputError
-from lcopa_bayes.provenance import fingerprint, settings_of
+from lcopa_bayes.provenance import digest, fingerprint, settings_of
 from lcopa_bayes.results import residual_rms, scores
 from lcopa_bayes.runfolder import save_json, save_table
 from lcopa_bayes.settings import SamplerSettings
@@ -57,8 +57,7 @@ class Contender:
             fingerprint(study, plan_of(problem_of(study), quick=self.quick)),
             self.candidate.improper,
             _VERSION,
-            [record.name for record in study.held_out],
-            [record.response.tobytes().hex()[:4096] for record in study.held_out],
+            [digest(record) for record in study.held_out],
         )
         return hashlib.sha256(json.dumps(told).encode()).hexdigest()
 
@@ -146,7 +145,7 @@ def card(candidate: Candidate, made: Fit) -> tuple[dict[str, Any], tuple[Predict
             "residual_rms": residual_rms(made),
             "fit_scores": scores(made, held_out=False),
             "held_out": scores(made, held_out=True),
-            "predictions": [one.as_json() for one in parts],
+            "predictions": [one.as_json() | {"grade": one.grade(grade.level)} for one in parts],
             "order_is_integer": [one.as_json() for one in integer_orders(made)],
             "parameters_told": [one.as_json() for one in made.draws.estimates()],
             "step_metrics": [one.as_json() for one in made.metrics],

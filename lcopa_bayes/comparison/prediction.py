@@ -15,6 +15,7 @@ from lcopa_bayes.comparison.parts import Part, parts_of, predicted, without
 from lcopa_bayes.estimate import plain
 from lcopa_bayes.fit import Fit
 from lcopa_bayes.inference.data import Samples
+from lcopa_bayes.inference.grade import TENTATIVE_RHAT, Level
 from lcopa_bayes.inference.noise import AR1, Noise, White
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.plant.forward import ForwardModel
@@ -51,6 +52,11 @@ class Predicted:
     """Draws the densities are worth [-]."""
     rhat: float
     """Between the ensembles of a refit [-]; NaN on the other roads."""
+
+    def grade(self, fitted: Level) -> Level:
+        """That of the draws, lowered where a refit's populations disagree or are small."""
+        agree = self.road != "refit" or (self.rhat <= TENTATIVE_RHAT and self.ess >= _FEWEST)
+        return fitted if agree or fitted == "unusable" else "tentative"
 
     def as_json(self) -> dict[str, Any]:
         """Plain values, without the samples."""

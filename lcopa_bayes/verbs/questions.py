@@ -74,7 +74,7 @@ def compare_study(options: argparse.Namespace, command: list[str]) -> Told:
         quick=options.quick,
         quiet=options.quiet,
     )
-    save_json(values | {"command": command}, folder / "compare.json")
+    save_json(values | {"provenance": provenance(study, command)}, folder / "compare.json")
     return with_report(values, write_comparison(folder), values["why"], values["fractional"]["sentence"])
 
 

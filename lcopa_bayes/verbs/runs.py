@@ -17,11 +17,23 @@ from lcopa_bayes.files import writable_folder
 from lcopa_bayes.fit import fit
 from lcopa_bayes.provenance import provenance
 from lcopa_bayes.report import write_report
+from lcopa_bayes.report.auditpage import write_audit
 from lcopa_bayes.report.calibrationpage import is_calibration, write_calibration
+from lcopa_bayes.report.comparisonpage import write_comparison
+from lcopa_bayes.report.designpage import write_design
+from lcopa_bayes.report.looppage import write_loop
 from lcopa_bayes.rival import integer_rival
 from lcopa_bayes.runfolder import save_fit, save_json, save_table
 from lcopa_bayes.study import Study
 from lcopa_bayes.verbs.outcome import Told, place_of, study_of, with_report
+
+_PAGES = {
+    "audit.json": write_audit,
+    "design.json": write_design,
+    "compare.json": write_comparison,
+    "loop.json": write_loop,
+}
+"""Pages beside the report of a fit, by what they are drawn from."""
 
 
 def run(options: argparse.Namespace, command: list[str]) -> Told:
@@ -55,9 +67,14 @@ def _fitted(options: argparse.Namespace, command: list[str], study: Study, stage
 
 
 def report(options: argparse.Namespace, command: list[str]) -> Told:
-    """The report of a run folder, drawn again."""
+    """Every page of a run folder, drawn again from what is stored there."""
     folder = options.folder
-    return with_report({}, write_calibration(folder) if is_calibration(folder) else write_report(folder))
+    if is_calibration(folder):
+        return with_report({}, write_calibration(folder))
+    pages = [write(folder) for name, write in _PAGES.items() if (folder / name).is_file()]
+    if (folder / "results.json").is_file() or not pages:
+        pages.insert(0, write_report(folder))
+    return with_report({"pages": [str(page) for page in pages]}, pages[0])
 
 
 def simulate(options: argparse.Namespace, command: list[str]) -> Told:

@@ -93,13 +93,13 @@ def _predicted(told: Mapping[str, Any]) -> Section:
     columns = (
         *(Column("model", "code"), Column("predicted", "code"), Column("how")),
         *(Column("samples", "number"), Column("log density [nat]", "number"), Column("road")),
-        *(Column("Pareto k", "number"), Column("ESS", "number")),
+        *(Column("Pareto k", "number"), Column("ESS", "number"), Column("grade", "grade")),
     )
     rows = tuple(
         (
             *(str(row["name"]), str(one["part"]), str(one["kind"]), str(one["samples"])),
             _with_error(one["elpd"], one["monte_carlo_sd"], 1),
-            *(str(one["road"]), figures(one["pareto_k"], 2), f"{one['ess']:.0f}"),
+            *(str(one["road"]), figures(one["pareto_k"], 2), f"{one['ess']:.0f}", str(one["grade"])),
         )
         for row in told["models"]
         for one in row["predictions"]
