@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import final
 
@@ -21,6 +21,8 @@ from lcopa_bayes.study import Study
 
 MOST = 99_999
 """Replicas a store has room for."""
+ENOUGH = 400
+"""Effective draws of a replica: a rank among so many is exact to 0.05, far below the scatter of ranks."""
 
 
 @final
@@ -53,17 +55,19 @@ def calibrate(
     """Draw truths, simulate the study's records from them, infer, and rank the truths (Talts et al. 2018).
 
     Truths come from the study's prior, or from the posterior in the run folder `around`. Every replica is
-    inferred with the study's sampler, model and priors; those derived from its records stay as they
-    are. Replica k depends on the study, its seed and k alone: neither on `jobs` processes nor on
-    the cluster at the address `dask`, nor on interruptions. With `folder`, finished replicas are stored in
-    its `replicas/`, and `resume` goes on from them. InputError for input that cannot be used, when a
-    worker is lost, and when not one replica could be done.
+    inferred with the study's sampler, model and priors, but for at most `ENOUGH` effective draws; priors
+    derived from its records stay as they are. Replica k depends on the study, its seed and k alone: neither
+    on `jobs` processes nor on the cluster at the address `dask`, nor on interruptions. With `folder`,
+    finished replicas are stored in its `replicas/`, and `resume` goes on from them. InputError for input that
+    cannot be used, when a worker is lost, and when not one replica could be done.
     """
     refuse_if(whole_number("replicas", replicas, 1, MOST))
     problem = problem_of(study)
     table = problem.posterior.table
     truths = truths_around(around, table) if around is not None else Truths(table)
-    replication = Replication(problem, plan_of(problem, quick=quick), truths)
+    plan = plan_of(problem, quick=quick)
+    plan = replace(plan, target_ess=min(plan.target_ess, ENOUGH))
+    replication = Replication(problem, plan, truths)
     with crew(replication, jobs=min(jobs, replicas), dask=dask) as perform:
         store = Store.within(folder, replication) if folder is not None else None
         done = store.load(replicas) if store and resume else {}
