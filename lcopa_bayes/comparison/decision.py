@@ -7,7 +7,7 @@ from typing import Any
 
 from lcopa_bayes.comparison.flags import flags
 from lcopa_bayes.comparison.fractional import fractional, undecided
-from lcopa_bayes.comparison.gains import Gain, Row, by_evidence, by_prediction
+from lcopa_bayes.comparison.gains import Gain, Row, by_evidence, by_prediction, simplest
 
 
 def decided(rows: Sequence[Row]) -> dict[str, Any]:
@@ -51,15 +51,6 @@ def decided(rows: Sequence[Row]) -> dict[str, Any]:
         "by_evidence": None if evident is None else evident["name"],
         "by_prediction": None if predictive is None else predictive["name"],
     }
-
-
-def simplest(rows: Sequence[Row], score: Any, key: str) -> Row | None:
-    """The candidate of fewest parameters among those that the best one does not beat beyond chance."""
-    if not rows:
-        return None
-    best = max(rows, key=lambda row: row[key])
-    level = [row for row in rows if row is best or not score(best, row).counts]
-    return min(level, key=lambda row: (row["parameters"], -row[key]))
 
 
 def _agreement(evident: Row | None, predictive: Row | None, usable: Sequence[Row]) -> tuple[bool | None, str]:

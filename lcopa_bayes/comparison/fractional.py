@@ -6,16 +6,21 @@ from collections.abc import Sequence
 from math import hypot
 from typing import Any
 
-from lcopa_bayes.comparison.gains import ERRORS, STRONG, TIE, Gain, Row, by_evidence, by_prediction
+from lcopa_bayes.comparison.gains import ERRORS, STRONG, TIE, Gain, Row, by_evidence, by_prediction, simplest
 
 
 def fractional(usable: Sequence[Row]) -> dict[str, Any]:
-    """Whether the best fractional candidate is warranted against the best integer one."""
+    """Whether the best fractional candidate is warranted against the best integer one.
+
+    The best is the simplest that none of its kind beats beyond chance.
+    """
     weighed = [row for row in usable if row["log_evidence"] is not None]
     kinds = [[row for row in weighed if row["integer"] is kind] for kind in (False, True)]
     if not all(kinds):
         return undecided("a fractional and an integer candidate with evidence are needed")
-    free, whole = (max(rows, key=lambda row: row["log_evidence"]) for rows in kinds)
+    free, whole = (simplest(rows, by_evidence, "log_evidence") for rows in kinds)
+    assert free is not None
+    assert whole is not None
     gain, predicted = by_evidence(free, whole), by_prediction(free, whole)
     assert gain is not None
     gains = [gain, *_other_widths(free, whole)]

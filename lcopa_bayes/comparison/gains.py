@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import hypot, log
 from typing import Any, final
@@ -53,3 +53,16 @@ def by_prediction(one: Row, other: Row) -> Gain | None:
         return None
     nats, sd = difference(one, other)
     return Gain(nats, hypot(sd, one["elpd_monte_carlo_sd"], other["elpd_monte_carlo_sd"]))
+
+
+def simplest(rows: Sequence[Row], score: Callable[[Row, Row], Gain | None], key: str) -> Row | None:
+    """The candidate of fewest parameters among those that the best one does not beat beyond chance."""
+    if not rows:
+        return None
+    best = max(rows, key=lambda row: row[key])
+    level = [row for row in rows if row is best or not _counts(score(best, row))]
+    return min(level, key=lambda row: (row["parameters"], -row[key]))
+
+
+def _counts(gain: Gain | None) -> bool:
+    return gain is not None and gain.counts

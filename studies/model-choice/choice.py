@@ -31,8 +31,7 @@ from lcopa_bayes.bench.command import staircase
 from lcopa_bayes.bench.device import Device, TransferPath
 from lcopa_bayes.calibration.simulated import measured
 from lcopa_bayes.comparison.candidates import candidates_of
-from lcopa_bayes.comparison.decision import simplest
-from lcopa_bayes.comparison.gains import by_evidence
+from lcopa_bayes.comparison.gains import by_evidence, simplest
 from lcopa_bayes.files import writable_folder, write_text
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.draws import gather
