@@ -72,7 +72,7 @@ class Autoregression:
         """Standardised prediction errors of columns (..., n), same shape [-]."""
         n, p = columns.shape[-1], self.order
         out = np.array(columns, dtype=float)
-        for j, weight in enumerate(self.predictors[p], start=1):
+        for j, weight in enumerate(self.predictors[p] if n > p else (), start=1):
             out[..., p:] -= weight * columns[..., p - j : n - j]
         out /= self.innovation_sd
         for k in range(min(p, n)):

@@ -14,8 +14,6 @@ from lcopa_bayes.inference.grade import Grade
 from lcopa_bayes.loop.basefit import BaseFit
 from lcopa_bayes.loop.density import LoopDensity
 from lcopa_bayes.loop.draws import LoopDraws, sample_loop, unit_of
-from lcopa_bayes.loop.extended import ExtendedModel
-from lcopa_bayes.loop.prediction import taken
 from lcopa_bayes.loop.rounds import Round, search
 from lcopa_bayes.loop.scores import Score, State, fit_scores, held_out_scores, left_out_scores
 from lcopa_bayes.loop.terms import fitted_base
@@ -63,6 +61,8 @@ class Loop:
     left_out: bool
     """Whether unseen errors come from leaving fit records out in turn, for want of held-out records."""
 
+    cautions: tuple[str, ...] = ()
+    """What limits the verdict."""
     draws: LoopDraws | None = None
     """Draws of base plus effects; None when none were asked for."""
 
@@ -123,14 +123,16 @@ def loop(
     are drawn and ensembles are half as long. InputError when the study does not fit its records.
     """
     kinds = list(catalogue(study.effects.add, study.folder).values()) if library is None else list(library)
-    problem, base, enlarged = fitted_base(study, as_stated=as_stated)
-    model = ExtendedModel.of(base.model, base.optimum.x, taken=taken(study))
-    start = State(model, base.optimum, base.regression.whitening, base.optimum.covariance)
+    draws = 200 if quick else 400
+    problem, base, start, enlarged = fitted_base(study, kinds, as_stated=as_stated, draws=draws)
     before = _side(problem, start)
+    cautions = (*base.caution, *_alone(study))
     if base.failed:
-        found = Found(base.failed, base.caution, False, np.nan, np.nan, (), (), 0, 0, "", 0, 0, "", np.nan)
+        found = Found(base.failed, cautions, False, np.nan, np.nan, (), (), 0, 0, "", 0, 0, "", np.nan)
         verdict = decide(found)
-        return Loop(problem, base, enlarged, (), (), (), verdict, before, before, not study.held_out)
+        return Loop(
+            problem, base, enlarged, (), (), (), verdict, before, before, not study.held_out, cautions
+        )
     searched = search(
         start, base, kinds, np.random.default_rng([study.seed, 11]), draws=200 if quick else 400
     )
@@ -144,7 +146,7 @@ def loop(
     verdict = decide(
         Found(
             "",
-            base.caution,
+            cautions,
             first.alarmed,
             first.largest,
             first.threshold,
@@ -162,14 +164,14 @@ def loop(
         )
     )
     named = verdict.kind in ("explained", "disturbance")
-    last_state, draws = searched.state if named else start, None
+    last_state, sampled = searched.state if named else start, None
     if verdict.kind == "unexplained":
         samples, noise = start.whitening.samples, start.whitening.noise
         last_state = replace(start, widening=Widening.of(samples, start.optimum.residual, noise))
     if sample:
         quiet = float(sum(one.samples for one in base.noise if one.known))
-        draws = sample_loop(LoopDensity(last_state, quiet), study.seed, jobs=jobs, quick=quick)
-        last_state = replace(last_state, covariance=draws.covariance)
+        sampled = sample_loop(LoopDensity(last_state, quiet), study.seed, jobs=jobs, quick=quick)
+        last_state = replace(last_state, covariance=sampled.covariance)
     return Loop(
         problem,
         base,
@@ -181,7 +183,18 @@ def loop(
         before,
         _side(problem, last_state),
         not study.held_out,
-        draws,
+        cautions,
+        sampled,
+    )
+
+
+def _alone(study: Study) -> tuple[str, ...]:
+    """What a single record cannot tell."""
+    if len(study.fit) > 1:
+        return ()
+    return (
+        "a single record cannot tell an effect of the device from a peculiarity of that record; fit a "
+        "second one",
     )
 
 

@@ -16,7 +16,7 @@ from lcopa_bayes.loop.scoreevidence import cosine
 from lcopa_bayes.loop.scores import State
 from lcopa_bayes.loop.signature import Signature, expected_margin, pair_evidence
 from lcopa_bayes.loop.trace import Trace, Traced, trace
-from lcopa_bayes.loop.verdict import MARGIN
+from lcopa_bayes.loop.verdict import MARGIN, PART
 from lcopa_bayes.loop.whitening import Whitening
 from lcopa_bayes.plant.effects.effect import Effect
 
@@ -140,8 +140,16 @@ def _alone(signature: Signature, seen: Trace) -> float:
     return float(signature.evidence(signature.span.T @ seen.residual[:, None], seen.scale)[0])
 
 
+def leading(start: State, seen: Trace) -> float:
+    """Largest log Bayes factor of a single named effect that would be accepted, 0 without any [nat]."""
+    refits, _, _ = _refits(start, seen)
+    return max((one.log_bayes_factor for one in refits if _accepted(one, seen)), default=0.0)
+
+
 def _accepted(made: Refit, seen: Trace) -> bool:
-    return made.log_bayes_factor > seen.threshold and made.left_out > 0 and made.significant
+    generic = max((g.log_bayes_factor for g in seen.traced if g.card.place == "generic"), default=-np.inf)
+    ahead = made.log_bayes_factor > generic + max(MARGIN, PART * generic)
+    return made.log_bayes_factor > seen.threshold and ahead and made.left_out > 0 and made.significant
 
 
 def _group(
@@ -234,7 +242,7 @@ def _paired(start: State, state: State, seen: Trace) -> Refit | None:
             made = refit(start.model, start.optimum, start.whitening, added, seen.scale.quiet)
         except ArithmeticError:
             continue
-        if made.log_bayes_factor > bar and made.significant and made.left_out > 0:
+        if made.log_bayes_factor > bar and _accepted(made, seen):
             bar, best = made.log_bayes_factor, made
     return best
 

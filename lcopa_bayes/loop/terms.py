@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -11,7 +12,13 @@ from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.loop.basefit import BaseFit, base_fit
 from lcopa_bayes.loop.basemodel import BaseModel
 from lcopa_bayes.loop.confirm import log_bayes_factor
+from lcopa_bayes.loop.extended import ExtendedModel
+from lcopa_bayes.loop.prediction import taken
 from lcopa_bayes.loop.regression import Regression
+from lcopa_bayes.loop.rounds import leading
+from lcopa_bayes.loop.scores import State
+from lcopa_bayes.loop.trace import trace
+from lcopa_bayes.plant.effects.effect import Effect
 from lcopa_bayes.study import Study
 
 _MOST = 3
@@ -25,21 +32,24 @@ class Base(NamedTuple):
 
     problem: Problem
     fit: BaseFit
+    start: State
     sentence: str
     """What was changed; empty when nothing was."""
 
 
-def fitted_base(study: Study, *, as_stated: bool) -> Base:
+def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: bool, draws: int) -> Base:
     """The base fit; with one free viscous term stated and not `as_stated`, of the number the evidence asks
     for.
 
-    A plant with too few terms is no undeclared effect, and would be named as one.
+    A plant with too few terms is no undeclared effect, and would be named as one; one with a term too many
+    may imitate an effect. So a further term is a candidate like any other: it is added when it is worth more
+    than the best named effect.
     """
     problem = problem_of(study)
     fit = base_fit(BaseModel(problem.posterior), np.random.default_rng([study.seed, 10]))
-    sentence = ""
-    if as_stated or study.model.terms != 1 or study.model.orders != "free":
-        return Base(problem, fit, sentence)
+    base = Base(problem, fit, _start(fit, study), "")
+    if as_stated or study.model.terms != 1 or study.model.orders != "free" or fit.failed:
+        return base
     for terms in range(2, _MOST + 1):
         larger = problem_of(replace(study, model=replace(study.model, terms=terms)))
         try:
@@ -47,12 +57,24 @@ def fitted_base(study: Study, *, as_stated: bool) -> Base:
         except ArithmeticError:
             break
         quiet = float(sum(one.samples for one in other.noise if one.known))
-        same = Regression(fit.model, other.regression.whitening).descend(fit.optimum.x)
+        same = Regression(base.fit.model, other.regression.whitening).descend(base.fit.optimum.x)
         gain = log_bayes_factor(same, other.optimum, quiet)
         if other.failed or not gain > _GAIN:
             break
-        problem, fit = larger, other
-        sentence = (
-            f"The base model has {terms} viscous terms: one more than {terms - 1} is worth {gain:.0f} nat."
+        state, noise = base.start, base.fit.noise
+        counts = [one.samples if one.known else 0 for one in noise]
+        rng = np.random.default_rng([study.seed, 12, terms])
+        seen = trace(
+            state.model, state.optimum, state.whitening, library, rng, noise_samples=counts, draws=draws
         )
-    return Base(problem, fit, sentence)
+        if seen.alarmed and leading(state, seen) >= gain:
+            break
+        told = f"The base model has {terms} viscous terms: one more than {terms - 1} is worth {gain:.0f} nat"
+        base = Base(larger, other, _start(other, study), f"{told}, more than any named effect.")
+    return base
+
+
+def _start(fit: BaseFit, study: Study) -> State:
+    """The plant alone, with the scales of the effects taken from it."""
+    model = ExtendedModel.of(fit.model, fit.optimum.x, taken=taken(study))
+    return State(model, fit.optimum, fit.regression.whitening, fit.optimum.covariance)

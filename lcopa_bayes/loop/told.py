@@ -26,7 +26,7 @@ def results(found: Loop) -> dict[str, Any]:
         "verdict": found.verdict.kind,
         "confidence": found.verdict.confidence,
         "sentence": found.verdict.sentence,
-        "cautions": found.base.caution,
+        "cautions": found.cautions,
         "base_failed": found.base.failed,
         "base_enlarged": found.enlarged,
         "time_unit": unit,

@@ -47,7 +47,9 @@ class Widening:
         times = [since_command(record) for record in samples]
         pooled = np.concatenate([t[np.isfinite(t)] for t in times])
         shares = np.linspace(0, 1, _BINS + 1)
-        edges = np.unique(np.quantile(pooled, shares)) if pooled.size else np.array([0.0, 1.0])
+        edges = np.unique(np.quantile(pooled, shares)) if pooled.size else np.zeros(1)
+        if edges.size < 2:  # a drive that changes with every sample: one bin for all
+            edges = np.array([edges[0], edges[0] + max(abs(edges[0]), 1e-9)])
         excess = []
         for axis, process in enumerate(noise):
             total, count = np.zeros(edges.size - 1), np.zeros(edges.size - 1)
