@@ -41,7 +41,7 @@ def fractional(usable: Sequence[Row]) -> dict[str, Any]:
         said += f", log predictive density {predicted}"
     strong = least.nats - ERRORS * least.sd > STRONG
     denied = predicted is not None and -predicted.nats > max(TIE, ERRORS * predicted.sd)
-    shown = predicted is None or predicted.counts
+    shown = predicted is None or predicted.nats > predicted.sd  # the evidence is strong by itself
     if strong and shown:
         return told | {"verdict": "warranted", "sentence": f"Fractional orders are warranted. {said}."}
     if denied or most.nats + ERRORS * most.sd < 0:
@@ -50,7 +50,7 @@ def fractional(usable: Sequence[Row]) -> dict[str, Any]:
             "sentence": f"Fractional orders are not warranted. {said}.",
         }
     lacking = "the evidence, or its prior's part, does not suffice" if not strong else ""
-    lacking = lacking or "what was left out is predicted no better beyond chance"
+    lacking = lacking or "what was left out is predicted no better by more than a standard error"
     return told | {
         "verdict": "not shown",
         "sentence": f"No win of fractional orders is claimed: {lacking}. {said}.",

@@ -11,10 +11,10 @@ import numpy as np
 
 from lcopa_bayes.loop.basefit import BaseFit, measured
 from lcopa_bayes.loop.confirm import SIGNIFICANT, Refit, log_bayes_factor, refit, tuned
+from lcopa_bayes.loop.groups import group
 from lcopa_bayes.loop.regression import Regression
-from lcopa_bayes.loop.scoreevidence import cosine
 from lcopa_bayes.loop.scores import State
-from lcopa_bayes.loop.signature import Signature, expected_margin, pair_evidence
+from lcopa_bayes.loop.signature import Signature, pair_evidence
 from lcopa_bayes.loop.trace import Trace, Traced, trace
 from lcopa_bayes.loop.verdict import MARGIN, PART
 from lcopa_bayes.loop.whitening import Whitening
@@ -31,8 +31,6 @@ _PAIRED = 8
 """Single effects of which pairs are formed [-]."""
 _PAIRS = 2
 """Pairs refitted [-]."""
-_CLOSE = 0.9
-"""Cosine above which two signatures are hardly told apart [-]."""
 
 
 @final
@@ -80,7 +78,7 @@ def search(
         rounds.append(Round(seen, tuple(refits), tuple(failures), chosen))
         if chosen is None:
             break
-        groups[chosen.added[0]] = _group(chosen, refits, seen, tuned_best)
+        groups[chosen.added[0]] = group(chosen, refits, seen, tuned_best)
         state = _settled(_kept(chosen, state.whitening), base)
     if rounds[-1].trace.alarmed and rounds[0].trace.alarmed:
         paired = _paired(start, state, rounds[0].trace)
@@ -150,42 +148,6 @@ def _accepted(made: Refit, seen: Trace) -> bool:
     generic = max((g.log_bayes_factor for g in seen.traced if g.card.place == "generic"), default=-np.inf)
     ahead = made.log_bayes_factor > generic + max(MARGIN, PART * generic)
     return made.log_bayes_factor > seen.threshold and ahead and made.left_out > 0 and made.significant
-
-
-def _group(
-    chosen: Refit, refits: Sequence[Refit], seen: Trace, signatures: dict[str, Signature]
-) -> tuple[str, ...]:
-    """Names that these records cannot tell from the chosen one.
-
-    A rival that was refitted belongs to the group when it lost by less than 3 nat; one that was not, when its
-    projected signature lies within cos 0.9 or the expected margin at the fitted size is below 3 nat.
-    """
-    name = chosen.added[0]
-    own = signatures[name]
-    amplitude = chosen.optimum.x[chosen.places(name)]
-    out = [name]
-    fitted = {one.added[0]: one for one in refits}
-    for one in seen.traced:
-        if one.name == name or one.card.place == "generic" or not one.signatures:
-            continue
-        if one.name in fitted:
-            if chosen.log_bayes_factor - fitted[one.name].log_bayes_factor < MARGIN:
-                out.append(one.name)
-            continue
-        margin = min(expected_margin(own, amplitude, rival, seen.scale) for rival in one.signatures)
-        if margin < MARGIN:
-            out.append(one.name)
-    return tuple(out)
-
-
-def closeness(seen: Trace, name: str) -> dict[str, float]:
-    """Largest cosine between the best instance of an effect and any of each other effect [-]."""
-    own = seen.of(name).signatures[seen.of(name).best]
-    return {
-        one.name: max(cosine(own.columns, rival.columns) for rival in one.signatures)
-        for one in seen.traced
-        if one.name != name and one.signatures
-    }
 
 
 def _state(made: Refit, whitening: Whitening) -> State:
