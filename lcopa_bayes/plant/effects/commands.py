@@ -124,8 +124,13 @@ class GreyQuantisation(DriveEffect):
 
     @classmethod
     def grid(cls, ranges: Ranges) -> tuple[Self, ...]:
-        """Usual depths of a drive."""
-        return tuple(cls(float(levels)) for levels in (15, 16, 31, 32, 63, 64, 127, 128, 255))
+        """Usual depths of a driver, and every depth up to 64: records need not reach its full scale.
+
+        Another depth is another pattern of errors, with no slope from one to the next: neighbours differ by
+        1.5 %, the width of a pattern at 16 levels.
+        """
+        usual = (15, 16, 31, 32, 63, 64, 127, 128, 255)
+        return tuple(cls(float(levels)) for levels in (*usual, *np.geomspace(6.0, 62.0, 156)))
 
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
         """w [-]."""

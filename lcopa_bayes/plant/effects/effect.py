@@ -42,11 +42,12 @@ class Ranges:
     """Scales that make coefficients comparable between devices; frozen once, at the base fit."""
 
     drive: Vector
-    """Largest magnitude of each drive [drive unit]."""
+    """Largest magnitude of any drive of the same unit [drive unit]."""
     response: Vector
-    """Largest deflection of each response axis in the base model [response unit]."""
+    """Largest deflection of each response axis in the base model, alike for axes of one unit in proportion to
+    what their drives hold [response unit]."""
     period: float
-    """Sampling period [time unit]."""
+    """Median distance of samples [time unit]."""
     span: float
     """Length of the longest record [time unit]."""
     speed: float
