@@ -28,6 +28,7 @@ class OverdrivePulse(DriveEffect):
     frame: float
     """Length of the pulse [time unit]."""
 
+    linear = True
     card: ClassVar[Card] = Card(
         name="overdrive_pulse",
         place="drive",
@@ -113,6 +114,7 @@ class GreyQuantisation(DriveEffect):
     levels: float
     """Steps within the largest drive [-]."""
 
+    linear = True
     card: ClassVar[Card] = Card(
         name="grey_quantisation",
         place="drive",
@@ -152,6 +154,7 @@ class Hysteresis(DriveEffect):
     width: float
     """Half-width of the play over the largest drive [-]."""
 
+    linear = True
     card: ClassVar[Card] = Card(
         name="hysteresis",
         place="drive",
@@ -186,6 +189,7 @@ class Hysteresis(DriveEffect):
 class VoltageKnee(DriveEffect):
     """Curve from drive to force after the calibration table."""
 
+    linear = True
     card: ClassVar[Card] = Card(
         name="voltage_knee",
         place="drive",

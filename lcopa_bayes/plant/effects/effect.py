@@ -137,6 +137,9 @@ class Effect(ABC):
     card: ClassVar[Card]
     per_command: ClassVar[bool] = False
     """Whether it is computed command by command, which takes long on records of thousands."""
+    linear: ClassVar[bool] = False
+    """Whether what it adds, where it acts, is proportional to its coefficients: one difference is then
+    enough for a slope."""
 
     @classmethod
     def grid(cls, ranges: Ranges) -> tuple[Self, ...]:
@@ -202,7 +205,9 @@ class SensorEffect(Effect):
 
 
 class ParallelEffect(Effect):
-    """A response of its own beside that of the paths."""
+    """A response of its own beside that of the paths, proportional to its coefficients."""
+
+    linear = True
 
     @abstractmethod
     def added(self, scene: Scene, psi: Vector) -> Matrix:
