@@ -165,7 +165,7 @@ def effected(
     n, fit = len(names), tuple(range(len(names)))
     at = epochs_of(names)[0] if epochs is None else epochs
     times = tuple(one.times for one in posterior.samples)
-    ranges = ranges_of(posterior.model, plant_of(posterior.table, values, fit, n))
+    ranges = ranges_of(posterior.model, plant_of(posterior.table, values, fit, n), times)
     simulator = Simulator(posterior.model, tuple(effects), ranges, at, times)
     return Effected(posterior.table, simulator, names, fit)
 

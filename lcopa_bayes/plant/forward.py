@@ -47,6 +47,10 @@ class Dynamics:
         return Dynamics(times, orders, self.delays[plants])
 
 
+Spectra = dict[tuple[int, int, float], Spectrum]
+"""Transfer functions by element, number of blocks and block width."""
+
+
 @final
 @dataclass(frozen=True, eq=False)
 class Experiment:
@@ -87,16 +91,18 @@ class ForwardModel:
     layout: Layout
     experiments: tuple[Experiment, ...]
 
-    def unit_responses(self, dynamics: Dynamics) -> list[Array]:
+    def unit_responses(self, dynamics: Dynamics, spectra: Spectra | None = None) -> list[Array]:
         """Deviation from rest per unit gain, for each experiment (units, batch, samples) [drive unit].
 
         The response of axis i is ``offset_i + sum_j gain_ij (rest_j + unit_ij)``. Second order in the
-        block width; see `operational.transfer`.
+        block width; see `operational.transfer`. `spectra` are transfer functions of these very dynamics, a
+        batch of one, under other commands; those that lack are added.
         """
         shapes = [(len(self.layout.units), dynamics.batch, e.mesh.reading.samples) for e in self.experiments]
         out = [np.zeros(shape) for shape in shapes]
         for plants in self._portions(dynamics.batch):
-            self._respond(dynamics[plants], [read[:, plants] for read in out])
+            own = {} if spectra is None else spectra
+            self._respond(dynamics[plants], [read[:, plants] for read in out], own)
         return out
 
     def _portions(self, batch: int) -> Iterator[slice]:
@@ -106,9 +112,8 @@ class ForwardModel:
         size = max(_ABREAST, _CELLS // (blocks * terms) // _ABREAST * _ABREAST)
         return (slice(first, first + size) for first in range(0, batch, size))
 
-    def _respond(self, dynamics: Dynamics, out: list[Array]) -> None:
+    def _respond(self, dynamics: Dynamics, out: list[Array], spectra: Spectra) -> None:
         """Write the unit responses of a few plants into `out`."""
-        spectra: dict[tuple[int, int, float], Spectrum] = {}
         known: dict[tuple[int, int, int, int], Array] = {}
         for number, (experiment, read) in enumerate(zip(self.experiments, out, strict=True)):
             grid, circle = experiment.mesh.grid, experiment.circle

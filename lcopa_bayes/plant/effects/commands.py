@@ -28,6 +28,7 @@ class OverdrivePulse(DriveEffect):
     frame: float
     """Length of the pulse [time unit]."""
 
+    linear = True
     card: ClassVar[Card] = Card(
         name="overdrive_pulse",
         place="drive",
@@ -113,6 +114,7 @@ class GreyQuantisation(DriveEffect):
     levels: float
     """Steps within the largest drive [-]."""
 
+    linear = True
     card: ClassVar[Card] = Card(
         name="grey_quantisation",
         place="drive",
@@ -124,8 +126,13 @@ class GreyQuantisation(DriveEffect):
 
     @classmethod
     def grid(cls, ranges: Ranges) -> tuple[Self, ...]:
-        """Usual depths of a drive."""
-        return tuple(cls(float(levels)) for levels in (15, 16, 31, 32, 63, 64, 127, 128, 255))
+        """Usual depths of a driver, and every depth up to 64: records need not reach its full scale.
+
+        Another depth is another pattern of errors, with no slope from one to the next: neighbours differ by
+        1.5 %, the width of a pattern at 16 levels.
+        """
+        usual = (15, 16, 31, 32, 63, 64, 127, 128, 255)
+        return tuple(cls(float(levels)) for levels in (*usual, *np.geomspace(6.0, 62.0, 156)))
 
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
         """w [-]."""
@@ -147,6 +154,7 @@ class Hysteresis(DriveEffect):
     width: float
     """Half-width of the play over the largest drive [-]."""
 
+    linear = True
     card: ClassVar[Card] = Card(
         name="hysteresis",
         place="drive",
@@ -181,6 +189,7 @@ class Hysteresis(DriveEffect):
 class VoltageKnee(DriveEffect):
     """Curve from drive to force after the calibration table."""
 
+    linear = True
     card: ClassVar[Card] = Card(
         name="voltage_knee",
         place="drive",

@@ -42,11 +42,12 @@ class Ranges:
     """Scales that make coefficients comparable between devices; frozen once, at the base fit."""
 
     drive: Vector
-    """Largest magnitude of each drive [drive unit]."""
+    """Largest magnitude of any drive of the same unit [drive unit]."""
     response: Vector
-    """Largest deflection of each response axis in the base model [response unit]."""
+    """Largest deflection of each response axis in the base model, alike for axes of one unit in proportion to
+    what their drives hold [response unit]."""
     period: float
-    """Sampling period [time unit]."""
+    """Median distance of samples [time unit]."""
     span: float
     """Length of the longest record [time unit]."""
     speed: float
@@ -136,6 +137,9 @@ class Effect(ABC):
     card: ClassVar[Card]
     per_command: ClassVar[bool] = False
     """Whether it is computed command by command, which takes long on records of thousands."""
+    linear: ClassVar[bool] = False
+    """Whether what it adds, where it acts, is proportional to its coefficients: one difference is then
+    enough for a slope."""
 
     @classmethod
     def grid(cls, ranges: Ranges) -> tuple[Self, ...]:
@@ -201,7 +205,9 @@ class SensorEffect(Effect):
 
 
 class ParallelEffect(Effect):
-    """A response of its own beside that of the paths."""
+    """A response of its own beside that of the paths, proportional to its coefficients."""
+
+    linear = True
 
     @abstractmethod
     def added(self, scene: Scene, psi: Vector) -> Matrix:

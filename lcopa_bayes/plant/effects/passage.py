@@ -21,7 +21,7 @@ from lcopa_bayes.plant.effects.effect import (
     SensorEffect,
     UnstableError,
 )
-from lcopa_bayes.plant.forward import Dynamics, Experiment, ForwardModel
+from lcopa_bayes.plant.forward import Dynamics, Experiment, ForwardModel, Spectra
 from lcopa_bayes.plant.layout import Layout
 
 Acting = Sequence[tuple[Effect, Vector]]
@@ -43,8 +43,12 @@ class Plant:
     @property
     def key(self) -> bytes:
         """Equal for plants that move alike."""
-        parts = (self.gains, *self.dynamics.times, *self.dynamics.orders, self.dynamics.delays)
-        return b"".join(part.tobytes() for part in parts)
+        return self.gains.tobytes() + self.dynamics.delays.tobytes() + self.elements
+
+    @property
+    def elements(self) -> bytes:
+        """Equal for plants of the same elements."""
+        return b"".join(part.tobytes() for part in (*self.dynamics.times, *self.dynamics.orders))
 
 
 class Moved(NamedTuple):
@@ -56,10 +60,10 @@ class Moved(NamedTuple):
     """(samples, axes) [response unit]."""
 
 
-def linear(model: ForwardModel, scenes: Sequence[Scene], plant: Plant) -> list[Moved]:
-    """Every record of the linear plant, by the forward model."""
+def linear(model: ForwardModel, scenes: Sequence[Scene], plant: Plant, spectra: Spectra) -> list[Moved]:
+    """Every record of the linear plant, by the forward model; `spectra` as there."""
     out = []
-    for scene, units in zip(scenes, model.unit_responses(plant.dynamics), strict=True):
+    for scene, units in zip(scenes, model.unit_responses(plant.dynamics, spectra), strict=True):
         rows = [
             np.sum(
                 [plant.gains[i, j] * (scene.rest[j] + units[unit, 0]) for j, unit in enumerate(row)], axis=0

@@ -28,6 +28,7 @@ from lcopa_bayes.plant.effects.effect import (
 class GainDrift(ReadoutEffect):
     """Deflection that changes in size through the campaign."""
 
+    linear = True
     card: ClassVar[Card] = Card(
         name="gain_drift",
         place="noise",
@@ -203,6 +204,7 @@ class Flicker(ReadoutEffect):
     frequency: float
     """[cycles per time unit]."""
 
+    linear = True
     card: ClassVar[Card] = Card(
         name="flicker",
         place="noise",

@@ -19,6 +19,7 @@ _STEERING = "diffraction angle against tilt, see lcopa_bayes.optics"
 class OddCurvature(ReadoutEffect):
     """Soft saturation, alike in both directions."""
 
+    linear = True
     card: ClassVar[Card] = Card(
         name="odd_curvature",
         place="output",
@@ -42,6 +43,7 @@ class OddCurvature(ReadoutEffect):
 class EvenCurvature(ReadoutEffect):
     """Curvature that differs between the two directions."""
 
+    linear = True
     card: ClassVar[Card] = Card(
         name="even_curvature",
         place="output",
@@ -65,6 +67,7 @@ class EvenCurvature(ReadoutEffect):
 class BilinearCrosstalk(ReadoutEffect):
     """Each axis gains by the product of two axes."""
 
+    linear = True
     card: ClassVar[Card] = Card(
         name="bilinear_crosstalk",
         place="output",
@@ -127,6 +130,7 @@ class Clipping(ReadoutEffect):
     level: float
     """Limit over the largest deflection [-]."""
 
+    linear = True
     card: ClassVar[Card] = Card(
         name="clipping",
         place="output",
@@ -159,6 +163,7 @@ class CentroidLocking(ReadoutEffect):
     cycles: float
     """Pixels within the largest deflection [-]."""
 
+    linear = True
     card: ClassVar[Card] = Card(
         name="centroid_locking",
         place="output",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import final
 
@@ -23,7 +23,7 @@ from lcopa_bayes.plant.effects.effect import (
     SensorEffect,
 )
 from lcopa_bayes.plant.effects.passage import Moved, Plant, linear, passed
-from lcopa_bayes.plant.forward import ForwardModel
+from lcopa_bayes.plant.forward import ForwardModel, Spectra
 
 UPSTREAM = (DriveEffect, ElementEffect, ForceEffect, SensorEffect)
 """Places before the reading."""
@@ -46,6 +46,9 @@ class Simulator:
     """Place of each record in the campaign, (records,), -1/2 to 1/2 [-]."""
     times: tuple[Vector, ...]
     """Sample times of each record [time unit]."""
+    spectra: OrderedDict[bytes, Spectra] = field(default_factory=OrderedDict)
+    """Transfer functions of the latest plants; shared with simulators of other effects, for most
+    simulations differ in the commands alone."""
 
     @cached_property
     def _kept(self) -> OrderedDict[bytes, list[Moved]]:
@@ -118,12 +121,20 @@ class Simulator:
             made = (
                 passed(model, scenes, plant, [self._acting(acting, psi, r) for r in range(len(scenes))])
                 if any(acting)
-                else linear(model, scenes, plant)
+                else linear(model, scenes, plant, self._spectra(plant))
             )
             self._kept[key] = made
             while len(self._kept) > _KEPT:
                 self._kept.popitem(last=False)
         return self._kept[key]
+
+    def _spectra(self, plant: Plant) -> Spectra:
+        """Transfer functions of a plant's elements."""
+        own = self.spectra.setdefault(plant.elements, {})
+        self.spectra.move_to_end(plant.elements)
+        while len(self.spectra) > _KEPT:
+            self.spectra.popitem(last=False)
+        return own
 
     def _bending(self, psi: Vector) -> list[bool]:
         """Of each effect, whether it acts between commands and reading."""

@@ -33,8 +33,9 @@ def coefficient_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[
     """Derivative of the responses in psi, per record (samples, axes, coefficients) [response unit / unit].
 
     A difference through the simulator itself, of second order with `COEFFICIENT_STEP` prior standard
-    deviations, to one side where a one-signed coefficient would turn negative. Coefficients of one
-    record are moved in all records at once: records do not see each other's.
+    deviations, to one side where a one-signed coefficient would turn negative; of first order, exact but
+    for what other effects bend, where the effect is `linear`. Coefficients of one record are moved in all
+    records at once: records do not see each other's.
     """
     records = len(simulator.model.experiments)
     here = simulator.finished(simulator.moved(plant, psi), psi)
@@ -52,8 +53,11 @@ def coefficient_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[
                 moved[columns] += change
                 return simulator.finished(simulator.moved(plant, moved), moved)
 
-            upward = coefficient.one_signed and bool(psi[columns].min() < step)
-            slopes = difference(at, step, upward=upward, here=here)
+            if effect.linear:
+                slopes = [(b - a) / step for a, b in zip(here, at(step), strict=True)]
+            else:
+                upward = coefficient.one_signed and bool(psi[columns].min() < step)
+                slopes = difference(at, step, upward=upward, here=here)
             for r, slope in enumerate(slopes):
                 out[r][..., columns[r if effect.card.per_record else 0]] = slope
         first += len(told) * (records if effect.card.per_record else 1)
