@@ -67,13 +67,14 @@ def refit(
     whitening: Whitening,
     added: Sequence[tuple[Effect, Vector]],
     quiet: float,
+    near: Vector | None = None,
 ) -> Refit:
     """With effects added to those of `model`, each started from zero and from its linear estimate.
 
     `added` holds each effect with its coefficients over their prior sd; `quiet` [-] are the samples the
     noise scale
     is known from (`Scale`). The descent uses the plant's own tangents
-    first and ends with those of the whole. ArithmeticError when no start has a bounded response.
+    first and ends with those of the whole; `near` are further coordinates to start from. ArithmeticError when no start has a bounded response.
     """
     extended = model.having(*model.effects, *(effect for effect, _ in added))
     linear = np.concatenate([psi for _, psi in added])
@@ -81,6 +82,7 @@ def refit(
     starts = [np.concatenate([before.x, factor * linear]) for factor in (1.0, 0.3, 0.0)]
     if any(effect.card.place == "drive" for effect, _ in added):
         starts += [_earlier(model, starts[0], share) for share in _DELAYS]
+    starts += [near] if near is not None else []
     starts = [np.clip(start, low, high) for start in starts]  # starts only
     quick = Regression(replace(extended, exact=False), whitening).best(starts)
     optimum = Regression(extended, whitening).descend(quick.x, most=12, gain=0.02)
@@ -123,7 +125,7 @@ def tuned(
     def evidence(signature: Signature) -> float:
         return float(signature.evidence(signature.span.T @ seen.residual[:, None], seen.scale)[0])
 
-    for name in _constants(best.effect):
+    for name in constants(best.effect):
         listed = sorted({getattr(one.effect, name) for one in traced.signatures})
         here = getattr(best.effect, name)
         place = listed.index(here) if here in listed else None
@@ -164,7 +166,7 @@ def _falling(
     return cost
 
 
-def _constants(effect: Effect) -> list[str]:
+def constants(effect: Effect) -> list[str]:
     """Names of the internal constants that are real numbers."""
     listed = [field.name for field in fields(effect)]  # type: ignore[arg-type]
     return [name for name in listed if isinstance(getattr(effect, name), float)]

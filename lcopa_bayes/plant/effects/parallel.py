@@ -9,15 +9,15 @@ from typing import ClassVar, Self, final
 import numpy as np
 from scipy.signal import fftconvolve
 
-from lcopa_bayes.arrays import Array, Index, Matrix, Vector
+from lcopa_bayes.arrays import Array, Matrix, Vector
 from lcopa_bayes.plant.drive import Drive
 from lcopa_bayes.plant.effects.effect import Card, Coefficient, ParallelEffect, Ranges, Scene, single
 from lcopa_bayes.plant.layout import Layout
 
 _MANY = 64
-"""Changes above which an even grid is worth a convolution [-]."""
-_EVEN = 1e-4
-"""How far instants may lie from an even grid [periods]: about the rounding of printed times."""
+"""Changes above which a convolution is worth while [-]."""
+_ROUNDING = 1e-4
+"""How far printed times may lie from an even grid [periods]."""
 
 
 def summed(
@@ -25,18 +25,11 @@ def summed(
 ) -> Vector:
     """``sum_k jumps_k shape(t - t_k - delay)``, (samples,); shape is 0 before 0.
 
-    Many changes at evenly spaced instants are one convolution; times are then even to 1e-4 of a period.
+    Many changes under evenly spaced samples are one convolution: a change between two samples is then shared
+    by them, which is of second order in the sampling period and exact for changes at samples.
     """
-    even = _evenly(times, drive.times) if drive.times.size > _MANY else None
-    if even is not None:
-        period, samples, changes = even
-        first, last = int(samples[0] - changes[-1]), int(samples[-1] - changes[0])
-        lags = np.arange(first, last + 1) * period - delay
-        kernel = np.zeros(lags.size)
-        kernel[lags >= 0] = shape(lags[lags >= 0])
-        dense = np.zeros(int(changes[-1] - changes[0]) + 1)
-        dense[changes - changes[0]] = jumps
-        return np.asarray(fftconvolve(kernel, dense)[samples - changes[0] - first])
+    if drive.times.size > _MANY and _even(times):
+        return _convolved(times, drive.times, delay, jumps, shape)
     out = np.zeros(times.size)
     for at, jump in zip(drive.times + delay, jumps, strict=True):
         if jump != 0.0:
@@ -45,17 +38,27 @@ def summed(
     return out
 
 
-def _evenly(times: Vector, changes: Vector) -> tuple[float, Index, Index] | None:
-    """Period [time unit] and places of samples and changes on one even grid; None when they have none."""
-    if times.size < 2:
-        return None
-    span = float(times[-1] - times[0])
-    period = span / max(round(span / float(np.median(np.diff(times)))), 1)
-    places = [(at - times[0]) / period for at in (times, changes)]
-    if any(np.abs(place - np.round(place)).max(initial=0.0) > _EVEN for place in places):
-        return None
-    seen, changed = (np.round(place).astype(np.intp) for place in places)
-    return period, seen, changed
+def _even(times: Vector) -> bool:
+    """Whether samples are evenly spaced."""
+    even = np.linspace(times[0], times[-1], times.size)
+    return bool(np.abs(times - even).max() < _ROUNDING * (times[-1] - times[0]) / (times.size - 1))
+
+
+def _convolved(
+    times: Vector, changes: Vector, delay: float, jumps: Vector, shape: Callable[[Array], Array]
+) -> Vector:
+    period = (times[-1] - times[0]) / (times.size - 1)
+    place = (changes - times[0]) / period
+    place = np.where(np.abs(place - np.round(place)) < _ROUNDING, np.round(place), place)
+    below = np.floor(place).astype(np.intp)
+    begin = min(int(below[0]), 0)
+    dense = np.zeros(max(int(below[-1]) + 2, times.size) - begin)
+    np.add.at(dense, below - begin, jumps * (1 - (place - below)))
+    np.add.at(dense, below + 1 - begin, jumps * (place - below))
+    lags = np.arange(dense.size) * period - delay
+    kernel = np.zeros(lags.size)
+    kernel[lags >= 0] = shape(lags[lags >= 0])
+    return np.asarray(fftconvolve(kernel, dense)[-begin : times.size - begin])
 
 
 def jumps_of(drive: Drive) -> Vector:
