@@ -67,13 +67,15 @@ def refit(
     whitening: Whitening,
     added: Sequence[tuple[Effect, Vector]],
     quiet: float,
+    near: Vector | None = None,
 ) -> Refit:
     """With effects added to those of `model`, each started from zero and from its linear estimate.
 
     `added` holds each effect with its coefficients over their prior sd; `quiet` [-] are the samples the
     noise scale is known from (`Scale`). The descent uses the plant's own tangents first, then moves the
     effects' internal constants too (`polished`), and ends with the tangents of the whole. The evidence pays
-    for the choice among the instances that were tried. ArithmeticError when no start has a bounded response.
+    for the choice among the instances that were tried. `near` are further coordinates to start from.
+    ArithmeticError when no start has a bounded response.
     """
     extended = model.having(*model.effects, *(effect for effect, _ in added))
     linear = np.concatenate([psi for _, psi in added])
@@ -81,6 +83,7 @@ def refit(
     starts = [np.concatenate([before.x, factor * linear]) for factor in (1.0, 0.3, 0.0)]
     if any(effect.card.place == "drive" for effect, _ in added):
         starts += [_earlier(model, starts[0], share) for share in _DELAYS]
+    starts += [near] if near is not None else []
     starts = [np.clip(start, low, high) for start in starts]  # starts only
     quick = Regression(replace(extended, exact=False), whitening).best(starts, gain=_NEAR)
     extended, start = polished(extended, quick.x, whitening, tuple(effect.name for effect, _ in added))

@@ -41,7 +41,7 @@ def polished(
         here = fit.at(x)
         columns, moves = [], []
         for k, effect in enumerate(model.effects):
-            for name in _constants(effect) if effect.name in names else ():
+            for name in constants_of(effect) if effect.name in names else ():
                 column = _slope(model, x, whitening, k, name)
                 if column is not None and column @ column > 1.0:
                     columns.append(column)
@@ -104,7 +104,7 @@ def tuned(
     def evidence(signature: Signature) -> float:
         return float(signature.evidence(signature.span.T @ seen.residual[:, None], seen.scale)[0])
 
-    for name in _constants(best.effect):
+    for name in constants_of(best.effect):
         listed = sorted({getattr(one.effect, name) for one in traced.signatures})
         here = getattr(best.effect, name)
         place = listed.index(here) if here in listed else None
@@ -145,7 +145,7 @@ def _falling(
     return cost
 
 
-def _constants(effect: Effect) -> list[str]:
+def constants_of(effect: Effect) -> list[str]:
     """Names of the internal constants that are real numbers."""
     listed = [field.name for field in fields(effect)]  # type: ignore[arg-type]
     return [name for name in listed if isinstance(getattr(effect, name), float)]

@@ -13,6 +13,7 @@ from lcopa_bayes.loop.basefit import BaseFit, measured
 from lcopa_bayes.loop.confirm import SIGNIFICANT, Refit, log_bayes_factor, refit
 from lcopa_bayes.loop.constants import tuned
 from lcopa_bayes.loop.groups import group
+from lcopa_bayes.loop.instances import descended, rough
 from lcopa_bayes.loop.regression import Regression
 from lcopa_bayes.loop.scores import State
 from lcopa_bayes.loop.signature import Signature, pair_evidence
@@ -112,31 +113,32 @@ def _refits(state: State, seen: Trace) -> tuple[list[Refit], list[str], dict[str
     done, failures, signatures = [], [], {}
     for one in worth:
         signatures[one.name] = tuned(state.model, state.optimum, state.whitening, one, seen)
-    reached = {name: _alone(signature, seen) for name, signature in signatures.items()}
+    reached = {name: seen.alone(signature) for name, signature in signatures.items()}
     ranked = sorted(reached, key=lambda name: -reached[name])
     near = [name for name in ranked if reached[name] > NEAR * reached[ranked[0]]][:_CANDIDATES]
+    far = rough(seen)
+    near = ranked if far else near
     for name in near:
         signature = signatures[name]
         try:
-            amplitude = signature.amplitude(seen.residual)
+            effect, amplitude, reached_at = signature.effect, signature.amplitude(seen.residual), None
+            if far:
+                effect, reached_at = descended(state, seen, seen.of(name), signature)
+                amplitude = reached_at[state.optimum.x.size :]
             done.append(
                 refit(
                     state.model,
                     state.optimum,
                     state.whitening,
-                    [(signature.effect, amplitude)],
+                    [(effect, amplitude)],
                     seen.scale.quiet,
+                    reached_at,
                 )
             )
         except ArithmeticError as error:
             failures.append(f"{name}: {error}")
     done.sort(key=lambda made: -made.log_bayes_factor)
     return done, failures, signatures
-
-
-def _alone(signature: Signature, seen: Trace) -> float:
-    """Log Bayes factor of one instance [nat]."""
-    return float(signature.evidence(signature.span.T @ seen.residual[:, None], seen.scale)[0])
 
 
 def leading(start: State, seen: Trace) -> float:

@@ -95,6 +95,10 @@ class Trace:
         chances = np.exp(logs - logsumexp(logs))
         return dict(zip(("none", *(one.name for one in self.traced)), chances.tolist(), strict=True))
 
+    def alone(self, signature: Signature) -> float:
+        """Log Bayes factor of one instance [nat]."""
+        return float(signature.evidence(signature.span.T @ self.residual[:, None], self.scale)[0])
+
     def of(self, name: str) -> Traced:
         """The effect of that name; KeyError when it was not traced."""
         for one in self.traced:

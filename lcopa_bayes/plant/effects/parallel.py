@@ -11,24 +11,8 @@ import numpy as np
 from lcopa_bayes.arrays import Array, Matrix, Vector
 from lcopa_bayes.plant.drive import Drive
 from lcopa_bayes.plant.effects.effect import Card, Coefficient, ParallelEffect, Ranges, Scene, single
+from lcopa_bayes.plant.effects.superposition import jumps_of, summed
 from lcopa_bayes.plant.layout import Layout
-
-
-def summed(
-    times: Vector, drive: Drive, delay: float, jumps: Vector, shape: Callable[[Array], Array]
-) -> Vector:
-    """``sum_k jumps_k shape(t - t_k - delay)``, (samples,); shape is 0 before 0."""
-    out = np.zeros(times.size)
-    for at, jump in zip(drive.times + delay, jumps, strict=True):
-        if jump != 0.0:
-            first = int(np.searchsorted(times, at))
-            out[first:] += jump * shape(times[first:] - at)
-    return out
-
-
-def jumps_of(drive: Drive) -> Vector:
-    """Change of the drive at each instant [drive unit]."""
-    return np.diff(drive.values, prepend=0.0)
 
 
 def relaxing(time: float) -> Callable[[Array], Array]:
