@@ -29,6 +29,7 @@ from lcopa_bayes.provenance import digest, fingerprint, settings_of
 from lcopa_bayes.results import residual_rms, scores
 from lcopa_bayes.runfolder import save_json, save_table
 from lcopa_bayes.settings import SamplerSettings
+from lcopa_bayes.study import Study
 
 CARD = "candidate.json"
 """File of a candidate's scores inside its folder."""
@@ -45,6 +46,9 @@ class Contender:
     """A candidate and how it is to be fitted."""
 
     candidate: Candidate
+    """With the short plan of a comparison."""
+    patient: SamplerSettings
+    """The study's own plan, for when the short one leaves nothing usable."""
     folder: Path | None
     quick: bool
     resume: bool
@@ -83,9 +87,10 @@ class Contender:
             return found
         with threadpool_limits(1):
             began = time.perf_counter()
-            made = fit(
-                self.candidate.study, folder=self.folder, resume=self.resume, quick=self.quick, quiet=True
-            )
+            made = self._fitted(self.candidate.study, self.folder)
+            if made.draws.grade.level == "unusable" and self.patient != self.candidate.study.sampler:
+                longer = replace(self.candidate.study, sampler=self.patient)
+                made = self._fitted(longer, None if self.folder is None else self.folder / "longer")
             told, found_parts = card(self.candidate, made)
             told = told | {
                 "fingerprint": self.fingerprint,
@@ -100,9 +105,15 @@ class Contender:
             save_json(told, self.folder / CARD)
         return told
 
+    def _fitted(self, study: Study, folder: Path | None) -> Fit:
+        return fit(study, folder=folder, resume=self.resume, quick=self.quick, quiet=True)
+
 
 def contender(candidate: Candidate, folder: Path | None, *, quick: bool, resume: bool) -> Contender:
-    """A candidate with a plan shorter than that of a fit; what the study's ``[sampler]`` states is kept."""
+    """A candidate with a plan shorter than that of a fit; what the study's ``[sampler]`` states is kept.
+
+    Where the short plan leaves a posterior that is unusable it is sampled again as a fit would.
+    """
     study, own, free = candidate.study, candidate.study.sampler, SamplerSettings()
     sampler = replace(
         own,
@@ -112,7 +123,7 @@ def contender(candidate: Candidate, folder: Path | None, *, quick: bool, resume:
     )
     # the study file may name candidates that say nothing of this one
     return Contender(
-        replace(candidate, study=replace(study, sampler=sampler, inputs={})), folder, quick, resume
+        replace(candidate, study=replace(study, sampler=sampler, inputs={})), own, folder, quick, resume
     )
 
 

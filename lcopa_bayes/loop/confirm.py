@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, final
+from typing import final
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 from scipy.stats import chi2
 
 from lcopa_bayes.arrays import Vector
+from lcopa_bayes.loop.constants import polished
 from lcopa_bayes.loop.extended import ExtendedModel
 from lcopa_bayes.loop.leftout import groups, log_scores
 from lcopa_bayes.loop.regression import Optimum, Regression
-from lcopa_bayes.loop.scoreevidence import Projection
-from lcopa_bayes.loop.signature import Scale, Signature, signature_of
-from lcopa_bayes.loop.trace import Trace, Traced
+from lcopa_bayes.loop.signature import Scale
 from lcopa_bayes.loop.whitening import Whitening
 from lcopa_bayes.plant.effects.effect import Effect
 
 SIGNIFICANT = 2.7e-3
 """Two-sided p-value of three standard deviations [-]."""
+_NEAR = 0.5
+"""Expected gain of a step with which a descent by the plant's own tangents ends [nat]."""
 _DELAYS = (-0.25, -0.1)
 """Shares of a delay by which it is also started earlier, for effects that act on the drive [-]."""
 
@@ -72,9 +72,10 @@ def refit(
     """With effects added to those of `model`, each started from zero and from its linear estimate.
 
     `added` holds each effect with its coefficients over their prior sd; `quiet` [-] are the samples the
-    noise scale
-    is known from (`Scale`). The descent uses the plant's own tangents
-    first and ends with those of the whole; `near` are further coordinates to start from. ArithmeticError when no start has a bounded response.
+    noise scale is known from (`Scale`). The descent uses the plant's own tangents first, then moves the
+    effects' internal constants too (`polished`), and ends with the tangents of the whole. The evidence pays
+    for the choice among the instances that were tried. `near` are further coordinates to start from.
+    ArithmeticError when no start has a bounded response.
     """
     extended = model.having(*model.effects, *(effect for effect, _ in added))
     linear = np.concatenate([psi for _, psi in added])
@@ -84,10 +85,12 @@ def refit(
         starts += [_earlier(model, starts[0], share) for share in _DELAYS]
     starts += [near] if near is not None else []
     starts = [np.clip(start, low, high) for start in starts]  # starts only
-    quick = Regression(replace(extended, exact=False), whitening).best(starts)
-    optimum = Regression(extended, whitening).descend(quick.x, most=12, gain=0.02)
+    quick = Regression(replace(extended, exact=False), whitening).best(starts, gain=_NEAR)
+    extended, start = polished(extended, quick.x, whitening, tuple(effect.name for effect, _ in added))
+    optimum = Regression(extended, whitening).descend(start, most=12, gain=0.02)
     sides = sum(one.coefficient.one_signed for one in extended.effected.coefficients[-linear.size :])
-    evidence = log_bayes_factor(before, optimum, quiet) + sides * np.log(2.0)
+    tried = sum(np.log(len(effect.grid(extended.effected.ranges))) for effect, _ in added)
+    evidence = log_bayes_factor(before, optimum, quiet) + sides * np.log(2.0) - tried
     left_out = groups(whitening)
     gain = float(log_scores(optimum, left_out).sum() - log_scores(before, left_out).sum())
     return Refit(extended, optimum, evidence, gain, tuple(effect.name for effect, _ in added))
@@ -109,64 +112,3 @@ def _earlier(model: ExtendedModel, start: Vector, share: float) -> Vector:
         if rows[k].kind == "delay":
             out[position] += np.log1p(share) if rows[k].log_scale else share * start[position]
     return out
-
-
-def tuned(
-    model: ExtendedModel, optimum: Optimum, whitening: Whitening, traced: Traced, seen: Trace
-) -> Signature:
-    """The best instance of an effect with its internal constants moved between their grid neighbours.
-
-    Each positive constant is maximised in turn over its logarithm, by the evidence in the residual that was
-    `seen`.
-    """
-    best = traced.signatures[traced.best]
-    project = Projection(optimum.jacobian * model.spread)
-
-    def evidence(signature: Signature) -> float:
-        return float(signature.evidence(signature.span.T @ seen.residual[:, None], seen.scale)[0])
-
-    for name in constants(best.effect):
-        listed = sorted({getattr(one.effect, name) for one in traced.signatures})
-        here = getattr(best.effect, name)
-        place = listed.index(here) if here in listed else None
-        if place is None or len(listed) < 2 or listed[0] <= 0:
-            continue
-        low, high = listed[max(place - 1, 0)], listed[min(place + 1, len(listed) - 1)]
-        tried: dict[float, Signature] = {}
-        found = minimize_scalar(
-            _falling(tried, best.effect, name, evidence, model, optimum.x, whitening, project),
-            bounds=(np.log(low), np.log(high)),
-            method="bounded",
-            options={"maxiter": 10, "xatol": 1e-3},
-        )
-        better = tried.get(float(found.x))
-        if better is not None and evidence(better) > evidence(best):
-            best = better
-    return best
-
-
-def _falling(
-    tried: dict[float, Signature],
-    effect: Effect,
-    name: str,
-    evidence: Callable[[Signature], float],
-    model: ExtendedModel,
-    x: Vector,
-    whitening: Whitening,
-    project: Projection,
-) -> Callable[[float], float]:
-    def cost(log_value: float) -> float:
-        moved: Any = replace(effect, **{name: float(np.exp(log_value))})  # type: ignore[type-var]
-        try:
-            tried[float(log_value)] = signature_of(model, x, whitening, project, moved)
-        except ArithmeticError:
-            return 1e9
-        return -evidence(tried[float(log_value)])
-
-    return cost
-
-
-def constants(effect: Effect) -> list[str]:
-    """Names of the internal constants that are real numbers."""
-    listed = [field.name for field in fields(effect)]  # type: ignore[arg-type]
-    return [name for name in listed if isinstance(getattr(effect, name), float)]

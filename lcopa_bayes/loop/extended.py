@@ -13,7 +13,7 @@ from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.inference.effected import Effected, Placed, effected
 from lcopa_bayes.loop.basemodel import BaseModel
 from lcopa_bayes.loop.whitening import stacked
-from lcopa_bayes.plant.effects.effect import Effect
+from lcopa_bayes.plant.effects.effect import Effect, ForceEffect
 
 
 @final
@@ -110,13 +110,20 @@ class ExtendedModel:
         return self.predict(x), np.vstack([plant, self._coefficient_slopes(values, psi)]).T
 
     def signature(self, x: Vector, effect: Effect) -> tuple[Matrix, tuple[Placed, ...]]:
-        """Derivatives, at coordinates of this model, in the coefficients of one more effect over their
-        prior sd
-        where it vanishes, (n, k) [response unit], and what the coefficients are."""
-        more = self.having(*self.effects, effect)
-        new = more.scale.size - self.scale.size
-        values, psi = more.split(np.concatenate([x, np.zeros(new)]))
-        return more._coefficient_slopes(values, psi)[self.scale.size :].T, more.effected.coefficients[-new:]
+        """Derivatives in the coefficients of one more effect over their prior sd where it vanishes, (n, k)
+        [response unit], at coordinates of this model, and what the coefficients are.
+
+        Without the forces that depend on the response, where this model has any: they take fifty times as
+        long and change a signature little.
+        """
+        kept = tuple(e for e in self.effects if not isinstance(e, ForceEffect))
+        more = self.having(*kept, effect)
+        told, old = self.effected.coefficients, self.effected.effects
+        own = [k for k, one in enumerate(told) if old[one.effect] in kept]
+        coordinates = np.concatenate([x[: self.plant_size], x[self.plant_size :][own]])
+        new = more.scale.size - len(own)
+        values, psi = more.split(np.concatenate([coordinates, np.zeros(new)]))
+        return more._coefficient_slopes(values, psi)[len(own) :].T, more.effected.coefficients[-new:]
 
     def _coefficient_slopes(self, values: Vector, psi: Vector) -> Matrix:
         slopes = [np.moveaxis(one, 2, 0) for one in self.effected.signature(values, psi)]

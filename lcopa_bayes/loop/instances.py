@@ -1,7 +1,7 @@
-"""Internal constants of a candidate chosen by descents of the whole model, where the linear evidence misleads.
+"""Internal constants of a candidate chosen by descents of the whole model, where linear evidence misleads.
 
-Far from the base fit the plant bends to imitate what is missing (an order above 1 imitates overdrive), and the
-best frame, level or frequency beside that bent plant is not the best beside the plant as it is.
+Far from the base fit the plant bends to imitate what is missing (an order above 1 imitates overdrive), and
+the best frame, level or frequency beside that bent plant is not the best beside the plant as it is.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from lcopa_bayes.arrays import Vector
-from lcopa_bayes.loop.confirm import constants
+from lcopa_bayes.loop.constants import constants_of
 from lcopa_bayes.loop.regression import Optimum, Regression
 from lcopa_bayes.loop.scores import State
 from lcopa_bayes.loop.signature import Signature
 from lcopa_bayes.loop.trace import Trace, Traced
 from lcopa_bayes.plant.effects.effect import Effect, ForceEffect
 
-ROUGH = 3.0
+ROUGH = 5.0
 """Residual over noise beyond which the linear evidence is too rough to choose by [-]."""
 _INSTANCES = 16
 """Instances descended from, those of largest evidence [-]."""
@@ -38,8 +38,8 @@ def rough(seen: Trace) -> bool:
 def descended(state: State, seen: Trace, traced: Traced, tuned: Signature) -> tuple[Effect, Vector]:
     """The instance with the lowest cost after a short descent, and the coordinates it reached.
 
-    Its positive constants are then moved between their grid neighbours. ArithmeticError when no instance has a
-    bounded response.
+    Its positive constants are then moved between their grid neighbours. ArithmeticError when no instance has
+    a bounded response.
     """
     listed = sorted(traced.signatures, key=lambda one: -seen.alone(one))[:_INSTANCES]
     best: tuple[Effect, Optimum] | None = None
@@ -49,14 +49,14 @@ def descended(state: State, seen: Trace, traced: Traced, tuned: Signature) -> tu
             best = signature.effect, found
     if best is None:
         raise FloatingPointError(f"{traced.name}: no instance has a bounded response")
-    for name in constants(best[0]):
+    for name in constants_of(best[0]):
         best = _moved(state, best, name, sorted({getattr(one.effect, name) for one in traced.signatures}))
     return best[0], best[1].x
 
 
 def _starts(state: State, signature: Signature, seen: Trace) -> list[Vector]:
-    """Coordinates to descend from: the linear estimate, and a prior sd to either side of none, there also with
-    every order at the nearest integer."""
+    """Coordinates to descend from: the linear estimate, and a prior sd to either side of none, there also
+    with every order at the nearest integer."""
     linear = signature.amplitude(seen.residual)
     sizes = [linear, 0.3 * linear]
     starts = [np.concatenate([state.optimum.x, size]) for size in sizes]

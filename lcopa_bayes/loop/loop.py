@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, final
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.estimate import LEVEL
 from lcopa_bayes.inference.assembly import Problem
@@ -123,6 +124,13 @@ def loop(
     are drawn and ensembles are half as long. InputError when the study does not fit its records.
     """
     kinds = list(catalogue(study.effects.add, study.folder).values()) if library is None else list(library)
+    with threadpool_limits(1):  # many small products: more threads only wait for each other
+        return _looped(study, kinds, jobs=jobs, sample=sample, quick=quick, as_stated=as_stated)
+
+
+def _looped(
+    study: Study, kinds: Sequence[type[Effect]], *, jobs: int, sample: bool, quick: bool, as_stated: bool
+) -> Loop:
     draws = 200 if quick else 400
     problem, base, start, enlarged = fitted_base(study, kinds, as_stated=as_stated, draws=draws)
     before = _side(problem, start)
@@ -133,9 +141,7 @@ def loop(
         return Loop(
             problem, base, enlarged, (), (), (), verdict, before, before, not study.held_out, cautions
         )
-    searched = search(
-        start, base, kinds, np.random.default_rng([study.seed, 11]), draws=200 if quick else 400
-    )
+    searched = search(start, base, kinds, np.random.default_rng([study.seed, 11]), draws=draws)
     first, last = searched.rounds[0].trace, searched.rounds[-1].trace
     generic = max(
         (one for one in first.traced if one.card.place == "generic"),

@@ -179,21 +179,22 @@ class Regression:
             converged,
         )
 
-    def best(self, starts: Sequence[Vector], *, glance: int = 5) -> Optimum:
-        """The lowest optimum from several starts: a few steps from each, the best two taken to the end.
+    def best(self, starts: Sequence[Vector], *, glance: int = 5, gain: float = _GAIN) -> Optimum:
+        """The lowest optimum from several starts: a few steps from each, the best two taken to the end, which
+        is where a step is expected to gain less than `gain` [nat].
 
         ArithmeticError when no start has a finite response.
         """
         looked: list[Optimum] = []
         for start in starts:
             try:
-                looked.append(self.descend(start, most=glance if len(starts) > 1 else 40))
+                looked.append(self.descend(start, most=glance if len(starts) > 1 else 40, gain=gain))
             except ArithmeticError:
                 continue
         if not looked:
             raise FloatingPointError("the simulated response is not finite at any start")
         looked.sort(key=lambda one: one.cost)
-        ended = [one if one.converged else self.descend(one.x) for one in looked[:2]]
+        ended = [one if one.converged else self.descend(one.x, gain=gain) for one in looked[:2]]
         return min(ended, key=lambda one: one.cost)
 
 

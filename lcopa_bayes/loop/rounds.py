@@ -10,14 +10,15 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.loop.basefit import BaseFit, measured
-from lcopa_bayes.loop.confirm import SIGNIFICANT, Refit, log_bayes_factor, refit, tuned
+from lcopa_bayes.loop.confirm import SIGNIFICANT, Refit, log_bayes_factor, refit
+from lcopa_bayes.loop.constants import tuned
 from lcopa_bayes.loop.groups import group
 from lcopa_bayes.loop.instances import descended, rough
 from lcopa_bayes.loop.regression import Regression
 from lcopa_bayes.loop.scores import State
 from lcopa_bayes.loop.signature import Signature, pair_evidence
 from lcopa_bayes.loop.trace import Trace, Traced, trace
-from lcopa_bayes.loop.verdict import MARGIN, PART
+from lcopa_bayes.loop.verdict import MARGIN
 from lcopa_bayes.loop.whitening import Whitening
 from lcopa_bayes.plant.effects.effect import Effect
 
@@ -156,7 +157,7 @@ def leading(start: State, seen: Trace) -> float:
 
 def _accepted(made: Refit, seen: Trace) -> bool:
     generic = max((g.log_bayes_factor for g in seen.traced if g.card.place == "generic"), default=-np.inf)
-    ahead = made.log_bayes_factor > generic + max(MARGIN, PART * generic)
+    ahead = made.log_bayes_factor > generic + MARGIN
     return made.log_bayes_factor > seen.threshold and ahead and made.left_out > 0 and made.significant
 
 

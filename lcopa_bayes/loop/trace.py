@@ -22,6 +22,8 @@ from lcopa_bayes.plant.effects.effect import Card, Effect, ScatterEffect
 LEAST = 3.0
 """Log Bayes factor that an effect needs at least [nat]."""
 QUANTILE = 0.99
+LEVEL = 0.5
+"""Difference of log evidence up to which instances of an effect are level [nat]."""
 _DRAWS = 400
 _NONE = 0.5
 """Prior probability that nothing is missing [-]; the effects share the rest evenly."""
@@ -41,7 +43,7 @@ class Traced:
     log_bayes_factor: float
     """Against no effect, averaged over the instances [nat]."""
     best: int
-    """Instance with the largest evidence."""
+    """First instance within 0.5 nat of the largest evidence: effects list likely constants first."""
     failed: str = ""
     """Why it could not be simulated."""
 
@@ -178,7 +180,8 @@ def _traced(
     if not signatures:
         return Traced(kind.card, (), -np.inf, 0, failed or "it cannot be simulated")
     mean = float(logsumexp(evidence) - np.log(len(evidence)))
-    return Traced(kind.card, tuple(signatures), mean, int(np.argmax(evidence)), failed)
+    best = int(np.argmax(np.array(evidence) > max(evidence) - LEVEL))
+    return Traced(kind.card, tuple(signatures), mean, best, failed)
 
 
 def _chance(

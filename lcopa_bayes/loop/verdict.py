@@ -14,8 +14,6 @@ EXPLAINED = 0.9
 remains [-]; with the noise known well it is their share of the log evidence."""
 MARGIN = 3.0
 """Log evidence by which a generic class or another set must win [nat]."""
-PART = 0.1
-"""Share of a generic class's log evidence by which a named effect must beat it, if that is more [-]."""
 
 
 @final

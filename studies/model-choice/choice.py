@@ -9,7 +9,8 @@ to a third of itself. Records are made by the forward model itself, since the ch
 not the numerics, which the calibration studies hold against the bench. Candidates are both integer models and
 fractional ones of up to one term more than the truth (two where it is integer): a further term is seldom
 determined, and sampling it takes as long as all others. The simplest candidate that no other beats beyond
-chance in log evidence is preferred, by the rule of `compare`. Finished replicas are kept in the folder: a killed run goes on where it stopped.
+chance in log evidence is preferred, by the rule of `compare`.
+Finished replicas are kept in the folder: a killed run goes on where it stopped.
 """
 
 import argparse

@@ -63,7 +63,6 @@ def frozen() -> dict[str, Any]:
     held = {
         "explained": verdict.EXPLAINED,
         "margin": verdict.MARGIN,
-        "part": verdict.PART,
         "least": trace.LEAST,
         "quantile": trace.QUANTILE,
         "seen": trace.SEEN,

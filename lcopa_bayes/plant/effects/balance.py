@@ -31,6 +31,8 @@ _SINGULAR = 1e-3
 _LEAST = 2
 """Windows this short are iterated to the end."""
 _LONG_SWEEPS = 400
+_SHARES = (0.5, 0.2, 0.05)
+"""Steps of an iteration that would overshoot, over the way to its target [-]."""
 _RUNAWAY = 1e6
 """A response this many times its scale has run away [-]."""
 
@@ -69,6 +71,8 @@ def _solve(
         before = np.concatenate((np.zeros((y.shape[0], 2)), y[:, max(a - 2, 0) : a]), axis=1)[:, -2:]
         method = _newton if _LEAST < n <= _DENSE else _iterate
         found = method(kernel[:, :n], force, y[:, a:b].copy(), before, scale, slice(a, b))
+        if found is None and n <= _LEAST:
+            found = _relaxed(kernel[:, :n], force, y[:, a:b].copy(), before, scale, slice(a, b))
         if found is not None:
             y[:, a:b], v[:, a:b] = found
             return limit if limit > _DENSE else min(_DENSE, max(limit, 2 * n))
@@ -183,6 +187,25 @@ def _iterate(
         weights = np.linalg.lstsq(differences, last, rcond=1e-12)[0]
         mixed = points[-1] - np.stack([points[-1] - p for p in points[:-1]], axis=1) @ weights
         y = mixed.reshape(y.shape) * scale
+    return None
+
+
+def _relaxed(
+    kernel: Matrix, force: Force, history: Matrix, before: Matrix, scale: Matrix, blocks: slice
+) -> tuple[Matrix, Matrix] | None:
+    """The same for a few blocks where the force turns too steeply for `_iterate`, by shorter steps."""
+    for share in _SHARES:
+        y = history
+        for _ in range(_LONG_SWEEPS):
+            with np.errstate(over="ignore", invalid="ignore"):
+                v = force(blocks, y, *_earlier(before, y))
+                target = history + convolved(kernel, v)
+                size = float(np.abs((target - y) / scale).max())
+            if not size < _RUNAWAY:  # NaN too
+                break
+            if size < _TOLERANCE:
+                return target, v
+            y = y + share * (target - y)
     return None
 
 

@@ -13,13 +13,22 @@ from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
 
-from lcopa_bayes.plant.effects import commands, dynamics, generic, parallel, records, response, sensor
+from lcopa_bayes.plant.effects import (
+    commands,
+    crossfade,
+    dynamics,
+    generic,
+    parallel,
+    records,
+    response,
+    sensor,
+)
 from lcopa_bayes.plant.effects.effect import Card, Effect
 from lcopa_bayes.problems import InputError, nearest
 
 GROUP = "lcopa_bayes.effects"
 """Entry point group of effects in installed packages."""
-_MODULES = (commands, dynamics, parallel, response, sensor, records, generic)
+_MODULES = (commands, dynamics, parallel, crossfade, response, sensor, records, generic)
 
 
 def bundled() -> dict[str, type[Effect]]:

@@ -40,7 +40,7 @@ class OverdrivePulse(DriveEffect):
 
     @classmethod
     def grid(cls, ranges: Ranges) -> tuple[Self, ...]:
-        """Frames from two samples to six times the response time, which the pulse itself may have shortened."""
+        """Frames from two samples to six times the response time, which the pulse may have shortened."""
         longest = max(6 * ranges.speed, 8 * ranges.period)
         return tuple(cls(float(frame)) for frame in np.geomspace(2 * ranges.period, longest, 16))
 

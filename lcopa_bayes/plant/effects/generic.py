@@ -9,7 +9,8 @@ import numpy as np
 
 from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.plant.effects.effect import Card, Coefficient, ParallelEffect, Ranges, Scene, per_axis
-from lcopa_bayes.plant.effects.parallel import falling, jumps_of, relaxing, summed
+from lcopa_bayes.plant.effects.parallel import falling, relaxing
+from lcopa_bayes.plant.effects.superposition import jumps_of, summed
 
 _LAGS = 6
 _WAVES = 8

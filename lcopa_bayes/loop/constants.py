@@ -1,0 +1,151 @@
+"""Internal constants of effects, moved off the grid they were tried on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from lcopa_bayes.arrays import Vector
+from lcopa_bayes.loop.extended import ExtendedModel
+from lcopa_bayes.loop.regression import Optimum, Regression
+from lcopa_bayes.loop.scoreevidence import Projection
+from lcopa_bayes.loop.signature import Signature, signature_of
+from lcopa_bayes.loop.trace import LEVEL, Trace, Traced
+from lcopa_bayes.loop.whitening import Whitening
+from lcopa_bayes.plant.effects.effect import Effect
+
+_ROUNDS = 6
+_STEP = 1e-3
+"""Step of a constant's logarithm for its slope [-]."""
+_FAR = 0.2
+"""Largest move of a constant's logarithm in one round, and the spread that holds it back [-]."""
+_GAIN = 0.05
+"""A round that gains less is the last [nat]."""
+
+
+def polished(
+    model: ExtendedModel, x: Vector, whitening: Whitening, names: Sequence[str]
+) -> tuple[ExtendedModel, Vector]:
+    """The model with the constants of its effects `names` where the residual is smallest, and coordinates.
+
+    Gauss-Newton over coordinates and logarithms of the positive constants together, with step halving and the
+    plant's own tangents. Constants without a slope, as a number of grey levels, stay.
+    """
+    low, high = model.bounds
+    fit = Regression(replace(model, exact=False), whitening)
+    for _ in range(_ROUNDS):
+        here = fit.at(x)
+        columns, moves = [], []
+        for k, effect in enumerate(model.effects):
+            for name in constants_of(effect) if effect.name in names else ():
+                column = _slope(model, x, whitening, k, name)
+                if column is not None and column @ column > 1.0:
+                    columns.append(column)
+                    moves.append((k, name))
+        if not moves:
+            break
+        jacobian = np.column_stack([here.jacobian, *columns])
+        held = np.concatenate([1 / model.spread**2, np.full(len(moves), 1 / _FAR**2)])
+        step = np.linalg.solve(jacobian.T @ jacobian + np.diag(held), jacobian.T @ here.white)
+        step *= min(1.0, _FAR / max(float(np.abs(step[x.size :]).max()), 1e-12))
+        for share in (1.0, 0.5, 0.25, 0.1):
+            other = _moved(model, moves, share * step[x.size :])
+            new = np.clip(x + share * step[: x.size], low, high)  # a step ends where the support does
+            cost = Regression(replace(other, exact=False), whitening).cost(new)
+            if cost < here.cost:
+                break
+        else:
+            break
+        model, x = other, new
+        fit = Regression(replace(model, exact=False), whitening)
+        if here.cost - cost < _GAIN:
+            break
+    return model, x
+
+
+def _moved(model: ExtendedModel, moves: Sequence[tuple[int, str]], logs: Vector) -> ExtendedModel:
+    """The model with the logarithms of these constants moved."""
+    effects: list[Any] = list(model.effects)
+    for (k, name), change in zip(moves, logs, strict=True):
+        value = getattr(effects[k], name) * float(np.exp(change))
+        effects[k] = replace(effects[k], **{name: value})
+    return model.having(*effects)
+
+
+def _slope(model: ExtendedModel, x: Vector, whitening: Whitening, effect: int, name: str) -> Vector | None:
+    """Whitened slope of the response in a constant's logarithm, (n,) [-]; None where there is none."""
+    if not getattr(model.effects[effect], name) > 0:
+        return None
+    try:
+        up, down = (
+            _moved(model, [(effect, name)], np.array([side * _STEP])).predict(x) for side in (1.0, -1.0)
+        )
+    except ArithmeticError:
+        return None
+    slope = (up - down) / (2 * _STEP)
+    return whitening(slope) if np.isfinite(slope).all() else None
+
+
+def tuned(
+    model: ExtendedModel, optimum: Optimum, whitening: Whitening, traced: Traced, seen: Trace
+) -> Signature:
+    """The best instance of an effect with its internal constants moved between their grid neighbours.
+
+    Each positive constant is maximised in turn over its logarithm, by the evidence in the residual that was
+    `seen`.
+    """
+    best = traced.signatures[traced.best]
+    project = Projection(optimum.jacobian * model.spread)
+
+    def evidence(signature: Signature) -> float:
+        return float(signature.evidence(signature.span.T @ seen.residual[:, None], seen.scale)[0])
+
+    for name in constants_of(best.effect):
+        listed = sorted({getattr(one.effect, name) for one in traced.signatures})
+        here = getattr(best.effect, name)
+        place = listed.index(here) if here in listed else None
+        if place is None or len(listed) < 2 or listed[0] <= 0:
+            continue
+        low, high = listed[max(place - 1, 0)], listed[min(place + 1, len(listed) - 1)]
+        tried: dict[float, Signature] = {}
+        found = minimize_scalar(
+            _falling(tried, best.effect, name, evidence, model, optimum.x, whitening, project),
+            bounds=(np.log(low), np.log(high)),
+            method="bounded",
+            options={"maxiter": 10, "xatol": 1e-3},
+        )
+        better = tried.get(float(found.x))
+        if better is not None and evidence(better) > evidence(best) + LEVEL:
+            best = better
+    return best
+
+
+def _falling(
+    tried: dict[float, Signature],
+    effect: Effect,
+    name: str,
+    evidence: Callable[[Signature], float],
+    model: ExtendedModel,
+    x: Vector,
+    whitening: Whitening,
+    project: Projection,
+) -> Callable[[float], float]:
+    def cost(log_value: float) -> float:
+        moved: Any = replace(effect, **{name: float(np.exp(log_value))})  # type: ignore[type-var]
+        try:
+            tried[float(log_value)] = signature_of(model, x, whitening, project, moved)
+        except ArithmeticError:
+            return 1e9
+        return -evidence(tried[float(log_value)])
+
+    return cost
+
+
+def constants_of(effect: Effect) -> list[str]:
+    """Names of the internal constants that are real numbers."""
+    listed = [field.name for field in fields(effect)]  # type: ignore[arg-type]
+    return [name for name in listed if isinstance(getattr(effect, name), float)]
