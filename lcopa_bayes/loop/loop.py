@@ -164,9 +164,7 @@ def _looped(
             last.largest,
             last.threshold,
             last.traced[0].name if last.traced else "",
-            searched.gained / (searched.gained + last.largest)
-            if searched.gained > 0 and last.alarmed
-            else 1.0,
+            searched.share,
         )
     )
     named = verdict.kind in ("explained", "disturbance")

@@ -59,6 +59,8 @@ class Search:
     """For each effect of the state, the names it cannot be told apart from, its own first."""
     gained: float
     """Log evidence of the final model over the base model [nat]."""
+    share: float
+    """Half the residual power that the effects took, over that and what the best class left would take [-]."""
 
 
 def search(
@@ -92,18 +94,24 @@ def search(
             rounds += [Round(rounds[0].trace, (paired,), (), paired), Round(seen, (), (), None)]
     names = [effect.name for effect in state.model.effects]
     told = tuple(groups.get(name, (name,)) for name in names)
-    return Search(tuple(rounds), state, told, _gained(start, state, float(sum(counts))))
+    gained, dropped = _gained(start, state, float(sum(counts)))
+    last = rounds[-1].trace
+    left = last.scale.drop(last.largest) if last.alarmed else 0.0
+    share = dropped / (dropped + left) if dropped > 0 else float(left <= 0)
+    return Search(tuple(rounds), state, told, gained, share)
 
 
-def _gained(start: State, state: State, quiet: float) -> float:
-    """Log evidence over the base model's under one whitening, that of the final noise [nat]."""
+def _gained(start: State, state: State, quiet: float) -> tuple[float, float]:
+    """Log evidence over the base model's under one whitening, that of the final noise [nat], and the drop of
+    half the residual power [-]."""
     if not state.model.effects:
-        return 0.0
+        return 0.0, 0.0
     plain = start.optimum
     if state.whitening is not start.whitening:
         plain = Regression(start.model, state.whitening).descend(start.optimum.x)
     sides = sum(one.coefficient.one_signed for one in state.model.effected.coefficients)
-    return log_bayes_factor(plain, state.optimum, quiet) + sides * float(np.log(2.0))
+    gained = log_bayes_factor(plain, state.optimum, quiet) + sides * float(np.log(2.0))
+    return gained, plain.cost - state.optimum.cost
 
 
 def _refits(state: State, seen: Trace) -> tuple[list[Refit], list[str], dict[str, Signature]]:
@@ -195,7 +203,7 @@ def _paired(start: State, state: State, seen: Trace) -> Refit | None:
         key=lambda pair: -pair_evidence(_best(pair[0]), _best(pair[1]), seen.residual),
     )
     have = {effect.name for effect in state.model.effects}
-    bar, best = _gained(start, state, seen.scale.quiet) + MARGIN, None
+    bar, best = _gained(start, state, seen.scale.quiet)[0] + MARGIN, None
     for pair in ranked[:_PAIRS]:
         if {one.name for one in pair} <= have:
             continue

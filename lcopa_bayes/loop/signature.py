@@ -42,6 +42,11 @@ class Scale:
         whole = self.quiet + self.power
         return np.asarray(-0.5 * (self.quiet + self.freedom) * np.log1p(-2 * half_power / whole))
 
+    def drop(self, gain: float) -> float:
+        """Drop of half the residual power that is worth `gain` nat, the inverse of `gain` [-]."""
+        whole = self.quiet + float(self.power[0])
+        return float(-0.5 * whole * np.expm1(-2 * gain / (self.quiet + self.freedom)))
+
 
 @final
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,8 @@
 """Starts of a base fit: the best of many draws, far from each other.
 
 Half are drawn from the prior. The other half have integer orders and time constants between the sampling
-period and the records' length: a lightly damped plant fills too little of the prior to be met by chance.
+period and the records' length, and a few the poles of a regression: a lightly damped plant fills too little of
+the prior to be met by chance.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import numpy as np
 
 from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.loop.regressedstarts import regressed
 
 _SCREENED = 512
 """Prior draws whose misfit is looked at [-]."""
@@ -24,6 +26,8 @@ def screened(posterior: Posterior, rng: np.random.Generator, *, count: int) -> l
     table = posterior.table
     drawn = table.draw(_SCREENED, rng)
     drawn[_SCREENED // 2 :] = _classical(posterior, drawn[_SCREENED // 2 :], rng)
+    told = regressed(posterior, drawn)
+    drawn[: len(told)] = told
     for axis in range(len(table.layout.responses)):
         pooled = np.concatenate([samples.axes[axis].values for samples in posterior.samples])
         scale = _SCREEN_NOISE * (float(pooled.std()) or 1.0)

@@ -10,8 +10,8 @@ Kind = Literal["clean", "explained", "disturbance", "unexplained"]
 Confidence = Literal["firm", "tentative"]
 
 EXPLAINED = 0.9
-"""Share of all log evidence against the base model that named effects must account for when something
-significant remains [-]."""
+"""Share of the residual power that effects can take which the named ones must take when something significant
+remains [-]; with the noise known well it is their share of the log evidence."""
 MARGIN = 3.0
 """Log evidence by which a generic class or another set must win [nat]."""
 
@@ -55,7 +55,7 @@ class Found:
     """[nat]."""
     remaining_name: str
     share: float
-    """Log evidence gained over that gained and remaining [-]."""
+    """Residual power taken by the effects over that and what the best remaining class would take [-]."""
 
 
 def decide(found: Found) -> Verdict:
@@ -94,13 +94,13 @@ def decide(found: Found) -> Verdict:
         return Verdict(
             "unexplained",
             confidence,
-            f"The nearest effect ({named}) accounts for {_percent(found.share)} of the evidence against "
-            "the base model "
+            f"The nearest effect ({named}) accounts for {_percent(found.share)} of what the base model "
+            "leaves to explain, "
             f"and {found.remaining_name} remains with {found.remaining:.0f} nat: no name is forced.",
         )
     rest = (
         f" What remains is significant ({found.remaining_name}, {found.remaining:.0f} nat) but small: "
-        f"{_percent(found.share)} of the evidence against the base model is accounted for."
+        f"{_percent(found.share)} of what the base model leaves to explain is accounted for."
         if left
         else " Nothing significant remains."
     )
