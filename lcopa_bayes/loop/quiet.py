@@ -46,6 +46,12 @@ def first_change(samples: Samples) -> float:
     return float(samples.record.time[moved[0]]) if moved.size else np.inf
 
 
+def quiet_samples(record: Samples, axis: int, delay: float) -> int:
+    """Number of samples of an axis before anything can have arrived [-]; `delay` as in `quiet_pieces`."""
+    until = first_change(record) + _SAFE * delay
+    return int(np.searchsorted(record.times[record.axes[axis].index], until))
+
+
 def quiet_pieces(samples: Sequence[Samples], axis: int, delay: float) -> list[Vector]:
     """Unbroken stretches of an axis before anything can have arrived [response unit].
 
@@ -54,8 +60,7 @@ def quiet_pieces(samples: Sequence[Samples], axis: int, delay: float) -> list[Ve
     out = []
     for record in samples:
         observed = record.axes[axis]
-        until = first_change(record) + _SAFE * delay
-        count = int(np.searchsorted(record.times[observed.index], until))
+        count = quiet_samples(record, axis, delay)
         gaps = observed.gaps[:count]
         out += [observed.values[:count][piece] for piece in unbroken(gaps)] if count > 1 else []
     return [piece for piece in out if piece.size > 1]

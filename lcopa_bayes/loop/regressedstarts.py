@@ -58,7 +58,9 @@ def _poles(samples: tuple[Samples, ...], axis: int, lag: int, period: float) -> 
         y, at = observed.values, one.times[observed.index]
         drive = one.record.drive
         held = [
-            drive[np.clip(np.searchsorted(one.record.time, at - k * period * (1 - 1e-6), "right") - 1, 0, None)]
+            drive[
+                np.clip(np.searchsorted(one.record.time, at - k * period * (1 - 1e-6), "right") - 1, 0, None)
+            ]
             for k in (lag, lag + 1)
         ]
         steady = np.abs(observed.gaps - 1.0) < _EVEN

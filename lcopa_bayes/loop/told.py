@@ -47,6 +47,7 @@ def results(found: Loop) -> dict[str, Any]:
             for axis, one in zip(found.study.response_axes, found.base.noise, strict=True)
         ],
         "effects": _effects(found, chances),
+        "outliers": _outliers(found),
         "before": side(found.before, found),
         "after": side(found.after, found),
         "unseen_by": "leaving records out in turn" if found.left_out else "held-out records",
@@ -122,6 +123,13 @@ def _effects(found: Loop, chances: dict[str, float]) -> list[dict[str, Any]]:
             }
         )
     return out
+
+
+def _outliers(found: Loop) -> dict[str, Any] | None:
+    if found.outliers is None:
+        return None
+    keys = ("count", "share", "width", "log_bayes_factor", "sentence")
+    return {key: getattr(found.outliers, key) for key in keys}
 
 
 def _evidence(found: Loop) -> dict[str, Any]:

@@ -113,6 +113,12 @@ def decide(found: Found) -> Verdict:
     return Verdict("explained", confidence, f"{named} was missing, worth {found.gained:.0f} nat." + rest)
 
 
+def beside(verdict: Verdict, said: str) -> Verdict:
+    """The verdict on records with outliers, which `said` tells of: they disturb, and nothing else changes."""
+    kind: Kind = "disturbance" if verdict.kind == "clean" else verdict.kind
+    return Verdict(kind, verdict.confidence, f"{said} {verdict.sentence}")
+
+
 def _percent(share: float) -> str:
     return f"{100 * share:.0f} %"
 
