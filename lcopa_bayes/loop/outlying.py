@@ -1,7 +1,7 @@
 """Samples far outside the noise, found by their neighbours and left out before anything is traced.
 
 An effect of the device is smooth from sample to sample, a lost centroid is not. Samples are held against the
-median of the five around them; what stands out must do so as often where no signal is as where the device
+median of the four around them; what stands out must do so as often where no signal is as where the device
 moves, or it is taken for a misfit and left alone.
 """
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from scipy.ndimage import median_filter
+from numpy.lib.stride_tricks import sliding_window_view
 
 from lcopa_bayes.arrays import Flags, Vector
 from lcopa_bayes.inference.data import Samples
@@ -25,9 +25,10 @@ from lcopa_bayes.study import Study
 
 NAME = "outliers"
 """Name of the effect of the catalogue."""
-_FAR = 4.0
+_FAR = 4.5
 """Distance from the median of the neighbours, over the noise, from which a sample is an outlier [-]."""
-_AROUND = 5
+_BESIDE = 2
+"""Neighbours on either side [-]."""
 _FEWEST = 5
 """Outliers among the quiet samples from which they belong to the noise [-]."""
 _ALIKE = 3.0
@@ -55,8 +56,8 @@ class Outlying:
     def sentence(self) -> str:
         """In words."""
         return (
-            f"{self.count} samples ({100 * self.share:.2g} %) are outliers of about {self.width:.0f} times the "
-            "noise, as often where nothing moves as elsewhere; they were left out of the fit."
+            f"{self.count} samples ({100 * self.share:.2g} %) are outliers of about {self.width:.0f} times "
+            "the noise, as often where nothing moves as elsewhere; they were left out of the fit."
         )
 
 
@@ -94,8 +95,10 @@ def outlying(study: Study, fit: BaseFit) -> Outlying | None:
 
 
 def _apart(residual: Vector) -> Vector:
-    """Distance of every sample from the median of those around it."""
-    return np.asarray(residual - median_filter(residual, size=_AROUND, mode="nearest"))
+    """Distance of every sample from the median of its neighbours, two on either side."""
+    padded = np.pad(residual, _BESIDE, mode="reflect" if residual.size > _BESIDE else "edge")
+    around = sliding_window_view(padded, 2 * _BESIDE + 1)
+    return np.asarray(residual - np.median(np.delete(around, _BESIDE, axis=1), axis=1))
 
 
 def _without(samples: Samples, number: int, far: Mapping[tuple[int, int], Flags]) -> Record:

@@ -60,7 +60,8 @@ class Search:
     gained: float
     """Log evidence of the final model over the base model [nat]."""
     share: float
-    """Half the residual power that the effects took, over that and what the best class left would take [-]."""
+    """Half the residual power that the effects took, over that and what the best class left would
+    take [-]."""
 
 
 def search(
