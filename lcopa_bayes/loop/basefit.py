@@ -97,7 +97,12 @@ def measured(posterior: Posterior, residual: Vector, delay: float) -> tuple[Axis
 
 def whitening(model: BaseModel, noise: Sequence[AxisNoise]) -> Whitening:
     """The whitening operator of the fit records."""
-    return Whitening(model.posterior.samples, tuple(one.process for one in noise))
+    processes = tuple(one.process for one in noise)
+    if all(one.known for one in noise):
+        return Whitening(model.posterior.samples, processes)
+    dependence = tuple(one.dependence for one in noise)
+    coloured = tuple(one.coloured or one.process for one in noise)
+    return Whitening(model.posterior.samples, processes, dependence, coloured)
 
 
 def axis_pieces(posterior: Posterior, stacked: Vector, axis: int) -> list[Vector]:

@@ -100,7 +100,7 @@ def log_bayes_factor(before: Optimum, after: Optimum, quiet: float) -> float:
     """Laplace evidence of one model over another's under the same whitening, noise scale integrated out
     [nat]."""
     volume = (after.log_evidence + after.cost) - (before.log_evidence + before.cost)
-    known = Scale(quiet, after.white.size - after.x.size, np.array([2 * before.cost]))
+    known = Scale(quiet, after.effective - after.x.size, np.array([2 * before.cost]))
     return float(volume + known.gain(np.array([before.cost - after.cost]))[0])
 
 

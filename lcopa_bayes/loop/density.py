@@ -76,7 +76,7 @@ class LoopDensity:
         inner = columns.T @ white - pull
         power = float(white @ white - inner @ inverse @ inner)
         reference = self.quiet + 2 * self.state.optimum.cost
-        freedom = self.quiet + white.size
+        freedom = self.quiet + self.state.whitening.effective
         value = prior - 0.5 * freedom * float(np.log1p((power - 2 * self.state.optimum.cost) / reference))
         if np.isnan(value):
             raise FloatingPointError(f"the log density of the loop is NaN at {z.tolist()}")

@@ -17,6 +17,8 @@ FEWEST = 50
 """Fewer quiet samples than this know the noise scale to worse than a tenth [-]."""
 _SAFE = 0.8
 """Share of the fitted delay inside which a response is surely at rest [-]."""
+_LAGS = 2000
+"""Autocorrelations of a residual that are summed at most [-]."""
 _ALIKE = 1e-3
 """p-value below which repeats differ by more than the quiet noise [-]."""
 
@@ -32,6 +34,10 @@ class AxisNoise:
     source: str
     """One of "quiet", "repeats", "joint"."""
     sentence: str
+    dependence: float = 1.0
+    """Samples that count as one independent sample [-]; above 1 only when fitted jointly."""
+    coloured: Autoregression | None = None
+    """Coloured noise that the residual may be, from which chance is drawn when fitted jointly."""
 
     @property
     def known(self) -> bool:
@@ -123,17 +129,28 @@ def axis_noise(samples: Sequence[Samples], axis: int, delay: float, name: str) -
 
 
 def joint_noise(residual: Sequence[Vector], name: str, quiet: int) -> AxisNoise:
-    """Noise of an axis fitted together with the plant, from its residual pieces [response unit]."""
-    process = estimated(residual)
+    """Noise of an axis fitted together with the plant, from its residual pieces [response unit].
+
+    Coloured noise as free as the residual would take every slow effect for noise, and a fit whitened by it
+    predicts the next sample and not the response. So the fit weighs all samples alike, and what its residual is
+    worth as evidence is divided by ``sum_k rho_k^2``, the samples per independent one of a power (Bayley and
+    Hammersley 1946, J. R. Stat. Soc. Suppl. 8), rho_k the autocorrelations of its autoregression.
+    """
+    count = sum(piece.size for piece in residual)
+    power = sum(float(((piece - piece.mean()) ** 2).sum()) for piece in residual)
+    process = Autoregression(np.empty(0), max(float(np.sqrt(power / count)), 1e-300))
+    longest = max(piece.size for piece in residual)
+    coloured = estimated(residual)
+    covariance = coloured.autocovariance(min(longest - 1, _LAGS))
+    rho2 = (covariance[1:] / covariance[0]) ** 2
+    dependence = 1.0 + 2.0 * float(((1 - np.arange(1, rho2.size + 1) / longest) * rho2).sum())
     sentence = (
-        f"{name}: {quiet} quiet samples and no repeats are too few to know the noise ({FEWEST} are "
-        "needed), so "
-        f"AR({process.order}) noise of sd {process.sd:.3g} is fitted to the residual together with the "
-        "plant: "
-        "what it takes for noise may be an effect, so no verdict is better than tentative. Record a stretch "
-        "before the first command, or a repeat."
+        f"{name}: {quiet} quiet samples and no repeats are too few to know the noise ({FEWEST} are needed), so "
+        f"noise of sd {process.sd:.3g} is fitted to the residual together with the plant, and {count} samples "
+        f"count as {count / dependence:.0f} independent ones: what it takes for noise may be an effect, so no "
+        "verdict is better than tentative. Record a stretch before the first command, or a repeat."
     )
-    return AxisNoise(process, sum(piece.size for piece in residual), "joint", sentence)
+    return AxisNoise(process, count, "joint", sentence, dependence, coloured)
 
 
 def _power(process: Autoregression, pieces: Sequence[Vector]) -> float:

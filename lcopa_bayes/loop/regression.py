@@ -47,6 +47,8 @@ class Optimum:
     at_bound: tuple[str, ...]
     """Names of the coordinates at an end of their support."""
     converged: bool
+    effective: float
+    """Independent samples [-]."""
 
     @cached_property
     def covariance(self) -> Matrix:
@@ -177,6 +179,7 @@ class Regression:
             float(-level - 0.5 * scaled),
             tuple(name for name, close in zip(self.curve.names, near, strict=True) if close),
             converged,
+            self.whitening.effective,
         )
 
     def best(self, starts: Sequence[Vector], *, glance: int = 5, gain: float = _GAIN) -> Optimum:

@@ -9,7 +9,7 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.loop.basefit import BaseFit, measured
+from lcopa_bayes.loop.basefit import BaseFit, measured, whitening
 from lcopa_bayes.loop.confirm import SIGNIFICANT, Refit, log_bayes_factor, refit
 from lcopa_bayes.loop.constants import tuned
 from lcopa_bayes.loop.groups import group
@@ -191,9 +191,9 @@ def _settled(state: State, base: BaseFit) -> State:
     values, _ = state.model.split(state.optimum.x)
     delays = [posterior.table.at("delay", k) for k in range(len(posterior.table.layout.delays))]
     noise = measured(posterior, state.optimum.residual, min(float(values[k]) for k in delays))
-    whitening = Whitening(posterior.samples, tuple(one.process for one in noise))
-    optimum = Regression(state.model, whitening).descend(state.optimum.x, most=12, gain=0.02)
-    return State(state.model, optimum, whitening, optimum.covariance)
+    again = whitening(base.model, noise)
+    optimum = Regression(state.model, again).descend(state.optimum.x, most=12, gain=0.02)
+    return State(state.model, optimum, again, optimum.covariance)
 
 
 def _paired(start: State, state: State, seen: Trace) -> Refit | None:

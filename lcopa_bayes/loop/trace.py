@@ -124,7 +124,7 @@ def trace(
     """
     project = Projection(optimum.jacobian * model.spread)
     residual = project(optimum.settled)
-    quiet, freedom = float(sum(noise_samples)), float(residual.size - optimum.x.size)
+    quiet, freedom = float(sum(noise_samples)), whitening.effective - optimum.x.size
     scale = Scale(quiet, freedom, np.array([residual @ residual]))
     present = {effect.name for effect in model.effects}
     found: list[Traced] = []
@@ -202,7 +202,10 @@ def _chance(
     every = np.concatenate(spans, axis=1).T
     maxima = []
     for _ in range(4):
-        z = rng.standard_normal((whitening.size, draws // 4))
+        if whitening.coloured:
+            z = np.ascontiguousarray(whitening(whitening.draw(draws // 4, rng)).T)
+        else:
+            z = rng.standard_normal((whitening.size, draws // 4))
         for axis, count in enumerate(noise_samples):
             if not count:  # the residual itself gave the scale
                 continue

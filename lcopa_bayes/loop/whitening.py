@@ -54,6 +54,10 @@ class Whitening:
     samples: tuple[Samples, ...]
     noise: tuple[Autoregression, ...]
     """One per response axis."""
+    dependence: tuple[float, ...] = ()
+    """Samples that count as one independent sample, per response axis; 1 by default [-]."""
+    coloured: tuple[Autoregression, ...] = ()
+    """Noise that chance residuals are drawn from, per response axis; by default `noise`."""
 
     @cached_property
     def parts(self) -> tuple[Part, ...]:
@@ -86,7 +90,16 @@ class Whitening:
         out = np.empty_like(columns, dtype=float)
         for axis, rows in self._stretches:
             out[..., rows] = self.noise[axis].whiten(columns[..., rows])
+            if self.dependence:
+                out[..., rows] /= np.sqrt(self.dependence[axis])
         return out
+
+    @cached_property
+    def effective(self) -> float:
+        """Independent samples [-]."""
+        if not self.dependence:
+            return float(self.size)
+        return float(sum((p.rows.stop - p.rows.start) / self.dependence[p.axis] for p in self.parts))
 
     @cached_property
     def log_scale(self) -> float:
@@ -97,7 +110,7 @@ class Whitening:
 
     def draw(self, count: int, rng: np.random.Generator) -> Matrix:
         """Noise of all samples, (count, n) [response unit]."""
-        out = np.empty((count, self.size))
+        out, noise = np.empty((count, self.size)), self.coloured or self.noise
         for axis, rows in self._stretches:
-            out[:, rows] = self.noise[axis].draw(count, rows.stop - rows.start, rng)
+            out[:, rows] = noise[axis].draw(count, rows.stop - rows.start, rng)
         return out
