@@ -132,9 +132,9 @@ def joint_noise(residual: Sequence[Vector], name: str, quiet: int) -> AxisNoise:
     """Noise of an axis fitted together with the plant, from its residual pieces [response unit].
 
     Coloured noise as free as the residual would take every slow effect for noise, and a fit whitened by it
-    predicts the next sample and not the response. So the fit weighs all samples alike, and what its residual is
-    worth as evidence is divided by ``sum_k rho_k^2``, the samples per independent one of a power (Bayley and
-    Hammersley 1946, J. R. Stat. Soc. Suppl. 8), rho_k the autocorrelations of its autoregression.
+    predicts the next sample and not the response. So the fit weighs all samples alike, and what its residual
+    is worth as evidence is divided by ``sum_k rho_k^2``, the samples per independent one of a power (Bayley
+    and Hammersley 1946, J. R. Stat. Soc. Suppl. 8), rho_k the autocorrelations of its autoregression.
     """
     count = sum(piece.size for piece in residual)
     power = sum(float(((piece - piece.mean()) ** 2).sum()) for piece in residual)
@@ -145,10 +145,10 @@ def joint_noise(residual: Sequence[Vector], name: str, quiet: int) -> AxisNoise:
     rho2 = (covariance[1:] / covariance[0]) ** 2
     dependence = 1.0 + 2.0 * float(((1 - np.arange(1, rho2.size + 1) / longest) * rho2).sum())
     sentence = (
-        f"{name}: {quiet} quiet samples and no repeats are too few to know the noise ({FEWEST} are needed), so "
-        f"noise of sd {process.sd:.3g} is fitted to the residual together with the plant, and {count} samples "
-        f"count as {count / dependence:.0f} independent ones: what it takes for noise may be an effect, so no "
-        "verdict is better than tentative. Record a stretch before the first command, or a repeat."
+        f"{name}: {quiet} quiet samples and no repeats are too few to know the noise ({FEWEST} are needed), "
+        f"so noise of sd {process.sd:.3g} is fitted to the residual together with the plant, and {count} "
+        f"samples count as {count / dependence:.0f} independent ones: what it takes for noise may be an "
+        "effect, so no verdict is better than tentative. Record a stretch before the first command, or a repeat."
     )
     return AxisNoise(process, count, "joint", sentence, dependence, coloured)
 

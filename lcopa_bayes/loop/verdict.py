@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, final
@@ -12,6 +13,8 @@ Confidence = Literal["firm", "tentative"]
 EXPLAINED = 0.9
 """Share of the residual power that effects can take which the named ones must take when something significant
 remains [-]; with the noise known well it is their share of the log evidence."""
+UNSEEN = 0.5
+"""Share of the error beyond noise on held-out records that named effects may leave [-]."""
 MARGIN = 3.0
 """Log evidence by which a generic class or another set must win [nat]."""
 
@@ -56,6 +59,9 @@ class Found:
     remaining_name: str
     share: float
     """Residual power taken by the effects over that and what the best remaining class would take [-]."""
+    unseen: float = math.nan
+    """Squared error beyond noise on held-out records, with the effects over without [-]; NaN where it says
+    nothing: no such records, no such error, or effects that differ from record to record."""
 
 
 def decide(found: Found) -> Verdict:
@@ -97,6 +103,14 @@ def decide(found: Found) -> Verdict:
             f"The nearest effect ({named}) accounts for {_percent(found.share)} of what the base model "
             "leaves to explain, "
             f"and {found.remaining_name} remains with {found.remaining:.0f} nat: no name is forced.",
+        )
+    if found.unseen > UNSEEN:
+        return Verdict(
+            "unexplained",
+            confidence,
+            f"The nearest effect ({named}) takes up what the fitted records leave, but "
+            f"{_percent(found.unseen)} of the squared error beyond noise stays on the records held out: no "
+            "name is forced.",
         )
     rest = (
         f" What remains is significant ({found.remaining_name}, {found.remaining:.0f} nat) but small: "
