@@ -67,6 +67,9 @@ def base_fit(model: BaseModel, rng: np.random.Generator, *, starts: int = _START
         optimum = regression.descend(optimum.x)
         if all(one.known for one in noise) and not _delay_moved(model, optimum, delays, delay):
             break
+    for _ in range(_ROUNDS):
+        if not optimum.converged:  # damped to a standstill: start again undamped
+            optimum = regression.descend(optimum.x)
     return BaseFit(model, noise, regression, optimum, _failure(model, optimum), _cautions(noise, optimum))
 
 

@@ -148,7 +148,8 @@ def joint_noise(residual: Sequence[Vector], name: str, quiet: int) -> AxisNoise:
         f"{name}: {quiet} quiet samples and no repeats are too few to know the noise ({FEWEST} are needed), "
         f"so noise of sd {process.sd:.3g} is fitted to the residual together with the plant, and {count} "
         f"samples count as {count / dependence:.0f} independent ones: what it takes for noise may be an "
-        "effect, so no verdict is better than tentative. Record a stretch before the first command, or a repeat."
+        "effect, so no verdict is better than tentative. Record a stretch before the first command, or a "
+        "repeat."
     )
     return AxisNoise(process, count, "joint", sentence, dependence, coloured)
 
