@@ -11,6 +11,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from lcopa_bayes.arrays import Vector
+from lcopa_bayes.inference.effected import Placed
 from lcopa_bayes.loop.constants import polished
 from lcopa_bayes.loop.extended import ExtendedModel
 from lcopa_bayes.loop.leftout import groups, log_scores
@@ -42,10 +43,16 @@ class Refit:
     """Names of the effects that are new."""
 
     def wald(self, name: str) -> float:
-        """p-value of an effect's coefficients being zero at the Laplace covariance [-]."""
+        """p-value of an effect's coefficients being zero at the Laplace covariance [-].
+
+        Other coordinates held by an end of their support stay there: a delay that cannot shrink is no alias.
+        """
         where = self.places(name)
         psi = self.optimum.x[where]
-        inner = self.optimum.covariance[np.ix_(where, where)]
+        free = np.flatnonzero(~self.optimum.stuck | np.isin(np.arange(self.optimum.x.size), where))
+        at = np.searchsorted(free, where)
+        covariance = np.linalg.pinv(self.optimum.information[np.ix_(free, free)], hermitian=True)
+        inner = covariance[np.ix_(at, at)]
         return float(chi2.sf(psi @ np.linalg.solve(inner, psi), len(where)))
 
     def places(self, name: str) -> list[int]:
@@ -54,6 +61,12 @@ class Refit:
         effects = self.model.effects
         told = self.model.effected.coefficients
         return [first + k for k, one in enumerate(told) if effects[one.effect].name == name]
+
+    @property
+    def new(self) -> tuple[Placed, ...]:
+        """Coefficients of the new effects."""
+        told, effects = self.model.effected.coefficients, self.model.effects
+        return tuple(one for one in told if effects[one.effect].name in self.added)
 
     @cached_property
     def significant(self) -> bool:

@@ -99,7 +99,7 @@ def tuned(
     `seen`.
     """
     best = traced.signatures[traced.best]
-    project = Projection(optimum.jacobian * model.spread)
+    project = Projection(optimum.moving * model.spread)
 
     def evidence(signature: Signature) -> float:
         return float(signature.evidence(signature.span.T @ seen.residual[:, None], seen.scale)[0])

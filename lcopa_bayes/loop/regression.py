@@ -9,7 +9,7 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Matrix, Vector
+from lcopa_bayes.arrays import Flags, Matrix, Vector
 from lcopa_bayes.loop.basemodel import Curve
 from lcopa_bayes.loop.whitening import Whitening
 
@@ -49,6 +49,13 @@ class Optimum:
     converged: bool
     effective: float
     """Independent samples [-]."""
+    stuck: Flags
+    """Coordinates held by an end of their support against the data, (k,)."""
+
+    @property
+    def moving(self) -> Matrix:
+        """The whitened tangents, zero for coordinates that are stuck, (n, k)."""
+        return np.where(self.stuck, 0.0, self.jacobian)
 
     @cached_property
     def covariance(self) -> Matrix:
@@ -165,13 +172,14 @@ class Regression:
         mean, precision = self._prior
         slope = jacobian.T @ white - precision * (x - mean)
         information = jacobian.T @ jacobian + np.diag(1 / spread**2)
+        stuck = ((x <= low) & (slope < 0)) | ((x >= high) & (slope > 0))
         level = cost + 0.5 * white.size * _LOG_2PI + self.whitening.log_scale
         scaled = np.linalg.slogdet(information * np.outer(spread, spread))[1]
         return Optimum(
             x,
             self.whitening.observed - predicted,
             white,
-            white - jacobian @ _solved(information, slope),
+            white - jacobian @ _solved_free(information, slope, ~stuck),
             jacobian,
             tangents,
             information,
@@ -180,6 +188,7 @@ class Regression:
             tuple(name for name, close in zip(self.curve.names, near, strict=True) if close),
             converged,
             self.whitening.effective,
+            stuck,
         )
 
     def best(self, starts: Sequence[Vector], *, glance: int = 5, gain: float = _GAIN) -> Optimum:
@@ -199,6 +208,14 @@ class Regression:
         looked.sort(key=lambda one: one.cost)
         ended = [one if one.converged else self.descend(one.x, gain=gain) for one in looked[:2]]
         return min(ended, key=lambda one: one.cost)
+
+
+def _solved_free(matrix: Matrix, right: Vector, free: Flags) -> Vector:
+    """Solution for the free coordinates, zero for the others."""
+    out = np.zeros(right.size)
+    if free.any():
+        out[free] = _solved(matrix[np.ix_(free, free)], right[free])
+    return out
 
 
 def _solved(matrix: Matrix, right: Vector) -> Vector:

@@ -79,7 +79,7 @@ def search(
             rounds.append(Round(seen, (), (), None))
             break
         refits, failures, tuned_best = _refits(state, seen)
-        chosen = next((one for one in refits if _accepted(one, seen)), None)
+        chosen = _leader([one for one in refits if _accepted(one, seen)])
         rounds.append(Round(seen, tuple(refits), tuple(failures), chosen))
         if chosen is None:
             break
@@ -160,6 +160,14 @@ def _accepted(made: Refit, seen: Trace) -> bool:
     generic = max((g.log_bayes_factor for g in seen.traced if g.card.place == "generic"), default=-np.inf)
     ahead = made.log_bayes_factor > generic + MARGIN
     return made.log_bayes_factor > seen.threshold and ahead and made.left_out > 0 and made.significant
+
+
+def _leader(accepted: Sequence[Refit]) -> Refit | None:
+    """The refit of largest evidence; of those level with it the first whose coefficients all records share, since
+    one of a single record predicts no other."""
+    level = [one for one in accepted if one.log_bayes_factor > accepted[0].log_bayes_factor - MARGIN]
+    shared = (one for one in level if not any(c.record is not None for c in one.new))
+    return next(shared, accepted[0] if accepted else None)
 
 
 def _state(made: Refit, whitening: Whitening) -> State:

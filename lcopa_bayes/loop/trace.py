@@ -122,7 +122,7 @@ def trace(
     `noise_samples`: samples each axis' noise was known from; the scale of a chance residual is uncertain by
     as much. Effects the model already has are left out.
     """
-    project = Projection(optimum.jacobian * model.spread)
+    project = Projection(optimum.moving * model.spread)
     residual = project(optimum.settled)
     quiet, freedom = float(sum(noise_samples)), whitening.effective - optimum.x.size
     scale = Scale(quiet, freedom, np.array([residual @ residual]))

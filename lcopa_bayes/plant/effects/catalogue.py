@@ -14,6 +14,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from lcopa_bayes.plant.effects import (
+    acquisition,
     commands,
     crossfade,
     dynamics,
@@ -28,7 +29,7 @@ from lcopa_bayes.problems import InputError, nearest
 
 GROUP = "lcopa_bayes.effects"
 """Entry point group of effects in installed packages."""
-_MODULES = (commands, dynamics, parallel, crossfade, response, sensor, records, generic)
+_MODULES = (acquisition, commands, dynamics, parallel, crossfade, response, sensor, records, generic)
 
 
 def bundled() -> dict[str, type[Effect]]:

@@ -117,10 +117,10 @@ class Overflow(ForceEffect):
 
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
         """s and k [-]."""
-        return (*single("s", 0.3), *single("k", 1.0, one_signed=True))
+        return (*single("s", 0.3, one_signed=True), *single("k", 1.0, one_signed=True))
 
     def force(self, f: Matrix, y: Matrix, rate: Matrix, scene: Scene, psi: Vector) -> Matrix:
-        """Pointwise; NaN, and hence unstable, where s < 0 leaves no square root."""
+        """Pointwise."""
         part = np.abs(y) / scene.ranges.column
         loss = 2.0 * y / (1.0 + np.sqrt(1.0 + 2.0 * psi[0] * part))
         beyond = scene.ranges.column * np.maximum(part - self.level, 0.0) * np.sign(y)
