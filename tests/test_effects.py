@@ -41,7 +41,7 @@ NAMES = [
     "bilinear_crosstalk", "axis_rotation", "sensor_lag", "exposure", "clipping", "centroid_locking",
     "clock_skew", "viscosity_drift", "gain_drift", "pointing_offset", "pointing_drift",
     "trigger_jitter", "vibration", "flicker", "outliers", "overflow", "unmodelled_linear",
-    "unmodelled_smooth", "unmodelled_nonlinear",
+    "unmodelled_smooth", "unmodelled_nonlinear", "sampled_drive",
 ]  # fmt: skip
 ALL = bundled()
 
