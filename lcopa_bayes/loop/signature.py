@@ -101,7 +101,7 @@ class Signature:
         """Cosine of the smallest angle between the spans [-]; 0 when either is empty."""
         if 0 in (self.scale.size, other.scale.size):
             return 0.0
-        return float(min(np.linalg.norm(self.span.T @ other.span, 2), 1.0))
+        return float(min(np.linalg.svd(self.span.T @ other.span, compute_uv=False).max(), 1.0))
 
     def amplitude(self, residual: Vector) -> Vector:
         """Posterior mean of the coefficients over their prior sd; the normal part of a one-signed one."""
