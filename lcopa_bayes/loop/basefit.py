@@ -17,7 +17,7 @@ from lcopa_bayes.loop.regression import Optimum, Regression
 from lcopa_bayes.loop.starts import screened
 from lcopa_bayes.loop.whitening import Whitening
 
-_STARTS = 3
+_STARTS = 8
 _DELAYS = (0.7, 0.85, 1.15, 1.3)
 """Factors on the fitted delays from which the descent is started again: delays can jump [-]."""
 _EXPLAINED = 0.5
