@@ -1,4 +1,4 @@
-"""What a fit says of samples it is not shown: each record, or each block of a single one, left out in turn.
+"""What a fit says of samples it is not shown: each record, or each fifth of a single one, left out in turn.
 
 Closed form of the linearised model. With whitened residual r and tangents J at the optimum, information
 ``H = J' J + prior`` and group k, the optimum without the group is one Gauss-Newton step away,
@@ -17,8 +17,10 @@ from lcopa_bayes.arrays import Index, Matrix, Vector
 from lcopa_bayes.loop.regression import Optimum
 from lcopa_bayes.loop.whitening import Whitening
 
-BLOCKS = 5
-"""Blocks a single record is cut into [-]."""
+PARTS = 5
+"""Parts of a single record that are left out in turn [-]."""
+_STRETCHES = 10
+"""Stretches of successive samples in each part [-]."""
 
 
 @final
@@ -32,7 +34,10 @@ class Group:
 
 
 def groups(whitening: Whitening) -> tuple[Group, ...]:
-    """One per record; a single record is cut into five blocks of successive samples, all axes alike."""
+    """One per record; of a single record every fifth of 50 stretches of successive samples, all axes alike.
+
+    One fifth in one piece would take away the only step of a record, and nothing predicts a step not seen.
+    """
     records = {part.record for part in whitening.parts if part.rows.stop > part.rows.start}
     if len(records) > 1:
         return tuple(
@@ -45,9 +50,13 @@ def groups(whitening: Whitening) -> tuple[Group, ...]:
             for r in sorted(records)
         )
     blocks = []
-    for k in range(BLOCKS):
-        rows = [np.array_split(np.arange(p.rows.start, p.rows.stop), BLOCKS)[k] for p in whitening.parts]
-        blocks.append(Group(f"block {k + 1} of {BLOCKS}", np.concatenate(rows)))
+    for k in range(PARTS):
+        rows = [
+            stretch
+            for p in whitening.parts
+            for stretch in np.array_split(np.arange(p.rows.start, p.rows.stop), PARTS * _STRETCHES)[k::PARTS]
+        ]
+        blocks.append(Group(f"part {k + 1} of {PARTS}", np.concatenate(rows)))
     return tuple(blocks)
 
 
