@@ -35,6 +35,12 @@ def rough(seen: Trace) -> bool:
     return float(np.mean(seen.residual**2)) > ROUGH**2
 
 
+def movable(traced: Traced) -> bool:
+    """Whether there are instances to choose from that take no iteration to simulate: a refit has several starts of
+    its own."""
+    return len(traced.signatures) > 1 and not isinstance(traced.signatures[0].effect, ForceEffect)
+
+
 def descended(state: State, seen: Trace, traced: Traced, tuned: Signature) -> tuple[Effect, Vector]:
     """The instance with the lowest cost after a short descent, and the coordinates it reached.
 
@@ -72,7 +78,7 @@ def _starts(state: State, signature: Signature, seen: Trace) -> list[Vector]:
 
 def _descent(state: State, effect: Effect, starts: list[Vector]) -> Optimum | None:
     model = state.model.having(*state.model.effects, effect)
-    curve = Regression(replace(model, exact=not isinstance(effect, ForceEffect)), state.whitening)
+    curve = Regression(model, state.whitening)
     low, high = model.bounds
     found: list[Optimum] = []
     for start in starts:

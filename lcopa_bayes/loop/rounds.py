@@ -13,7 +13,7 @@ from lcopa_bayes.loop.basefit import BaseFit, measured, whitening
 from lcopa_bayes.loop.confirm import SIGNIFICANT, Refit, log_bayes_factor, refit
 from lcopa_bayes.loop.constants import tuned
 from lcopa_bayes.loop.groups import group
-from lcopa_bayes.loop.instances import descended, rough
+from lcopa_bayes.loop.instances import descended, movable, rough
 from lcopa_bayes.loop.regression import Regression
 from lcopa_bayes.loop.scores import State
 from lcopa_bayes.loop.signature import Signature, pair_evidence
@@ -131,7 +131,7 @@ def _refits(state: State, seen: Trace) -> tuple[list[Refit], list[str], dict[str
         signature = signatures[name]
         try:
             effect, amplitude, reached_at = signature.effect, signature.amplitude(seen.residual), None
-            if far:
+            if far and movable(seen.of(name)):
                 effect, reached_at = descended(state, seen, seen.of(name), signature)
                 amplitude = reached_at[state.optimum.x.size :]
             done.append(
