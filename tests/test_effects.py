@@ -41,7 +41,7 @@ NAMES = [
     "bilinear_crosstalk", "axis_rotation", "sensor_lag", "exposure", "clipping", "centroid_locking",
     "sampled_drive", "clock_skew", "viscosity_drift", "gain_drift", "pointing_offset", "pointing_drift",
     "trigger_jitter", "vibration", "flicker", "outliers", "overflow", "unmodelled_linear",
-    "unmodelled_smooth", "unmodelled_nonlinear",
+    "unmodelled_smooth", "unmodelled_nonlinear", "sampled_drive",
 ]  # fmt: skip
 ALL = bundled()
 
@@ -133,6 +133,34 @@ def test_signature_is_the_slope(name: str):
     size = max(float(np.abs(s @ scales(made)).max()) for s in signature)
     assert left[2] < 0.02 * 0.01 * size + 2e-3 * 0.01 + 1e-12
     assert left[2] < 0.75 * left[0] or left[0] < 1e-9
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if ALL[name].linear])
+def test_a_linear_effect_is_proportional_to_its_coefficients(name: str):
+    """What one difference for a slope rests on."""
+    made = middle(name)
+    psi, here = scales(made), made.responses(VALUES, made.vanishing)
+    once, twice = made.responses(VALUES, psi), made.responses(VALUES, 2 * psi)
+    size = max(float(np.abs(b - a).max()) for a, b in zip(here, once, strict=True))
+    left = [c - 2 * b + a for a, b, c in zip(here, once, twice, strict=True)]
+    assert max(float(np.abs(one).max()) for one in left) < 1e-8 * max(size, 1e-3)
+
+
+def test_axes_of_one_unit_share_their_scales():
+    """Drives of 1 and 0.8 and a device twice as long the other way: a coefficient means the same on both."""
+    ranges = BASE.ranges
+    assert ranges.drive[0] == ranges.drive[1] == 1.0
+    gains = [abs(VALUES[BASE.table.at("gain", k, k)]) for k in (0, 1)]
+    assert ranges.response[1] / ranges.response[0] == pytest.approx(gains[1] / gains[0])
+    assert ranges.period == pytest.approx(0.1, rel=1e-9)
+
+
+def test_grey_levels_are_those_of_one_driver():
+    """Both axes step by a sixteenth of the larger drive, at full strength."""
+    made = BASE.with_effects([ALL["grey_quantisation"](16.0)])
+    scene = made.simulator.scenes(made.plant(VALUES), np.array([1.0]))[0]
+    for drive in scene.drives:
+        assert np.allclose(16 * drive.values, np.round(16 * drive.values), atol=1e-9)
 
 
 @pytest.mark.parametrize("name", sorted(set(NAMES) - {"outliers", "grey_quantisation", "unmodelled_smooth"}))

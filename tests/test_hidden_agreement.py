@@ -131,6 +131,7 @@ def test_another_size_is_seen(name: str):
 def test_nearly_every_effect_is_covered():
     assert set(bundled()) - set(SHARED) == NO_MEAN | {
         "pointing_drift",
+        "sampled_drive",
         "unmodelled_linear",
         "unmodelled_smooth",
         "unmodelled_nonlinear",

@@ -243,6 +243,8 @@ FOUND = Found("", (), True, 50.0, 3.0, ("a",), (), 48.0, 20.0, "smooth", 1.0, 3.
         ({"remaining": 4.0, "share": 0.95}, "explained"),
         ({"remaining": 40.0, "share": 0.95, "generic": 90.0}, "unexplained"),
         ({"failed": "the base fit did not converge"}, "unexplained"),
+        ({"unseen": 0.2}, "explained"),
+        ({"unseen": 0.8}, "unexplained"),
     ],
 )
 def test_the_verdict_follows_from_what_was_found(change, kind):

@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal
 
 from lcopa_bayes.loop.autoregression import Autoregression, estimated, unbroken
 from lcopa_bayes.loop.scatter import scatter_evidence
-from lcopa_bayes.loop.scoreevidence import Projection, cosine, log_bayes_factors, survival
+from lcopa_bayes.loop.scoreevidence import Projection, log_bayes_factors, survival
 from lcopa_bayes.loop.signature import Scale, Signature
 from lcopa_bayes.plant.effects.catalogue import catalogue
 
@@ -84,11 +84,19 @@ def test_what_the_base_model_imitates_does_not_survive():
     inside, outside = tangents[:, :1] * 1e-6, np.eye(20)[:, :1]
     assert survival(inside, project(inside)) < 1e-5
     assert survival(outside, project(outside)) > 0.5
-    assert cosine(inside, tangents) == pytest.approx(1.0)
 
 
 def _signature(columns, one_signed=False):
     return Signature.of(next(iter(catalogue().values())).__new__, columns, 1.0, one_signed)
+
+
+def test_angles_between_signatures():
+    axes = np.eye(6)
+    first, both, apart = _signature(axes[:, :1]), _signature(axes[:, :2]), _signature(axes[:, 3:4])
+    tilted = _signature(3.0 * (axes[:, :1] + axes[:, 3:4]))
+    assert first.cosine(both) == pytest.approx(1.0)
+    assert first.cosine(apart) == pytest.approx(0.0, abs=1e-6)
+    assert first.cosine(tilted) == apart.cosine(tilted) == pytest.approx(np.sqrt(0.5), rel=1e-6)
 
 
 def test_known_noise_scale_gives_the_plain_evidence():

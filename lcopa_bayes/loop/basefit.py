@@ -17,7 +17,7 @@ from lcopa_bayes.loop.regression import Optimum, Regression
 from lcopa_bayes.loop.starts import screened
 from lcopa_bayes.loop.whitening import Whitening
 
-_STARTS = 3
+_STARTS = 8
 _DELAYS = (0.7, 0.85, 1.15, 1.3)
 """Factors on the fitted delays from which the descent is started again: delays can jump [-]."""
 _EXPLAINED = 0.5
@@ -67,6 +67,9 @@ def base_fit(model: BaseModel, rng: np.random.Generator, *, starts: int = _START
         optimum = regression.descend(optimum.x)
         if all(one.known for one in noise) and not _delay_moved(model, optimum, delays, delay):
             break
+    for _ in range(_ROUNDS):
+        if not optimum.converged:  # damped to a standstill: start again undamped
+            optimum = regression.descend(optimum.x)
     return BaseFit(model, noise, regression, optimum, _failure(model, optimum), _cautions(noise, optimum))
 
 

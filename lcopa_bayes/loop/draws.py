@@ -23,6 +23,8 @@ from lcopa_bayes.plant.effects.simulator import UPSTREAM
 ENSEMBLES = 4
 _FREEDOM = 12
 """Degrees of freedom of the jump's t distribution [-]: heavier tails than any posterior it is used on."""
+_JUMPS = 0.8
+"""Share of the steps that jump by the approximation [-]."""
 _BURN = 0.3
 """Share of the steps that is discarded [-]."""
 _STEPS = 120
@@ -123,15 +125,15 @@ def _ensemble(task: tuple[LoopDensity, int, int, int]) -> tuple[Array, float]:
     random = np.random.RandomState(np.random.MT19937(np.random.SeedSequence([seed, 20, number])))
     walkers = 2 * centre.size + 2
     start = _started(density, centre, covariance, walkers, random)
-    moves = [(emcee.moves.MHMove(_jump(centre, covariance)), 0.6), (emcee.moves.DEMove(), 0.25)]
-    moves.append((emcee.moves.StretchMove(), 0.15))
+    moves = [(emcee.moves.MHMove(_jump(centre, covariance)), _JUMPS), (emcee.moves.DEMove(), 0.15)]
+    moves.append((emcee.moves.StretchMove(), 0.85 - _JUMPS))
     burn = int(_BURN * steps)
     first = emcee.EnsembleSampler(walkers, centre.size, density, moves=moves)
     first.random_state = random.get_state()
     reached = first.run_mcmc(start, burn, skip_initial_state_check=True)
     learnt = first.get_chain(discard=burn // 2, flat=True)
     # jumps learnt from what is discarded are fixed from here on, so the kept draws are of one Markov chain
-    moves[0] = (emcee.moves.MHMove(_jump(learnt.mean(axis=0), np.cov(learnt.T))), 0.6)
+    moves[0] = (emcee.moves.MHMove(_jump(learnt.mean(axis=0), np.cov(learnt.T))), _JUMPS)
     sampler = emcee.EnsembleSampler(walkers, centre.size, density, moves=moves)
     sampler.random_state = reached.random_state
     sampler.run_mcmc(reached, steps - burn, skip_initial_state_check=True)

@@ -15,16 +15,20 @@ from lcopa_bayes.inference.grade import Grade
 from lcopa_bayes.loop.basefit import BaseFit
 from lcopa_bayes.loop.density import LoopDensity
 from lcopa_bayes.loop.draws import LoopDraws, sample_loop, unit_of
+from lcopa_bayes.loop.outlying import NAME as OUTLIERS
+from lcopa_bayes.loop.outlying import Outlying, outlying
 from lcopa_bayes.loop.rounds import Round, search
 from lcopa_bayes.loop.scores import Score, State, fit_scores, held_out_scores, left_out_scores
 from lcopa_bayes.loop.terms import fitted_base
 from lcopa_bayes.loop.trace import Trace
-from lcopa_bayes.loop.verdict import Found, Verdict, decide
+from lcopa_bayes.loop.verdict import Found, Verdict, beside, decide
 from lcopa_bayes.loop.widening import Widening
 from lcopa_bayes.plant.effects.catalogue import catalogue
 from lcopa_bayes.plant.effects.effect import Effect
 from lcopa_bayes.study import Study
 
+_SEEN = 5.0
+"""Standard deviations of a chance sum of squares that error beyond noise must exceed to be judged [-]."""
 Z90 = 1.6448536269514722
 """Half width of a central 90 % interval of a normal distribution [sd]."""
 
@@ -66,6 +70,13 @@ class Loop:
     """What limits the verdict."""
     draws: LoopDraws | None = None
     """Draws of base plus effects; None when none were asked for."""
+    outliers: Outlying | None = None
+    """Samples left out before anything was traced; None without any."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What is named: the effects, and outliers."""
+        return (*(e.name for e in self.effects), *([OUTLIERS] if self.outliers else []))
 
     @property
     def grade(self) -> Grade:
@@ -133,13 +144,18 @@ def _looped(
 ) -> Loop:
     draws = 200 if quick else 400
     problem, base, start, enlarged = fitted_base(study, kinds, as_stated=as_stated, draws=draws)
+    outliers = outlying(study, base)
+    if outliers is not None:
+        study, kinds = outliers.study, [kind for kind in kinds if kind.card.name != OUTLIERS]
+        problem, base, start, enlarged = fitted_base(study, kinds, as_stated=as_stated, draws=draws)
     before = _side(problem, start)
     cautions = (*base.caution, *_alone(study))
     if base.failed:
         found = Found(base.failed, cautions, False, np.nan, np.nan, (), (), 0, 0, "", 0, 0, "", np.nan)
         verdict = decide(found)
         return Loop(
-            problem, base, enlarged, (), (), (), verdict, before, before, not study.held_out, cautions
+            *(problem, base, enlarged, (), (), (), verdict, before, before, not study.held_out, cautions),
+            outliers=outliers,
         )
     searched = search(start, base, kinds, np.random.default_rng([study.seed, 11]), draws=draws)
     first, last = searched.rounds[0].trace, searched.rounds[-1].trace
@@ -148,6 +164,7 @@ def _looped(
         key=lambda one: one.log_bayes_factor,
         default=None,
     )
+    after = _side(problem, searched.state)
     names = tuple(effect.name for effect in searched.state.model.effects)
     verdict = decide(
         Found(
@@ -165,8 +182,11 @@ def _looped(
             last.threshold,
             last.traced[0].name if last.traced else "",
             searched.share,
+            _beyond(before.unseen, after.unseen, searched.state) if study.held_out else np.nan,
         )
     )
+    if outliers is not None:
+        verdict = beside(verdict, outliers.sentence)
     named = verdict.kind in ("explained", "disturbance")
     last_state, sampled = searched.state if named else start, None
     if verdict.kind == "unexplained":
@@ -189,7 +209,20 @@ def _looped(
         not study.held_out,
         cautions,
         sampled,
+        outliers,
     )
+
+
+def _beyond(before: Sequence[Score], after: Sequence[Score], state: State) -> float:
+    """See `Found.unseen`."""
+    if any(effect.card.per_record for effect in state.model.effects):
+        return np.nan
+    counts = np.array([score.time.size for score in before], dtype=float)
+    was, now = (
+        float(counts @ [(score.rmse / score.noise_sd) ** 2 - 1 for score in scores])
+        for scores in (before, after)
+    )
+    return now / was if was > _SEEN * np.sqrt(2 * counts.sum()) else np.nan
 
 
 def _alone(study: Study) -> tuple[str, ...]:

@@ -52,6 +52,12 @@ def first_change(samples: Samples) -> float:
     return float(samples.record.time[moved[0]]) if moved.size else np.inf
 
 
+def quiet_samples(record: Samples, axis: int, delay: float) -> int:
+    """Number of samples of an axis before anything can have arrived [-]; `delay` as in `quiet_pieces`."""
+    until = first_change(record) + _SAFE * delay
+    return int(np.searchsorted(record.times[record.axes[axis].index], until))
+
+
 def quiet_pieces(samples: Sequence[Samples], axis: int, delay: float) -> list[Vector]:
     """Unbroken stretches of an axis before anything can have arrived [response unit].
 
@@ -60,8 +66,7 @@ def quiet_pieces(samples: Sequence[Samples], axis: int, delay: float) -> list[Ve
     out = []
     for record in samples:
         observed = record.axes[axis]
-        until = first_change(record) + _SAFE * delay
-        count = int(np.searchsorted(record.times[observed.index], until))
+        count = quiet_samples(record, axis, delay)
         gaps = observed.gaps[:count]
         out += [observed.values[:count][piece] for piece in unbroken(gaps)] if count > 1 else []
     return [piece for piece in out if piece.size > 1]
@@ -127,9 +132,9 @@ def joint_noise(residual: Sequence[Vector], name: str, quiet: int) -> AxisNoise:
     """Noise of an axis fitted together with the plant, from its residual pieces [response unit].
 
     Coloured noise as free as the residual would take every slow effect for noise, and a fit whitened by it
-    predicts the next sample and not the response. So the fit weighs all samples alike, and what its residual is
-    worth as evidence is divided by ``sum_k rho_k^2``, the samples per independent one of a power (Bayley and
-    Hammersley 1946, J. R. Stat. Soc. Suppl. 8), rho_k the autocorrelations of its autoregression.
+    predicts the next sample and not the response. So the fit weighs all samples alike, and what its residual
+    is worth as evidence is divided by ``sum_k rho_k^2``, the samples per independent one of a power (Bayley
+    and Hammersley 1946, J. R. Stat. Soc. Suppl. 8), rho_k the autocorrelations of its autoregression.
     """
     count = sum(piece.size for piece in residual)
     power = sum(float(((piece - piece.mean()) ** 2).sum()) for piece in residual)
@@ -140,10 +145,11 @@ def joint_noise(residual: Sequence[Vector], name: str, quiet: int) -> AxisNoise:
     rho2 = (covariance[1:] / covariance[0]) ** 2
     dependence = 1.0 + 2.0 * float(((1 - np.arange(1, rho2.size + 1) / longest) * rho2).sum())
     sentence = (
-        f"{name}: {quiet} quiet samples and no repeats are too few to know the noise ({FEWEST} are needed), so "
-        f"noise of sd {process.sd:.3g} is fitted to the residual together with the plant, and {count} samples "
-        f"count as {count / dependence:.0f} independent ones: what it takes for noise may be an effect, so no "
-        "verdict is better than tentative. Record a stretch before the first command, or a repeat."
+        f"{name}: {quiet} quiet samples and no repeats are too few to know the noise ({FEWEST} are needed), "
+        f"so noise of sd {process.sd:.3g} is fitted to the residual together with the plant, and {count} "
+        f"samples count as {count / dependence:.0f} independent ones: what it takes for noise may be an "
+        "effect, so no verdict is better than tentative. Record a stretch before the first command, or a "
+        "repeat."
     )
     return AxisNoise(process, count, "joint", sentence, dependence, coloured)
 

@@ -1,8 +1,9 @@
 """Starts from a linear regression of the samples on their own past: where a lightly damped plant resonates.
 
-``y_t = a1 y_(t-1) + a2 y_(t-2) + sum_j (b0_j u_j(t-l) + b1_j u_j(t-l-1)) + c`` is fitted by least squares for lags l
-of a few sampling periods; the roots z of ``z^2 - a1 z - a2`` are poles ``log(z) / period`` of the continuous plant.
-Noise pulls such poles towards damping (Ljung 1999, System Identification, ch. 7): good for a start, not for a fit.
+``y_t = a1 y_(t-1) + a2 y_(t-2) + sum_j (b0_j u_j(t-l) + b1_j u_j(t-l-1)) + c`` is fitted by least squares
+for lags l of a few sampling periods; the roots z of ``z^2 - a1 z - a2`` are poles ``log(z) / period`` of the
+continuous plant. Noise pulls such poles towards damping (Ljung 1999, System Identification, ch. 7): good for
+a start, not for a fit.
 """
 
 from __future__ import annotations

@@ -60,7 +60,8 @@ class Search:
     gained: float
     """Log evidence of the final model over the base model [nat]."""
     share: float
-    """Half the residual power that the effects took, over that and what the best class left would take [-]."""
+    """Half the residual power that the effects took, over that and what the best class left would
+    take [-]."""
 
 
 def search(
@@ -162,8 +163,8 @@ def _accepted(made: Refit, seen: Trace) -> bool:
 
 
 def _leader(accepted: Sequence[Refit]) -> Refit | None:
-    """The refit of largest evidence; of those level with it the first whose coefficients all records share, since
-    one of a single record predicts no other."""
+    """The refit of largest evidence; of those level with it the first whose coefficients all records share,
+    since one of a single record predicts no other."""
     level = [one for one in accepted if one.log_bayes_factor > accepted[0].log_bayes_factor - MARGIN]
     shared = (one for one in level if not any(c.record is not None for c in one.new))
     return next(shared, accepted[0] if accepted else None)

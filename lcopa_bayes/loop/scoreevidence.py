@@ -55,14 +55,3 @@ def log_bayes_factors(signature: Matrix, residuals: Matrix) -> Vector:
     inner = left.T @ residuals
     gain = 0.5 * np.einsum("k,kd->d", power / (1.0 + power), inner**2)
     return np.asarray(gain - 0.5 * np.log1p(power).sum())
-
-
-def cosine(first: Matrix, second: Matrix) -> float:
-    """Cosine of the smallest angle between the spans [-]; 0 when either vanishes."""
-    spans = []
-    for columns in (first, second):
-        left, scale, _ = np.linalg.svd(columns, full_matrices=False)
-        spans.append(left[:, scale > _RANK * max(float(scale.max(initial=0.0)), 1e-300)])
-    if 0 in (spans[0].shape[1], spans[1].shape[1]):
-        return 0.0
-    return float(min(np.linalg.svd(spans[0].T @ spans[1], compute_uv=False).max(), 1.0))

@@ -97,6 +97,12 @@ class Signature:
             gain = gain + np.log(2) + log_ndtr(sign * scale[0] * inner[0] / np.sqrt(1 + power[0]))
         return np.asarray(gain)
 
+    def cosine(self, other: Signature) -> float:
+        """Cosine of the smallest angle between the spans [-]; 0 when either is empty."""
+        if 0 in (self.scale.size, other.scale.size):
+            return 0.0
+        return float(min(np.linalg.svd(self.span.T @ other.span, compute_uv=False).max(), 1.0))
+
     def amplitude(self, residual: Vector) -> Vector:
         """Posterior mean of the coefficients over their prior sd; the normal part of a one-signed one."""
         weight = self.scale / (1 + self.scale**2)

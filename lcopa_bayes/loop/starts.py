@@ -1,8 +1,8 @@
 """Starts of a base fit: the best of many draws, far from each other.
 
 Half are drawn from the prior. The other half have integer orders and time constants between the sampling
-period and the records' length, and a few the poles of a regression: a lightly damped plant fills too little of
-the prior to be met by chance.
+period and the records' length, and a few the poles of a regression: a lightly damped plant fills too little
+of the prior to be met by chance.
 """
 
 from __future__ import annotations

@@ -48,58 +48,62 @@ def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: boo
 
     A plant with too few terms is no undeclared effect, and would be named as one; one with a term too many
     may imitate an effect. So a further term is a candidate like any other: it is added when it is worth more
-    than the best named effect.
+    than the best named effect, or more together with what it leaves to be named.
     """
-    problem = problem_of(study)
-    fit = base_fit(BaseModel(problem.posterior), np.random.default_rng([study.seed, 10]))
-    later, said = _later(study, fit), ""
+    base = _based(study)
+    later = _later(study, base.fit)
     if later is not None:
         study, said = later
-        problem = problem_of(study)
-        fit = base_fit(BaseModel(problem.posterior), np.random.default_rng([study.seed, 10]))
-    base = Base(problem, fit, _start(fit, study), said)
+        base = _based(study)._replace(sentence=said)
     if as_stated or study.model.terms != 1 or study.model.orders != "free":
         return base
     for terms in range(2, _MOST + 1):
-        larger = problem_of(replace(study, model=replace(study.model, terms=terms)))
         try:
-            other = base_fit(BaseModel(larger.posterior), np.random.default_rng([study.seed, 10, terms]))
+            wider = _based(replace(study, model=replace(study.model, terms=terms)), terms)
         except ArithmeticError:
             break
-        quiet = float(sum(one.samples for one in other.noise if one.known))
-        same = Regression(base.fit.model, other.regression.whitening).descend(base.fit.optimum.x)
-        gain = log_bayes_factor(same, other.optimum, quiet)
-        if base.fit.failed and terms < _MOST and (other.failed or not gain > _GAIN):
-            continue
-        if other.failed or not gain > _GAIN:
+        gain = _gain(base, wider)
+        if wider.fit.failed or not gain > _GAIN:
+            if base.fit.failed:
+                continue
             break
         if base.fit.failed:
             told = f"The base model has {terms} viscous terms, because with fewer {base.fit.failed}."
-            base = Base(larger, other, _start(other, study), " ".join([said, told]).strip())
-            continue
-        state, noise = base.start, base.fit.noise
-        counts = [one.samples if one.known else 0 for one in noise]
-        rng = np.random.default_rng([study.seed, 12, terms])
-        seen = trace(
-            state.model, state.optimum, state.whitening, library, rng, noise_samples=counts, draws=draws
-        )
-        named = leading(state, seen) if seen.alarmed else 0.0
-        if named >= gain:
-            after = trace(
-                (wider := _start(other, study)).model,
-                wider.optimum,
-                wider.whitening,
-                library,
-                rng,
-                noise_samples=[one.samples if one.known else 0 for one in other.noise],
-                draws=draws,
-            )
-            if not gain + (leading(wider, after) if after.alarmed else 0.0) > named + _GAIN:
+        else:
+            rng = np.random.default_rng([study.seed, 12, terms])
+            named = _named(base, library, rng, draws)
+            if named >= gain and not gain + _named(wider, library, rng, draws) > named + _GAIN:
                 break
-        told = f"The base model has {terms} viscous terms: one more than {terms - 1} is worth {gain:.0f} nat"
-        told = f"{told}, with the effects that each leaves to be named."
-        base = Base(larger, other, _start(other, study), " ".join([said, told]).strip())
+            told = (
+                f"The base model has {terms} viscous terms: one more than {terms - 1} is worth {gain:.0f} "
+                "nat, with the effects that each leaves to be named."
+            )
+        base = wider._replace(sentence=f"{base.sentence} {told}".strip())
     return base
+
+
+def _based(study: Study, *key: int) -> Base:
+    """A study's base fit as it stands; `key` tells its random numbers from others'."""
+    problem = problem_of(study)
+    fit = base_fit(BaseModel(problem.posterior), np.random.default_rng([study.seed, 10, *key]))
+    model = ExtendedModel.of(fit.model, fit.optimum.x, taken=taken(study))
+    state = State(model, fit.optimum, fit.regression.whitening, fit.optimum.covariance)
+    return Base(problem, fit, state, "")
+
+
+def _gain(base: Base, wider: Base) -> float:
+    """Log evidence of the wider model over the other under the wider one's noise [nat]."""
+    quiet = float(sum(one.samples for one in wider.fit.noise if one.known))
+    same = Regression(base.fit.model, wider.fit.regression.whitening).descend(base.fit.optimum.x)
+    return log_bayes_factor(same, wider.fit.optimum, quiet)
+
+
+def _named(base: Base, library: Sequence[type[Effect]], rng: np.random.Generator, draws: int) -> float:
+    """Log evidence that the best named effect adds to a base fit [nat]; 0 without one."""
+    start = base.start
+    counts = [one.samples if one.known else 0 for one in base.fit.noise]
+    seen = trace(start.model, start.optimum, start.whitening, library, rng, noise_samples=counts, draws=draws)
+    return leading(start, seen) if seen.alarmed else 0.0
 
 
 def _later(study: Study, fit: BaseFit) -> tuple[Study, str] | None:
@@ -121,9 +125,3 @@ def _later(study: Study, fit: BaseFit) -> tuple[Study, str] | None:
     return replace(study, priors={**study.priors, **longer}), (
         f"The default prior of {names} is too short for these records and was made twice as long."
     )
-
-
-def _start(fit: BaseFit, study: Study) -> State:
-    """The plant alone, with the scales of the effects taken from it."""
-    model = ExtendedModel.of(fit.model, fit.optimum.x, taken=taken(study))
-    return State(model, fit.optimum, fit.regression.whitening, fit.optimum.covariance)

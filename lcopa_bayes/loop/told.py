@@ -16,6 +16,9 @@ from lcopa_bayes.loop.rounds import Round
 from lcopa_bayes.loop.scores import Score, pooled_coverage, pooled_rmse
 from lcopa_bayes.loop.trace import SEEN
 
+_NEAREST = 4
+"""Rivals that are listed for each named effect [-]."""
+
 
 def results(found: Loop) -> dict[str, Any]:
     """Every number of the loop; `None` is open or undefined."""
@@ -47,6 +50,7 @@ def results(found: Loop) -> dict[str, Any]:
             for axis, one in zip(found.study.response_axes, found.base.noise, strict=True)
         ],
         "effects": _effects(found, chances),
+        "outliers": _outliers(found),
         "before": side(found.before, found),
         "after": side(found.after, found),
         "unseen_by": "leaving records out in turn" if found.left_out else "held-out records",
@@ -110,6 +114,7 @@ def _effects(found: Loop, chances: dict[str, float]) -> list[dict[str, Any]]:
                 "formula": effect.card.formula,
                 "source": effect.card.source,
                 "group": list(found.groups[number]),
+                "nearest": _nearest(found, effect.name),
                 "probability": chances.get(effect.name),
                 "constants": effect.constants,
                 "parameters": [
@@ -122,6 +127,23 @@ def _effects(found: Loop, chances: dict[str, float]) -> list[dict[str, Any]]:
             }
         )
     return out
+
+
+def _nearest(found: Loop, name: str) -> list[dict[str, Any]]:
+    """Effects whose signatures lie closest to a named one, as what the base model cannot imitate of them."""
+    assert found.trace is not None
+    own = found.trace.of(name)
+    others = [one for one in found.trace.traced if one.signatures and one.name != name]
+    angles = {one.name: own.signatures[own.best].cosine(one.signatures[one.best]) for one in others}
+    ranked = sorted(angles, key=lambda other: -angles[other])[:_NEAREST]
+    return [{"name": other, "cosine": angles[other]} for other in ranked]
+
+
+def _outliers(found: Loop) -> dict[str, Any] | None:
+    if found.outliers is None:
+        return None
+    keys = ("count", "share", "width", "log_bayes_factor", "sentence")
+    return {key: getattr(found.outliers, key) for key in keys}
 
 
 def _evidence(found: Loop) -> dict[str, Any]:

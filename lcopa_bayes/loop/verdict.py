@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, final
@@ -12,6 +13,8 @@ Confidence = Literal["firm", "tentative"]
 EXPLAINED = 0.9
 """Share of the residual power that effects can take which the named ones must take when something significant
 remains [-]; with the noise known well it is their share of the log evidence."""
+UNSEEN = 0.5
+"""Share of the error beyond noise on held-out records that named effects may leave [-]."""
 MARGIN = 3.0
 """Log evidence by which a generic class or another set must win [nat]."""
 
@@ -56,6 +59,9 @@ class Found:
     remaining_name: str
     share: float
     """Residual power taken by the effects over that and what the best remaining class would take [-]."""
+    unseen: float = math.nan
+    """Squared error beyond noise on held-out records, with the effects over without [-]; NaN where it says
+    nothing: no such records, no such error, or effects that differ from record to record."""
 
 
 def decide(found: Found) -> Verdict:
@@ -98,6 +104,14 @@ def decide(found: Found) -> Verdict:
             "leaves to explain, "
             f"and {found.remaining_name} remains with {found.remaining:.0f} nat: no name is forced.",
         )
+    if found.unseen > UNSEEN:
+        return Verdict(
+            "unexplained",
+            confidence,
+            f"The nearest effect ({named}) takes up what the fitted records leave, but "
+            f"{_percent(found.unseen)} of the squared error beyond noise stays on the records held out: no "
+            "name is forced.",
+        )
     rest = (
         f" What remains is significant ({found.remaining_name}, {found.remaining:.0f} nat) but small: "
         f"{_percent(found.share)} of what the base model leaves to explain is accounted for."
@@ -111,6 +125,12 @@ def decide(found: Found) -> Verdict:
             f"{named} disturb(s) the records; the plant stays as it is, the noise model changes." + rest,
         )
     return Verdict("explained", confidence, f"{named} was missing, worth {found.gained:.0f} nat." + rest)
+
+
+def beside(verdict: Verdict, said: str) -> Verdict:
+    """The verdict on records with outliers, which `said` tells of: they disturb, and nothing else changes."""
+    kind: Kind = "disturbance" if verdict.kind == "clean" else verdict.kind
+    return Verdict(kind, verdict.confidence, f"{said} {verdict.sentence}")
 
 
 def _percent(share: float) -> str:

@@ -63,6 +63,7 @@ def frozen() -> dict[str, Any]:
     held = {
         "explained": verdict.EXPLAINED,
         "margin": verdict.MARGIN,
+        "unseen": verdict.UNSEEN,
         "least": trace.LEAST,
         "quantile": trace.QUANTILE,
         "seen": trace.SEEN,

@@ -23,7 +23,7 @@ from lcopa_bayes.plant.effects.effect import (
 @final
 @dataclass(frozen=True)
 class SampledDrive(DriveEffect):
-    """A drive that was sampled while it moved, not commanded and held: its changes come half a period earlier."""
+    """A drive that was sampled while it moved, not commanded and held: it changes half a period earlier."""
 
     card: ClassVar[Card] = Card(
         name="sampled_drive",

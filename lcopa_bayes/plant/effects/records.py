@@ -151,10 +151,10 @@ class PointingDrift(ParallelEffect):
         return np.outer((scene.times - middle) / scene.ranges.span, psi)
 
 
-def _frequencies(ranges: Ranges) -> Vector:
-    """Half a cycle per record apart, up to 40 cycles or a quarter of the sampling rate."""
+def _frequencies(ranges: Ranges, fewest: float) -> Vector:
+    """Half a cycle per record apart, from `fewest` cycles up to 40 or a quarter of the sampling rate."""
     highest = min(40.0, ranges.span / (4 * ranges.period))
-    return np.arange(1.0, max(highest, 1.5), 0.5) / ranges.span
+    return np.arange(fewest, max(highest, fewest + 0.5), 0.5) / ranges.span
 
 
 def _wave(scene: Scene, frequency: float) -> Matrix:
@@ -185,7 +185,7 @@ class Vibration(ParallelEffect):
     @classmethod
     def grid(cls, ranges: Ranges) -> tuple[Self, ...]:
         """See `_frequencies`."""
-        return tuple(cls(float(f)) for f in _frequencies(ranges))
+        return tuple(cls(float(f)) for f in _frequencies(ranges, 1.0))
 
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
         """a and b [response unit] per axis."""
@@ -218,8 +218,8 @@ class Flicker(ReadoutEffect):
 
     @classmethod
     def grid(cls, ranges: Ranges) -> tuple[Self, ...]:
-        """See `_frequencies`."""
-        return tuple(cls(float(f)) for f in _frequencies(ranges))
+        """From six cycles on: fewer in a short record are a drift, and imitate what follows the drive."""
+        return tuple(cls(float(f)) for f in _frequencies(ranges, 6.0))
 
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
         """a and b [-]."""

@@ -21,6 +21,10 @@ def _found(told: Mapping[str, Any]) -> Section:
     for effect in told["effects"]:
         rest = effect["group"][1:]
         also = f" These records cannot tell it from {', '.join(rest)}." if rest else ""
+        near = ", ".join(f"{one['name']} {one['cosine']:.2f}" for one in effect["nearest"])
+        also += (
+            f" Nearest to it, by the cosine of the angle between what each leaves: {near}." if near else ""
+        )
         text.append(f"{effect['name']}: {effect['formula']} ({effect['source']}).{also}")
     if told["next_measurement"]:
         text.append(f"Next measurement: {told['next_measurement']}")
