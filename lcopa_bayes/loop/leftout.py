@@ -60,6 +60,13 @@ def groups(whitening: Whitening) -> tuple[Group, ...]:
     return tuple(blocks)
 
 
+def in_turn(records: int) -> str:
+    """In words, what is left out of that many records."""
+    if records > 1:
+        return "leaving records out in turn"
+    return f"leaving each of {PARTS} parts of the only record out in turn"
+
+
 def log_scores(optimum: Optimum, chosen: Sequence[Group]) -> Vector:
     """Log predictive density of each group given the others, without the constant of the noise [nat]."""
     whole = np.linalg.slogdet(optimum.information)[1]

@@ -192,6 +192,10 @@ def _looped(
     if verdict.kind == "unexplained":
         samples, noise = start.whitening.samples, start.whitening.noise
         last_state = replace(start, widening=Widening.of(samples, start.optimum.residual, noise))
+    elif last.alarmed:  # named, and something significant remains
+        samples, residual = last_state.whitening.samples, last_state.optimum.residual
+        widening = Widening.of(samples, residual, last_state.whitening.noise)
+        last_state = replace(last_state, widening=widening)
     if sample:
         quiet = float(sum(one.samples for one in base.noise if one.known))
         sampled = sample_loop(LoopDensity(last_state, quiet), study.seed, jobs=jobs, quick=quick)
@@ -218,9 +222,10 @@ def _beyond(before: Sequence[Score], after: Sequence[Score], state: State) -> fl
     if any(effect.card.per_record for effect in state.model.effects):
         return np.nan
     counts = np.array([score.time.size for score in before], dtype=float)
+    noise = np.array([score.noise_sd for score in after])
     was, now = (
-        float(counts @ [(score.rmse / score.noise_sd) ** 2 - 1 for score in scores])
-        for scores in (before, after)
+        float(counts @ ((np.array([one.rmse for one in scores]) / noise) ** 2 - 1))
+        for scores in (before, after)  # against one noise: fitted jointly, each side has its own
     )
     return now / was if was > _SEEN * np.sqrt(2 * counts.sum()) else np.nan
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from lcopa_bayes.estimate import plain
+from lcopa_bayes.loop.leftout import in_turn
 from lcopa_bayes.loop.loop import Loop, Side
 from lcopa_bayes.loop.moved import moved
 from lcopa_bayes.loop.nextmeasurement import next_measurement
@@ -53,7 +54,7 @@ def results(found: Loop) -> dict[str, Any]:
         "outliers": _outliers(found),
         "before": side(found.before, found),
         "after": side(found.after, found),
-        "unseen_by": "leaving records out in turn" if found.left_out else "held-out records",
+        "unseen_by": in_turn(len(found.study.fit)) if found.left_out else "held-out records",
         "survival": {one.name: one.survival for one in trace.traced} if trace else {},
         "invisible": [one.name for one in trace.traced if one.survival < SEEN] if trace else [],
         "evidence": _evidence(found),
@@ -224,8 +225,7 @@ def _curve(before: Score, after: Score, most: int = 1500) -> dict[str, Any]:
 def words(told: dict[str, Any]) -> Sequence[str]:
     """Lines for a reader."""
     out = [f"{told['verdict']} ({told['confidence']}): {told['sentence']}"]
-    out += [told["base_enlarged"]] if told["base_enlarged"] else []
-    out += [f"caution: {one}" for one in told["cautions"]]
+    out += [one for one in (told["base_enlarged"], *(f"caution: {c}" for c in told["cautions"])) if one]
     for effect in told["effects"]:
         group = f" (cannot be told from {', '.join(effect['group'][1:])})" if len(effect["group"]) > 1 else ""
         out.append(f"effect {effect['name']}, acts on the {effect['place']}{group}")
@@ -233,8 +233,8 @@ def words(told: dict[str, Any]) -> Sequence[str]:
             f"  {p['name']} = {p['value']:.4g} [{p['lower']:.4g}, {p['upper']:.4g}] {p['unit']}, {p['grade']}"
             for p in effect["parameters"][:6]
         ]
+    after = told["after"]
     for axis, value in told["before"]["fit_rmse"].items():
-        after = told["after"]
         out.append(
             f"axis {axis}: fit RMSE {value:.4g} -> {after['fit_rmse'][axis]:.4g}, unseen "
             f"{told['before']['held_out_rmse'][axis]:.4g} -> {after['held_out_rmse'][axis]:.4g} "
