@@ -39,7 +39,7 @@ NAMES = [
     "odd_curvature", "even_curvature", "voltage_knee", "cubic_stiffness", "overdrive_pulse",
     "refresh_hold", "grey_quantisation", "hysteresis", "ion_creep", "extra_mode", "missing_cross_path",
     "bilinear_crosstalk", "axis_rotation", "sensor_lag", "exposure", "clipping", "centroid_locking",
-    "clock_skew", "viscosity_drift", "gain_drift", "pointing_offset", "pointing_drift",
+    "sampled_drive", "clock_skew", "viscosity_drift", "gain_drift", "pointing_offset", "pointing_drift",
     "trigger_jitter", "vibration", "flicker", "outliers", "overflow", "unmodelled_linear",
     "unmodelled_smooth", "unmodelled_nonlinear", "sampled_drive",
 ]  # fmt: skip

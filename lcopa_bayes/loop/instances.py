@@ -24,6 +24,8 @@ ROUGH = 5.0
 """Residual over noise beyond which the linear evidence is too rough to choose by [-]."""
 _INSTANCES = 16
 """Instances descended from, those of largest evidence [-]."""
+_FORCED = 3
+"""The same beside a force that is already there [-]."""
 _STEPS = 12
 _MOVES = 10
 _SIZES = (1.0, -1.0)
@@ -47,7 +49,8 @@ def descended(state: State, seen: Trace, traced: Traced, tuned: Signature) -> tu
     Its positive constants are then moved between their grid neighbours. ArithmeticError when no instance has
     a bounded response.
     """
-    listed = sorted(traced.signatures, key=lambda one: -seen.alone(one))[:_INSTANCES]
+    listed = sorted(traced.signatures, key=lambda one: -seen.alone(one))
+    listed = listed[: _FORCED if _forced(state) else _INSTANCES]
     best: tuple[Effect, Optimum] | None = None
     for signature in [tuned, *listed]:
         found = _descent(state, signature.effect, _starts(state, signature, seen))
@@ -60,13 +63,18 @@ def descended(state: State, seen: Trace, traced: Traced, tuned: Signature) -> tu
     return best[0], best[1].x
 
 
+def _forced(state: State) -> bool:
+    """Whether the plant already has a force that takes iterations to simulate."""
+    return any(isinstance(effect, ForceEffect) for effect in state.model.effects)
+
+
 def _starts(state: State, signature: Signature, seen: Trace) -> list[Vector]:
     """Coordinates to descend from: the linear estimate, and a prior sd to either side of none, there also
     with every order at the nearest integer."""
     linear = signature.amplitude(seen.residual)
     sizes = [linear, 0.3 * linear]
     starts = [np.concatenate([state.optimum.x, size]) for size in sizes]
-    if linear.size == 1:
+    if linear.size == 1 and not _forced(state):
         rows = state.model.base.posterior.table.rows
         straight = state.optimum.x.copy()
         for position, k in enumerate(state.model.base.least.columns):
@@ -78,7 +86,7 @@ def _starts(state: State, signature: Signature, seen: Trace) -> list[Vector]:
 
 def _descent(state: State, effect: Effect, starts: list[Vector]) -> Optimum | None:
     model = state.model.having(*state.model.effects, effect)
-    curve = Regression(model, state.whitening)
+    curve = Regression(replace(model, exact=not _forced(state)), state.whitening)
     low, high = model.bounds
     found: list[Optimum] = []
     for start in starts:
