@@ -38,7 +38,8 @@ def rough(seen: Trace) -> bool:
 
 
 def movable(traced: Traced) -> bool:
-    """Whether there are instances to choose from that take no iteration to simulate."""
+    """Whether there are instances to choose from that take no iteration to simulate: a refit has several
+    starts of its own."""
     return len(traced.signatures) > 1 and not isinstance(traced.signatures[0].effect, ForceEffect)
 
 

@@ -17,7 +17,7 @@ from lcopa_bayes.loop.density import LoopDensity
 from lcopa_bayes.loop.draws import LoopDraws, sample_loop, unit_of
 from lcopa_bayes.loop.outlying import NAME as OUTLIERS
 from lcopa_bayes.loop.outlying import Outlying, outlying
-from lcopa_bayes.loop.rounds import Round, search
+from lcopa_bayes.loop.rounds import MOST, Round, search
 from lcopa_bayes.loop.scores import Score, State, fit_scores, held_out_scores, left_out_scores
 from lcopa_bayes.loop.terms import fitted_base
 from lcopa_bayes.loop.trace import Trace
@@ -157,7 +157,9 @@ def _looped(
             *(problem, base, enlarged, (), (), (), verdict, before, before, not study.held_out, cautions),
             outliers=outliers,
         )
-    searched = search(start, base, kinds, np.random.default_rng([study.seed, 11]), draws=draws)
+    most = 1 if len(study.fit) == 1 and not study.held_out else MOST
+    rng = np.random.default_rng([study.seed, 11])
+    searched = search(start, base, kinds, rng, draws=draws, most=most)
     first, last = searched.rounds[0].trace, searched.rounds[-1].trace
     generic = max(
         (one for one in first.traced if one.card.place == "generic"),
@@ -235,8 +237,8 @@ def _alone(study: Study) -> tuple[str, ...]:
     if len(study.fit) > 1:
         return ()
     return (
-        "a single record cannot tell an effect of the device from a peculiarity of that record; fit a "
-        "second one",
+        "a single record cannot tell an effect of the device from a peculiarity of that record, and where "
+        "none is held out at most one effect is named; fit a second one",
     )
 
 

@@ -65,17 +65,23 @@ class Search:
 
 
 def search(
-    start: State, base: BaseFit, library: Sequence[type[Effect]], rng: np.random.Generator, *, draws: int
+    start: State,
+    base: BaseFit,
+    library: Sequence[type[Effect]],
+    rng: np.random.Generator,
+    *,
+    draws: int,
+    most: int = MOST,
 ) -> Search:
-    """Add effects one at a time while evidence, records left out and significance all speak for it; then try
-    pairs where something remains, and take back what is no longer significant."""
+    """Add effects one at a time, up to `most`, while evidence, records left out and significance all speak
+    for it; then try pairs where something remains, and take back what is no longer significant."""
     counts = [one.samples if one.known else 0 for one in base.noise]
     state, rounds, groups = start, [], {}
-    for number in range(MOST + 1):
+    for number in range(most + 1):
         seen = trace(
             state.model, state.optimum, state.whitening, library, rng, noise_samples=counts, draws=draws
         )
-        if not seen.alarmed or number == MOST:
+        if not seen.alarmed or number == most:
             rounds.append(Round(seen, (), (), None))
             break
         refits, failures, tuned_best = _refits(state, seen)
@@ -85,7 +91,7 @@ def search(
             break
         groups[chosen.added[0]] = group(chosen, refits, seen, tuned_best)
         state = _settled(_kept(chosen, state.whitening), base)
-    if rounds[-1].trace.alarmed and rounds[0].trace.alarmed:
+    if rounds[-1].trace.alarmed and rounds[0].trace.alarmed and most > 1:
         paired = _paired(start, state, rounds[0].trace)
         if paired is not None:
             state = _settled(_state(paired, start.whitening), base)

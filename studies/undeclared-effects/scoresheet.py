@@ -147,6 +147,13 @@ def sheet(rows: Sequence[Row], targets: Mapping[str, Any], seen: float) -> list[
             "90 % bands before correction", [r["coverage_before"] for r in corrected], np.mean, 0.0, "least"
         ),
         share("two effects, both found", by["pair"], _both, targets["two_effects"], "least"),
+        share(
+            "the same where both survive",
+            [row for row in by["pair"] if all((one or 1.0) > seen for one in _told(row))],
+            _both,
+            targets["two_effects"],
+            "least",
+        ),
         share("crashed", list(rows), lambda r: bool(r["crashed"]), 0.0, "most"),
     ]
 
@@ -166,6 +173,11 @@ def matrix(rows: Sequence[Row]) -> dict[str, dict[str, int]]:
 def _survival(row: Row) -> float | None:
     values = list(row["survival"].values())
     return values[0] if values else None
+
+
+def _told(row: Row) -> list[float | None]:
+    """Survival of every hidden effect; None for one that changes only the noise."""
+    return [one if one is None or one > 0 else 1e-9 for one in row["survival"].values()]
 
 
 def _grouped(row: Row) -> bool:
