@@ -233,14 +233,14 @@ def test_bands_are_not_given_outside_the_excited_range(clean):
 def test_errors_on_held_out_records_count_while_the_drive_stays_in_range(clean):
     """Twice the noise before, 1.5 times after; beyond the fitted range the effect may say what it likes."""
     made = study(1)
-    made = replace(made, fit=(*made.fit, *made.held_out))  # drives of the whole range
+    (record,) = made.held_out
+    made = replace(made, fit=(*made.fit, replace(record, name="again")))  # drives of the whole range
     score = clean.before.unseen[0]
     before = replace(score, predicted=score.observed - 2 * score.noise_sd)
     after = replace(score, predicted=score.observed - 1.5 * score.noise_sd)
     state = clean.before.state
     assert unseen_share(made, [before], [after], state) == pytest.approx(1.25 / 3)
     assert np.isnan(unseen_share(made, [replace(score, predicted=score.observed)], [after], state))
-    (record,) = made.held_out
     late = record.time > record.time[np.flatnonzero(np.diff(record.drive[:, 0]))[1]]
     wild = replace(record, drive=np.where(late[:, None], 9.0, record.drive))
     far = score.time > record.time[late][0]
