@@ -27,8 +27,9 @@ def unseen_share(study: Study, before: Sequence[Score], after: Sequence[Score], 
     for one, other in zip(before, after, strict=True):
         inside = one.time < _left(study, one.record)
         count += int(inside.sum())
-        was += float((((one.observed - one.predicted)[inside] / one.noise_sd) ** 2 - 1).sum())
-        now += float((((other.observed - other.predicted)[inside] / other.noise_sd) ** 2 - 1).sum())
+        noise = other.noise_sd  # of both: a fit without the effects may have taken them for noise
+        was += float((((one.observed - one.predicted)[inside] / noise) ** 2 - 1).sum())
+        now += float((((other.observed - other.predicted)[inside] / noise) ** 2 - 1).sum())
     return now / was if was > _SEEN * np.sqrt(2 * count) else np.nan
 
 
