@@ -19,6 +19,7 @@ from lcopa_bayes.loop.loop import loop
 from lcopa_bayes.loop.quiet import axis_noise, repeat_pieces
 from lcopa_bayes.loop.regression import Regression
 from lcopa_bayes.loop.told import drawn, results, words
+from lcopa_bayes.loop.unseen import unseen_share
 from lcopa_bayes.loop.verdict import Found, decide
 from lcopa_bayes.loop.whitening import Whitening
 from lcopa_bayes.loop.widening import Widening
@@ -227,6 +228,26 @@ def test_bands_are_not_given_outside_the_excited_range(clean):
     assert np.isfinite(wide.variance(samples, 0)).all()
     beyond = replace(samples, record=replace(samples.record, drive=3.0 * samples.record.drive))
     assert np.isnan(wide.variance(beyond, 0)).any()
+
+
+def test_errors_on_held_out_records_count_while_the_drive_stays_in_range(clean):
+    """Twice the noise before, 1.5 times after; beyond the fitted range the effect may say what it likes."""
+    made = study(1)
+    (record,) = made.held_out
+    made = replace(made, fit=(*made.fit, replace(record, name="again")))  # drives of the whole range
+    score = clean.before.unseen[0]
+    before = replace(score, predicted=score.observed - 2 * score.noise_sd)
+    after = replace(score, predicted=score.observed - 1.5 * score.noise_sd)
+    state = clean.before.state
+    assert unseen_share(made, [before], [after], state) == pytest.approx(1.25 / 3)
+    assert np.isnan(unseen_share(made, [replace(score, predicted=score.observed)], [after], state))
+    late = record.time > record.time[np.flatnonzero(np.diff(record.drive[:, 0]))[1]]
+    wild = replace(record, drive=np.where(late[:, None], 9.0, record.drive))
+    far = score.time > record.time[late][0]
+    worse = replace(after, predicted=np.where(far, 1e3, after.predicted))
+    changed = replace(made, held_out=(wild,))
+    assert unseen_share(changed, [before], [worse], state) == pytest.approx(1.25 / 3)
+    assert unseen_share(made, [before], [worse], state) > 1.0
 
 
 FOUND = Found("", (), True, 50.0, 3.0, ("a",), (), 48.0, 20.0, "smooth", 1.0, 3.0, "b", 1.0)

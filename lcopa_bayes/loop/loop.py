@@ -21,14 +21,13 @@ from lcopa_bayes.loop.rounds import MOST, Round, search
 from lcopa_bayes.loop.scores import Score, State, fit_scores, held_out_scores, left_out_scores
 from lcopa_bayes.loop.terms import fitted_base
 from lcopa_bayes.loop.trace import Trace
+from lcopa_bayes.loop.unseen import unseen_share
 from lcopa_bayes.loop.verdict import Found, Verdict, beside, decide
 from lcopa_bayes.loop.widening import Widening
 from lcopa_bayes.plant.effects.catalogue import catalogue
 from lcopa_bayes.plant.effects.effect import Effect
 from lcopa_bayes.study import Study
 
-_SEEN = 5.0
-"""Standard deviations of a chance sum of squares that error beyond noise must exceed to be judged [-]."""
 Z90 = 1.6448536269514722
 """Half width of a central 90 % interval of a normal distribution [sd]."""
 
@@ -184,7 +183,7 @@ def _looped(
             last.threshold,
             last.traced[0].name if last.traced else "",
             searched.share,
-            _beyond(before.unseen, after.unseen, searched.state) if study.held_out else np.nan,
+            unseen_share(study, before.unseen, after.unseen, searched.state) if study.held_out else np.nan,
         )
     )
     if outliers is not None:
@@ -217,19 +216,6 @@ def _looped(
         sampled,
         outliers,
     )
-
-
-def _beyond(before: Sequence[Score], after: Sequence[Score], state: State) -> float:
-    """See `Found.unseen`."""
-    if any(effect.card.per_record for effect in state.model.effects):
-        return np.nan
-    counts = np.array([score.time.size for score in before], dtype=float)
-    noise = np.array([score.noise_sd for score in after])
-    was, now = (
-        float(counts @ ((np.array([one.rmse for one in scores]) / noise) ** 2 - 1))
-        for scores in (before, after)  # against one noise: fitted jointly, each side has its own
-    )
-    return now / was if was > _SEEN * np.sqrt(2 * counts.sum()) else np.nan
 
 
 def _alone(study: Study) -> tuple[str, ...]:

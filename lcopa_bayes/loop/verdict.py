@@ -118,13 +118,14 @@ def decide(found: Found) -> Verdict:
         if left
         else " Nothing significant remains."
     )
+    verb = "was" if len(found.effects) == 1 else "were"
     if set(found.effects) <= set(found.disturbances):
         return Verdict(
             "disturbance",
             confidence,
             f"{named} disturb(s) the records; the plant stays as it is, the noise model changes." + rest,
         )
-    return Verdict("explained", confidence, f"{named} was missing, worth {found.gained:.0f} nat." + rest)
+    return Verdict("explained", confidence, f"{named} {verb} missing, worth {found.gained:.0f} nat." + rest)
 
 
 def beside(verdict: Verdict, said: str) -> Verdict:
