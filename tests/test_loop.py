@@ -258,6 +258,8 @@ FOUND = Found("", (), True, 50.0, 3.0, ("a",), (), 48.0, 20.0, "smooth", 1.0, 3.
     [
         ({}, "explained"),
         ({"alarmed": False}, "clean"),
+        ({"alarmed": False, "scatter": 50.0}, "disturbance"),
+        ({"alarmed": False, "scatter": 50.0, "missed": 3.0}, "unexplained"),
         ({"effects": ()}, "unexplained"),
         ({"disturbances": ("a",)}, "disturbance"),
         ({"remaining": 40.0, "share": 0.5}, "unexplained"),

@@ -24,6 +24,10 @@ _DELAYS = (0.7, 0.85, 1.15, 1.3)
 _EXPLAINED = 0.5
 """Share of the response variance that a usable base fit explains at least [-]."""
 _ROUNDS = 3
+_SPARE = 2
+"""Independent samples beyond the parameters with which a residual can be judged at all [-]."""
+_MOVED = 0.05
+"""Change of the dead time from which the noise is measured anew [-]."""
 
 
 @final
@@ -53,25 +57,25 @@ def base_fit(model: BaseModel, rng: np.random.Generator, *, starts: int = _START
     """
     posterior = model.posterior
     _moving(posterior)
-    delays = [posterior.table.at("delay", k) for k in range(len(posterior.table.layout.delays))]
     seeds = [model.coordinates(values) for values in screened(posterior, rng, count=starts)]
     white = Whitening(posterior.samples, _guessed(posterior))
     optimum = Regression(model, white).best(seeds)
     optimum = Regression(model, white).best([optimum.x, *_other_delays(model, optimum.x)])
     noise: tuple[AxisNoise, ...] = ()
     for _ in range(_ROUNDS):
-        delay = min(float(model.values(optimum.x)[k]) for k in delays)
+        delay = model.dead_time(optimum.x)
         again = measured(posterior, optimum.residual, delay)
         if noise and all(_alike(a, b) for a, b in zip(noise, again, strict=True)):
             break
         noise = again
         regression = Regression(model, whitening(model, noise))
         optimum = regression.descend(optimum.x)
-        if all(one.known for one in noise) and not _delay_moved(model, optimum, delays, delay):
+        if all(one.known for one in noise) and abs(model.dead_time(optimum.x) - delay) <= _MOVED * delay:
             break
     for _ in range(_ROUNDS):
-        if not optimum.converged:  # damped to a standstill: start again undamped
-            optimum = regression.descend(optimum.x)
+        if optimum.converged:
+            break
+        optimum = regression.descend(optimum.x)  # damped to a standstill: start again undamped
     return BaseFit(model, noise, regression, optimum, _failure(model, optimum), _cautions(noise, optimum))
 
 
@@ -96,12 +100,6 @@ def _guessed(posterior: Posterior) -> tuple[Autoregression, ...]:
     return tuple(Autoregression(np.empty(0), 0.01 * (float(values.std()) or 1.0)) for values in pooled)
 
 
-def _delay_moved(model: BaseModel, optimum: Optimum, delays: Sequence[int], before: float) -> bool:
-    """Whether the dead time is another one than that the noise was measured in."""
-    now = min(float(model.values(optimum.x)[k]) for k in delays)
-    return abs(now - before) > 0.05 * max(before, 1e-300)
-
-
 def measured(posterior: Posterior, residual: Vector, delay: float) -> tuple[AxisNoise, ...]:
     """Noise of every axis; from the stacked `residual` [response unit] where nothing else gives it."""
     out = []
@@ -122,6 +120,14 @@ def whitening(model: BaseModel, noise: Sequence[AxisNoise]) -> Whitening:
     dependence = tuple(one.dependence for one in noise)
     coloured = tuple(one.coloured or one.process for one in noise)
     return Whitening(model.posterior.samples, processes, dependence, coloured)
+
+
+def renewed(model: BaseModel, optimum: Optimum, known: Whitening) -> Whitening:
+    """The noise as the residual of another optimum gives it, where it had to be fitted jointly."""
+    if not known.dependence:
+        return known
+    delay = model.dead_time(optimum.x[: len(model.names)])
+    return whitening(model, measured(model.posterior, optimum.residual, delay))
 
 
 def axis_pieces(posterior: Posterior, stacked: Vector, axis: int) -> list[Vector]:
@@ -157,6 +163,11 @@ def _alike(one: AxisNoise, other: AxisNoise) -> bool:
 def _failure(model: BaseModel, optimum: Optimum) -> str:
     if not optimum.converged:
         return "the base fit did not converge within its steps"
+    if optimum.effective < optimum.x.size + _SPARE:
+        return (
+            f"the residual of the base fit is so smooth that its samples count as {optimum.effective:.0f} "
+            f"independent ones, too few beside {optimum.x.size} parameters"
+        )
     responses = model.posterior.table.layout.responses
     for axis, response in enumerate(responses):
         seen = axis_pieces(model.posterior, model.observed, axis)

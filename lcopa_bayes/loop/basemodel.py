@@ -105,6 +105,11 @@ class BaseModel:
         raw = self.least.values(x, self.template)
         return np.asarray(self.posterior.table.canonical(raw[None])[0])
 
+    def dead_time(self, x: Vector) -> float:
+        """Shortest delay at coordinates [time unit]."""
+        table, values = self.posterior.table, self.values(x)
+        return min(float(values[table.at("delay", k)]) for k in range(len(table.layout.delays)))
+
     def coordinates(self, values: Vector) -> Vector:
         """Coordinates of table values."""
         return self.least.coordinates(values)

@@ -8,10 +8,11 @@ from functools import cached_property
 from typing import final
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import chi2, f
 
 from lcopa_bayes.arrays import Vector
 from lcopa_bayes.inference.effected import Placed
+from lcopa_bayes.loop.basefit import renewed
 from lcopa_bayes.loop.constants import polished
 from lcopa_bayes.loop.extended import ExtendedModel
 from lcopa_bayes.loop.leftout import groups, log_scores
@@ -41,6 +42,11 @@ class Refit:
     """Gain of the summed log predictive densities of records left out in turn [nat]."""
     added: tuple[str, ...]
     """Names of the effects that are new."""
+    taken: float
+    """Share of the residual's power that the new effects take [-]."""
+    whitening: Whitening
+    """The noise it is judged under: where that is known from residuals alone, from the one with the
+    effects."""
 
     def wald(self, name: str) -> float:
         """p-value of an effect's coefficients being zero at the Laplace covariance [-].
@@ -70,8 +76,16 @@ class Refit:
 
     @cached_property
     def significant(self) -> bool:
-        """Whether all new effects are three standard deviations or more away from zero."""
-        return all(self.wald(name) < SIGNIFICANT for name in self.added)
+        """Whether all new effects are three standard deviations or more away from zero.
+
+        Where the noise is known from the residual alone its scale falls with them, and the ratio of both
+        residuals decides at the same level (F test).
+        """
+        if not self.whitening.dependence:
+            return all(self.wald(name) < SIGNIFICANT for name in self.added)
+        k, freedom = len(self.new), self.optimum.effective - self.optimum.x.size
+        ratio = self.taken / (1 - self.taken) * freedom / k
+        return bool(freedom > 0 and f.sf(ratio, k, freedom) < SIGNIFICANT)
 
 
 def refit(
@@ -101,12 +115,24 @@ def refit(
     quick = Regression(replace(extended, exact=False), whitening).best(starts, gain=_NEAR)
     extended, start = polished(extended, quick.x, whitening, tuple(effect.name for effect, _ in added))
     optimum = Regression(extended, whitening).descend(start, most=12, gain=0.02)
+    if whitening.dependence:
+        whitening = renewed(model.base, optimum, whitening)
+        optimum = Regression(extended, whitening).descend(optimum.x, most=12, gain=0.02)
+        before = Regression(model, whitening).descend(before.x, most=12, gain=0.02)
     sides = sum(one.coefficient.one_signed for one in extended.effected.coefficients[-linear.size :])
     tried = sum(np.log(len(effect.grid(extended.effected.ranges))) for effect, _ in added)
     evidence = log_bayes_factor(before, optimum, quiet) + sides * np.log(2.0) - tried
     left_out = groups(whitening)
     gain = float(log_scores(optimum, left_out).sum() - log_scores(before, left_out).sum())
-    return Refit(extended, optimum, evidence, gain, tuple(effect.name for effect, _ in added))
+    return Refit(
+        extended,
+        optimum,
+        evidence,
+        gain,
+        tuple(effect.name for effect, _ in added),
+        1.0 - optimum.cost / before.cost,
+        whitening,
+    )
 
 
 def log_bayes_factor(before: Optimum, after: Optimum, quiet: float) -> float:

@@ -17,11 +17,11 @@ from lcopa_bayes.loop.density import LoopDensity
 from lcopa_bayes.loop.draws import LoopDraws, sample_loop, unit_of
 from lcopa_bayes.loop.outlying import NAME as OUTLIERS
 from lcopa_bayes.loop.outlying import Outlying, outlying
-from lcopa_bayes.loop.rounds import MOST, Round, search
+from lcopa_bayes.loop.rounds import SINGLE, Round, search
 from lcopa_bayes.loop.scores import Score, State, fit_scores, held_out_scores, left_out_scores
 from lcopa_bayes.loop.terms import fitted_base
 from lcopa_bayes.loop.trace import Trace
-from lcopa_bayes.loop.unseen import unseen_share
+from lcopa_bayes.loop.unseen import missed, unseen_share
 from lcopa_bayes.loop.verdict import Found, Verdict, beside, decide
 from lcopa_bayes.loop.widening import Widening
 from lcopa_bayes.plant.effects.catalogue import catalogue
@@ -156,9 +156,9 @@ def _looped(
             *(problem, base, enlarged, (), (), (), verdict, before, before, not study.held_out, cautions),
             outliers=outliers,
         )
-    most = 1 if len(study.fit) == 1 and not study.held_out else MOST
+    least = SINGLE if len(study.fit) == 1 and not study.held_out else 0.0
     rng = np.random.default_rng([study.seed, 11])
-    searched = search(start, base, kinds, rng, draws=draws, most=most)
+    searched = search(start, base, kinds, rng, draws=draws, least=least)
     first, last = searched.rounds[0].trace, searched.rounds[-1].trace
     generic = max(
         (one for one in first.traced if one.card.place == "generic"),
@@ -171,7 +171,7 @@ def _looped(
         Found(
             "",
             cautions,
-            first.alarmed,
+            first.alarmed or bool(names),
             first.largest,
             first.threshold,
             names,
@@ -181,8 +181,10 @@ def _looped(
             generic.name if generic else "",
             last.largest,
             last.threshold,
-            last.traced[0].name if last.traced else "",
+            last.leader.name if last.leader else "",
             searched.share,
+            first.scatter if base.noise_known else -np.inf,
+            missed(study, before.unseen, start) if study.held_out else np.nan,
             unseen_share(study, before.unseen, after.unseen, searched.state) if study.held_out else np.nan,
         )
     )
@@ -222,10 +224,10 @@ def _alone(study: Study) -> tuple[str, ...]:
     """What a single record cannot tell."""
     if len(study.fit) > 1:
         return ()
-    return (
-        "a single record cannot tell an effect of the device from a peculiarity of that record, and where "
-        "none is held out at most one effect is named; fit a second one",
-    )
+    told = "a single record cannot tell an effect of the device from a peculiarity of that record"
+    if not study.held_out:
+        told += f": an effect is named only where it takes {100 * SINGLE:.0f} % of the residual's power"
+    return (f"{told}; fit a second one",)
 
 
 def _side(problem: Problem, state: State) -> Side:

@@ -65,8 +65,7 @@ def outlying(study: Study, fit: BaseFit) -> Outlying | None:
     """Outliers in the residual of a base fit; None where there are none that belong to the noise."""
     posterior, residual = fit.model.posterior, fit.optimum.residual
     samples = posterior.samples
-    delays = [posterior.table.at("delay", k) for k in range(len(posterior.table.layout.delays))]
-    delay = min(float(fit.model.values(fit.optimum.x)[k]) for k in delays)
+    delay = fit.model.dead_time(fit.optimum.x)
     far: dict[tuple[int, int], Flags] = {}
     sizes: list[Vector] = []
     counts = np.zeros((2, 2))  # rows: at rest, moving; columns: samples, outliers

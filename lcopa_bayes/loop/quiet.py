@@ -8,6 +8,7 @@ from typing import final
 
 import numpy as np
 from scipy import stats
+from scipy.signal import correlate
 
 from lcopa_bayes.arrays import Vector
 from lcopa_bayes.inference.data import Samples
@@ -18,7 +19,9 @@ FEWEST = 50
 _SAFE = 0.8
 """Share of the fitted delay inside which a response is surely at rest [-]."""
 _LAGS = 2000
-"""Autocorrelations of a residual that are summed at most [-]."""
+"""Autocorrelations of an autoregression that are summed at most [-]."""
+_WINDOW = 5.0
+"""Lags over which autocorrelations are summed, over the sum itself (Sokal 1997, Functional Integration) [-]."""
 _ALIKE = 1e-3
 """p-value below which repeats differ by more than the quiet noise [-]."""
 
@@ -134,16 +137,13 @@ def joint_noise(residual: Sequence[Vector], name: str, quiet: int) -> AxisNoise:
     Coloured noise as free as the residual would take every slow effect for noise, and a fit whitened by it
     predicts the next sample and not the response. So the fit weighs all samples alike, and what its residual
     is worth as evidence is divided by ``sum_k rho_k^2``, the samples per independent one of a power (Bayley
-    and Hammersley 1946, J. R. Stat. Soc. Suppl. 8), rho_k the autocorrelations of its autoregression.
+    and Hammersley 1946, J. R. Stat. Soc. Suppl. 8), rho_k its autocorrelations.
     """
     count = sum(piece.size for piece in residual)
     power = sum(float(((piece - piece.mean()) ** 2).sum()) for piece in residual)
     process = Autoregression(np.empty(0), max(float(np.sqrt(power / count)), 1e-300))
-    longest = max(piece.size for piece in residual)
     coloured = estimated(residual)
-    covariance = coloured.autocovariance(min(longest - 1, _LAGS))
-    rho2 = (covariance[1:] / covariance[0]) ** 2
-    dependence = 1.0 + 2.0 * float(((1 - np.arange(1, rho2.size + 1) / longest) * rho2).sum())
+    dependence = _dependence(residual, coloured)
     sentence = (
         f"{name}: {quiet} quiet samples and no repeats are too few to know the noise ({FEWEST} are needed), "
         f"so noise of sd {process.sd:.3g} is fitted to the residual together with the plant, and {count} "
@@ -152,6 +152,29 @@ def joint_noise(residual: Sequence[Vector], name: str, quiet: int) -> AxisNoise:
         "repeat."
     )
     return AxisNoise(process, count, "joint", sentence, dependence, coloured)
+
+
+def _dependence(pieces: Sequence[Vector], coloured: Autoregression) -> float:
+    """Samples per independent one of a power, from unbroken pieces and their autoregression [-].
+
+    The lesser of two estimates, as each errs upwards where its assumption fails: the autoregression where a
+    smooth misfit under a little white noise makes it nearly a random walk, the pieces' own autocorrelations
+    where a ripple goes on for ever.
+    """
+    longest = max(piece.size for piece in pieces)
+    covariance = coloured.autocovariance(min(longest - 1, _LAGS))
+    rho2 = (covariance[1:] / covariance[0]) ** 2
+    regressed = 1.0 + 2.0 * float(((1 - np.arange(1, rho2.size + 1) / longest) * rho2).sum())
+    products = np.zeros(longest)
+    for piece in pieces:
+        apart = piece - piece.mean()
+        products[: piece.size] += correlate(apart, apart, mode="full", method="fft")[piece.size - 1 :]
+    if products[0] == 0.0:
+        return 1.0
+    summed = 1.0 + 2.0 * np.cumsum((products[1:] / products[0]) ** 2)
+    wide = np.flatnonzero(np.arange(1, longest) >= _WINDOW * summed)
+    own = float(summed[wide[0]] if wide.size else summed[-1]) if longest > 1 else 1.0
+    return min(own, regressed)
 
 
 def _power(process: Autoregression, pieces: Sequence[Vector]) -> float:

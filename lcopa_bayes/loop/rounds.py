@@ -9,7 +9,7 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.loop.basefit import BaseFit, measured, whitening
+from lcopa_bayes.loop.basefit import BaseFit
 from lcopa_bayes.loop.confirm import SIGNIFICANT, Refit, log_bayes_factor, refit
 from lcopa_bayes.loop.constants import tuned
 from lcopa_bayes.loop.groups import group
@@ -19,11 +19,12 @@ from lcopa_bayes.loop.scores import State
 from lcopa_bayes.loop.signature import Signature, pair_evidence
 from lcopa_bayes.loop.trace import Trace, Traced, trace
 from lcopa_bayes.loop.verdict import MARGIN
-from lcopa_bayes.loop.whitening import Whitening
 from lcopa_bayes.plant.effects.effect import Effect
 
-MOST = 3
+_MOST = 3
 """Effects that are added at most [-]."""
+SINGLE = 0.3
+"""Share of the residual's power that an effect must take when a single record is all there is [-]."""
 _CANDIDATES = 4
 _TUNED = 8
 """Named effects whose internal constants are moved off their grid before they are ranked [-]."""
@@ -71,30 +72,31 @@ def search(
     rng: np.random.Generator,
     *,
     draws: int,
-    most: int = MOST,
+    least: float = 0.0,
 ) -> Search:
-    """Add effects one at a time, up to `most`, while evidence, records left out and significance all speak
-    for it; then try pairs where something remains, and take back what is no longer significant."""
+    """Add effects one at a time, up to three, while evidence, records left out and significance all speak
+    for it and each takes a share of the residual's power beyond `least`; then try pairs where something
+    remains, and take back what is no longer significant."""
     counts = [one.samples if one.known else 0 for one in base.noise]
     state, rounds, groups = start, [], {}
-    for number in range(most + 1):
+    for number in range(_MOST + 1):
         seen = trace(
             state.model, state.optimum, state.whitening, library, rng, noise_samples=counts, draws=draws
         )
-        if not seen.alarmed or number == most:
+        if not (seen.alarmed or state.whitening.dependence) or number == _MOST:
             rounds.append(Round(seen, (), (), None))
             break
         refits, failures, tuned_best = _refits(state, seen)
-        chosen = _leader([one for one in refits if _accepted(one, seen)])
+        chosen = _leader([one for one in refits if _accepted(one, seen) and one.taken > least])
         rounds.append(Round(seen, tuple(refits), tuple(failures), chosen))
         if chosen is None:
             break
         groups[chosen.added[0]] = group(chosen, refits, seen, tuned_best)
-        state = _settled(_kept(chosen, state.whitening), base)
-    if rounds[-1].trace.alarmed and rounds[0].trace.alarmed and most > 1:
+        state = _kept(chosen)
+    if rounds[-1].trace.alarmed and rounds[0].trace.alarmed and not least:
         paired = _paired(start, state, rounds[0].trace)
         if paired is not None:
-            state = _settled(_state(paired, start.whitening), base)
+            state = _state(paired)
             seen = trace(
                 state.model, state.optimum, state.whitening, library, rng, noise_samples=counts, draws=draws
             )
@@ -130,7 +132,9 @@ def _refits(state: State, seen: Trace) -> tuple[list[Refit], list[str], dict[str
         signatures[one.name] = tuned(state.model, state.optimum, state.whitening, one, seen)
     reached = {name: seen.alone(signature) for name, signature in signatures.items()}
     ranked = sorted(reached, key=lambda name: -reached[name])
-    near = [name for name in ranked if reached[name] > NEAR * reached[ranked[0]]][:_CANDIDATES]
+    # noise fitted jointly holds the misfit too: only a refit shows what an effect is worth
+    least = -np.inf if state.whitening.dependence else NEAR * max(reached.values(), default=0.0)
+    near = [name for name in ranked if reached[name] > least][:_CANDIDATES]
     far = rough(seen)
     near = ranked if far else near
     for name in near:
@@ -176,11 +180,11 @@ def _leader(accepted: Sequence[Refit]) -> Refit | None:
     return next(shared, accepted[0] if accepted else None)
 
 
-def _state(made: Refit, whitening: Whitening) -> State:
-    return State(made.model, made.optimum, whitening, made.optimum.covariance)
+def _state(made: Refit) -> State:
+    return State(made.model, made.optimum, made.whitening, made.optimum.covariance)
 
 
-def _kept(made: Refit, whitening: Whitening) -> State:
+def _kept(made: Refit) -> State:
     """Without effects that are no longer significant beside the new one."""
     idle = [
         effect.name
@@ -188,26 +192,13 @@ def _kept(made: Refit, whitening: Whitening) -> State:
         if effect.name not in made.added and made.wald(effect.name) > SIGNIFICANT
     ]
     if not idle:
-        return _state(made, whitening)
+        return _state(made)
     kept = tuple(effect for effect in made.model.effects if effect.name not in idle)
     model = made.model.having(*kept)
     gone = {k for name in idle for k in made.places(name)}
     x = np.array([value for k, value in enumerate(made.optimum.x) if k not in gone])
-    optimum = Regression(model, whitening).descend(x, most=12, gain=0.02)
-    return State(model, optimum, whitening, optimum.covariance)
-
-
-def _settled(state: State, base: BaseFit) -> State:
-    """With the noise estimated anew from the new residual, where it had to be fitted jointly."""
-    if base.noise_known:
-        return state
-    posterior = base.model.posterior
-    values, _ = state.model.split(state.optimum.x)
-    delays = [posterior.table.at("delay", k) for k in range(len(posterior.table.layout.delays))]
-    noise = measured(posterior, state.optimum.residual, min(float(values[k]) for k in delays))
-    again = whitening(base.model, noise)
-    optimum = Regression(state.model, again).descend(state.optimum.x, most=12, gain=0.02)
-    return State(state.model, optimum, again, optimum.covariance)
+    optimum = Regression(model, made.whitening).descend(x, most=12, gain=0.02)
+    return State(model, optimum, made.whitening, optimum.covariance)
 
 
 def _paired(start: State, state: State, seen: Trace) -> Refit | None:

@@ -21,6 +21,7 @@ from lcopa_bayes.loop.widening import Widening
 
 LEVEL = 0.9
 """Probability inside the bands [-]."""
+_WIDTH = float(norm.ppf(0.5 + LEVEL / 2))
 
 
 @final
@@ -38,11 +39,16 @@ class Score:
     """(n,) [response unit]."""
     predicted: Vector
     """(n,) [response unit]."""
-    half_width: Vector
-    """Half the width of the 90 % band with noise, (n,) [response unit]; NaN where no band is given."""
+    variance: Vector
+    """Of what the fit leaves uncertain, without noise, (n,) [response unit^2]; NaN where no band is given."""
     noise_sd: float
     """Standard deviation of the noise [response unit]."""
     level_from: str
+
+    @property
+    def half_width(self) -> Vector:
+        """Half the width of the 90 % band with noise, (n,) [response unit]; NaN where no band is given."""
+        return np.asarray(_WIDTH * np.sqrt(self.variance + self.noise_sd**2))
 
     @property
     def rmse(self) -> float:
@@ -137,9 +143,7 @@ def _own_levels(state: State) -> bool:
 
 
 def _delay(state: State) -> float:
-    table = state.model.base.posterior.table
-    values, _ = state.model.split(state.optimum.x)
-    return min(float(values[table.at("delay", k)]) for k in range(len(table.layout.delays)))
+    return state.model.base.dead_time(state.optimum.x[: state.model.plant_size])
 
 
 def _scores(
@@ -151,7 +155,6 @@ def _scores(
     priors: Sequence[LevelPrior] = (),
 ) -> list[Score]:
     """One score per record and axis; with a `delay` each record's level is found first."""
-    width = float(norm.ppf(0.5 + LEVEL / 2))
     whitening, out = state.whitening, []
     for part in whitening.parts:
         record = whitening.samples[part.record]
@@ -177,7 +180,7 @@ def _scores(
                 record.times[observed.index],
                 observed.values,
                 centre,
-                width * np.sqrt(spread + noise.sd**2),
+                spread,
                 noise.sd,
                 source,
             )

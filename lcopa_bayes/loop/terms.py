@@ -17,6 +17,7 @@ from lcopa_bayes.loop.prediction import taken
 from lcopa_bayes.loop.regression import Regression
 from lcopa_bayes.loop.rounds import leading
 from lcopa_bayes.loop.scores import State
+from lcopa_bayes.loop.startlevel import Mended, started
 from lcopa_bayes.loop.trace import trace
 from lcopa_bayes.plant.effects.effect import Effect
 from lcopa_bayes.settings import PriorSettings
@@ -51,10 +52,11 @@ def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: boo
     than the best named effect, or more together with what it leaves to be named.
     """
     base = _based(study)
-    later = _later(study, base.fit)
-    if later is not None:
-        study, said = later
-        base = _based(study)._replace(sentence=said)
+    for mended in (started, _later):
+        better = mended(study, base.fit)
+        if better is not None:
+            study = better.study
+            base = _based(study)._replace(sentence=f"{base.sentence} {better.sentence}".strip())
     if as_stated or study.model.terms != 1 or study.model.orders != "free":
         return base
     for terms in range(2, _MOST + 1):
@@ -106,7 +108,7 @@ def _named(base: Base, library: Sequence[type[Effect]], rng: np.random.Generator
     return leading(start, seen) if seen.alarmed else 0.0
 
 
-def _later(study: Study, fit: BaseFit) -> tuple[Study, str] | None:
+def _later(study: Study, fit: BaseFit) -> Mended | None:
     """The study with a longer default prior of its delays, where one stands at the end of it; else None."""
     model = fit.model
     stuck = []
@@ -122,6 +124,7 @@ def _later(study: Study, fit: BaseFit) -> tuple[Study, str] | None:
         for name, end in stuck
     }
     names = ", ".join(f"{name} (ends at {end:.4g} {model.time_unit})" for name, end in stuck)
-    return replace(study, priors={**study.priors, **longer}), (
-        f"The default prior of {names} is too short for these records and was made twice as long."
+    return Mended(
+        replace(study, priors={**study.priors, **longer}),
+        f"The default prior of {names} is too short for these records and was made twice as long.",
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import final
 
@@ -53,6 +53,11 @@ class Traced:
         return self.card.name
 
     @property
+    def scatters(self) -> bool:
+        """Whether it changes the distribution of the noise alone."""
+        return not self.signatures and not self.failed
+
+    @property
     def survival(self) -> float:
         """Largest share of an instance's signature that is left [-]; NaN for one that changes only the
         noise."""
@@ -69,7 +74,7 @@ class Trace:
     threshold: float
     """Largest of 3 and the 99 % quantile of the largest log Bayes factor by chance [nat]."""
     p_value: float
-    """Share of chance maxima at or above the largest found, no less than 1 / (draws + 1) [-]."""
+    """Share of chance maxima at or above `largest`, no less than 1 / (draws + 1) [-]."""
     draws: int
     """Chance maxima drawn [-]."""
     residual: Vector
@@ -78,14 +83,24 @@ class Trace:
     """What is known of the noise scale."""
 
     @property
+    def leader(self) -> Traced | None:
+        """The effect of largest evidence among those that change the response; None without any."""
+        return next((one for one in self.traced if not one.scatters), None)
+
+    @property
     def largest(self) -> float:
-        """Largest log Bayes factor [nat]; -inf without effects."""
-        return max((one.log_bayes_factor for one in self.traced), default=-np.inf)
+        """Its log Bayes factor [nat]; -inf without any."""
+        return self.leader.log_bayes_factor if self.leader else -np.inf
 
     @property
     def alarmed(self) -> bool:
-        """Whether anything is above the threshold."""
+        """Whether any effect that changes the response is above the threshold."""
         return self.largest > self.threshold
+
+    @property
+    def scatter(self) -> float:
+        """Evidence that the noise is not normal [nat]; -inf where that was not asked."""
+        return max((one.log_bayes_factor for one in self.traced if one.scatters), default=-np.inf)
 
     @cached_property
     def probabilities(self) -> dict[str, float]:
@@ -143,16 +158,10 @@ def trace(
         found.append(_traced(model, optimum, whitening, project, residual, scale, kind))
     maxima = _chance(project, whitening, found, rng, noise_samples, draws, scale)
     found.sort(key=lambda one: -one.log_bayes_factor)
-    largest = found[0].log_bayes_factor if found else -np.inf
-    beaten = int(np.count_nonzero(maxima >= largest))
-    return Trace(
-        tuple(found),
-        max(LEAST, float(np.quantile(maxima, QUANTILE))) if maxima.size else LEAST,
-        (beaten + 1) / (draws + 1),
-        draws,
-        residual,
-        scale,
-    )
+    threshold = max(LEAST, float(np.quantile(maxima, QUANTILE))) if maxima.size else LEAST
+    made = Trace(tuple(found), threshold, np.nan, draws, residual, scale)
+    beaten = int(np.count_nonzero(maxima >= made.largest))
+    return replace(made, p_value=(beaten + 1) / (draws + 1))
 
 
 def commands_of(drive: Matrix) -> int:
@@ -213,11 +222,11 @@ def _chance(
             for part in whitening.parts:
                 if part.axis == axis:
                     z[part.rows] *= factor
-        inner = (every @ z.astype(np.float32)).astype(float)
-        left, _ = project.parts
-        power = np.einsum("nd,nd->d", z, z) - np.einsum("kd,kd->d", left.T @ z, left.T @ z)
-        known = Scale(scale.quiet, scale.freedom, power)
-        scatter = [scatter_evidence(column) for column in z.T] if _scatters(found) else None
+        left = project(z)
+        inner = (every @ left.astype(np.float32)).astype(float)
+        known = Scale(scale.quiet, scale.freedom, np.einsum("nd,nd->d", left, left))
+        scatters = any(one.scatters for one in found)
+        scatter = [scatter_evidence(column) for column in z.T] if scatters else None
         evidence = [
             one.evidence(inner[a:b], known) for one, a, b in zip(listed, edges[:-1], edges[1:], strict=True)
         ]
@@ -231,7 +240,3 @@ def _chance(
             by_effect.append(np.array(scatter))
         maxima.append(np.max(by_effect, axis=0))
     return np.concatenate(maxima)
-
-
-def _scatters(found: Sequence[Traced]) -> bool:
-    return any(not one.signatures and not one.failed for one in found)

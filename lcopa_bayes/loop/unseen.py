@@ -11,6 +11,8 @@ from lcopa_bayes.study import Study
 
 _ROOM = 0.05
 """Share of the range of a drive beyond which a model extrapolates [-]."""
+_DOUBTS = 9.0
+"""Variances of a prediction that an error must exceed [-]."""
 _SEEN = 5.0
 """Standard deviations of a chance sum of squares that error beyond noise must exceed to be judged [-]."""
 
@@ -23,14 +25,36 @@ def unseen_share(study: Study, before: Sequence[Score], after: Sequence[Score], 
     """
     if any(effect.card.per_record for effect in state.model.effects):
         return np.nan
-    was, now, count = 0.0, 0.0, 0
-    for one, other in zip(before, after, strict=True):
-        inside = one.time < _left(study, one.record)
-        count += int(inside.sum())
-        noise = other.noise_sd  # of both: a fit without the effects may have taken them for noise
-        was += float((((one.observed - one.predicted)[inside] / noise) ** 2 - 1).sum())
-        now += float((((other.observed - other.predicted)[inside] / noise) ** 2 - 1).sum())
+    # one noise for both: a fit without the effects may have taken them for noise
+    noise = [one.noise_sd for one in after]
+    was, count = _beyond(study, before, state, noise)
+    now, _ = _beyond(study, after, state, noise)
     return now / was if was > _SEEN * np.sqrt(2 * count) else np.nan
+
+
+def missed(study: Study, scores: Sequence[Score], state: State) -> float:
+    """Root mean square error on held-out records over the noise, where it is more than noise and three
+    standard deviations of what the fit leaves uncertain; NaN where it is not [-]."""
+    noise = [one.noise_sd for one in scores]
+    power, count = _beyond(study, scores, state, noise)
+    unsure, _ = _beyond(study, scores, state, noise, doubts=_DOUBTS)
+    return float(np.sqrt(1 + power / count)) if unsure > _SEEN * np.sqrt(2 * count) else np.nan
+
+
+def _beyond(
+    study: Study, scores: Sequence[Score], state: State, noise: Sequence[float], doubts: float = 0.0
+) -> tuple[float, float]:
+    """Squared error less that of `noise` and `doubts` times the fit's own variance, over the noise's, summed
+    over independent samples inside the fitted drive range; and their number [-]."""
+    axes = {axis.name: k for k, axis in enumerate(study.response_axes)}
+    power, count = 0.0, 0.0
+    for one, sd in zip(scores, noise, strict=True):
+        inside = one.time < _left(study, one.record)
+        independent = 1 / state.whitening.dependence[axes[one.axis]] if state.whitening.dependence else 1.0
+        error = (one.observed - one.predicted)[inside]
+        power += independent * float(((error**2 - doubts * one.variance[inside]) / sd**2 - 1).sum())
+        count += independent * float(inside.sum())
+    return power, count
 
 
 def _left(study: Study, name: str) -> float:

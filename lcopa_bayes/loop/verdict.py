@@ -59,6 +59,11 @@ class Found:
     remaining_name: str
     share: float
     """Residual power taken by the effects over that and what the best remaining class would take [-]."""
+    scatter: float = -math.inf
+    """Evidence that the noise is not normal, in the first residual [nat]."""
+    missed: float = math.nan
+    """Root mean square error of the base model on held-out records over the noise; NaN where noise and what
+    the fit leaves uncertain explain it [-]."""
     unseen: float = math.nan
     """Squared error beyond noise on held-out records, with the effects over without [-]; NaN where it says
     nothing: no such records, no such error, or effects that differ from record to record."""
@@ -70,14 +75,7 @@ def decide(found: Found) -> Verdict:
     if found.failed:
         return Verdict("unexplained", "tentative", f"No effect is named, because {found.failed}.")
     if not found.alarmed:
-        return Verdict(
-            "clean",
-            confidence,
-            "Nothing is missing that these records could show: the largest log Bayes factor of any "
-            "effect is "
-            f"{found.largest:.1f} nat, and chance alone reaches {found.threshold:.1f} once in a hundred "
-            "times.",
-        )
+        return _quiet(found, confidence)
     named = ", ".join(found.effects)
     if not found.effects:
         return Verdict(
@@ -126,6 +124,30 @@ def decide(found: Found) -> Verdict:
             f"{named} disturb(s) the records; the plant stays as it is, the noise model changes." + rest,
         )
     return Verdict("explained", confidence, f"{named} {verb} missing, worth {found.gained:.0f} nat." + rest)
+
+
+def _quiet(found: Found, confidence: Confidence) -> Verdict:
+    """The verdict where the fitted records show nothing."""
+    nothing = (
+        "Nothing is missing that these records could show: the largest log Bayes factor of any effect is "
+        f"{found.largest:.1f} nat, and chance alone reaches {found.threshold:.1f} once in a hundred times."
+    )
+    if found.missed > 0:
+        return Verdict(
+            "unexplained",
+            confidence,
+            f"The records held out are missed by {found.missed:.1f} times the noise, more than the fit "
+            "leaves uncertain, though the fitted ones show no effect (the largest log Bayes factor is "
+            f"{found.largest:.1f} nat): no name is forced.",
+        )
+    if found.scatter > found.threshold:
+        return Verdict(
+            "disturbance",
+            confidence,
+            f"{nothing} But the noise is not normal ({found.scatter:.0f} nat): a few samples lie far "
+            "outside, so that intervals are narrower than they should be; a Student noise would hold them.",
+        )
+    return Verdict("clean", confidence, nothing)
 
 
 def beside(verdict: Verdict, said: str) -> Verdict:
