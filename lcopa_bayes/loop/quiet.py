@@ -21,7 +21,7 @@ _SAFE = 0.8
 _LAGS = 2000
 """Autocorrelations of an autoregression that are summed at most [-]."""
 _WINDOW = 5.0
-"""Lags over which autocorrelations are summed, over the sum itself (Sokal 1997, Functional Integration) [-]."""
+"""Lags over which autocorrelations are summed, over that sum (Sokal 1997, NATO ASI B 361) [-]."""
 _ALIKE = 1e-3
 """p-value below which repeats differ by more than the quiet noise [-]."""
 
