@@ -141,9 +141,9 @@ def panel(k, seed=1):
 def test_a_small_effect_of_a_single_record_is_not_named():
     library = [catalogue()["overdrive_pulse"]]
     found = loop(panel(0.02), library=library, sample=False, quick=True, as_stated=True)
-    taken = found.rounds[0].refits[0].taken
+    made = found.rounds[0].refits[0]
     assert found.trace.alarmed
-    assert 0.05 < taken < SINGLE
+    assert 0.05 < made.taken < SINGLE
     assert found.verdict.kind == "unexplained"
     assert any(f"{100 * SINGLE:.0f} %" in caution for caution in found.cautions)
 

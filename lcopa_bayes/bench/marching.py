@@ -54,13 +54,14 @@ def marched(
     for k in range(n):
         history = np.einsum("ij,ij->i", acting[:, :k], backward[:, n - k - 1 : n - 1])
         now = history + kernel[:, 0] * (acting[:, k - 1] if k else 0.0)
-        for _ in range(_SWEEPS):
-            v = balance(force[:, k], level + 0.5 * (now + before), (now - before) / step, k) - level
-            new = history + kernel[:, 0] * v
-            moved = np.abs(new - now).max()
-            now = new
-            if moved <= close:
-                break
+        with np.errstate(over="ignore", invalid="ignore"):  # what runs away is told below
+            for _ in range(_SWEEPS):
+                v = balance(force[:, k], level + 0.5 * (now + before), (now - before) / step, k) - level
+                new = history + kernel[:, 0] * v
+                moved = np.abs(new - now).max()
+                now = new
+                if moved <= close:
+                    break
         if not np.abs(now).max() < bound:
             raise MarchError(step * k)
         acting[:, k], y[:, k], before = v, now, now

@@ -36,17 +36,47 @@ class Refit:
 
     model: ExtendedModel
     optimum: Optimum
-    log_bayes_factor: float
-    """Laplace evidence over that of the plant with the effects it had before [nat]."""
-    left_out: float
-    """Gain of the summed log predictive densities of records left out in turn [nat]."""
+    before: Optimum
+    """That of the plant with the effects it had before."""
+    whitening: Whitening
+    """The noise both are judged under."""
     added: tuple[str, ...]
     """Names of the effects that are new."""
-    taken: float
-    """Share of the residual's power that the new effects take [-]."""
-    whitening: Whitening
-    """The noise it is judged under: where that is known from residuals alone, from the one with the
-    effects."""
+    quiet: float
+    """Samples the noise scale is known from [-]."""
+    paid: float
+    """Evidence of signs that are known less that of the choice among what was tried [nat]."""
+
+    @cached_property
+    def log_bayes_factor(self) -> float:
+        """Laplace evidence over that of the plant before [nat]."""
+        return log_bayes_factor(self.before, self.optimum, self.quiet) + self.paid
+
+    @cached_property
+    def left_out(self) -> float:
+        """Gain of the summed log predictive densities of records left out in turn [nat]."""
+        apart = groups(self.whitening)
+        return float(log_scores(self.optimum, apart).sum() - log_scores(self.before, apart).sum())
+
+    @property
+    def taken(self) -> float:
+        """Share of the residual's power that the new effects take [-]."""
+        return 1.0 - self.optimum.cost / self.before.cost
+
+    @property
+    def excess(self) -> float:
+        """Root mean square of the residual before over that of the noise [-]."""
+        return self.whitening.excess(self.before.residual)
+
+    def under(self, whitening: Whitening) -> Refit:
+        """The same judged under another noise."""
+        plain = self.model.having(*(e for e in self.model.effects if e.name not in self.added))
+        return replace(
+            self,
+            optimum=Regression(self.model, whitening).descend(self.optimum.x, most=12, gain=_NEAR),
+            before=Regression(plain, whitening).descend(self.before.x, most=12, gain=_NEAR),
+            whitening=whitening,
+        )
 
     def wald(self, name: str) -> float:
         """p-value of an effect's coefficients being zero at the Laplace covariance [-].
@@ -115,24 +145,25 @@ def refit(
     quick = Regression(replace(extended, exact=False), whitening).best(starts, gain=_NEAR)
     extended, start = polished(extended, quick.x, whitening, tuple(effect.name for effect, _ in added))
     optimum = Regression(extended, whitening).descend(start, most=12, gain=0.02)
-    if whitening.dependence:
-        whitening = renewed(model.base, optimum, whitening)
-        optimum = Regression(extended, whitening).descend(optimum.x, most=12, gain=0.02)
-        before = Regression(model, whitening).descend(before.x, most=12, gain=0.02)
     sides = sum(one.coefficient.one_signed for one in extended.effected.coefficients[-linear.size :])
     tried = sum(np.log(len(effect.grid(extended.effected.ranges))) for effect, _ in added)
-    evidence = log_bayes_factor(before, optimum, quiet) + sides * np.log(2.0) - tried
-    left_out = groups(whitening)
-    gain = float(log_scores(optimum, left_out).sum() - log_scores(before, left_out).sum())
+    names = tuple(effect.name for effect, _ in added)
     return Refit(
-        extended,
-        optimum,
-        evidence,
-        gain,
-        tuple(effect.name for effect, _ in added),
-        1.0 - optimum.cost / before.cost,
-        whitening,
+        extended, optimum, before, whitening, names, quiet, sides * float(np.log(2.0)) - float(tried)
     )
+
+
+def under_one_noise(made: Sequence[Refit]) -> list[Refit]:
+    """Refits of one residual, by falling evidence.
+
+    Where noise is known from residuals alone it holds the misfit too: then all are judged under that of the
+    refit that leaves least.
+    """
+    if made and made[0].whitening.dependence:
+        least = max(made, key=lambda one: one.taken)
+        noise = renewed(least.model.base, least.optimum, least.whitening)
+        made = [one.under(noise) for one in made]
+    return sorted(made, key=lambda one: -one.log_bayes_factor)
 
 
 def log_bayes_factor(before: Optimum, after: Optimum, quiet: float) -> float:

@@ -17,12 +17,12 @@ from lcopa_bayes.loop.density import LoopDensity
 from lcopa_bayes.loop.draws import LoopDraws, sample_loop, unit_of
 from lcopa_bayes.loop.outlying import NAME as OUTLIERS
 from lcopa_bayes.loop.outlying import Outlying, outlying
-from lcopa_bayes.loop.rounds import SINGLE, Round, search
+from lcopa_bayes.loop.rounds import CLEAR, SINGLE, Round, search
 from lcopa_bayes.loop.scores import Score, State, fit_scores, held_out_scores, left_out_scores
 from lcopa_bayes.loop.terms import fitted_base
 from lcopa_bayes.loop.trace import Trace
 from lcopa_bayes.loop.unseen import missed, unseen_share
-from lcopa_bayes.loop.verdict import Found, Verdict, beside, decide
+from lcopa_bayes.loop.verdict import ALONE, EXPLAINED, Found, Verdict, beside, decide
 from lcopa_bayes.loop.widening import Widening
 from lcopa_bayes.plant.effects.catalogue import catalogue
 from lcopa_bayes.plant.effects.effect import Effect
@@ -156,9 +156,9 @@ def _looped(
             *(problem, base, enlarged, (), (), (), verdict, before, before, not study.held_out, cautions),
             outliers=outliers,
         )
-    least = SINGLE if len(study.fit) == 1 and not study.held_out else 0.0
+    alone = len(study.fit) == 1 and not study.held_out
     rng = np.random.default_rng([study.seed, 11])
-    searched = search(start, base, kinds, rng, draws=draws, least=least)
+    searched = search(start, base, kinds, rng, draws=draws, alone=alone)
     first, last = searched.rounds[0].trace, searched.rounds[-1].trace
     generic = max(
         (one for one in first.traced if one.card.place == "generic"),
@@ -183,6 +183,8 @@ def _looped(
             last.threshold,
             last.leader.name if last.leader else "",
             searched.share,
+            start.whitening.excess(start.optimum.residual),
+            ALONE if alone else EXPLAINED,
             first.scatter if base.noise_known else -np.inf,
             missed(study, before.unseen, start) if study.held_out else np.nan,
             unseen_share(study, before.unseen, after.unseen, searched.state) if study.held_out else np.nan,
@@ -226,7 +228,10 @@ def _alone(study: Study) -> tuple[str, ...]:
         return ()
     told = "a single record cannot tell an effect of the device from a peculiarity of that record"
     if not study.held_out:
-        told += f": an effect is named only where it takes {100 * SINGLE:.0f} % of the residual's power"
+        told += (
+            f": an effect is named only where the residual is {CLEAR:g} times the noise and it takes "
+            f"{100 * SINGLE:.0f} % of its power"
+        )
     return (f"{told}; fit a second one",)
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import final
 
 import numpy as np
 
 from lcopa_bayes.loop.basefit import BaseFit
-from lcopa_bayes.loop.confirm import SIGNIFICANT, Refit, log_bayes_factor, refit
+from lcopa_bayes.loop.confirm import SIGNIFICANT, Refit, log_bayes_factor, refit, under_one_noise
 from lcopa_bayes.loop.constants import tuned
 from lcopa_bayes.loop.groups import group
 from lcopa_bayes.loop.instances import descended, movable, rough
@@ -25,6 +25,9 @@ _MOST = 3
 """Effects that are added at most [-]."""
 SINGLE = 0.3
 """Share of the residual's power that an effect must take when a single record is all there is [-]."""
+CLEAR = 1.5
+"""Residual over noise from which a single record names anything: its noise may differ from level to level
+[-]."""
 _CANDIDATES = 4
 _TUNED = 8
 """Named effects whose internal constants are moved off their grid before they are ranked [-]."""
@@ -72,11 +75,11 @@ def search(
     rng: np.random.Generator,
     *,
     draws: int,
-    least: float = 0.0,
+    alone: bool = False,
 ) -> Search:
     """Add effects one at a time, up to three, while evidence, records left out and significance all speak
-    for it and each takes a share of the residual's power beyond `least`; then try pairs where something
-    remains, and take back what is no longer significant."""
+    for it, from a record that stands `alone` only large ones; then try pairs where something remains, and
+    take back what is no longer significant."""
     counts = [one.samples if one.known else 0 for one in base.noise]
     state, rounds, groups = start, [], {}
     for number in range(_MOST + 1):
@@ -87,13 +90,15 @@ def search(
             rounds.append(Round(seen, (), (), None))
             break
         refits, failures, tuned_best = _refits(state, seen)
-        chosen = _leader([one for one in refits if _accepted(one, seen) and one.taken > least])
+        # what one refit leaves is not noise alone: a further effect must stand out from it
+        bar = seen.threshold + (MARGIN if number else 0.0)
+        chosen = _leader([one for one in refits if _accepted(one, seen, bar) and (not alone or _large(one))])
         rounds.append(Round(seen, tuple(refits), tuple(failures), chosen))
         if chosen is None:
             break
         groups[chosen.added[0]] = group(chosen, refits, seen, tuned_best)
         state = _kept(chosen)
-    if rounds[-1].trace.alarmed and rounds[0].trace.alarmed and not least:
+    if rounds[-1].trace.alarmed and rounds[0].trace.alarmed and not alone:
         paired = _paired(start, state, rounds[0].trace)
         if paired is not None:
             state = _state(paired)
@@ -133,7 +138,7 @@ def _refits(state: State, seen: Trace) -> tuple[list[Refit], list[str], dict[str
     reached = {name: seen.alone(signature) for name, signature in signatures.items()}
     ranked = sorted(reached, key=lambda name: -reached[name])
     # noise fitted jointly holds the misfit too: only a refit shows what an effect is worth
-    least = -np.inf if state.whitening.dependence else NEAR * max(reached.values(), default=0.0)
+    least = -np.inf if not seen.alarmed else NEAR * max(reached.values(), default=0.0)
     near = [name for name in ranked if reached[name] > least][:_CANDIDATES]
     far = rough(seen)
     near = ranked if far else near
@@ -156,20 +161,24 @@ def _refits(state: State, seen: Trace) -> tuple[list[Refit], list[str], dict[str
             )
         except ArithmeticError as error:
             failures.append(f"{name}: {error}")
-    done.sort(key=lambda made: -made.log_bayes_factor)
-    return done, failures, signatures
+    return under_one_noise(done), failures, signatures
 
 
 def leading(start: State, seen: Trace) -> float:
     """Largest log Bayes factor of a single named effect that would be accepted, 0 without any [nat]."""
     refits, _, _ = _refits(start, seen)
-    return max((one.log_bayes_factor for one in refits if _accepted(one, seen)), default=0.0)
+    accepted = [one.log_bayes_factor for one in refits if _accepted(one, seen, seen.threshold)]
+    return max(accepted, default=0.0)
 
 
-def _accepted(made: Refit, seen: Trace) -> bool:
+def _accepted(made: Refit, seen: Trace, bar: float) -> bool:
     generic = max((g.log_bayes_factor for g in seen.traced if g.card.place == "generic"), default=-np.inf)
     ahead = made.log_bayes_factor > generic + MARGIN
-    return made.log_bayes_factor > seen.threshold and ahead and made.left_out > 0 and made.significant
+    return made.log_bayes_factor > bar and ahead and made.left_out > 0 and made.significant
+
+
+def _large(made: Refit) -> bool:
+    return made.taken > SINGLE and made.excess > CLEAR
 
 
 def _leader(accepted: Sequence[Refit]) -> Refit | None:
@@ -202,13 +211,17 @@ def _kept(made: Refit) -> State:
 
 
 def _paired(start: State, state: State, seen: Trace) -> Refit | None:
-    """The best pair of effects, when its evidence beats what was found one by one; else None."""
+    """The best pair of effects, when its evidence beats what was found one by one; else None.
+
+    It is one of many, and its evidence pays for the choice.
+    """
     named = [one for one in seen.traced if one.card.place != "generic" and one.signatures][:_PAIRED]
     ranked = sorted(
         combinations(named, 2),
         key=lambda pair: -pair_evidence(_best(pair[0]), _best(pair[1]), seen.residual),
     )
     have = {effect.name for effect in state.model.effects}
+    choice = float(np.log(max(len(ranked), 1)))
     bar, best = _gained(start, state, seen.scale.quiet)[0] + MARGIN, None
     for pair in ranked[:_PAIRS]:
         if {one.name for one in pair} <= have:
@@ -221,7 +234,8 @@ def _paired(start: State, state: State, seen: Trace) -> Refit | None:
             made = refit(start.model, start.optimum, start.whitening, added, seen.scale.quiet)
         except ArithmeticError:
             continue
-        if made.log_bayes_factor > bar and _accepted(made, seen):
+        made = replace(under_one_noise([made])[0], paid=made.paid - choice)
+        if made.log_bayes_factor > bar and _accepted(made, seen, seen.threshold):
             bar, best = made.log_bayes_factor, made
     return best
 

@@ -13,6 +13,8 @@ Confidence = Literal["firm", "tentative"]
 EXPLAINED = 0.9
 """Share of the residual power that effects can take which the named ones must take when something significant
 remains [-]; with the noise known well it is their share of the log evidence."""
+ALONE = 0.8
+"""The same from a single record, whose smaller effects are not named [-]."""
 UNSEEN = 0.5
 """Share of the error beyond noise on held-out records that named effects may leave [-]."""
 MARGIN = 3.0
@@ -59,6 +61,10 @@ class Found:
     remaining_name: str
     share: float
     """Residual power taken by the effects over that and what the best remaining class would take [-]."""
+    excess: float = math.nan
+    """Root mean square residual of the base model over the noise [-]."""
+    enough: float = EXPLAINED
+    """Share of the residual power that named effects must take when something significant remains [-]."""
     scatter: float = -math.inf
     """Evidence that the noise is not normal, in the first residual [nat]."""
     missed: float = math.nan
@@ -82,8 +88,8 @@ def decide(found: Found) -> Verdict:
             "unexplained",
             confidence,
             f"Something is missing (log Bayes factor {found.largest:.0f} nat against "
-            f"{found.threshold:.1f} by "
-            "chance), but no effect of the library survives a full refit: no name is forced.",
+            f"{found.threshold:.1f} by chance), and the residual is {found.excess:.2f} times the noise; but "
+            "no effect of the library survives a full refit: no name is forced.",
         )
     left = found.remaining > found.remaining_threshold
     if left and found.generic > found.gained + MARGIN:
@@ -94,7 +100,7 @@ def decide(found: Found) -> Verdict:
             f"{found.generic - found.gained:.0f} nat than the nearest named effect ({named}): no name "
             "is forced.",
         )
-    if left and not found.share >= EXPLAINED:
+    if left and not found.share >= found.enough:
         return Verdict(
             "unexplained",
             confidence,

@@ -108,6 +108,11 @@ class Whitening:
             sum(self.noise[axis].log_scale(rows.stop - rows.start) for axis, rows in self._stretches)
         )
 
+    def excess(self, residual: Vector) -> float:
+        """Root mean square of a stacked residual over the noise's [-]."""
+        power = sum(np.sum((residual[p.rows] / self.noise[p.axis].sd) ** 2) for p in self.parts)
+        return float(np.sqrt(power / self.size))
+
     def draw(self, count: int, rng: np.random.Generator) -> Matrix:
         """Noise of all samples, (count, n) [response unit]."""
         out, noise = np.empty((count, self.size)), self.coloured or self.noise

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from lcopa_bayes.bench.marching import MarchError
 from lcopa_bayes.bench.undeclared import NOISE, Campaign, campaign, drawn
 from lcopa_bayes.files import write_text
 from lcopa_bayes.loop.loop import Loop, Side, loop
@@ -16,6 +17,7 @@ from lcopa_bayes.loop.scores import pooled_coverage
 from lcopa_bayes.settings import ModelSettings
 from lcopa_bayes.study import Study
 
+_ATTEMPTS = 20
 TERMS = {"direct": 2, "cross": 1}
 """What the study of a campaign says of its model: the truth's, without any effect."""
 
@@ -49,8 +51,7 @@ def play(task: Task, folder: Path) -> dict[str, Any]:
     if path.exists():
         return json.loads(path.read_text(encoding="utf-8"))
     with threadpool_limits(1):
-        rng = np.random.default_rng([task.seed, 77])
-        made = campaign(drawn(task.effects, rng), rng, drives=task.drives, correlation=task.correlation)
+        made = measured(task)
         begun, cpu = time.perf_counter(), time.process_time()
         try:
             found = loop(study_of(made, task.seed), sample=task.sampled, as_stated=True)
@@ -60,6 +61,17 @@ def play(task: Task, folder: Path) -> dict[str, Any]:
     row |= {"seconds": time.perf_counter() - begun, "cpu_seconds": time.process_time() - cpu}
     write_text(path, json.dumps(row, indent=1))
     return row
+
+
+def measured(task: Task) -> Campaign:
+    """The campaign of a task; sizes whose device runs away are drawn again, since nobody could measure it."""
+    for attempt in range(_ATTEMPTS):
+        rng = np.random.default_rng([task.seed, 77, *([attempt] if attempt else [])])
+        try:
+            return campaign(drawn(task.effects, rng), rng, drives=task.drives, correlation=task.correlation)
+        except MarchError:
+            continue
+    raise RuntimeError(f"{task.name}: no device of {_ATTEMPTS} has a bounded response")
 
 
 def judged(found: Loop, made: Campaign) -> dict[str, Any]:

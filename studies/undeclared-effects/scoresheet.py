@@ -8,8 +8,9 @@ import numpy as np
 from scipy.stats import beta
 
 Row = Mapping[str, Any]
-EQUIVALENT = {"duffing_with_memory": {"cubic_stiffness"}}
-"""Outsiders whose leading term the catalogue has: naming it counts as right."""
+EQUIVALENT = {"duffing_with_memory": {"cubic_stiffness"}, "fringing_gain": {"odd_curvature"}}
+"""Outsiders whose leading term the catalogue has: naming it, and nothing else, counts as right. A gain that
+changes with the deflection is an odd curvature of every axis while one axis moves."""
 
 
 def bounds(hits: int, trials: int, level: float = 0.95) -> tuple[float, float]:

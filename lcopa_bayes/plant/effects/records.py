@@ -184,8 +184,8 @@ class Vibration(ParallelEffect):
 
     @classmethod
     def grid(cls, ranges: Ranges) -> tuple[Self, ...]:
-        """See `_frequencies`."""
-        return tuple(cls(float(f)) for f in _frequencies(ranges, 1.0))
+        """From two and a half cycles on: fewer are a drift, and imitate what follows the drive."""
+        return tuple(cls(float(f)) for f in _frequencies(ranges, 2.5))
 
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
         """a and b [response unit] per axis."""
