@@ -194,7 +194,7 @@ def _state(made: Refit) -> State:
 
 
 def _kept(made: Refit) -> State:
-    """Without effects that are no longer significant beside the new one."""
+    """Without effects that are no longer significant beside the new one, and not missed when they go."""
     idle = [
         effect.name
         for effect in made.model.effects
@@ -207,6 +207,8 @@ def _kept(made: Refit) -> State:
     gone = {k for name in idle for k in made.places(name)}
     x = np.array([value for k, value in enumerate(made.optimum.x) if k not in gone])
     optimum = Regression(model, made.whitening).descend(x, most=12, gain=0.02)
+    if log_bayes_factor(optimum, made.optimum, made.quiet) > MARGIN:
+        return _state(made)
     return State(model, optimum, made.whitening, optimum.covariance)
 
 
