@@ -23,10 +23,13 @@ from lcopa_bayes.loop.surrogate import Surrogate
 from lcopa_bayes.plant.effects.simulator import UPSTREAM
 
 ENSEMBLES = 4
-_INDEPENDENT = 0.9
-"""Share of the steps that walk on the surrogate or jump, by the acceptance of each in the burn-in [-]."""
-_DIFFERENTIAL = 0.05
-"""Share of those that differ by two other walkers [-]; the rest stretch towards another."""
+_NEAR = 0.2
+"""Share of the steps that walk a short way on the surrogate [-]."""
+_INDEPENDENT = (0.4, 0.75)
+"""Share of those that walk far or jump, where few and where most of these are accepted [-]; the rest combine
+walkers."""
+_FIRST = (0.4, 0.3)
+"""Shares of steps that walk and that jump during the burn-in [-]."""
 _FAVOUR = 4
 """Power of the acceptance by which moves share the steps [-]."""
 _WALKERS = 12
@@ -37,7 +40,7 @@ _ROUND = 10
 _STEPS = 120
 _STEPS_DEAR = 60
 """Most steps where an effect bends the dynamics: a density costs ten times as much."""
-_LENGTH = 8.0
+_LENGTH = 6.0
 """Least length of a chain over the steps after which it forgets [-]."""
 _KEPT = 400
 """Draws kept of all coordinates, at least [-]."""
@@ -174,15 +177,17 @@ def _begun(task: tuple[Surrogate, Jump, int, int]) -> _Run:
     random = np.random.RandomState(np.random.MT19937(np.random.SeedSequence([seed, 20, number])))
     start = emcee.State(_started(density, law, walkers, random), random_state=random.get_state())
     empty = np.zeros((walkers, 0, k)), np.zeros((walkers, 0, density.linear.size))
-    run = _Run(start, law, (_INDEPENDENT / 2, _INDEPENDENT / 2), *empty, 0)
+    run = _Run(start, law, _FIRST, *empty, 0)
     sampler, _, _ = _sampler(surrogate, law, run)
     state = sampler.run_mcmc(start, _BURN, skip_initial_state_check=True)
     jump = law.updated(sampler.get_chain(discard=_BURN // 2, flat=True))
     sampler, walk, jumped = _sampler(surrogate, law, replace(run, jump=jump))
     state = sampler.run_mcmc(state, _BURN, skip_initial_state_check=True)
     # what is learnt from draws that are discarded is fixed from here on: those kept are of one Markov chain
-    share = _INDEPENDENT / (1 + (jumped.acceptance / walk.acceptance) ** _FAVOUR)
-    return _Run(state, jump, (share, _INDEPENDENT - share), *empty, 0)
+    low, high = _INDEPENDENT
+    both = low + (high - low) * max(walk.acceptance, jumped.acceptance)
+    share = both / (1 + (jumped.acceptance / walk.acceptance) ** _FAVOUR)
+    return _Run(state, jump, (share, both - share), *empty, 0)
 
 
 def _continued(task: tuple[Surrogate, Jump, _Run]) -> _Run:
@@ -206,12 +211,14 @@ def _continued(task: tuple[Surrogate, Jump, _Run]) -> _Run:
 def _sampler(surrogate: Surrogate, law: Jump, run: _Run) -> tuple[Any, Counted, Counted]:
     """A sampler with the moves of a run, and those that are counted."""
     walk, jump = Counted(Walk(surrogate, law)), Counted(run.jump)
+    rest = (1 - _NEAR - sum(run.shares)) / 2
     # beside moves that go anywhere, the two that combine walkers need not span the space themselves
     moves = [
         (walk, run.shares[0]),
+        (emcee.moves.MHMove(Walk(surrogate, law, near=True)), _NEAR),
         (jump, run.shares[1]),
-        (emcee.moves.DEMove(live_dangerously=True), _DIFFERENTIAL),
-        (emcee.moves.StretchMove(live_dangerously=True), 1 - _INDEPENDENT - _DIFFERENTIAL),
+        (emcee.moves.DEMove(live_dangerously=True), rest),
+        (emcee.moves.StretchMove(live_dangerously=True), rest),
     ]
     walkers, dimension = run.chain.shape[0], run.chain.shape[2]
     sampler = emcee.EnsembleSampler(walkers, dimension, _told, args=[surrogate.density], moves=moves)

@@ -17,7 +17,8 @@ Proposal: TypeAlias = Callable[[Matrix, np.random.RandomState], tuple[Matrix, Ve
 _FREEDOM = 12
 """Degrees of freedom of the jump's t distribution [-]: heavier tails than any posterior it is used on."""
 _STEPS = 30
-"""Steps on the surrogate per proposal [-]."""
+_STEPS_NEAR = 8
+"""Steps on the surrogate per proposal, of long walks and of those that stay near [-]."""
 _LEARNERS = 64
 _LEARNT = 15
 """Walks on the surrogate that its mean and covariance are learnt from, the first third discarded [-]."""
@@ -81,6 +82,9 @@ class Walk:
 
     surrogate: Callable[[Matrix], Vector]
     jump: Jump
+    near: bool = False
+    """Whether it only strides, a few times: it ends where the surrogate errs alike, and is accepted where far
+    ones are not."""
 
     def __call__(self, here: Matrix, random: np.random.RandomState) -> tuple[Matrix, Vector]:
         """As a `Proposal`."""
@@ -88,8 +92,8 @@ class Walk:
         first = value = self.surrogate(z)
         density = self.jump.log_density(z)
         longest = _LONGEST / np.sqrt(z.shape[1])
-        for _ in range(_STEPS):
-            far = random.random_sample(count) < 0.5
+        for _ in range(_STEPS_NEAR if self.near else _STEPS):
+            far = random.random_sample(count) < (0.0 if self.near else 0.5)
             stride = longest * _SHORTEST ** random.random_sample(count)
             near = z + stride[:, None] * random.standard_normal(z.shape) @ self.jump.root.T
             new = np.where(far[:, None], self.jump.drawn(count, random), near)
