@@ -1,37 +1,49 @@
-"""Posterior draws of plant and effects: ensembles of walkers that also jump by the Laplace approximation."""
+"""Posterior draws of plant and effects: ensembles of walkers that mostly propose by a surrogate."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import cached_property
 from multiprocessing import get_context
 from typing import Any, final
 
 import emcee
 import numpy as np
-from scipy.stats import multivariate_t
 
 from lcopa_bayes.arrays import Array, Matrix, Vector
 from lcopa_bayes.estimate import Estimate
 from lcopa_bayes.inference.grade import Grade, Quality, overall, qualities
 from lcopa_bayes.loop.density import LoopDensity
 from lcopa_bayes.loop.extended import ExtendedModel
+from lcopa_bayes.loop.proposals import Counted, Jump, Walk, learnt
+from lcopa_bayes.loop.surrogate import Surrogate
 from lcopa_bayes.plant.effects.simulator import UPSTREAM
 
 ENSEMBLES = 4
-_FREEDOM = 12
-"""Degrees of freedom of the jump's t distribution [-]: heavier tails than any posterior it is used on."""
-_JUMPS = 0.8
-"""Share of the steps that jump by the approximation [-]."""
-_BURN = 0.3
-"""Share of the steps that is discarded [-]."""
+_NEAR = 0.2
+"""Share of the steps that walk a short way on the surrogate [-]."""
+_INDEPENDENT = (0.4, 0.75)
+"""Share of those that walk far or jump, where few and where most of these are accepted [-]; the rest combine
+walkers."""
+_FIRST = (0.4, 0.3)
+"""Shares of steps that walk and that jump during the burn-in [-]."""
+_FAVOUR = 4
+"""Power of the acceptance by which moves share the steps [-]."""
+_WALKERS = 12
+"""Walkers of an ensemble, at least [-]."""
+_BURN = 5
+"""Steps of either half of the burn-in [-]."""
+_ROUND = 10
 _STEPS = 120
 _STEPS_DEAR = 60
-"""Steps where an effect bends the dynamics: a density costs thirty times as much."""
+"""Most steps where an effect bends the dynamics: a density costs ten times as much."""
+_LENGTH = 6.0
+"""Least length of a chain over the steps after which it forgets [-]."""
 _KEPT = 400
-"""Draws whose integrated coordinates are drawn [-]."""
+"""Draws kept of all coordinates, at least [-]."""
 TARGET_ESS = 400.0
 
 
@@ -91,81 +103,142 @@ def unit_of(model: ExtendedModel, k: int) -> tuple[str, str, float]:
 
 
 def sample_loop(density: LoopDensity, seed: int, *, jobs: int = 1, quick: bool = False) -> LoopDraws:
-    """Four independent ensembles from overdispersed starts about the optimum; deterministic given `seed`."""
+    """Four independent ensembles from overdispersed starts about the optimum; deterministic given `seed`.
+
+    They go on, 10 steps at a time, until the draws grade as reliable, or as long as an evaluation's price
+    allows (half as long with `quick`).
+    """
     dear = any(isinstance(effect, UPSTREAM) for effect in density.state.model.effects)
-    steps = (_STEPS_DEAR if dear else _STEPS) // (2 if quick else 1)
-    tasks = [(density, seed, number, steps) for number in range(ENSEMBLES)]
-    if jobs > 1:
-        with ProcessPoolExecutor(min(jobs, ENSEMBLES), mp_context=get_context("spawn")) as pool:
-            done = list(pool.map(_ensemble, tasks))
-    else:
-        done = [_ensemble(task) for task in tasks]
-    chains = np.stack([chain for chain, _ in done])
+    most = (_STEPS_DEAR if dear else _STEPS) // (2 if quick else 1)
     names = [unit_of(density.state.model, int(k))[0] for k in density.sampled]
-    found = qualities(names, chains)
+    surrogate = Surrogate.of(density)
+    law = learnt(surrogate, surrogate.centre, surrogate.root, np.random.RandomState([seed, 22]))
+    with _mapped(jobs) as mapped:
+        runs = mapped(_begun, [(surrogate, law, seed, number) for number in range(ENSEMBLES)])
+        while True:
+            runs = mapped(_continued, [(surrogate, law, run) for run in runs])
+            chains = np.stack([run.chain for run in runs])
+            found, kept = qualities(names, chains), chains.shape[2]
+            if kept >= most or (overall(found, TARGET_ESS).level == "reliable" and _long(found, chains)):
+                break
+    stride = max(1, chains.shape[0] * chains.shape[1] * kept // _KEPT)
+    thin = np.stack([run.chain[:, ::-1][:, ::stride] for run in runs])
+    shifts = np.stack([run.shifts[:, ::-1][:, ::stride] for run in runs])
     rng = np.random.default_rng([seed, 21])
-    stride = max(1, chains.shape[0] * chains.shape[1] * chains.shape[2] // _KEPT)
-    kept = chains[:, :, ::-1][:, :, ::stride]
-    full = np.array([density.completed(z, rng) for z in kept.reshape(-1, kept.shape[-1])])
+    full = density.completed(thin.reshape(-1, thin.shape[-1]), shifts.reshape(-1, shifts.shape[-1]), rng)
     return LoopDraws(
         density.state.model,
-        full.reshape(*kept.shape[:3], -1),
+        full.reshape(*thin.shape[:3], -1),
         found,
-        float(np.mean([share for _, share in done])),
+        float(np.mean([run.accepted for run in runs]) / (kept * chains.shape[1])),
         tuple(int(k) for k in density.sampled),
     )
 
 
-def _ensemble(task: tuple[LoopDensity, int, int, int]) -> tuple[Array, float]:
-    """Chain (walkers, draws, dimension) of one ensemble, and its acceptance."""
-    density, seed, number, steps = task
-    state = density.state
-    centre = state.optimum.x[density.sampled]
-    covariance = state.optimum.covariance[np.ix_(density.sampled, density.sampled)]
+def _long(found: Sequence[Quality], chains: Array) -> bool:
+    """Whether every walker took many times the steps after which it forgets where it was: from shorter chains
+    that number of steps cannot be told."""
+    memory = chains[..., 0].size / min(quality.ess for quality in found)
+    return bool(chains.shape[2] > _LENGTH * memory)
+
+
+@contextmanager
+def _mapped(jobs: int) -> Iterator[Callable[..., list[Any]]]:
+    """A map over ensembles, in processes where there are several."""
+    if jobs > 1:
+        with ProcessPoolExecutor(min(jobs, ENSEMBLES), mp_context=get_context("spawn")) as pool:
+            yield lambda function, tasks: list(pool.map(function, tasks))
+    else:
+        yield lambda function, tasks: [function(task) for task in tasks]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """An ensemble where it stands, and what it has drawn."""
+
+    state: Any
+    jump: Jump
+    shares: tuple[float, float]
+    """Of the steps that walk on the surrogate, and of those that jump [-]."""
+    chain: Array
+    """(walkers, draws, dimension)."""
+    shifts: Array
+    """Of what is integrated out, (walkers, draws, linear)."""
+    accepted: int
+    """Proposals accepted in the chain."""
+
+
+def _begun(task: tuple[Surrogate, Jump, int, int]) -> _Run:
+    """An ensemble after its burn-in, in which its jump and the shares of its moves are learnt."""
+    surrogate, law, seed, number = task
+    density, k = surrogate.density, law.centre.size
+    walkers = max(k + 2, _WALKERS)
     random = np.random.RandomState(np.random.MT19937(np.random.SeedSequence([seed, 20, number])))
-    walkers = 2 * centre.size + 2
-    start = _started(density, centre, covariance, walkers, random)
-    moves = [(emcee.moves.MHMove(_jump(centre, covariance)), _JUMPS), (emcee.moves.DEMove(), 0.15)]
-    moves.append((emcee.moves.StretchMove(), 0.85 - _JUMPS))
-    burn = int(_BURN * steps)
-    first = emcee.EnsembleSampler(walkers, centre.size, density, moves=moves)
-    first.random_state = random.get_state()
-    reached = first.run_mcmc(start, burn, skip_initial_state_check=True)
-    learnt = first.get_chain(discard=burn // 2, flat=True)
-    # jumps learnt from what is discarded are fixed from here on, so the kept draws are of one Markov chain
-    moves[0] = (emcee.moves.MHMove(_jump(learnt.mean(axis=0), np.cov(learnt.T))), _JUMPS)
-    sampler = emcee.EnsembleSampler(walkers, centre.size, density, moves=moves)
-    sampler.random_state = reached.random_state
-    sampler.run_mcmc(reached, steps - burn, skip_initial_state_check=True)
-    return np.asarray(sampler.get_chain().swapaxes(0, 1)), float(np.mean(sampler.acceptance_fraction))
+    start = emcee.State(_started(density, law, walkers, random), random_state=random.get_state())
+    empty = np.zeros((walkers, 0, k)), np.zeros((walkers, 0, density.linear.size))
+    run = _Run(start, law, _FIRST, *empty, 0)
+    sampler, _, _ = _sampler(surrogate, law, run)
+    state = sampler.run_mcmc(start, _BURN, skip_initial_state_check=True)
+    jump = law.updated(sampler.get_chain(discard=_BURN // 2, flat=True))
+    sampler, walk, jumped = _sampler(surrogate, law, replace(run, jump=jump))
+    state = sampler.run_mcmc(state, _BURN, skip_initial_state_check=True)
+    # what is learnt from draws that are discarded is fixed from here on: those kept are of one Markov chain
+    low, high = _INDEPENDENT
+    both = low + (high - low) * max(walk.acceptance, jumped.acceptance)
+    share = both / (1 + (jumped.acceptance / walk.acceptance) ** _FAVOUR)
+    return _Run(state, jump, (share, both - share), *empty, 0)
 
 
-def _started(
-    density: LoopDensity, centre: Vector, covariance: Matrix, walkers: int, random: np.random.RandomState
-) -> Matrix:
-    """Walkers twice as widely spread as the Laplace approximation, inside the support."""
+def _continued(task: tuple[Surrogate, Jump, _Run]) -> _Run:
+    """The ensemble with further draws."""
+    surrogate, law, run = task
+    sampler, _, _ = _sampler(surrogate, law, run)
+    reached = sampler.run_mcmc(run.state, _ROUND, skip_initial_state_check=True)
+    chain, shifts = sampler.get_chain().swapaxes(0, 1), sampler.get_blobs().swapaxes(0, 1)
+    return _Run(
+        reached,
+        run.jump,
+        run.shares,
+        np.concatenate([run.chain, chain], axis=1),
+        np.concatenate(
+            [run.shifts, shifts.reshape(*chain.shape[:2], -1)[..., : run.shifts.shape[2]]], axis=1
+        ),
+        run.accepted + int(sampler.backend.accepted.sum()),
+    )
+
+
+def _sampler(surrogate: Surrogate, law: Jump, run: _Run) -> tuple[Any, Counted, Counted]:
+    """A sampler with the moves of a run, and those that are counted."""
+    walk, jump = Counted(Walk(surrogate, law)), Counted(run.jump)
+    rest = (1 - _NEAR - sum(run.shares)) / 2
+    # beside moves that go anywhere, the two that combine walkers need not span the space themselves
+    moves = [
+        (walk, run.shares[0]),
+        (emcee.moves.MHMove(Walk(surrogate, law, near=True)), _NEAR),
+        (jump, run.shares[1]),
+        (emcee.moves.DEMove(live_dangerously=True), rest),
+        (emcee.moves.StretchMove(live_dangerously=True), rest),
+    ]
+    walkers, dimension = run.chain.shape[0], run.chain.shape[2]
+    sampler = emcee.EnsembleSampler(walkers, dimension, _told, args=[surrogate.density], moves=moves)
+    return sampler, walk, jump
+
+
+def _told(z: Vector, density: LoopDensity) -> tuple[float, Vector]:
+    """Log density, and the shifts of what is integrated out; 0 stands for none."""
+    value, shift = density.told(z)
+    return value, shift if shift.size else np.zeros(1)
+
+
+def _started(density: LoopDensity, law: Jump, walkers: int, random: np.random.RandomState) -> Matrix:
+    """Walkers twice as widely spread as the surrogate, inside the support."""
     out: list[Vector] = []
     wide = 2.0
     while len(out) < walkers:
-        for z in _normal(centre, wide**2 * covariance, walkers, random):
+        noise = random.standard_normal((walkers, law.centre.size))
+        for z in law.centre + wide * noise @ law.root.T:
             if len(out) < walkers and np.isfinite(density(z)):
                 out.append(z)
         wide *= 0.8  # where the support is narrow, starts come closer
     return np.array(out)
-
-
-def _normal(centre: Vector, covariance: Matrix, count: int, random: np.random.RandomState) -> Matrix:
-    values, vectors = np.linalg.eigh(covariance)
-    root = vectors * np.sqrt(np.where(values > 0, values, 0.0))
-    return np.asarray(centre + random.standard_normal((count, centre.size)) @ root.T)
-
-
-def _jump(centre: Vector, covariance: Matrix) -> Callable[..., Any]:
-    """Independent proposals from the t distribution about the Laplace approximation."""
-    law = multivariate_t(centre, covariance, df=_FREEDOM, allow_singular=True)
-
-    def proposal(coordinates: Matrix, random: np.random.RandomState) -> tuple[Matrix, Vector]:
-        wanted = np.atleast_2d(law.rvs(size=len(coordinates), random_state=random))
-        return wanted, np.asarray(law.logpdf(coordinates) - law.logpdf(wanted))
-
-    return proposal

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 from scipy import fft
-from scipy.linalg import solve_triangular, toeplitz
+from scipy.linalg import toeplitz
+from scipy.linalg.lapack import dtrtrs
 
-from lcopa_bayes.arrays import Matrix, Vector
+from lcopa_bayes.arrays import Index, Matrix, Vector
 
-Force: TypeAlias = Callable[[slice, Matrix, Matrix, Matrix], Matrix]
+Force: TypeAlias = Callable[[slice | Index, Matrix, Matrix, Matrix], Matrix]
 """(blocks, deviation of y, its values one and two blocks before) -> deviation of the force, each of
-(axes, blocks)."""
+(axes, blocks); blocks by their positions may come several times."""
 
-_TOLERANCE = 1e-12
+TOLERANCE = 1e-12
 """Change of y in the last iteration over the largest y [-]."""
 _SWEEPS = 32
 _PATIENCE = 2.5
@@ -33,7 +35,7 @@ _LEAST = 2
 _LONG_SWEEPS = 400
 _SHARES = (0.5, 0.2, 0.05)
 """Steps of an iteration that would overshoot, over the way to its target [-]."""
-_RUNAWAY = 1e6
+RUNAWAY = 1e6
 """A response this many times its scale has run away [-]."""
 
 
@@ -55,71 +57,105 @@ def balanced(kernel: Matrix, force: Force, scale: Vector) -> Matrix:
     Raises RunawayError. Accuracy: 1e-12 of the scale per iteration.
     """
     y, v = np.zeros(kernel.shape), np.zeros(kernel.shape)
-    _solve(kernel, force, y, v, scale[:, None], 0, kernel.shape[1], kernel.shape[1])
+    reach = min(kernel.shape[1], _DENSE)
+    operators = [np.asfortranarray(toeplitz(row[:reach], np.zeros(reach))) for row in kernel]
+    made = _Balance(kernel, operators, force, scale[:, None], y, v)
+    made.solve(0, kernel.shape[1], kernel.shape[1], None)
     return y
 
 
-def _solve(
-    kernel: Matrix, force: Force, y: Matrix, v: Matrix, scale: Matrix, a: int, b: int, limit: int
-) -> int:
-    """Solve blocks a to b in place; `y` holds there what earlier forces leave, on return the response.
+@dataclass(frozen=True, eq=False)
+class _Balance:
+    """What is solved, and what of it is."""
 
-    A stretch longer than `limit` is halved untried. Returns the limit that experience suggests.
-    """
-    n = b - a
-    if n <= max(limit, _LEAST):
-        before = np.concatenate((np.zeros((y.shape[0], 2)), y[:, max(a - 2, 0) : a]), axis=1)[:, -2:]
-        method = _newton if _LEAST < n <= _DENSE else _iterate
-        found = method(kernel[:, :n], force, y[:, a:b].copy(), before, scale, slice(a, b))
-        if found is None and n <= _LEAST:
-            found = _relaxed(kernel[:, :n], force, y[:, a:b].copy(), before, scale, slice(a, b))
-        if found is not None:
-            y[:, a:b], v[:, a:b] = found
-            return limit if limit > _DENSE else min(_DENSE, max(limit, 2 * n))
-        if n <= _LEAST:
-            raise RunawayError(a)
-        limit = min(n // 2, _DENSE)
-    middle = (a + b) // 2
-    limit = _solve(kernel, force, y, v, scale, a, middle, limit)
-    y[:, middle:b] += convolved(kernel[:, :n], v[:, a:middle])[:, middle - a :]
-    return _solve(kernel, force, y, v, scale, middle, b, limit)
+    kernel: Matrix
+    operators: list[Matrix]
+    """Convolution with each row of the kernel, over the longest dense stretch; its leading part over less."""
+    force: Force
+    scale: Matrix
+    """(axes, 1)."""
+    y: Matrix
+    v: Matrix
+
+    def solve(self, a: int, b: int, limit: int, guess: Matrix | None) -> int:
+        """Solve blocks a to b in place; `y` holds there what earlier forces leave, on return the response.
+
+        A stretch longer than `limit` is halved untried. `guess` is the response of the whole as far as an
+        iteration got. Returns the limit that experience suggests.
+        """
+        n, blocks = b - a, slice(a, b)
+        if n <= max(limit, _LEAST):
+            y = self.y
+            before = np.concatenate((np.zeros((y.shape[0], 2)), y[:, max(a - 2, 0) : a]), axis=1)[:, -2:]
+            problem = self.kernel[:, :n], self.force, y[:, a:b].copy(), before, self.scale, blocks
+            if _LEAST < n <= _DENSE:
+                found = None if guess is None else _newton(self.operators, *problem[1:], guess[:, a:b])
+                found = _newton(self.operators, *problem[1:], problem[2]) if found is None else found
+            else:
+                found, reached = _iterate(*problem)
+                if a == 0 and b == y.shape[1]:
+                    guess = reached
+            if found is None and n <= _LEAST:
+                found = _relaxed(*problem)
+            if found is not None:
+                y[:, a:b], self.v[:, a:b] = found
+                return limit if limit > _DENSE else min(_DENSE, max(limit, 2 * n))
+            if n <= _LEAST:
+                raise RunawayError(a)
+            limit = min(n // 2, _DENSE)
+        middle = (a + b) // 2
+        limit = self.solve(a, middle, limit, guess)
+        self.y[:, middle:b] += convolved(self.kernel[:, :n], self.v[:, a:middle])[:, middle - a :]
+        return self.solve(middle, b, limit, guess)
 
 
 def _newton(
-    kernel: Matrix, force: Force, history: Matrix, before: Matrix, scale: Matrix, blocks: slice
+    operators: Sequence[Matrix],
+    force: Force,
+    history: Matrix,
+    before: Matrix,
+    scale: Matrix,
+    blocks: slice,
+    start: Matrix,
 ) -> tuple[Matrix, Matrix] | None:
-    """Fixed point as in `_iterate`, by Newton's method.
+    """Fixed point as in `_iterate`, by Newton's method from `start`.
 
     Slopes of the force, in y and in its two earlier values, are differences over 1e-6 of the scale; that
     of one axis in another is left to the iteration.
     """
-    n = kernel.shape[1]
-    operators = [toeplitz(row, np.zeros(n)) for row in kernel]
-    y = history
+    axes, n = history.shape
+    nudge = _NUDGE * scale[..., None] * np.eye(4)[1:].T  # (axes, 4 variants, 3 arguments)
+    every = np.tile(np.arange(blocks.start, blocks.stop), 4)
+    diagonal = np.arange(n)
+    y = start
     for _ in range(_NEWTON):
         with np.errstate(over="ignore", invalid="ignore"):
             one, two = _earlier(before, y)
-            v = force(blocks, y, one, two)
-            nudge = _NUDGE * scale
-            slopes = [
-                (force(blocks, y + nudge, one, two) - v) / nudge,
-                (force(blocks, y, one + nudge, two) - v) / nudge,
-                (force(blocks, y, one, two + nudge) - v) / nudge,
+            varied = [
+                (value[:, None, :] + nudge[:, :, k, None]).reshape(axes, -1)
+                for k, value in enumerate((y, one, two))
             ]
-            left = history + np.stack([k @ row for k, row in zip(operators, v, strict=True)]) - y
+            forces = force(every, *varied).reshape(axes, 4, n)
+            v = forces[:, 0]
+            slopes = (forces[:, 1:] - forces[:, :1]) / (_NUDGE * scale[..., None])
+            left = history - y
+            for i, operator in enumerate(operators):
+                left[i] += operator[:n, :n] @ v[i]
         size = float(np.abs(left / scale).max())
-        if not (size < _RUNAWAY and np.isfinite(sum(slopes)).all()):  # NaN too
+        if not (size < RUNAWAY and np.isfinite(slopes.sum())):  # NaN too
             return None
-        if size < _TOLERANCE:
+        if size < TOLERANCE:
             return y + left, v
         step = np.empty_like(y)
         for i, operator in enumerate(operators):
-            matrix = np.eye(n)
-            for back, slope in enumerate(slopes):
-                matrix[:, : n - back] -= operator[:, back:] * slope[i, back:]
-            if not np.all(np.abs(np.diag(matrix)) > _SINGULAR):
+            matrix = operator[:n, :n] * -slopes[i, 0]
+            for back in (1, 2):
+                if slopes[i, back].any():
+                    matrix[:, : n - back] -= operator[:n, back:n] * slopes[i, back, back:]
+            matrix[diagonal, diagonal] += 1.0
+            if not np.all(np.abs(matrix[diagonal, diagonal]) > _SINGULAR):
                 return None
-            step[i] = solve_triangular(matrix, left[i], lower=True, check_finite=False)
+            step[i] = dtrtrs(matrix, left[i], lower=1)[0]
         y = y + step
     return None
 
@@ -145,8 +181,8 @@ def convolved(kernel: Matrix, v: Matrix) -> Matrix:
 
 def _iterate(
     kernel: Matrix, force: Force, history: Matrix, before: Matrix, scale: Matrix, blocks: slice
-) -> tuple[Matrix, Matrix] | None:
-    """Fixed point of ``y = history + kernel * force(y)``, or None."""
+) -> tuple[tuple[Matrix, Matrix] | None, Matrix | None]:
+    """Fixed point of ``y = history + kernel * force(y)``, or None, and the y that came nearest."""
     n = kernel.shape[1]
     short = n <= _LEAST
     length = fft.next_fast_len(2 * n - 1, real=True)
@@ -162,20 +198,23 @@ def _iterate(
     steps: list[Vector] = []
     points: list[Vector] = []
     sizes: list[float] = []
+    nearest: Matrix | None = None
     for sweep in range(_LONG_SWEEPS if short else _SWEEPS):
         with np.errstate(over="ignore", invalid="ignore"):
             target, v = swept(y)
             change = (target - y) / scale
         size = float(np.abs(change).max())
-        if not size < _RUNAWAY:  # NaN too
-            return None
-        if size < _TOLERANCE:
-            return target, v
+        if not size < RUNAWAY:  # NaN too
+            return None, nearest
+        if size < TOLERANCE:
+            return (target, v), target
+        if size < min(sizes, default=1.0):
+            nearest = target
         sizes.append(size)
         if sweep >= 8 and not short:  # give up early where the pace of the last sweeps would not do
             pace = np.log(size / sizes[-6]) / 5
-            if pace >= 0 or np.log(_TOLERANCE / size) / pace > _PATIENCE * (_SWEEPS - sweep):
-                return None
+            if pace >= 0 or np.log(TOLERANCE / size) / pace > _PATIENCE * (_SWEEPS - sweep):
+                return None, nearest
         steps.append(change.ravel())
         points.append((target / scale).ravel())
         del steps[: -_DEPTH - 1], points[: -_DEPTH - 1]
@@ -183,11 +222,12 @@ def _iterate(
             y = target
             continue
         last = steps[-1]
-        differences = np.stack([last - step for step in steps[:-1]], axis=1)
-        weights = np.linalg.lstsq(differences, last, rcond=1e-12)[0]
-        mixed = points[-1] - np.stack([points[-1] - p for p in points[:-1]], axis=1) @ weights
+        differences = np.stack([last - step for step in steps[:-1]])
+        gram = differences @ differences.T
+        weights = np.linalg.lstsq(gram, differences @ last, rcond=1e-14)[0]
+        mixed = points[-1] - weights @ np.stack([points[-1] - p for p in points[:-1]])
         y = mixed.reshape(y.shape) * scale
-    return None
+    return None, nearest
 
 
 def _relaxed(
@@ -201,28 +241,9 @@ def _relaxed(
                 v = force(blocks, y, *_earlier(before, y))
                 target = history + convolved(kernel, v)
                 size = float(np.abs((target - y) / scale).max())
-            if not size < _RUNAWAY:  # NaN too
+            if not size < RUNAWAY:  # NaN too
                 break
-            if size < _TOLERANCE:
+            if size < TOLERANCE:
                 return target, v
             y = y + share * (target - y)
     return None
-
-
-def resting(force: Callable[[Matrix], Matrix], start: Matrix, scale: Vector) -> Matrix:
-    """Level at which ``force(y) = y``, (axes, 1), by the secant method from `start`; raises RunawayError."""
-    y, small, size = start, _TOLERANCE * scale[:, None], scale[:, None]
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        ahead = force(y) - y
-        step = np.full(y.shape, 1e-6) * size
-        for _ in range(_LONG_SWEEPS):
-            done = np.abs(ahead) <= small
-            if done.all():
-                return y
-            slope = (force(y + step) - (y + step) - ahead) / step
-            move = np.where(done, 0.0, -ahead / slope)
-            y, ahead = y + move, force(y + move) - (y + move)
-            if not np.all(np.abs(y) < _RUNAWAY * size):  # NaN too
-                break
-            step = np.where(done, 1e-6 * size, 1e-3 * move)
-    raise RunawayError(0)

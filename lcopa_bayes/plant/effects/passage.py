@@ -9,10 +9,10 @@ from typing import NamedTuple, final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Array, Matrix, Vector
+from lcopa_bayes.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.operational.series import Spectrum
 from lcopa_bayes.operational.transfer import transfer
-from lcopa_bayes.plant.effects.balance import RunawayError, balanced, resting
+from lcopa_bayes.plant.effects.balance import RunawayError, balanced
 from lcopa_bayes.plant.effects.effect import (
     Effect,
     ElementEffect,
@@ -21,6 +21,7 @@ from lcopa_bayes.plant.effects.effect import (
     SensorEffect,
     UnstableError,
 )
+from lcopa_bayes.plant.effects.resting import resting
 from lcopa_bayes.plant.forward import Dynamics, Experiment, ForwardModel, Spectra
 from lcopa_bayes.plant.layout import Layout
 
@@ -167,7 +168,7 @@ class _Passage:
                 f = effect.force(f, y, rate, scene, own)
             return f
 
-        def deviation(blocks: slice, y: Matrix, one: Matrix, two: Matrix) -> Matrix:
+        def deviation(blocks: slice | Index, y: Matrix, one: Matrix, two: Matrix) -> Matrix:
             rate = (1.5 * y - 2.0 * one + 0.5 * two) / self.experiment.mesh.grid.step
             return acting(f[:, blocks], level + y, rate) - level
 
