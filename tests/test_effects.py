@@ -15,7 +15,7 @@ from small import ONE, problem, record
 from lcopa_bayes.bench.command import on_off, prbs, staircase, two_axis
 from lcopa_bayes.bench.device import Device, TransferPath
 from lcopa_bayes.inference.effected import Effected, carried, effected, epochs_of
-from lcopa_bayes.plant.drive import Drive
+from lcopa_bayes.plant.drive import Drive, sorted_jumps
 from lcopa_bayes.plant.effects import balance, sensor
 from lcopa_bayes.plant.effects.catalogue import bundled, catalogue
 from lcopa_bayes.plant.effects.commands import Hysteresis, RefreshHold
@@ -25,10 +25,10 @@ from lcopa_bayes.plant.effects.dynamics import (
     Overflow,
     RiseFallAsymmetry,
 )
-from lcopa_bayes.plant.effects.effect import UnstableError, sorted_jumps
+from lcopa_bayes.plant.effects.effect import UnstableError
 from lcopa_bayes.plant.effects.parallel import Backflow
-from lcopa_bayes.plant.effects.records import Vibration
 from lcopa_bayes.plant.effects.response import OddCurvature
+from lcopa_bayes.plant.effects.ripples import Vibration
 from lcopa_bayes.plant.effects.sensor import SensorLag
 from lcopa_bayes.predict import responses
 from lcopa_bayes.problems import InputError

@@ -235,7 +235,7 @@ def test_errors_on_held_out_records_count_while_the_drive_stays_in_range(clean):
     made = study(1)
     (record,) = made.held_out
     made = replace(made, fit=(*made.fit, replace(record, name="again")))  # drives of the whole range
-    score = clean.before.unseen[0]
+    score = replace(clean.before.unseen[0], variance=np.zeros_like(clean.before.unseen[0].variance))
     before = replace(score, predicted=score.observed - 2 * score.noise_sd)
     after = replace(score, predicted=score.observed - 1.5 * score.noise_sd)
     state = clean.before.state

@@ -16,6 +16,7 @@ from lcopa_bayes.loop.basefit import renewed
 from lcopa_bayes.loop.constants import polished
 from lcopa_bayes.loop.extended import ExtendedModel
 from lcopa_bayes.loop.leftout import groups, log_scores
+from lcopa_bayes.loop.quiet import quiet_samples
 from lcopa_bayes.loop.regression import Optimum, Regression
 from lcopa_bayes.loop.signature import Scale
 from lcopa_bayes.loop.whitening import Whitening
@@ -68,9 +69,34 @@ class Refit:
         """Root mean square of the residual before over that of the noise [-]."""
         return self.whitening.excess(self.before.residual)
 
+    def without(self, names: Sequence[str]) -> tuple[ExtendedModel, Vector]:
+        """The model less these effects, and the coordinates that are left."""
+        gone = {k for name in names for k in self.places(name)}
+        kept = (e for e in self.model.effects if e.name not in names)
+        return self.model.having(*kept), np.delete(self.optimum.x, sorted(gone))
+
+    @cached_property
+    def resting(self) -> bool:
+        """Whether new effects that go on where nothing moves make the residual there smaller.
+
+        What only follows the drive may look like a vibration, but not before the first command.
+        """
+        names = [e.name for e in self.model.effects if e.card.resting and e.name in self.added]
+        if not names:
+            return True
+        model, x = self.without(names)
+        delay = self.model.base.dead_time(x[: self.model.plant_size])
+        bare = self.whitening(self.whitening.observed - model.predict(x))
+        drop = 0.0
+        for part in self.whitening.parts:
+            count = quiet_samples(self.whitening.samples[part.record], part.axis, delay)
+            rows = slice(part.rows.start, part.rows.start + count)
+            drop += float((bare[rows] ** 2 - self.optimum.white[rows] ** 2).sum())
+        return drop >= 0.0
+
     def under(self, whitening: Whitening) -> Refit:
         """The same judged under another noise."""
-        plain = self.model.having(*(e for e in self.model.effects if e.name not in self.added))
+        plain, _ = self.without(self.added)
         return replace(
             self,
             optimum=Regression(self.model, whitening).descend(self.optimum.x, most=12, gain=_NEAR),

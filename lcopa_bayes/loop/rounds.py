@@ -174,7 +174,7 @@ def leading(start: State, seen: Trace) -> float:
 def _accepted(made: Refit, seen: Trace, bar: float) -> bool:
     generic = max((g.log_bayes_factor for g in seen.traced if g.card.place == "generic"), default=-np.inf)
     ahead = made.log_bayes_factor > generic + MARGIN
-    return made.log_bayes_factor > bar and ahead and made.left_out > 0 and made.significant
+    return made.log_bayes_factor > bar and ahead and made.left_out > 0 and made.significant and made.resting
 
 
 def _large(made: Refit) -> bool:
@@ -202,10 +202,7 @@ def _kept(made: Refit) -> State:
     ]
     if not idle:
         return _state(made)
-    kept = tuple(effect for effect in made.model.effects if effect.name not in idle)
-    model = made.model.having(*kept)
-    gone = {k for name in idle for k in made.places(name)}
-    x = np.array([value for k, value in enumerate(made.optimum.x) if k not in gone])
+    model, x = made.without(idle)
     optimum = Regression(model, made.whitening).descend(x, most=12, gain=0.02)
     if log_bayes_factor(optimum, made.optimum, made.quiet) > MARGIN:
         return _state(made)
@@ -224,7 +221,8 @@ def _paired(start: State, state: State, seen: Trace) -> Refit | None:
     )
     have = {effect.name for effect in state.model.effects}
     choice = float(np.log(max(len(ranked), 1)))
-    bar, best = _gained(start, state, seen.scale.quiet)[0] + MARGIN, None
+    more = 2 - len(have) if len(have) < 2 else 0
+    bar, best = _gained(start, state, seen.scale.quiet)[0] + (1 + more) * MARGIN, None
     for pair in ranked[:_PAIRS]:
         if {one.name for one in pair} <= have:
             continue

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lcopa_bayes.arrays import Vector
 from lcopa_bayes.loop.scores import Score, State
 from lcopa_bayes.study import Study
 
@@ -20,13 +21,15 @@ _SEEN = 5.0
 def unseen_share(study: Study, before: Sequence[Score], after: Sequence[Score], state: State) -> float:
     """Squared error beyond noise on held-out records, with the effects over without [-].
 
-    Over samples before the drive leaves the range it has in the fitted records. NaN where it says nothing: no
-    such error, or effects that differ from record to record.
+    Over samples before the drive leaves the range it has in the fitted records; what the effects leave
+    uncertain is no error of either. NaN where it says nothing: no such error, or effects that all differ from
+    record to record.
     """
-    if any(effect.card.per_record for effect in state.model.effects):
+    effects = state.model.effects
+    if effects and all(effect.card.per_record for effect in effects):
         return np.nan
     # one noise for both: a fit without the effects may have taken them for noise
-    noise = [one.noise_sd for one in after]
+    noise = [(one.noise_sd, one.variance) for one in after]
     was, count = _beyond(study, before, state, noise)
     now, _ = _beyond(study, after, state, noise)
     return now / was if was > _SEEN * np.sqrt(2 * count) else np.nan
@@ -35,24 +38,23 @@ def unseen_share(study: Study, before: Sequence[Score], after: Sequence[Score], 
 def missed(study: Study, scores: Sequence[Score], state: State) -> float:
     """Root mean square error on held-out records over the noise, where it is more than noise and three
     standard deviations of what the fit leaves uncertain; NaN where it is not [-]."""
-    noise = [one.noise_sd for one in scores]
-    power, count = _beyond(study, scores, state, noise)
-    unsure, _ = _beyond(study, scores, state, noise, doubts=_DOUBTS)
+    power, count = _beyond(study, scores, state, [(one.noise_sd, 0 * one.variance) for one in scores])
+    unsure, _ = _beyond(study, scores, state, [(one.noise_sd, _DOUBTS * one.variance) for one in scores])
     return float(np.sqrt(1 + power / count)) if unsure > _SEEN * np.sqrt(2 * count) else np.nan
 
 
 def _beyond(
-    study: Study, scores: Sequence[Score], state: State, noise: Sequence[float], doubts: float = 0.0
+    study: Study, scores: Sequence[Score], state: State, noise: Sequence[tuple[float, Vector]]
 ) -> tuple[float, float]:
-    """Squared error less that of `noise` and `doubts` times the fit's own variance, over the noise's, summed
-    over independent samples inside the fitted drive range; and their number [-]."""
+    """Squared error less that of the noise and a variance of the prediction, over the noise's, summed over
+    independent samples inside the fitted drive range; and their number [-]."""
     axes = {axis.name: k for k, axis in enumerate(study.response_axes)}
     power, count = 0.0, 0.0
-    for one, sd in zip(scores, noise, strict=True):
+    for one, (sd, variance) in zip(scores, noise, strict=True):
         inside = one.time < _left(study, one.record)
         independent = 1 / state.whitening.dependence[axes[one.axis]] if state.whitening.dependence else 1.0
         error = (one.observed - one.predicted)[inside]
-        power += independent * float(((error**2 - doubts * one.variance[inside]) / sd**2 - 1).sum())
+        power += independent * float(((error**2 - variance[inside]) / sd**2 - 1).sum())
         count += independent * float(inside.sum())
     return power, count
 

@@ -22,6 +22,7 @@ from lcopa_bayes.plant.effects import (
     parallel,
     records,
     response,
+    ripples,
     sensor,
 )
 from lcopa_bayes.plant.effects.effect import Card, Effect
@@ -29,7 +30,7 @@ from lcopa_bayes.problems import InputError, nearest
 
 GROUP = "lcopa_bayes.effects"
 """Entry point group of effects in installed packages."""
-_MODULES = (acquisition, commands, dynamics, parallel, crossfade, response, sensor, records, generic)
+_MODULES = (acquisition, commands, dynamics, parallel, crossfade, response, sensor, records, ripples, generic)
 
 
 def bundled() -> dict[str, type[Effect]]:

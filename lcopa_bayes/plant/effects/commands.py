@@ -8,7 +8,7 @@ from typing import ClassVar, Self, final
 import numpy as np
 
 from lcopa_bayes.arrays import Vector
-from lcopa_bayes.plant.drive import Drive
+from lcopa_bayes.plant.drive import Drive, sorted_jumps
 from lcopa_bayes.plant.effects.effect import (
     Card,
     Coefficient,
@@ -16,7 +16,6 @@ from lcopa_bayes.plant.effects.effect import (
     Ranges,
     Scene,
     single,
-    sorted_jumps,
 )
 
 

@@ -17,8 +17,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Self, final
 
-import numpy as np
-
 from lcopa_bayes.arrays import Index, Matrix, Vector
 from lcopa_bayes.plant.drive import Drive
 from lcopa_bayes.plant.grid import Grid
@@ -100,6 +98,8 @@ class Card:
     """Whether each record has coefficients of its own."""
     disturbance: bool = False
     """Whether it belongs to the noise model and not to the plant."""
+    resting: bool = False
+    """Whether it goes on where nothing moves."""
 
 
 @final
@@ -240,10 +240,3 @@ def per_axis(
         for axis, size in zip(ranges.names, ranges.response, strict=True)
         for name in names
     )
-
-
-def sorted_jumps(times: Vector, jumps: Vector) -> Drive:
-    """Drive with these changes, in any order; changes at one instant are added, those of 0 left out."""
-    times, jumps = times[jumps != 0], jumps[jumps != 0]
-    at, where = np.unique(times, return_inverse=True)
-    return Drive(at, np.cumsum(np.bincount(where, weights=jumps, minlength=at.size)))
