@@ -19,6 +19,10 @@ from lcopa_bayes.loop.whitening import Whitening
 from lcopa_bayes.plant.effects.effect import Effect
 
 _ROUNDS = 6
+_STEPS = 4
+"""Steps after which a constant that moved back to its grid is judged [-]."""
+_HOPELESS = 1000.0
+"""Cost beyond which these steps would not mend it [nat]."""
 _STEP = 1e-3
 """Step of a constant's logarithm for its slope [-]."""
 _FAR = 0.2
@@ -33,7 +37,8 @@ def polished(
     """The model with the constants of its effects `names` where the residual is smallest, and coordinates.
 
     Gauss-Newton over coordinates and logarithms of the positive constants together, with step halving and the
-    plant's own tangents. Constants without a slope, as a number of grey levels, stay.
+    plant's own tangents. Constants without a slope, as a number of grey levels, stay; so does one whose move
+    off the grid the records do not ask for.
     """
     low, high = model.bounds
     fit = Regression(replace(model, exact=False), whitening)
@@ -64,16 +69,46 @@ def polished(
         fit = Regression(replace(model, exact=False), whitening)
         if here.cost - cost < _GAIN:
             break
+    return _likely(model, x, whitening, names)
+
+
+def _likely(
+    model: ExtendedModel, x: Vector, whitening: Whitening, names: Sequence[str]
+) -> tuple[ExtendedModel, Vector]:
+    """The model with constants back on the grid, of likely values, where the fit does not tell them apart.
+
+    A phase and a delay move together until a command falls to another refresh, which other records may show.
+    """
+    cost = Regression(model, whitening).cost(x)
+    for k, effect in enumerate(model.effects):
+        listed = effect.grid(model.effected.ranges)
+        for name in constants_of(effect) if effect.name in names else ():
+            here = getattr(effect, name)
+            values = np.array([getattr(one, name) for one in listed])
+            near = float(values[np.argmin(np.abs(values - here))])
+            back = _replaced(model, k, name, near)
+            fit = Regression(back, whitening)
+            if near == here or not fit.cost(x) < cost + _HOPELESS:
+                continue
+            found = fit.descend(x, most=_STEPS, gain=_GAIN)
+            if found.cost < cost + LEVEL:
+                model, x = back, found.x
     return model, x
+
+
+def _replaced(model: ExtendedModel, effect: int, name: str, value: float) -> ExtendedModel:
+    """The model with one constant of one effect at another value."""
+    effects: list[Any] = list(model.effects)
+    effects[effect] = replace(effects[effect], **{name: value})
+    return model.having(*effects)
 
 
 def _moved(model: ExtendedModel, moves: Sequence[tuple[int, str]], logs: Vector) -> ExtendedModel:
     """The model with the logarithms of these constants moved."""
-    effects: list[Any] = list(model.effects)
     for (k, name), change in zip(moves, logs, strict=True):
-        value = getattr(effects[k], name) * float(np.exp(change))
-        effects[k] = replace(effects[k], **{name: value})
-    return model.having(*effects)
+        value = getattr(model.effects[k], name) * float(np.exp(change))
+        model = _replaced(model, k, name, value)
+    return model
 
 
 def _slope(model: ExtendedModel, x: Vector, whitening: Whitening, effect: int, name: str) -> Vector | None:

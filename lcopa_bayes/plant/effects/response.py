@@ -129,6 +129,9 @@ class Clipping(ReadoutEffect):
 
     level: float
     """Limit over the largest deflection [-]."""
+    skew: float = 1.0
+    """The same of each next axis over that of the one before [-]: what clips also bends the deflections that
+    the limit is measured in."""
 
     linear = True
     card: ClassVar[Card] = Card(
@@ -151,7 +154,8 @@ class Clipping(ReadoutEffect):
 
     def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """Pointwise."""
-        beyond = np.maximum(np.abs(y) - self.level * scene.ranges.response, 0.0)
+        limit = self.level * self.skew ** np.arange(scene.ranges.axes) * scene.ranges.response
+        beyond = np.maximum(np.abs(y) - limit, 0.0)
         return np.asarray(y - psi[0] * np.sign(y) * beyond)
 
 
