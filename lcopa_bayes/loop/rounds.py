@@ -21,7 +21,7 @@ from lcopa_bayes.loop.trace import Trace, Traced, trace
 from lcopa_bayes.loop.verdict import MARGIN
 from lcopa_bayes.plant.effects.effect import Effect
 
-_MOST = 3
+MOST = 3
 """Effects that are added at most [-]."""
 SINGLE = 0.3
 """Share of the residual's power that an effect must take when a single record is all there is [-]."""
@@ -82,11 +82,11 @@ def search(
     take back what is no longer significant."""
     counts = [one.samples if one.known else 0 for one in base.noise]
     state, rounds, groups = start, [], {}
-    for number in range(_MOST + 1):
+    for number in range(MOST + 1):
         seen = trace(
             state.model, state.optimum, state.whitening, library, rng, noise_samples=counts, draws=draws
         )
-        if not (seen.alarmed or state.whitening.dependence) or number == _MOST:
+        if not (seen.alarmed or state.whitening.dependence) or number == MOST:
             rounds.append(Round(seen, (), (), None))
             break
         refits, failures, tuned_best = _refits(state, seen)

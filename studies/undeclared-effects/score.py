@@ -62,6 +62,9 @@ def frozen() -> dict[str, Any]:
     told = tomllib.loads((HERE / "thresholds.toml").read_text(encoding="utf-8"))
     held = {
         "explained": verdict.EXPLAINED,
+        "alone": verdict.ALONE,
+        "single": rounds.SINGLE,
+        "clear": rounds.CLEAR,
         "margin": verdict.MARGIN,
         "unseen": verdict.UNSEEN,
         "least": trace.LEAST,
