@@ -13,6 +13,7 @@ from lcopa_bayes.loop.basemodel import BaseModel
 from lcopa_bayes.loop.extended import ExtendedModel
 from lcopa_bayes.loop.loop import loop
 from lcopa_bayes.loop.rounds import SINGLE
+from lcopa_bayes.loop.scores import State
 from lcopa_bayes.loop.startlevel import started
 from lcopa_bayes.loop.trace import trace
 from lcopa_bayes.loop.unseen import missed
@@ -119,8 +120,9 @@ def test_chance_residuals_are_judged_as_the_residual_is():
     study = study_of(3.5, noise=0.5)
     fit = fitted(study)
     model = ExtendedModel.of(fit.model, fit.optimum.x)
+    state = State(model, fit.optimum, fit.regression.whitening, fit.optimum.covariance)
     library = [catalogue()["unmodelled_smooth"]]
-    seen = trace(model, fit.optimum, fit.regression.whitening, library, np.random.default_rng(1), draws=200)
+    seen = trace(state, library, np.random.default_rng(1), draws=200)
     assert np.isfinite(seen.threshold)
     assert seen.residual @ seen.residual == pytest.approx(float(seen.scale.power[0]))
 

@@ -45,6 +45,11 @@ class BaseFit:
     """What limits the verdict."""
 
     @property
+    def noise_samples(self) -> tuple[int, ...]:
+        """Samples that the noise of each axis is known from, 0 where it was fitted jointly [-]."""
+        return tuple(one.samples if one.known else 0 for one in self.noise)
+
+    @property
     def noise_known(self) -> bool:
         """Whether the noise of every axis was measured apart from the fit."""
         return all(one.known for one in self.noise)

@@ -135,10 +135,6 @@ def tuned(
     """
     best = traced.signatures[traced.best]
     project = Projection(optimum.moving * model.spread)
-
-    def evidence(signature: Signature) -> float:
-        return float(signature.evidence(signature.span.T @ seen.residual[:, None], seen.scale)[0])
-
     for name in constants_of(best.effect):
         listed = sorted({getattr(one.effect, name) for one in traced.signatures})
         here = getattr(best.effect, name)
@@ -148,13 +144,13 @@ def tuned(
         low, high = listed[max(place - 1, 0)], listed[min(place + 1, len(listed) - 1)]
         tried: dict[float, Signature] = {}
         found = minimize_scalar(
-            _falling(tried, best.effect, name, evidence, model, optimum.x, whitening, project),
+            _falling(tried, best.effect, name, seen, model, optimum.x, whitening, project),
             bounds=(np.log(low), np.log(high)),
             method="bounded",
             options={"maxiter": 10, "xatol": 1e-3},
         )
         better = tried.get(float(found.x))
-        if better is not None and evidence(better) > evidence(best) + LEVEL:
+        if better is not None and seen.alone(better) > seen.alone(best) + LEVEL:
             best = better
     return best
 
@@ -163,7 +159,7 @@ def _falling(
     tried: dict[float, Signature],
     effect: Effect,
     name: str,
-    evidence: Callable[[Signature], float],
+    seen: Trace,
     model: ExtendedModel,
     x: Vector,
     whitening: Whitening,
@@ -175,7 +171,7 @@ def _falling(
             tried[float(log_value)] = signature_of(model, x, whitening, project, moved)
         except ArithmeticError:
             return 1e9
-        return -evidence(tried[float(log_value)])
+        return -seen.alone(tried[float(log_value)])
 
     return cost
 

@@ -45,6 +45,9 @@ _LENGTH = 6.0
 _KEPT = 400
 """Draws kept of all coordinates, at least [-]."""
 TARGET_ESS = 400.0
+_BEYOND = 1.2
+"""Effective sample size at which ensembles end, over the target [-]: its estimate scatters, and to end with
+the first that reaches the target would favour those that are too high."""
 
 
 @final
@@ -119,7 +122,8 @@ def sample_loop(density: LoopDensity, seed: int, *, jobs: int = 1, quick: bool =
             runs = mapped(_continued, [(surrogate, law, run) for run in runs])
             chains = np.stack([run.chain for run in runs])
             found, kept = qualities(names, chains), chains.shape[2]
-            if kept >= most or (overall(found, TARGET_ESS).level == "reliable" and _long(found, chains)):
+            enough = overall(found, _BEYOND * TARGET_ESS).level == "reliable" and _long(found, chains)
+            if enough or kept >= most:
                 break
     stride = max(1, chains.shape[0] * chains.shape[1] * kept // _KEPT)
     thin = np.stack([run.chain[:, ::-1][:, ::stride] for run in runs])

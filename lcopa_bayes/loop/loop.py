@@ -165,29 +165,31 @@ def _looped(
         key=lambda one: one.log_bayes_factor,
         default=None,
     )
-    after = _side(problem, searched.state)
+    reached = _side(problem, searched.state)
     names = tuple(effect.name for effect in searched.state.model.effects)
     verdict = decide(
         Found(
-            "",
-            cautions,
-            first.alarmed or bool(names),
-            first.largest,
-            first.threshold,
-            names,
-            tuple(effect.name for effect in searched.state.model.effects if effect.card.disturbance),
-            searched.gained,
-            generic.log_bayes_factor if generic else -np.inf,
-            generic.name if generic else "",
-            last.largest,
-            last.threshold,
-            last.leader.name if last.leader else "",
-            searched.share,
-            start.whitening.excess(start.optimum.residual),
-            ALONE if alone else EXPLAINED,
-            first.scatter if base.noise_known else -np.inf,
-            missed(study, before.unseen, start) if study.held_out else np.nan,
-            unseen_share(study, before.unseen, after.unseen, searched.state) if study.held_out else np.nan,
+            failed="",
+            cautions=cautions,
+            alarmed=first.alarmed or bool(names),
+            largest=first.largest,
+            threshold=first.threshold,
+            effects=names,
+            disturbances=tuple(e.name for e in searched.state.model.effects if e.card.disturbance),
+            gained=searched.gained,
+            generic=generic.log_bayes_factor if generic else -np.inf,
+            generic_name=generic.name if generic else "",
+            remaining=last.largest,
+            remaining_threshold=last.threshold,
+            remaining_name=last.leader.name if last.leader else "",
+            share=searched.share,
+            excess=start.whitening.excess(start.optimum.residual),
+            enough=ALONE if alone else EXPLAINED,
+            scatter=first.scatter if base.noise_known else -np.inf,
+            missed=missed(study, before.unseen, start) if study.held_out else np.nan,
+            unseen=unseen_share(study, before.unseen, reached.unseen, searched.state)
+            if study.held_out
+            else np.nan,
         )
     )
     if outliers is not None:
@@ -202,7 +204,7 @@ def _looped(
         widening = Widening.of(samples, residual, last_state.whitening.noise)
         last_state = replace(last_state, widening=widening)
     if sample:
-        quiet = float(sum(one.samples for one in base.noise if one.known))
+        quiet = float(sum(base.noise_samples))
         sampled = sample_loop(LoopDensity(last_state, quiet), study.seed, jobs=jobs, quick=quick)
         last_state = replace(last_state, covariance=sampled.covariance)
     return Loop(
@@ -214,7 +216,7 @@ def _looped(
         searched.groups if named else (),
         verdict,
         before,
-        _side(problem, last_state),
+        reached if last_state is searched.state else _side(problem, last_state),
         not study.held_out,
         cautions,
         sampled,

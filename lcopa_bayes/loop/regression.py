@@ -111,8 +111,7 @@ class Regression:
             mean, precision = self._prior
             slope = jacobian.T @ white - precision * (x - mean)
             information = jacobian.T @ jacobian + np.diag(precision + 1e-9 / self.curve.spread**2)
-            stuck = ((x <= low) & (slope < 0)) | ((x >= high) & (slope > 0))
-            free = np.flatnonzero(~stuck)
+            free = np.flatnonzero(~self._stuck(x, slope))
             if not free.size:
                 converged = True
                 break
@@ -146,6 +145,11 @@ class Regression:
         """The description of a point, without moving."""
         return self._described(x, *self._rows(x), converged=True)
 
+    def _stuck(self, x: Vector, slope: Vector) -> Flags:
+        """Coordinates at an end of their support beyond which the cost falls."""
+        low, high = self.curve.bounds
+        return np.asarray(((x <= low) & (slope < 0)) | ((x >= high) & (slope > 0)))
+
     def _rows(self, x: Vector) -> tuple[Vector, Vector, Matrix, Matrix]:
         predicted, tangents = self.curve.tangents(x)
         if not (np.isfinite(predicted).all() and np.isfinite(tangents).all()):
@@ -172,7 +176,7 @@ class Regression:
         mean, precision = self._prior
         slope = jacobian.T @ white - precision * (x - mean)
         information = jacobian.T @ jacobian + np.diag(1 / spread**2)
-        stuck = ((x <= low) & (slope < 0)) | ((x >= high) & (slope > 0))
+        stuck = self._stuck(x, slope)
         level = cost + 0.5 * white.size * _LOG_2PI + self.whitening.log_scale
         scaled = np.linalg.slogdet(information * np.outer(spread, spread))[1]
         return Optimum(

@@ -80,12 +80,10 @@ def search(
     """Add effects one at a time, up to three, while evidence, records left out and significance all speak
     for it, from a record that stands `alone` only large ones; then try pairs where something remains, and
     take back what is no longer significant."""
-    counts = [one.samples if one.known else 0 for one in base.noise]
+    counts = base.noise_samples
     state, rounds, groups = start, [], {}
     for number in range(MOST + 1):
-        seen = trace(
-            state.model, state.optimum, state.whitening, library, rng, noise_samples=counts, draws=draws
-        )
+        seen = trace(state, library, rng, noise_samples=counts, draws=draws)
         if not (seen.alarmed or state.whitening.dependence) or number == MOST:
             rounds.append(Round(seen, (), (), None))
             break
@@ -102,9 +100,7 @@ def search(
         paired = _paired(start, state, rounds[0].trace)
         if paired is not None:
             state = _state(paired)
-            seen = trace(
-                state.model, state.optimum, state.whitening, library, rng, noise_samples=counts, draws=draws
-            )
+            seen = trace(state, library, rng, noise_samples=counts, draws=draws)
             rounds += [Round(rounds[0].trace, (paired,), (), paired), Round(seen, (), (), None)]
     names = [effect.name for effect in state.model.effects]
     told = tuple(groups.get(name, (name,)) for name in names)

@@ -95,17 +95,15 @@ def _based(study: Study, *key: int) -> Base:
 
 def _gain(base: Base, wider: Base) -> float:
     """Log evidence of the wider model over the other under the wider one's noise [nat]."""
-    quiet = float(sum(one.samples for one in wider.fit.noise if one.known))
+    quiet = float(sum(wider.fit.noise_samples))
     same = Regression(base.fit.model, wider.fit.regression.whitening).descend(base.fit.optimum.x)
     return log_bayes_factor(same, wider.fit.optimum, quiet)
 
 
 def _named(base: Base, library: Sequence[type[Effect]], rng: np.random.Generator, draws: int) -> float:
     """Log evidence that the best named effect adds to a base fit [nat]; 0 without one."""
-    start = base.start
-    counts = [one.samples if one.known else 0 for one in base.fit.noise]
-    seen = trace(start.model, start.optimum, start.whitening, library, rng, noise_samples=counts, draws=draws)
-    return leading(start, seen) if seen.alarmed else 0.0
+    seen = trace(base.start, library, rng, noise_samples=base.fit.noise_samples, draws=draws)
+    return leading(base.start, seen) if seen.alarmed else 0.0
 
 
 def _later(study: Study, fit: BaseFit) -> Mended | None:

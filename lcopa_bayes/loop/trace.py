@@ -11,10 +11,9 @@ import numpy as np
 from scipy.special import logsumexp
 
 from lcopa_bayes.arrays import Matrix, Vector
-from lcopa_bayes.loop.extended import ExtendedModel
-from lcopa_bayes.loop.regression import Optimum
 from lcopa_bayes.loop.scatter import scatter_evidence
 from lcopa_bayes.loop.scoreevidence import Projection
+from lcopa_bayes.loop.scores import State
 from lcopa_bayes.loop.signature import Scale, Signature, signature_of
 from lcopa_bayes.loop.whitening import Whitening
 from lcopa_bayes.plant.effects.effect import Card, Effect, ScatterEffect
@@ -123,20 +122,19 @@ class Trace:
 
 
 def trace(
-    model: ExtendedModel,
-    optimum: Optimum,
-    whitening: Whitening,
+    state: State,
     library: Sequence[type[Effect]],
     rng: np.random.Generator,
     *,
     noise_samples: Sequence[int] = (),
     draws: int = _DRAWS,
 ) -> Trace:
-    """Evidence of every effect of `library` in the residual of `optimum`, and the threshold of chance.
+    """Evidence of every effect of `library` in the residual of a model, and the threshold of chance.
 
     `noise_samples`: samples each axis' noise was known from; the scale of a chance residual is uncertain by
     as much. Effects the model already has are left out.
     """
+    model, optimum, whitening = state.model, state.optimum, state.whitening
     project = Projection(optimum.moving * model.spread)
     residual = project(optimum.settled)
     quiet, freedom = float(sum(noise_samples)), whitening.effective - optimum.x.size
@@ -155,7 +153,7 @@ def trace(
             why = f"it follows every command by itself, and a record has {commands} (at most {MOST_COMMANDS})"
             found.append(Traced(kind.card, (), -np.inf, 0, why))
             continue
-        found.append(_traced(model, optimum, whitening, project, residual, scale, kind))
+        found.append(_traced(state, project, residual, scale, kind))
     maxima = _chance(project, whitening, found, rng, noise_samples, draws, scale)
     found.sort(key=lambda one: -one.log_bayes_factor)
     threshold = max(LEAST, float(np.quantile(maxima, QUANTILE))) if maxima.size else LEAST
@@ -169,19 +167,11 @@ def commands_of(drive: Matrix) -> int:
     return int((np.diff(drive, axis=0) != 0).any(axis=1).sum())
 
 
-def _traced(
-    model: ExtendedModel,
-    optimum: Optimum,
-    whitening: Whitening,
-    project: Projection,
-    residual: Vector,
-    scale: Scale,
-    kind: type[Effect],
-) -> Traced:
+def _traced(state: State, project: Projection, residual: Vector, scale: Scale, kind: type[Effect]) -> Traced:
     signatures, evidence, failed = [], [], ""
-    for instance in kind.grid(model.effected.ranges):
+    for instance in kind.grid(state.model.effected.ranges):
         try:
-            signatures.append(signature_of(model, optimum.x, whitening, project, instance))
+            signatures.append(signature_of(state.model, state.optimum.x, state.whitening, project, instance))
         except ArithmeticError as error:
             failed = str(error)
             continue
