@@ -38,7 +38,7 @@ _BURN = 5
 """Steps of either half of the burn-in [-]."""
 _ROUND = 10
 _STEPS = 120
-_STEPS_DEAR = 60
+_STEPS_DEAR = 90
 """Most steps where an effect bends the dynamics: a density costs ten times as much."""
 _LENGTH = 6.0
 """Least length of a chain over the steps after which it forgets [-]."""
