@@ -78,7 +78,10 @@ def _likely(
     """The model with constants back on the grid, of likely values, where the fit does not tell them apart.
 
     A phase and a delay move together until a command falls to another refresh, which other records may show.
+    A noise that still holds what the effect takes away tells too little apart.
     """
+    if whitening.dependence:
+        return model, x
     cost = Regression(model, whitening).cost(x)
     for k, effect in enumerate(model.effects):
         listed = effect.grid(model.effected.ranges)

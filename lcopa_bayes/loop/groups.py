@@ -17,6 +17,7 @@ def group(
 
     A rival that was refitted belongs to the group when it lost by less than 3 nat; one that was not, when the
     margin expected at the fitted size, which the angle between projected signatures sets, is below 3 nat.
+    Where noise was fitted jointly that margin would count the effect as noise, and only refits say.
     """
     name = chosen.added[0]
     own = signatures[name]
@@ -29,6 +30,8 @@ def group(
         if one.name in fitted:
             if chosen.log_bayes_factor - fitted[one.name].log_bayes_factor < MARGIN:
                 out.append(one.name)
+            continue
+        if chosen.whitening.dependence:
             continue
         margin = min(expected_margin(own, amplitude, rival, seen.scale) for rival in one.signatures)
         if margin < MARGIN:
