@@ -185,7 +185,7 @@ def _looped(
             share=searched.share,
             excess=start.whitening.excess(start.optimum.residual),
             enough=ALONE if alone else EXPLAINED,
-            scatter=first.scatter if base.noise_known else -np.inf,
+            scatter=first.scatter,
             missed=missed(study, before.unseen, start) if study.held_out else np.nan,
             unseen=unseen_share(study, before.unseen, reached.unseen, searched.state)
             if study.held_out

@@ -145,8 +145,9 @@ def trace(
         if kind.card.name in present or not kind.applies(model.base.posterior.table.layout):
             continue
         if issubclass(kind, ScatterEffect):
-            told = scatter_evidence(optimum.white)
-            found.append(Traced(kind.card, (), told, 0))
+            joint = "the noise is known from the residual alone" if whitening.dependence else ""
+            told = -np.inf if joint else scatter_evidence(optimum.white)
+            found.append(Traced(kind.card, (), told, 0, joint))
             continue
         commands = max(commands_of(one.record.drive) for one in whitening.samples)
         if kind.per_command and commands > MOST_COMMANDS:
