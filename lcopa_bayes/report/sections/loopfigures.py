@@ -58,7 +58,7 @@ def _residuals(told: Mapping[str, Any], curves: Sequence[Mapping[str, Any]]) -> 
         for axes, when in zip(panels, ("before", "after"), strict=True):
             _residual(axes, one, when, colour, told["time_unit"])
         panels[0].set_ylabel(label("residual", one["unit"]))
-        before, after = (np.sqrt(np.mean(np.square(one[when]))) for when in ("before", "after"))
+        before, after = (_rmse(told[when], one) for when in ("before", "after"))
         caption = (
             f"{one['record']}, {one['axis']}: root mean square {before:.3g} before and {after:.3g} "
             "after, noise "
@@ -69,6 +69,13 @@ def _residuals(told: Mapping[str, Any], curves: Sequence[Mapping[str, Any]]) -> 
     rest = len(curves) - len(chosen)
     text = (f"{rest} more residuals are in loop_curves.json.",) if rest else ()
     return Section("Residuals side by side", text, tuple(drawings))
+
+
+def _rmse(side: Mapping[str, Any], curve: Mapping[str, Any]) -> float:
+    """Of all samples, of which the curve shows some [response unit]."""
+    keys = ("record", "axis", "held_out")
+    wanted = [curve[key] for key in keys]
+    return float(next(one["rmse"] for one in side["scores"] if [one[key] for key in keys] == wanted))
 
 
 def _residual(axes: Axes, one: Mapping[str, Any], when: str, colour: str, unit: str) -> None:
