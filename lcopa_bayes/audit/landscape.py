@@ -13,7 +13,7 @@ from scipy.optimize import least_squares, minimize
 from scipy.special import expit, logit
 
 from lcopa_bayes.arrays import Matrix, Vector
-from lcopa_bayes.inference.leastsquares import LeastSquares
+from lcopa_bayes.inference.leastsquares import LeastSquares, apart
 from lcopa_bayes.inference.posterior import Posterior
 
 _TAIL = 1e-9
@@ -144,27 +144,14 @@ class Landscape:
             return values
         ends = np.array([self.search(least.columns[p]) for p in moving]).T
         whole = least.coordinates(values)
-        memory: dict[bytes, tuple[Vector, Matrix]] = {}
 
         def both(x: Vector) -> tuple[Vector, Matrix]:
-            key = x.tobytes()
-            if key not in memory:
-                memory.clear()
-                at = whole.copy()
-                at[moving] = x
-                memory[key] = self.rows(at, values, moving)
-            return memory[key]
-
-        def residual(x: Vector) -> Vector:
-            return both(x)[0]
-
-        def jacobian(x: Vector) -> Matrix:
-            return both(x)[1]
+            at = whole.copy()
+            at[moving] = x
+            return self.rows(at, values, moving)
 
         found = least_squares(
-            residual,
-            np.clip(whole[moving], *ends),  # a start only
-            jacobian,
+            *apart(both, np.clip(whole[moving], *ends)),  # a start only
             bounds=(ends[0], ends[1]),
             x_scale="jac",
             max_nfev=most,

@@ -8,11 +8,11 @@ from typing import final
 import numpy as np
 from scipy.optimize import least_squares
 
-from lcopa_bayes.arrays import Flags, Matrix, Vector
+from lcopa_bayes.arrays import Flags, Vector
 from lcopa_bayes.bench.device import Device, TransferPath
 from lcopa_bayes.design.information import Bench
 from lcopa_bayes.inference.assembly import Problem, problem_of
-from lcopa_bayes.inference.leastsquares import LeastSquares
+from lcopa_bayes.inference.leastsquares import LeastSquares, apart
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.record import Record
 from lcopa_bayes.settings import PriorSettings
@@ -128,25 +128,9 @@ def _solve(problem: Problem, start: Vector) -> Vector:
     """
     least = LeastSquares(problem.posterior)
     low, high = least.bounds
-    memory: dict[bytes, tuple[Vector, Matrix]] = {}
-
-    def both(x: Vector) -> tuple[Vector, Matrix]:
-        key = x.tobytes()
-        if key not in memory:
-            memory.clear()
-            memory[key] = least.residual(x, start)
-        return memory[key]
-
-    def residual(x: Vector) -> Vector:
-        return both(x)[0]
-
-    def jacobian(x: Vector) -> Matrix:
-        return both(x)[1]
-
+    near = np.clip(least.coordinates(start), low, high)  # a start only
     found = least_squares(
-        residual,
-        np.clip(least.coordinates(start), low, high),  # a start only
-        jacobian,
+        *apart(lambda x: least.residual(x, start), near),
         bounds=(low, high),
         x_scale="jac",
         ftol=_CONVERGED,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -161,25 +162,8 @@ class LeastSquares:
         """From a start to a local minimum: table values and the Jacobian there."""
         low, high = self._bounds_around(values)
         start = np.clip(self.coordinates(values), low, high)
-        memory: dict[bytes, tuple[Vector, Matrix]] = {}
-
-        def both(x: Vector) -> tuple[Vector, Matrix]:
-            key = x.tobytes()
-            if key not in memory:
-                memory.clear()
-                memory[key] = self.residual(x, values)
-            return memory[key]
-
-        def residual(x: Vector) -> Vector:
-            return both(x)[0]
-
-        def jacobian(x: Vector) -> Matrix:
-            return both(x)[1]
-
         found = least_squares(
-            residual,
-            start,
-            jacobian,
+            *apart(lambda x: self.residual(x, values), start),
             bounds=(low, high),
             x_scale="jac",
             max_nfev=100,
@@ -215,3 +199,20 @@ def _inside(value: float, domain: tuple[float, float]) -> float:
         return float(np.clip(value, 1.01 * low, max(1.01 * low, high / 1.01)))
     margin = 1e-3 * (high - low) if np.isfinite(high - low) else 1e-12
     return float(np.clip(value, low + margin, high - margin))
+
+
+def apart(
+    both: Callable[[Vector], tuple[Vector, Matrix]], start: Vector
+) -> tuple[Callable[[Vector], Vector], Vector, Callable[[Vector], Matrix]]:
+    """Residual, start and Jacobian as `scipy.optimize.least_squares` takes them, from a function that gives
+    both at once: it is evaluated once for each place."""
+    memory: dict[bytes, tuple[Vector, Matrix]] = {}
+
+    def at(x: Vector) -> tuple[Vector, Matrix]:
+        key = x.tobytes()
+        if key not in memory:
+            memory.clear()
+            memory[key] = both(x)
+        return memory[key]
+
+    return (lambda x: at(x)[0]), start, (lambda x: at(x)[1])

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from lcopa_bayes.paper.earlier import earlier
 from lcopa_bayes.paper.posteriorclaims import needs_audit
 from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict
-from lcopa_bayes.problems import InputError
 from lcopa_bayes.stated import Stated
 
 COLLINEAR = 10.0
@@ -26,17 +25,7 @@ Reading = Callable[[Stated, Mapping[str, Any]], Verdict]
 
 def load_audit(folder: Path) -> Mapping[str, Any]:
     """`audit.json` of a run folder; InputError when there is none or it cannot be used."""
-    path = folder / "audit.json"
-    try:
-        told: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: cannot be read ({error}); give the run folder that `audit` wrote"
-        ) from None
-    absent = [key for key in _NEEDS if key not in told] if isinstance(told, dict) else list(_NEEDS)
-    if absent:
-        raise InputError(f"{path}: lacks {', '.join(absent)}; run `audit` again with --resume")
-    return told
+    return earlier(folder, "audit", _NEEDS)
 
 
 def from_audit(reading: Reading, question: str) -> Test:

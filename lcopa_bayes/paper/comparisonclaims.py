@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from math import hypot, log
 from pathlib import Path
 from typing import Any
 
+from lcopa_bayes.paper.earlier import earlier
 from lcopa_bayes.paper.posteriorclaims import needs_comparison
 from lcopa_bayes.paper.printedmodel import integer_rival
 from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict
-from lcopa_bayes.problems import InputError
 from lcopa_bayes.stated import Stated
 
 STRONG = log(20)
@@ -28,17 +27,7 @@ Model = Mapping[str, Any]
 
 def load_comparison(folder: Path) -> Mapping[str, Any]:
     """`compare.json` of a run folder; InputError when there is none or it cannot be used."""
-    path = folder / "compare.json"
-    try:
-        told: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: cannot be read ({error}); give the run folder that `compare` wrote"
-        ) from None
-    absent = [key for key in _NEEDS if key not in told] if isinstance(told, dict) else list(_NEEDS)
-    if absent:
-        raise InputError(f"{path}: lacks {', '.join(absent)}; run `compare` again with --resume")
-    return told
+    return earlier(folder, "compare", _NEEDS)
 
 
 def from_comparison(
