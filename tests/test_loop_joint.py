@@ -79,9 +79,9 @@ def test_a_start_level_predicts_records_held_out():
 def test_held_out_records_that_only_noise_separates_are_not_missed():
     found = loop(study_of(3.5), library=[], sample=False, quick=True, as_stated=True)
     score, state = found.before.unseen[0], found.before.state
-    assert np.isnan(missed(found.study, [score], state))
+    assert np.isnan(missed(found.study, found.before.fit, [score], state))
     away = replace(score, predicted=score.predicted + 3 * score.noise_sd)
-    assert missed(found.study, [away], state) == pytest.approx(np.sqrt(10), rel=0.1)
+    assert missed(found.study, found.before.fit, [away], state) == pytest.approx(np.sqrt(10), rel=0.1)
 
 
 def test_a_bend_is_named_from_a_residual_that_holds_it():

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from lcopa_bayes.bench.undeclared import campaign, drawn
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.effected import effected
 from lcopa_bayes.loop.loop import loop
+from lcopa_bayes.loop.trace import SEEN
 from lcopa_bayes.plant.effects.catalogue import catalogue
 from lcopa_bayes.plant.effects.response import Clipping
 from lcopa_bayes.record import Axis, Record
@@ -17,6 +19,7 @@ PERIOD, TIME, DELAY, NOISE = 0.1, 2.0, 1.5, 2e-3
 """Sampling period, time constant and delay [ms], noise [rad]."""
 REFRESH, PHASE = 1.0, 0.75
 """Period of the drive's refresh [ms] and its first over that [-]."""
+SEED = 300000207
 
 
 def commanded(name, seed, *, held=False, ripple=None):
@@ -98,3 +101,16 @@ def test_a_limit_may_differ_from_axis_to_axis():
     offsets = made.plant(values).offsets[0]
     limits = np.array([0.5, 0.4]) * made.ranges.response
     np.testing.assert_allclose(clipped - offsets, np.clip(free - offsets, -limits, limits), atol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_lag_that_the_base_model_imitates_to_first_order_is_in_the_group():
+    """A lag of 0.4 ms is a delay and an order but for 2 % of its signature; a refit of it shows the rest."""
+    rng = np.random.default_rng([SEED, 77])
+    made = campaign(drawn(("sensor_lag",), rng), rng)
+    model = ModelSettings(terms={"direct": 2, "cross": 1})
+    study = Study("hidden", None, "ms", SEED, made.fit, made.held_out, model)
+    found = looped(study, "sensor_lag", "exposure", "overdrive_pulse", "ion_creep", "unmodelled_linear")
+    assert found.trace.of("sensor_lag").survival < SEEN
+    assert found.trace.of("sensor_lag").log_bayes_factor < found.trace.threshold
+    assert "sensor_lag" in found.groups[0]

@@ -186,7 +186,7 @@ def _looped(
             excess=start.whitening.excess(start.optimum.residual),
             enough=ALONE if alone else EXPLAINED,
             scatter=first.scatter,
-            missed=missed(study, before.unseen, start) if study.held_out else np.nan,
+            missed=missed(study, before.fit, before.unseen, start) if study.held_out else np.nan,
             unseen=unseen_share(study, before.unseen, reached.unseen, searched.state)
             if study.held_out
             else np.nan,

@@ -10,10 +10,9 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.loop.basefit import BaseFit
+from lcopa_bayes.loop.candidates import refitted
 from lcopa_bayes.loop.confirm import SIGNIFICANT, Refit, log_bayes_factor, refit, under_one_noise
-from lcopa_bayes.loop.constants import tuned
 from lcopa_bayes.loop.groups import group
-from lcopa_bayes.loop.instances import descended, movable, rough
 from lcopa_bayes.loop.regression import Regression
 from lcopa_bayes.loop.scores import State
 from lcopa_bayes.loop.signature import Signature, pair_evidence
@@ -28,11 +27,6 @@ SINGLE = 0.3
 CLEAR = 1.5
 """Residual over noise from which a single record names anything: its noise may differ from level to level
 [-]."""
-_CANDIDATES = 4
-_TUNED = 8
-"""Named effects whose internal constants are moved off their grid before they are ranked [-]."""
-NEAR = 0.7
-"""Candidates reach this share of the best log Bayes factor [-]."""
 _PAIRED = 8
 """Single effects of which pairs are formed [-]."""
 _PAIRS = 2
@@ -87,7 +81,7 @@ def search(
         if not (seen.alarmed or state.whitening.dependence) or number == MOST:
             rounds.append(Round(seen, (), (), None))
             break
-        refits, failures, tuned_best = _refits(state, seen)
+        refits, failures, tuned_best = refitted(state, seen)
         # what one refit leaves is not noise alone: a further effect must stand out from it
         bar = seen.threshold + (MARGIN if number else 0.0)
         chosen = _leader([one for one in refits if _accepted(one, seen, bar) and (not alone or _large(one))])
@@ -124,45 +118,9 @@ def _gained(start: State, state: State, quiet: float) -> tuple[float, float]:
     return gained, plain.cost - state.optimum.cost
 
 
-def _refits(state: State, seen: Trace) -> tuple[list[Refit], list[str], dict[str, Signature]]:
-    """Named candidates within reach of the best, refitted."""
-    named = [one for one in seen.traced if one.card.place != "generic" and one.signatures][:_TUNED]
-    worth = [one for one in named if one.log_bayes_factor > 0]
-    done, failures, signatures = [], [], {}
-    for one in worth:
-        signatures[one.name] = tuned(state.model, state.optimum, state.whitening, one, seen)
-    reached = {name: seen.alone(signature) for name, signature in signatures.items()}
-    ranked = sorted(reached, key=lambda name: -reached[name])
-    # noise fitted jointly holds the misfit too: only a refit shows what an effect is worth
-    least = -np.inf if not seen.alarmed else NEAR * max(reached.values(), default=0.0)
-    near = [name for name in ranked if reached[name] > least][:_CANDIDATES]
-    far = rough(seen)
-    near = ranked if far else near
-    for name in near:
-        signature = signatures[name]
-        try:
-            effect, amplitude, reached_at = signature.effect, signature.amplitude(seen.residual), None
-            if far and movable(seen.of(name)):
-                effect, reached_at = descended(state, seen, seen.of(name), signature)
-                amplitude = reached_at[state.optimum.x.size :]
-            done.append(
-                refit(
-                    state.model,
-                    state.optimum,
-                    state.whitening,
-                    [(effect, amplitude)],
-                    seen.scale.quiet,
-                    reached_at,
-                )
-            )
-        except ArithmeticError as error:
-            failures.append(f"{name}: {error}")
-    return under_one_noise(done), failures, signatures
-
-
 def leading(start: State, seen: Trace) -> float:
     """Largest log Bayes factor of a single named effect that would be accepted, 0 without any [nat]."""
-    refits, _, _ = _refits(start, seen)
+    refits, _, _ = refitted(start, seen)
     accepted = [one.log_bayes_factor for one in refits if _accepted(one, seen, seen.threshold)]
     return max(accepted, default=0.0)
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lcopa_bayes.arrays import Vector
-from lcopa_bayes.loop.scores import Score, State
+from lcopa_bayes.loop.scores import Score, State, pooled_rmse
 from lcopa_bayes.study import Study
 
 _ROOM = 0.05
@@ -35,11 +35,16 @@ def unseen_share(study: Study, before: Sequence[Score], after: Sequence[Score], 
     return now / was if was > _SEEN * np.sqrt(2 * count) else np.nan
 
 
-def missed(study: Study, scores: Sequence[Score], state: State) -> float:
-    """Root mean square error on held-out records over the noise, where it is more than noise and three
-    standard deviations of what the fit leaves uncertain; NaN where it is not [-]."""
-    power, count = _beyond(study, scores, state, [(one.noise_sd, 0 * one.variance) for one in scores])
-    unsure, _ = _beyond(study, scores, state, [(one.noise_sd, _DOUBTS * one.variance) for one in scores])
+def missed(study: Study, fit: Sequence[Score], scores: Sequence[Score], state: State) -> float:
+    """Root mean square error on held-out records over that of the fit, where it is more than that and three
+    standard deviations of what the fit leaves uncertain; NaN where it is not [-].
+
+    The fit's own residual, where nothing is found in it, knows the noise better than the quiet samples do.
+    """
+    noise = {one.axis: max(pooled_rmse(fit, one.axis), one.noise_sd) for one in scores}
+    power, count = _beyond(study, scores, state, [(noise[one.axis], 0 * one.variance) for one in scores])
+    allowed = [(noise[one.axis], _DOUBTS * one.variance) for one in scores]
+    unsure, _ = _beyond(study, scores, state, allowed)
     return float(np.sqrt(1 + power / count)) if unsure > _SEEN * np.sqrt(2 * count) else np.nan
 
 

@@ -68,8 +68,8 @@ class Found:
     scatter: float = -math.inf
     """Evidence that the noise is not normal, in the first residual [nat]."""
     missed: float = math.nan
-    """Root mean square error of the base model on held-out records over the noise; NaN where noise and what
-    the fit leaves uncertain explain it [-]."""
+    """Root mean square error of the base model on held-out records over that of the fit; NaN where that and
+    what the fit leaves uncertain explain it [-]."""
     unseen: float = math.nan
     """Squared error beyond noise on held-out records, with the effects over without [-]; NaN where it says
     nothing: no such records, no such error, or effects that differ from record to record."""
@@ -142,8 +142,8 @@ def _quiet(found: Found, confidence: Confidence) -> Verdict:
         return Verdict(
             "unexplained",
             confidence,
-            f"The records held out are missed by {found.missed:.1f} times the noise, more than the fit "
-            "leaves uncertain, though the fitted ones show no effect (the largest log Bayes factor is "
+            f"The records held out are missed by {found.missed:.1f} times the residual of the fit, more than "
+            "it leaves uncertain, though the fitted ones show no effect (the largest log Bayes factor is "
             f"{found.largest:.1f} nat): no name is forced.",
         )
     if found.scatter > found.threshold:

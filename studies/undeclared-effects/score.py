@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from lcopa_bayes.bench.undeclared import NAMED, OUTSIDE
 from lcopa_bayes.files import writable_folder, write_text
-from lcopa_bayes.loop import rounds, trace, verdict
+from lcopa_bayes.loop import candidates, rounds, trace, verdict
 from lcopa_bayes.report.canvas import look
 from lcopa_bayes.report.page import Verdict, write_page
 from lcopa_bayes.report.section import Column, Section, Table
@@ -70,7 +70,7 @@ def frozen() -> dict[str, Any]:
         "least": trace.LEAST,
         "quantile": trace.QUANTILE,
         "seen": trace.SEEN,
-        "near": rounds.NEAR,
+        "near": candidates.NEAR,
         "most_effects": rounds.MOST,
     }
     wrong = [key for key in held if told["package"][key] != held[key]]
