@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from multiprocessing import get_context
 from typing import Any, final
 
 import emcee
@@ -16,6 +13,7 @@ import numpy as np
 from lcopa_bayes.arrays import Array, Matrix, Vector
 from lcopa_bayes.estimate import Estimate
 from lcopa_bayes.inference.grade import Grade, Quality, overall, qualities
+from lcopa_bayes.loop.crew import crew
 from lcopa_bayes.loop.density import LoopDensity
 from lcopa_bayes.loop.extended import ExtendedModel
 from lcopa_bayes.loop.proposals import Counted, Jump, Walk, learnt
@@ -116,7 +114,7 @@ def sample_loop(density: LoopDensity, seed: int, *, jobs: int = 1, quick: bool =
     names = [unit_of(density.state.model, int(k))[0] for k in density.sampled]
     surrogate = Surrogate.of(density)
     law = learnt(surrogate, surrogate.centre, surrogate.root, np.random.RandomState([seed, 22]))
-    with _mapped(jobs) as mapped:
+    with crew(min(jobs, ENSEMBLES)) as mapped:
         runs = mapped(_begun, [(surrogate, law, seed, number) for number in range(ENSEMBLES)])
         while True:
             runs = mapped(_continued, [(surrogate, law, run) for run in runs])
@@ -144,16 +142,6 @@ def _long(found: Sequence[Quality], chains: Array) -> bool:
     that number of steps cannot be told."""
     memory = chains[..., 0].size / min(quality.ess for quality in found)
     return bool(chains.shape[2] > _LENGTH * memory)
-
-
-@contextmanager
-def _mapped(jobs: int) -> Iterator[Callable[..., list[Any]]]:
-    """A map over ensembles, in processes where there are several."""
-    if jobs > 1:
-        with ProcessPoolExecutor(min(jobs, ENSEMBLES), mp_context=get_context("spawn")) as pool:
-            yield lambda function, tasks: list(pool.map(function, tasks))
-    else:
-        yield lambda function, tasks: [function(task) for task in tasks]
 
 
 @final
