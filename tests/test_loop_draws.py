@@ -111,7 +111,8 @@ class Linear:
         model = SimpleNamespace(
             plant_size=4, base=base, bounds=(np.full(4, -np.inf), np.full(4, np.inf)), effects=()
         )
-        self.state = SimpleNamespace(optimum=optimum, model=model)
+        whitening = SimpleNamespace(size=self.noise.size)
+        self.state = SimpleNamespace(optimum=optimum, model=model, whitening=whitening)
         self.columns, self.pull = self.tangents[:, 3:], np.zeros(1)
         self.inverse = np.linalg.inv(self.columns.T @ self.columns)
 

@@ -38,6 +38,9 @@ _ROUND = 10
 _STEPS = 120
 _STEPS_DEAR = 90
 """Most steps where an effect bends the dynamics: a density costs ten times as much."""
+_SAMPLES = 10_000
+_LONGER = 8.0
+"""Samples from which these are the most; of fewer, which cost less, there may be so many times more [-]."""
 _LENGTH = 6.0
 """Least length of a chain over the steps after which it forgets [-]."""
 _KEPT = 400
@@ -110,7 +113,8 @@ def sample_loop(density: LoopDensity, seed: int, *, jobs: int = 1, quick: bool =
     allows (half as long with `quick`).
     """
     dear = any(isinstance(effect, UPSTREAM) for effect in density.state.model.effects)
-    most = (_STEPS_DEAR if dear else _STEPS) // (2 if quick else 1)
+    longer = min(max(1.0, _SAMPLES / density.state.whitening.size), _LONGER)
+    most = int(longer * (_STEPS_DEAR if dear else _STEPS)) // (2 if quick else 1)
     names = [unit_of(density.state.model, int(k))[0] for k in density.sampled]
     surrogate = Surrogate.of(density)
     law = learnt(surrogate, surrogate.centre, surrogate.root, np.random.RandomState([seed, 22]))
