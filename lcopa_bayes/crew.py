@@ -1,9 +1,9 @@
-"""Who runs ensembles: this process, or several of one thread each."""
+"""Who does independent tasks: this process, or several of one thread each."""
 
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import get_context
@@ -13,14 +13,15 @@ from threadpoolctl import threadpool_limits
 
 
 @contextmanager
-def crew(workers: int) -> Iterator[Callable[..., list[Any]]]:
-    """A map of a function over tasks, in order, by that many processes where there are several."""
+def crew(workers: int) -> Iterator[Callable[..., Iterable[Any]]]:
+    """A map of a function over tasks, in order and as they are done, by that many processes where there are
+    several."""
     if workers <= 1:
         with threadpool_limits(1):
-            yield lambda function, tasks: [function(task) for task in tasks]
+            yield map
         return
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_ready) as pool:
-        yield lambda function, tasks: list(pool.map(function, tasks))
+        yield pool.map
 
 
 def _ready() -> None:

@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).parents[1] / "lcopa_bayes"
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.name != "__init__.py")
 
 ORDER = (
-    ("problems", "cores"),
+    ("problems", "cores", "crew"),
     ("arrays", "files", "checks"),
     ("stated", "cells", "estimate"),
     ("record",),

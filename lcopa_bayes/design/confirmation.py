@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from math import isfinite
-from multiprocessing import get_context
 from typing import Any, final
 
 import numpy as np
 from scipy.stats import chi2
-from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.bench.acquisition import Bench as VirtualBench
 from lcopa_bayes.bench.acquisition import truth
+from lcopa_bayes.crew import crew
 from lcopa_bayes.design.design import LINEAR, Design
 from lcopa_bayes.design.information import Bench
 from lcopa_bayes.design.refit import Trial, device_of
@@ -216,14 +214,8 @@ def _confirmed(made: Design, chosen: int, where: str, replicas: int, jobs: int) 
 
 
 def _performed(tasks: list[Trial], jobs: int) -> Iterable[tuple[Vector, Flags]]:
-    if jobs <= 1:
-        with threadpool_limits(1):
-            yield from (task() for task in tasks)
-        return
-    with ProcessPoolExecutor(
-        jobs, mp_context=get_context("spawn"), initializer=threadpool_limits, initargs=(1,)
-    ) as pool:
-        yield from pool.map(_perform, tasks)
+    with crew(jobs) as mapped:
+        yield from mapped(_perform, tasks)
 
 
 def _perform(task: Trial) -> tuple[Vector, Flags]:

@@ -8,21 +8,18 @@ costs a tenth per point.
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable, Iterable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
 from typing import Any, final
 
 import numpy as np
 from dynesty import NestedSampler
 from dynesty.internal_samplers import InternalSampler, SamplerArgument, SamplerReturn
 from scipy.special import logsumexp
-from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from lcopa_bayes.arrays import Index, Matrix, Vector
+from lcopa_bayes.crew import crew
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.strands import Strands
@@ -149,16 +146,8 @@ def _effective(draws: Vector, ratios: Matrix, owner: Index) -> float:
 def _performed(
     tasks: list[tuple[Posterior, NestedPlan, np.random.SeedSequence]], jobs: int
 ) -> Iterable[tuple[Strands, int]]:
-    if jobs <= 1:
-        yield from map(_run, tasks)
-        return
-    with ProcessPoolExecutor(
-        jobs,
-        mp_context=get_context("spawn"),
-        initializer=signal.signal,
-        initargs=(signal.SIGINT, signal.SIG_DFL),
-    ) as pool:
-        yield from pool.map(_run, tasks)
+    with crew(jobs) as mapped:
+        yield from mapped(_run, tasks)
 
 
 def _run(task: tuple[Posterior, NestedPlan, np.random.SeedSequence]) -> tuple[Strands, int]:
@@ -168,22 +157,21 @@ def _run(task: tuple[Posterior, NestedPlan, np.random.SeedSequence]) -> tuple[St
     walk = Walk(cube, plan.steps)
     points = cube.draw(plan.live, rng)
     start = cube.coordinates(points)
-    with threadpool_limits(1):
-        sampler = NestedSampler(
-            lambda z: float(cube.log_likelihood(z[None])[0]),
-            lambda point: cube.coordinates(point[None])[0],
-            cube.dimension,
-            nlive=plan.live,
-            bound="none",
-            sample=_Travellers(walk=walk, ndim=cube.dimension),
-            rstate=rng,
-            pool=_Together,
-            queue_size=min(_QUEUE, int(_LATE * plan.live)),
-            use_pool={"prior_transform": False, "loglikelihood": False, "update_bound": False},
-            live_points=(points, start, cube.log_likelihood(start)),
-            first_update={"min_ncall": 1, "min_eff": 100.0},
-        )
-        sampler.run_nested(dlogz=_REMAINDER, print_progress=False, save_bounds=False)
+    sampler = NestedSampler(
+        lambda z: float(cube.log_likelihood(z[None])[0]),
+        lambda point: cube.coordinates(point[None])[0],
+        cube.dimension,
+        nlive=plan.live,
+        bound="none",
+        sample=_Travellers(walk=walk, ndim=cube.dimension),
+        rstate=rng,
+        pool=_Together,
+        queue_size=min(_QUEUE, int(_LATE * plan.live)),
+        use_pool={"prior_transform": False, "loglikelihood": False, "update_bound": False},
+        live_points=(points, start, cube.log_likelihood(start)),
+        first_update={"min_ncall": 1, "min_eff": 100.0},
+    )
+    sampler.run_nested(dlogz=_REMAINDER, print_progress=False, save_bounds=False)
     found = sampler.results
     strands = Strands.of(
         np.array(found.samples), np.array(found.logl), np.unique(found.samples_id, return_inverse=True)[1]

@@ -85,7 +85,7 @@ class Refit:
         if not names:
             return True
         model, x = self.without(names)
-        delay = self.model.base.dead_time(x[: self.model.plant_size])
+        delay = model.dead_time(x)
         bare = self.whitening(self.whitening.observed - model.predict(x))
         drop = 0.0
         for part in self.whitening.parts:

@@ -11,9 +11,9 @@ import emcee
 import numpy as np
 
 from lcopa_bayes.arrays import Array, Matrix, Vector
+from lcopa_bayes.crew import crew
 from lcopa_bayes.estimate import Estimate
 from lcopa_bayes.inference.grade import Grade, Quality, overall, qualities
-from lcopa_bayes.loop.crew import crew
 from lcopa_bayes.loop.density import LoopDensity
 from lcopa_bayes.loop.extended import ExtendedModel
 from lcopa_bayes.loop.proposals import Counted, Jump, Walk, learnt
@@ -119,9 +119,9 @@ def sample_loop(density: LoopDensity, seed: int, *, jobs: int = 1, quick: bool =
     surrogate = Surrogate.of(density)
     law = learnt(surrogate, surrogate.centre, surrogate.root, np.random.RandomState([seed, 22]))
     with crew(min(jobs, ENSEMBLES)) as mapped:
-        runs = mapped(_begun, [(surrogate, law, seed, number) for number in range(ENSEMBLES)])
+        runs = list(mapped(_begun, [(surrogate, law, seed, number) for number in range(ENSEMBLES)]))
         while True:
-            runs = mapped(_continued, [(surrogate, law, run) for run in runs])
+            runs = list(mapped(_continued, [(surrogate, law, run) for run in runs]))
             chains = np.stack([run.chain for run in runs])
             found, kept = qualities(names, chains), chains.shape[2]
             enough = overall(found, _BEYOND * TARGET_ESS).level == "reliable" and _long(found, chains)

@@ -89,6 +89,10 @@ class ExtendedModel:
         n = self.plant_size
         return self.base.values(x[:n]), x[n:] * self.scale
 
+    def dead_time(self, x: Vector) -> float:
+        """Shortest delay at coordinates [time unit]."""
+        return self.base.dead_time(x[: self.plant_size])
+
     def predict(self, x: Vector) -> Vector:
         """Stacked responses, (n,) [response unit]; UnstableError where there are none."""
         if not self.effects:

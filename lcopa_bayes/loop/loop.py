@@ -158,7 +158,7 @@ def _looped(
         )
     alone = len(study.fit) == 1 and not study.held_out
     rng = np.random.default_rng([study.seed, 11])
-    searched = search(start, base, kinds, rng, draws=draws, alone=alone)
+    searched = search(start, kinds, rng, noise_samples=base.noise_samples, draws=draws, alone=alone)
     first, last = searched.rounds[0].trace, searched.rounds[-1].trace
     generic = max(
         (one for one in first.traced if one.card.place == "generic"),
@@ -196,13 +196,9 @@ def _looped(
         verdict = beside(verdict, outliers.sentence)
     named = verdict.kind in ("explained", "disturbance")
     last_state, sampled = searched.state if named else start, None
-    if verdict.kind == "unexplained":
-        samples, noise = start.whitening.samples, start.whitening.noise
-        last_state = replace(start, widening=Widening.of(samples, start.optimum.residual, noise))
-    elif last.alarmed:  # named, and something significant remains
-        samples, residual = last_state.whitening.samples, last_state.optimum.residual
-        widening = Widening.of(samples, residual, last_state.whitening.noise)
-        last_state = replace(last_state, widening=widening)
+    if verdict.kind == "unexplained" or last.alarmed:  # something significant remains
+        white, residual = last_state.whitening, last_state.optimum.residual
+        last_state = replace(last_state, widening=Widening.of(white.samples, residual, white.noise))
     if sample:
         quiet = float(sum(base.noise_samples))
         sampled = sample_loop(LoopDensity(last_state, quiet), study.seed, jobs=jobs, quick=quick)

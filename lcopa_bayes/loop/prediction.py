@@ -15,13 +15,10 @@ from lcopa_bayes.inference.data import Samples
 from lcopa_bayes.inference.effected import Effected, carried
 from lcopa_bayes.loop.autoregression import Autoregression
 from lcopa_bayes.loop.extended import ExtendedModel
-from lcopa_bayes.loop.quiet import first_change
+from lcopa_bayes.loop.quiet import quiet_samples
 from lcopa_bayes.loop.whitening import parts, stacked
 from lcopa_bayes.record import Record
 from lcopa_bayes.study import Study
-
-_SAFE = 0.8
-"""Share of the fitted delay inside which a response is surely at rest [-]."""
 
 
 @final
@@ -157,9 +154,7 @@ def levelled(
     squares,
     and from what the levels of the fit records make likely.
     """
-    observed = record.axes[axis]
-    until = first_change(record) + _SAFE * delay
-    count = int(np.searchsorted(record.times[observed.index], until))
+    count = quiet_samples(record, axis, delay)
     source = "samples before the drive acts" if count >= 3 else "the record itself"
     used = misfit[:count] if count >= 3 else misfit
     white, ones = noise.whiten(np.stack([used, np.ones_like(used)]))

@@ -9,7 +9,6 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.loop.basefit import BaseFit
 from lcopa_bayes.loop.candidates import refitted
 from lcopa_bayes.loop.confirm import SIGNIFICANT, Refit, log_bayes_factor, refit, under_one_noise
 from lcopa_bayes.loop.groups import group
@@ -64,20 +63,19 @@ class Search:
 
 def search(
     start: State,
-    base: BaseFit,
     library: Sequence[type[Effect]],
     rng: np.random.Generator,
     *,
+    noise_samples: Sequence[int],
     draws: int,
     alone: bool = False,
 ) -> Search:
     """Add effects one at a time, up to three, while evidence, records left out and significance all speak
     for it, from a record that stands `alone` only large ones; then try pairs where something remains, and
     take back what is no longer significant."""
-    counts = base.noise_samples
     state, rounds, groups = start, [], {}
     for number in range(MOST + 1):
-        seen = trace(state, library, rng, noise_samples=counts, draws=draws)
+        seen = trace(state, library, rng, noise_samples=noise_samples, draws=draws)
         if not (seen.alarmed or state.whitening.dependence) or number == MOST:
             rounds.append(Round(seen, (), (), None))
             break
@@ -94,11 +92,11 @@ def search(
         paired = _paired(start, state, rounds[0].trace)
         if paired is not None:
             state = _state(paired)
-            seen = trace(state, library, rng, noise_samples=counts, draws=draws)
+            seen = trace(state, library, rng, noise_samples=noise_samples, draws=draws)
             rounds += [Round(rounds[0].trace, (paired,), (), paired), Round(seen, (), (), None)]
     names = [effect.name for effect in state.model.effects]
     told = tuple(groups.get(name, (name,)) for name in names)
-    gained, dropped = _gained(start, state, float(sum(counts)))
+    gained, dropped = _gained(start, state, float(sum(noise_samples)))
     last = rounds[-1].trace
     left = last.scale.drop(last.largest) if last.alarmed else 0.0
     share = dropped / (dropped + left) if dropped > 0 else float(left <= 0)

@@ -115,7 +115,8 @@ def left_out_scores(state: State) -> list[Score]:
         tangents = state.optimum.tangents[group.rows]
         mean[group.rows] += tangents @ shift
         variance[group.rows] = np.einsum("nk,kl,nl->n", tangents, covariance, tangents, optimize=True)
-    delay = _delay(state) if _own_levels(state) and len(state.whitening.samples) > 1 else None
+    several = len(state.whitening.samples) > 1
+    delay = state.model.dead_time(state.optimum.x) if several and _own_levels(state) else None
     return _scores(state, mean, variance, "the other records", delay)
 
 
@@ -132,18 +133,15 @@ def held_out_scores(state: State, problem: Problem) -> list[Score]:
     if not _own_levels(state):
         return _scores(elsewhere, told.mean, told.variance, "the fit records", None)
     axes = range(len(state.whitening.noise))
+    delay = state.model.dead_time(state.optimum.x)
     priors = [LevelPrior.of(state.model, state.optimum.x, state.covariance, axis) for axis in axes]
-    return _scores(elsewhere, told.mean, told.variance, "the fit records", _delay(state), priors)
+    return _scores(elsewhere, told.mean, told.variance, "the fit records", delay, priors)
 
 
 def _own_levels(state: State) -> bool:
     """Whether every record has an offset of its own."""
     table = state.model.base.posterior.table
     return any(row.kind == "offset" and row.place.second >= 0 for row in table.rows)
-
-
-def _delay(state: State) -> float:
-    return state.model.base.dead_time(state.optimum.x[: state.model.plant_size])
 
 
 def _scores(

@@ -77,8 +77,7 @@ class Surrogate:
             raise FloatingPointError("the optimum has no bounded response")
         told: dict[int, tuple[Vector, Matrix]] = {}
         for j in range(centre.size):
-            k = j if j < len(delays) else -1
-            told[j] = _walked(density, centre, root[:, j], white, far=k >= 0)
+            told[j] = _walked(density, centre, root[:, j], white, far=j < len(delays))
         basis, _ = np.linalg.qr(
             np.concatenate(
                 [white[:, None], density.columns, *(nodes.T for _, nodes in told.values())], axis=1
