@@ -65,12 +65,18 @@ class Experiment:
 
     @classmethod
     def of(
-        cls, record: Record, times: Vector, *, blocks: int | None = None, exposure: float = 0.0
+        cls,
+        record: Record,
+        times: Vector,
+        *,
+        blocks: int | None = None,
+        exposure: float = 0.0,
+        refinement: int = 1,
     ) -> Experiment:
         """For reading `record` at `times` [time unit]; see `Mesh.of_samples` for the options."""
         drives = tuple(Drive.of_rows(record.time, column) for column in record.drive.T)
         begin = min((drive.times[0] for drive in drives if drive.moves), default=times[0])
-        mesh = Mesh.of_samples(times, float(begin), blocks=blocks, exposure=exposure)
+        mesh = Mesh.of_samples(times, float(begin), blocks=blocks, exposure=exposure, refinement=refinement)
         return cls(record.name, mesh, drives, record.drive[0])
 
     @cached_property
@@ -223,10 +229,11 @@ def forward_model(
     *,
     blocks: int | None = None,
     exposure: float = 0.0,
+    refinement: int = 1,
 ) -> ForwardModel:
     """Forward model of `records`, each read at its own `times` [time unit]."""
     experiments = (
-        Experiment.of(record, at, blocks=blocks, exposure=exposure)
+        Experiment.of(record, at, blocks=blocks, exposure=exposure, refinement=refinement)
         for record, at in zip(records, times, strict=True)
     )
     return ForwardModel(layout, tuple(experiments))

@@ -130,7 +130,13 @@ class Mesh:
 
     @classmethod
     def of_samples(
-        cls, times: Vector, begin: float, *, blocks: int | None = None, exposure: float = 0.0
+        cls,
+        times: Vector,
+        begin: float,
+        *,
+        blocks: int | None = None,
+        exposure: float = 0.0,
+        refinement: int = 1,
     ) -> Mesh:
         """For samples at `times`, when nothing moves before `begin` (the first drive change).
 
@@ -140,7 +146,7 @@ class Mesh:
         mean over ``[t - exposure, t]``.
 
         Parameters: times (samples,) increasing [time unit]; blocks: at least so many blocks, or
-        chosen from the samples; exposure [time unit] >= 0.
+        chosen from the samples; exposure [time unit] >= 0; refinement: blocks are narrower by this factor.
         """
         if times[-1] <= begin:
             begin = times[0]
@@ -157,7 +163,7 @@ class Mesh:
         wanted = blocks or FEWEST_BLOCKS
         later = times[first:]
         if equidistant and span / period < max(8 * MOST_BLOCKS, 2 * times.size):
-            split = max(1, ceil(wanted * period / span))
+            split = refinement * max(1, ceil(wanted * period / span))
             places = np.round((later - later[0]) / period).astype(int) * split
             lattice = Lattice(_rounded(period / split), later, places, exposure)
             if exposure == 0.0:
@@ -166,6 +172,7 @@ class Mesh:
             if blocks is None:
                 typical = float(np.median(np.diff(later))) if later.size > 1 else span
                 wanted = int(np.clip(ceil(span / typical), FEWEST_BLOCKS, max(MOST_BLOCKS, times.size)))
+            wanted *= refinement
             lattice = Lattice(_rounded(span / wanted), later, None, exposure)
         step = span / ceil(span / lattice.step - 1e-6)
         grid = Grid(begin, step, round(span / step) + 2)  # two spare blocks: the last sample is interior
