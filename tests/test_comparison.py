@@ -8,7 +8,7 @@ from math import log
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
-from scipy.stats import multivariate_normal, norm
+from scipy.stats import norm
 from small import Toy, problem, record
 
 from lcopa_bayes.comparison.carry import carried
@@ -17,11 +17,9 @@ from lcopa_bayes.comparison.differences import stretches, total_sd
 from lcopa_bayes.comparison.integerorder import savage_dickey
 from lcopa_bayes.comparison.judgement import judged
 from lcopa_bayes.comparison.parts import CUTS, parts_of, predicted, without
-from lcopa_bayes.comparison.prediction import _densities
 from lcopa_bayes.comparison.priorwidth import _scaled
 from lcopa_bayes.comparison.stacking import probabilities, stacking_weights
 from lcopa_bayes.estimate import Estimate
-from lcopa_bayes.inference.noise import AR1, Student, White
 from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.priors import Prior
 
@@ -152,28 +150,6 @@ def test_of_one_record_the_future_is_predicted_stretch_by_stretch():
     for part in parts:
         known = without(one.posterior, part)
         assert known.size == part.known
-
-
-def test_correlated_noise_remembers_the_last_known_sample(rng):
-    """Against the conditional of the joint normal distribution."""
-    sigma, rho, n = 0.7, 0.8, 6
-    gaps = np.array([1.0, 1.0, 2.0, 1.0, 0.5, 1.0])
-    at = np.cumsum(gaps)
-    covariance = sigma**2 * rho ** np.abs(at[:, None] - at)
-    residual = rng.multivariate_normal(np.zeros(n), covariance)
-    chosen = np.array([3, 4, 5])
-    told = _densities(AR1(), residual[None], np.array([[sigma, rho]]), gaps, chosen, 3)[0]
-    for value, k in zip(told, chosen, strict=True):
-        pair = np.ix_([2, k], [2, k])
-        joint = multivariate_normal.logpdf(residual[[2, k]], cov=covariance[pair])
-        assert value == pytest.approx(joint - norm.logpdf(residual[2], scale=sigma), rel=1e-10)
-    alone = _densities(AR1(), residual[None], np.array([[sigma, rho]]), gaps, chosen, 0)[0]
-    np.testing.assert_allclose(alone, norm.logpdf(residual[chosen], scale=sigma))
-    for noise, row in ((White(), [[sigma]]), (Student(), [[sigma, 5.0]])):
-        plain = noise.pointwise(residual[None], np.array(row), gaps)[0, chosen]
-        np.testing.assert_allclose(
-            _densities(noise, residual[None], np.array(row), gaps, chosen, 3)[0], plain
-        )
 
 
 def test_the_error_of_a_total_knows_that_neighbours_err_together():
