@@ -82,6 +82,23 @@ def test_far_from_the_integer_the_tail_is_normal_and_says_so(rng):
     assert abs(found.log_bayes_factor - norm.logpdf(1, 0.8, 0.02) - log(2)) < 4 * found.log_sd
 
 
+@pytest.mark.parametrize("sd", [0.0005, 0.0008, 0.002])
+@pytest.mark.parametrize("apart", [0.0, 3.0, 6.0])
+def test_a_sharply_known_order_is_not_an_integer_because_it_is_near_one(rng, sd, apart):
+    """Windows follow the posterior however narrow: 6 standard deviations off are 6 standard deviations."""
+    draws, prior = rng.normal(1 + apart * sd, sd, 4_000), rng.uniform(0, 2, 200_000)
+    found = savage_dickey(draws, prior, estimate(draws, 4_000))
+    exact = norm.logpdf(apart) - log(sd) + log(2)
+    assert abs(found.log_bayes_factor - exact) < 4 * found.log_sd + 0.02
+    assert found.answer == {0.0: "integer", 3.0: "integer", 6.0: "not an integer"}[apart]
+
+
+def test_draws_that_do_not_vary_say_nothing(rng):
+    draws = np.ones(4_000)
+    found = savage_dickey(draws, rng.uniform(0, 2, 200_000), estimate(draws, 4_000))
+    assert (found.road, found.answer) == ("undefined", "undecided")
+
+
 def test_an_order_at_an_end_of_its_domain_is_compared_with_the_prior_there(rng):
     draws, prior = 2 - np.abs(rng.normal(0, 0.05, 20_000)), rng.uniform(0, 2, 200_000)
     found = savage_dickey(draws, prior, estimate(draws, 20_000))
@@ -226,6 +243,14 @@ def test_orders_and_noise_keep_their_priors():
 # -- decisions -------------------------------------------------------------------------------------
 
 
+def prior_widths(half: float | None, twice: float | None) -> list[dict]:
+    """Log evidence under priors half and twice as wide; None: it could not be had."""
+    return [
+        {"factor": factor, "log_evidence": value, "sd": None if value is None else 0.1}
+        for factor, value in ((0.5, half), (2.0, twice))
+    ]
+
+
 def card(name: str, evidence: float | None, lpd: float, **told: object) -> dict:
     """A card whose 40 predicted samples share `lpd` evenly, with a small fixed wobble."""
     wobble = 0.01 * np.sin(np.arange(40.0) * (1 + len(name)))
@@ -241,7 +266,7 @@ def card(name: str, evidence: float | None, lpd: float, **told: object) -> dict:
         "log_evidence": evidence,
         "log_evidence_sd": None if evidence is None else 0.1,
         "evidence_undefined": "",
-        "prior_widths": [],
+        "prior_widths": [] if evidence is None else prior_widths(evidence, evidence),
         "pointwise": {
             "part": ["b"] * 40,
             "axis": ["y"] * 40,
@@ -320,10 +345,28 @@ def test_a_fractional_win_needs_evidence_and_prediction():
 
 
 def test_a_win_that_hangs_on_the_prior_is_not_claimed():
-    wide = {"factor": 2.0, "log_evidence": 1.0, "sd": 0.1}
-    free = card("free", 20.0, 10.0, parameters=6, prior_widths=[wide])
-    whole = card("first-order", 0.0, 0.0, prior_widths=[wide | {"log_evidence": 0.0}])
+    free = card("free", 20.0, 10.0, parameters=6, prior_widths=prior_widths(20.0, 1.0))
+    whole = card("first-order", 0.0, 0.0)
     assert outcome(free, whole)["fractional"]["verdict"] == "not shown"
+
+
+@pytest.mark.parametrize(("half", "twice", "said"), [(None, 20.0, "0.5"), (20.0, None, "2")])
+def test_a_width_that_could_not_be_computed_is_told_and_no_win_claimed(half, twice, said):
+    """Such a width is no width at which the win holds."""
+    whole = card("first-order", 0.0, 0.0)
+    known = outcome(card("free", 20.0, 10.0, parameters=6, prior_widths=prior_widths(20.0, 19.0)), whole)
+    assert known["fractional"]["verdict"] == "warranted"
+    assert "least over priors half and twice as wide +19.0" in known["fractional"]["sentence"]
+    free = card("free", 20.0, 10.0, parameters=6, prior_widths=prior_widths(half, twice))
+    found = outcome(free, whole)["fractional"]
+    assert found["verdict"] == "not shown"
+    assert f"under priors {said} times as wide free gave no evidence" in found["sentence"]
+    other = outcome(
+        card("free", 20.0, 10.0, parameters=6), whole | {"prior_widths": prior_widths(half, twice)}
+    )
+    assert "first-order gave no evidence" in other["fractional"]["prior_widths_unknown"][0]
+    lost = outcome(card("free", -20.0, -20.0, parameters=6, prior_widths=prior_widths(half, twice)), whole)
+    assert lost["fractional"]["verdict"] == "not warranted"
 
 
 def test_a_high_order_over_a_residual_that_is_not_white_is_flagged():
