@@ -169,7 +169,7 @@ def _scored(
         if not chosen.size:
             continue
         response = plant[axis][:, observed.index]
-        offset, source = offset_draws(
+        offset, _, used = offset_draws(
             table,
             values,
             axis,
@@ -181,7 +181,7 @@ def _scored(
             rng=rng,
         )
         residual = observed.values - response - offset[:, None]
-        if source == "samples before the drive acts":  # these set the offset: no prediction
+        if used:  # samples before the drive acts set the offset: no prediction
             begin = _quiet(samples, observed.index)
             chosen = chosen[~begin[chosen]]
         parameters = values[:, [table.at(name, axis) for name in noise.names]]
