@@ -118,6 +118,7 @@ class Parameter:
         low, high = _DOMAIN[self.kind]
         zero = self.kind in _MAY_BE_ZERO
         where = f"{'[' if zero else '('}{low:g}, {high:g}{']' if self.kind == 'order' else ')'}"
+        where += "" if self.unit == "-" else f" {self.unit}"
         if self.prior is None:
             fits = bool(_inside(self.kind, np.array(self.value))) or (zero and self.value == 0)
             return [] if fits else [f"[priors] {self.name} = {self.value:g}: must lie in {where}"]
