@@ -140,8 +140,7 @@ def offset_draws(
     if not held_out:
         return values[:, places[axis, r]], "fitted"
     observed = record.axes[axis]
-    begin = _first_change(record)
-    quiet = record.times[observed.index] <= begin
+    quiet = record.times[observed.index] <= record.first_change
     if quiet.any():
         return (
             _given(observed, quiet, response, noise, table, values, axis, rng),
@@ -173,9 +172,3 @@ def _given(
     precision = np.einsum("bn,bn->b", white[:, 0], white[:, 0])
     mean = np.einsum("bn,bn->b", white[:, 0], white[:, 1]) / precision
     return np.asarray(mean + rng.standard_normal(mean.size) / np.sqrt(precision))
-
-
-def _first_change(record: Samples) -> float:
-    """Time of the first drive change, infinite when there is none [time unit]."""
-    moved = np.flatnonzero((record.record.drive != record.record.drive[0]).any(axis=1))
-    return float(record.record.time[moved[0]]) if moved.size else np.inf

@@ -75,9 +75,9 @@ class WhiteAR1(GaussianNoise):
     def priors(scales: Scales, axis: int) -> Mapping[str, Prior]:
         """Default prior of each parameter on a response axis."""
         return {
-            "sigma": scales.sigma(axis),
-            "sigma_ar": scales.sigma(axis),
-            "rho": scales.rho(),
+            "sigma": scales.sigma_white(axis),
+            "sigma_ar": scales.sigma_ar(axis),
+            "rho": scales.rho_short(),
         }
 
     @staticmethod
