@@ -8,12 +8,10 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 from scipy.linalg.lapack import dpttrf, dpttrs
 
-from lcopa_bayes.arrays import Array, Index, Matrix, Vector
+from lcopa_bayes.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.noisemodel import (
     SLIGHT,
     GaussianNoise,
-    link_over,
-    log_normal,
     products,
     root_mean_square,
 )
@@ -99,23 +97,6 @@ class WhiteAR1(GaussianNoise):
             "rho": second / first,
         }
 
-    def marginal(
-        self, residual: Matrix, parameters: Matrix, gaps: Vector, chosen: Index, last: int
-    ) -> Matrix:
-        """Log density of each chosen sample given those up to `last` alone, (batch, chosen)."""
-        white, correlated = parameters[:, :1] ** 2, parameters[:, 1:2] ** 2
-        mean, variance = np.zeros_like(white), correlated
-        if last >= 0:
-            known, until = residual[:, : last + 1], gaps[: last + 1]
-            innovation = np.exp(self.log_scales(parameters, until)[:, -1:])
-            standard = self.whiten(known[:, None], parameters, until)[0][:, 0, -1:]
-            mean = known[:, -1:] - white / innovation * standard
-            variance = white * (1 - white / innovation**2)
-        link = link_over(parameters[:, 2:], gaps, chosen, last)
-        return log_normal(
-            residual[:, chosen] - link * mean, white + correlated * (1 - link**2) + variance * link**2
-        )
-
     @staticmethod
     def _factors(parameters: Matrix, gaps: Vector) -> tuple[Matrix, Vector, Vector]:
         """Correlation with the previous sample, (batch, n - 1); of the whole batch in one row, innovation
@@ -129,7 +110,8 @@ class WhiteAR1(GaussianNoise):
         diagonal[:, 1:] = white * (1 + link**2) - correlated * np.expm1(2 * steps)
         beside = np.zeros(diagonal.shape)  # zero from one member of the batch to the next
         beside[:, :-1] = -white * link
-        variances, lower, failed = dpttrf(diagonal.ravel(), beside.ravel()[: diagonal.size - 1], 1, 1)
+        off = beside.ravel()[: max(1, diagonal.size - 1)]  # LAPACK's wrapper wants one where there is none
+        variances, lower, failed = dpttrf(diagonal.ravel(), off, 1, 1)
         if failed:
             raise FloatingPointError(f"noise without a positive innovation variance among {parameters}")
         return link, variances, lower

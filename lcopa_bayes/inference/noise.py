@@ -9,9 +9,9 @@ import numpy as np
 from scipy.special import gammaln
 from scipy.stats import t as student_t
 
-from lcopa_bayes.arrays import Array, Index, Matrix, Vector
+from lcopa_bayes.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.mixednoise import WhiteAR1
-from lcopa_bayes.inference.noisemodel import SLIGHT, link_over, log_normal, products, root_mean_square
+from lcopa_bayes.inference.noisemodel import SLIGHT, products, root_mean_square
 from lcopa_bayes.inference.noisemodel import GaussianNoise as GaussianNoise
 from lcopa_bayes.inference.noisemodel import Noise as Noise
 from lcopa_bayes.inference.priors import Prior
@@ -98,14 +98,6 @@ class AR1(GaussianNoise):
         """Standard deviation and first autocorrelation."""
         power, lagged = (products(residuals, lag) for lag in (0, 1))
         return {"sigma": root_mean_square(residuals), "rho": lagged / power if power else 0.0}
-
-    def marginal(
-        self, residual: Matrix, parameters: Matrix, gaps: Vector, chosen: Index, last: int
-    ) -> Matrix:
-        """Log density of each chosen sample given those up to `last` alone, (batch, chosen)."""
-        sigma, rho = parameters[:, :1], parameters[:, 1:2]
-        link = link_over(rho, gaps, chosen, last)
-        return log_normal(residual[:, chosen] - link * residual[:, [last]], sigma**2 * (1 - link**2))
 
     @staticmethod
     def _transition(parameters: Matrix, gaps: Vector) -> tuple[Matrix, Matrix]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from lcopa_bayes.arrays import Array, Index, Matrix, Vector
+from lcopa_bayes.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.priors import Prior
 
 if TYPE_CHECKING:
@@ -41,6 +41,10 @@ class Noise(ABC):
     def draw(self, parameters: Matrix, gaps: Vector, rng: np.random.Generator) -> Matrix:
         """Noise for each parameter set, (batch, n) [response unit]."""
 
+    def standard(self, residual: Matrix, parameters: Matrix, gaps: Vector) -> Matrix:
+        """Residual less what those before it predict, over the noise scale, (batch, n) [-]."""
+        return residual / parameters[:, :1]
+
     @staticmethod
     @abstractmethod
     def priors(scales: Scales, axis: int) -> Mapping[str, Prior]:
@@ -56,15 +60,6 @@ class Noise(ABC):
         """Starting values from residuals of equally spaced samples, by moments where there are any."""
         return cls.nearly_white(root_mean_square(residuals))
 
-    def marginal(
-        self, residual: Matrix, parameters: Matrix, gaps: Vector, chosen: Index, last: int
-    ) -> Matrix:
-        """Log density of each chosen sample given those up to `last` alone, (batch, chosen).
-
-        `chosen` are positions after `last`, which is -1 where no sample is known.
-        """
-        return self.pointwise(residual[:, chosen], parameters, np.ones(chosen.size))
-
 
 class GaussianNoise(Noise):
     """Noise that a linear map makes white with unit variance."""
@@ -75,8 +70,12 @@ class GaussianNoise(Noise):
 
     def pointwise(self, residual: Matrix, parameters: Matrix, gaps: Vector) -> Matrix:
         """Log density of each sample given those before it, (batch, n)."""
-        white, _ = self.whiten(residual[:, None, :], parameters, gaps)
-        return -0.5 * (white[:, 0] ** 2 + LOG_2PI) - self.log_scales(parameters, gaps)
+        white = self.standard(residual, parameters, gaps)
+        return -0.5 * (white**2 + LOG_2PI) - self.log_scales(parameters, gaps)
+
+    def standard(self, residual: Matrix, parameters: Matrix, gaps: Vector) -> Matrix:
+        """Residual less what those before it predict, over its innovation sd, (batch, n) [-]."""
+        return np.asarray(self.whiten(residual[:, None, :], parameters, gaps)[0][:, 0])
 
     @abstractmethod
     def log_scales(self, parameters: Matrix, gaps: Vector) -> Matrix:
@@ -91,16 +90,3 @@ def root_mean_square(residuals: Sequence[Vector]) -> float:
 def products(residuals: Sequence[Vector], lag: int) -> float:
     """Sum of products of samples `lag` apart [unit of the residuals squared]."""
     return sum(float(residual[lag:] @ residual[: residual.size - lag]) for residual in residuals)
-
-
-def link_over(rho: Matrix, gaps: Vector, chosen: Index, last: int) -> Matrix:
-    """Correlation of chosen samples with the last known one, (batch, chosen); zero where none is known."""
-    if last < 0:
-        return np.zeros((rho.shape[0], chosen.size))
-    at = np.cumsum(gaps)
-    return np.asarray(rho ** (at[chosen] - at[last]))
-
-
-def log_normal(misfit: Matrix, variance: Matrix) -> Matrix:
-    """Log density of normal deviates [nat]."""
-    return -0.5 * (misfit**2 / variance + np.log(variance) + LOG_2PI)
