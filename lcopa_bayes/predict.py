@@ -155,7 +155,7 @@ def offset_draws(
     if not held_out:
         return values[:, places[axis, r]], "fitted", 0
     observed = record.axes[axis]
-    quiet = record.times[observed.index] <= _first_change(record)
+    quiet = record.times[observed.index] <= record.first_change
     used, source = quiet, BEFORE_DRIVE
     if quiet.all():
         source = "all samples of the held-out record, whose drive does not change before the last of them"
@@ -203,9 +203,3 @@ def _student_levels(misfit: Matrix, parameters: Matrix, rng: np.random.Generator
         mean = np.einsum("bn,bn->b", precision, misfit) / total
         level = mean + rng.standard_normal(mean.size) / np.sqrt(total)
     return np.asarray(level)
-
-
-def _first_change(record: Samples) -> float:
-    """Time of the first drive change, infinite when there is none [time unit]."""
-    moved = np.flatnonzero((record.record.drive != record.record.drive[0]).any(axis=1))
-    return float(record.record.time[moved[0]]) if moved.size else np.inf

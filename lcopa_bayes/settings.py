@@ -24,6 +24,8 @@ from lcopa_bayes.record import TIME_UNITS
 
 STAGES: Mapping[str, frozenset[str]] = MappingProxyType({"fit": frozenset(), "rival": frozenset()})
 """Stages a study may name, each with the keys of its settings."""
+NOISE_KINDS = ("white", "ar1", "white+ar1", "student")
+"""Noise models by the name a study gives them."""
 S = TypeVar("S")
 
 
@@ -123,11 +125,11 @@ class ModelSettings:
 class NoiseSettings:
     """Table ``[noise]``."""
 
-    kind: Literal["white", "ar1", "student"] = "ar1"
-    """Independent Gaussian, first-order autoregressive or independent Student noise."""
+    kind: Literal["white", "ar1", "white+ar1", "student"] = "white+ar1"
+    """Independent Gaussian, first-order autoregressive, the sum of both, or independent Student noise."""
 
     def __post_init__(self) -> None:
-        refuse_if(one_of("kind", self.kind, ("white", "ar1", "student")))
+        refuse_if(one_of("kind", self.kind, NOISE_KINDS))
 
 
 @final

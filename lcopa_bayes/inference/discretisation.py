@@ -2,9 +2,9 @@
 
 Two measures. Before sampling, at the best least-squares optimum: with W the whitening of the noise, J the
 whitened Jacobian and d the change of the whitened response on narrower blocks, the optimum moves by
-``(J' J + prior)^-1 J' d`` to first order. After sampling, at draws of the posterior, whatever its shape: draws
-weighted by the ratio of the likelihoods on narrow and on used blocks have the mean that sampling on narrow
-blocks would have had.
+``(J' J + prior)^-1 J' d`` to first order. After sampling, at draws of the posterior, whatever its shape:
+draws weighted by the ratio of the likelihoods on narrow and on used blocks have the mean that sampling on
+narrow blocks would have had.
 """
 
 from __future__ import annotations
