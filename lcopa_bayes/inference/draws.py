@@ -127,8 +127,8 @@ def gather(posterior: Posterior, run: Run) -> Draws:
     rows = [(k, posterior.table.rows[k]) for k in posterior.sampled]
     hills = [ridges(row.name, row.unit, values[..., k], log_scale=row.log_scale) for k, row in rows]
     several = tuple(one for one in hills if one.boundaries)
-    names = posterior.table.names
-    ordered = tuple(with_shares(found[name], several) for name in names if name in found)
+    free = [name for name in posterior.table.names if name in found]
+    ordered = tuple(with_shares(found[name], several) for name in free)
     by_draw = values.swapaxes(1, 2).reshape(ensembles, -1, values.shape[-1])
     densities = log_density.swapaxes(1, 2).reshape(ensembles, -1)
     picked = np.linspace(0, by_draw.shape[1] - 1, min(_PER_ENSEMBLE, by_draw.shape[1])).astype(int)
