@@ -65,6 +65,7 @@ def results(fit: Fit) -> dict[str, Any]:
             "verdict": verdict(fit),
             "grade": grade.level,
             "grade_reason": grade.reason,
+            "limitations": [one.as_json() for one in fit.draws.limitations],
             "time_unit": fit.study.time_unit,
             "parameters": parameters,
             "fixed": [
@@ -81,7 +82,8 @@ def results(fit: Fit) -> dict[str, Any]:
             "held_out": scores(fit, held_out=True),
             "fit_scores": scores(fit, held_out=False),
             "ridges": [
-                r.as_json() | {"grade": fit.draws.capped(shares_grade(r)).level} for r in fit.draws.ridges
+                r.as_json() | {"grade": fit.draws.level(r.parameter, shares_grade(r))}
+                for r in fit.draws.ridges
             ],
             "sensitivity": [moved.as_json() for moved in fit.sensitivity],
             "step_metrics": [metric.as_json() for metric in fit.metrics],
