@@ -17,10 +17,14 @@ from lcopa_bayes.arrays import Flags, Matrix, Vector
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 
-_SPLIT = (0.1, 0.9)
+_SPLIT = (0.3, 0.7)
 """Smallest and largest share of a term that is split in two [-]."""
 _ORDERS_APART = 0.02
 """Relative distance of the orders of a term that is split [-]: equal ones are a singular point."""
+_HARDLY = 0.1
+"""White part over the correlated one that hardly shows [-]."""
+_BECOMES = frozenset({("white", "ar1"), ("white", "student"), ("white", "white+ar1"), ("ar1", "white+ar1")})
+"""Noise models, of which the second can become the first."""
 Slots = tuple[tuple[int, ...], ...]
 _FAST = (1e-3, 2e-2)
 """Quantiles of the prior between which the time of a term lies that is too fast to be seen [-]."""
@@ -114,14 +118,21 @@ class _Lift:
         return not theirs or bool(own)
 
     def _noise(self, values: Matrix, out: Matrix, target: Posterior) -> bool:
-        if self.large_noise != self.small_noise and self.small_noise != "white":
+        if (self.small_noise, self.large_noise) not in _BECOMES and self.small_noise != self.large_noise:
             return False
         for axis in range(len(self.large.layout.responses)):
-            sigma = values[:, self.small.at("sigma", axis)]
-            for name in target.noise.names:
-                same = self.large_noise == self.small_noise
-                source = values[:, self.small.at(name, axis)] if same else _NEARLY_WHITE.get(name, sigma)
-                out[:, self.large.at(name, axis)] = source
+            own = {
+                row.kind: k for k, row in enumerate(self.small.rows) if row.noise and row.place.first == axis
+            }
+            told = {name: values[:, k] for name, k in own.items()}
+            if self.small_noise == "ar1" and self.large_noise == "white+ar1":
+                told |= {"sigma_ar": told["sigma"], "sigma": _HARDLY * told["sigma"]}
+            elif self.small_noise != self.large_noise:
+                sd = told["sigma"]
+                white = [target.noise.nearly_white(float(one)) for one in sd]
+                told = {name: np.array([one[name] for one in white]) for name in target.noise.names}
+            for name, column in told.items():
+                out[:, self.large.at(name, axis)] = column
         return True
 
     def _elements(self, values: Matrix, out: Matrix) -> bool:
@@ -184,7 +195,3 @@ class _Lift:
         if row.prior is None:
             return np.full(n, row.value)
         return np.asarray(row.prior.frozen.ppf(self.rng.uniform(*_FAST, n)), dtype=float)
-
-
-_NEARLY_WHITE = {"rho": 0.02, "nu": 100.0}
-"""Parameters of a noise at which it is close to white, its scale apart."""
