@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple, final
+from typing import Literal, NamedTuple, final, get_args
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -19,6 +19,7 @@ from lcopa_bayes.calibration.truths import Truths
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.data import Samples
 from lcopa_bayes.inference.draws import Draws, gather
+from lcopa_bayes.inference.importance import first_look, weighted_draws
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.sampler import SamplePlan, sample
 from lcopa_bayes.stepmetrics import StepCurves, step_curves
@@ -29,6 +30,10 @@ _SHARES = (0.125, 0.25, 0.5, 1.0)
 """Where step responses are looked at: shares of the time between the longest delay and the span [-]."""
 _LATEST = 0.999
 """Prior probability that a delay is shorter than what counts as the longest [-]."""
+Engine = Literal["importance", "sampling"]
+"""Importance sampling around the optima, with the ensembles where its weights are not good; or always the
+ensembles."""
+ENGINES: tuple[Engine, ...] = get_args(Engine)
 _STREAM = 4
 """Marks the randomness of truth, noise and ranks apart from that of sampling."""
 
@@ -64,6 +69,10 @@ class Outcome:
     """0 to `RANKED`."""
     inside: tuple[tuple[bool, ...], ...]
     """Whether the central interval of each of `LEVELS` holds the truth."""
+    engine: Engine
+    """What gave the draws."""
+    pareto_k: float | None
+    """Of the importance weights [-]; None where none were tried or k is infinite."""
 
 
 @final
@@ -84,6 +93,7 @@ class Replication:
     problem: Problem
     plan: SamplePlan
     truths: Truths
+    engine: Engine = "importance"
 
     def seed_of(self, number: int) -> int:
         """Root of all randomness of a replica."""
@@ -127,7 +137,8 @@ class Replication:
     def __call__(self, number: int) -> Outcome:
         """Draw, simulate, infer, rank."""
         start, seed = time.thread_time(), self.seed_of(number)
-        drawing, noise, ranking = map(np.random.default_rng, np.random.SeedSequence([seed, _STREAM]).spawn(3))
+        streams = np.random.SeedSequence([seed, _STREAM]).spawn(4)
+        drawing, noise, ranking, looking = map(np.random.default_rng, streams)
         truth = self.truths.draw(drawing)
         exact = exact_responses(self.problem, truth)
         records = measured(self.problem, truth, exact, noise)
@@ -137,7 +148,7 @@ class Replication:
         posterior = replace(
             self.problem.posterior, samples=tuple(Samples.of(record, period) for record in records)
         )
-        draws = gather(posterior, sample(posterior, replace(self.plan, seed=seed)))
+        draws, engine, pareto_k = self._inferred(posterior, seed, looking)
         curves = step_curves(draws, self.problem.scales.span)
         at = [int(np.abs(curves.time - moment).argmin()) for moment in self.step_times]
         true = self._true(posterior, truth, curves.time[at])
@@ -159,7 +170,20 @@ class Replication:
                 tuple(holds(column, value, level) for level in LEVELS)
                 for value, column in zip(true, drawn, strict=True)
             ),
+            engine,
+            pareto_k,
         )
+
+    def _inferred(
+        self, posterior: Posterior, seed: int, rng: np.random.Generator
+    ) -> tuple[Draws, Engine, float | None]:
+        """Draws, what gave them, and the Pareto k of the importance weights that were tried."""
+        look = first_look(posterior, rng) if self.engine == "importance" else None
+        if look is not None and look.good(self.plan.target_ess):
+            draws = weighted_draws(posterior, look, rng, target_ess=self.plan.target_ess)
+            return draws, "importance", look.pareto_k
+        draws = gather(posterior, sample(posterior, replace(self.plan, seed=seed)))
+        return draws, "sampling", look.pareto_k if look is not None and np.isfinite(look.pareto_k) else None
 
     def _true(self, posterior: Posterior, truth: Vector, times: Vector) -> list[float]:
         """True value of each quantity; step responses by the bench."""
