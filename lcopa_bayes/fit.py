@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
@@ -90,7 +90,7 @@ def fit(
             log_evidence=weighed.value if weighed else None,
             log_evidence_sd=weighed.sd if weighed else None,
         )
-        draws = draws if check.agrees else replace(draws, cap=check.lowered(draws.grade))
+        draws = draws.limited(check.limitations(draws.grade))
     noise, rng = problem.posterior.noise, np.random.default_rng([plan.seed, 2])
     shown = bands(draws, problem.posterior.model, problem.posterior.samples, noise, held_out=False, rng=rng)
     if study.held_out:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from small import draws_of, problem
 
-from lcopa_bayes.inference.grade import Grade, Quality, overall, qualities
+from lcopa_bayes.inference.grade import Grade, Limitation, Quality, limited, overall, qualities
 
 SHAPE = (4, 16, 60)
 """Ensembles, walkers, draws."""
@@ -124,3 +125,31 @@ def test_the_worst_parameter_grades_the_run_and_is_named():
     assert overall([good, weak, bad], 400).reason.startswith("bad")
     worst = Grade.worst([quality.grade(400) for quality in (good, bad, weak)])
     assert worst == bad.grade(400)
+
+
+# -- limitations -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sampled", ["reliable", "tentative", "unusable"])
+def test_the_grade_is_the_worst_of_the_sampling_and_every_limitation_and_names_all(sampled):
+    before = Grade(sampled, "the ensembles")
+    first = Limitation("tentative", "intervals hold only if A", "do A")
+    second = Limitation("unusable", "intervals hold only if B")
+    assert limited(before, []) is before
+    assert limited(before, [first]).level == ("tentative" if sampled == "reliable" else sampled)
+    both = limited(before, [first, second])
+    assert both.level == "unusable"
+    for words in ("the ensembles", "intervals hold only if A; do A", "intervals hold only if B"):
+        assert words in both.reason
+    assert both.reason.index("only if B") < both.reason.index("only if A")
+
+
+def test_a_limitation_that_names_parameters_leaves_the_others():
+    one = Limitation("tentative", "intervals hold only if A", parameters=("gain",))
+    table = problem().posterior.table
+    draws = draws_of(table, np.ones((8, len(table.rows)))).limited([one])
+    assert draws.grade.level == "tentative"
+    grades = {estimate.name: estimate.grade for estimate in draws.estimates()}
+    assert grades["gain"] == "tentative"
+    assert {grade for name, grade in grades.items() if name != "gain"} == {"reliable"}
+    assert draws.limited([Limitation("unusable", "B")]).limitations[0] is one

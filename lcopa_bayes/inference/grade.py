@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil
-from typing import Literal, final
+from typing import Any, Literal, final
 
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]
@@ -105,6 +105,53 @@ class Grade:
     def worst(grades: Sequence[Grade]) -> Grade:
         """The lowest of several grades."""
         return max(grades, key=lambda grade: _RANK[grade.level])
+
+
+@final
+@dataclass(frozen=True)
+class Limitation:
+    """A condition under which intervals hold and that the draws cannot check: no number it concerns is
+    graded better than `level`."""
+
+    level: Level
+    """The best grade while it stands."""
+    reason: str
+    """A clause without a full stop, such as "intervals hold only if the noise model explains the rest"."""
+    remedy: str = ""
+    """What to do about it, a clause without a full stop."""
+    parameters: tuple[str, ...] = ()
+    """The parameters it concerns; empty: every number."""
+
+    @property
+    def sentence(self) -> str:
+        """Reason and remedy, without a full stop."""
+        return f"{self.reason}; {self.remedy}" if self.remedy else self.reason
+
+    def concerns(self, parameter: str) -> bool:
+        """Whether the numbers of a parameter rest on it."""
+        return not self.parameters or parameter in self.parameters
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "level": self.level,
+            "reason": self.reason,
+            "remedy": self.remedy,
+            "parameters": list(self.parameters),
+        }
+
+
+def limited(grade: Grade, limitations: Sequence[Limitation]) -> Grade:
+    """`grade`, or the lowest level of the limitations where that is lower, with the reason of each, the most
+    severe first; what was said of the sampling comes first where it is as low, else last."""
+    if not limitations:
+        return grade
+    ordered = sorted(limitations, key=lambda one: -_RANK[one.level])
+    said = "; ".join(one.sentence for one in ordered)
+    if _RANK[grade.level] >= _RANK[ordered[0].level]:
+        joint = "but " if grade.level == "reliable" else "also, "
+        return Grade(grade.level, f"{grade.reason}; {joint}{said}")
+    return Grade(ordered[0].level, f"{said}; the sampling by itself is {grade.level}: {grade.reason}")
 
 
 def qualities(names: Sequence[str], values: Array) -> tuple[Quality, ...]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from lcopa_bayes.arrays import Array, Flags, Index, Matrix, Vector
 from lcopa_bayes.inference.defaults import Scales
+from lcopa_bayes.inference.kinds import KINDS
 from lcopa_bayes.inference.noise import NOISES
 from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.priors import Prior
@@ -198,9 +199,9 @@ def parameter_table(
         elif model.offset == "shared":
             add("offset", (i, -1), axis, response.unit, scales.offset(i))
     for i, response in enumerate(layout.responses):
-        for name in NOISES[noise].names:
-            prior = scales.sigma(i) if name == "sigma" else scales.rho() if name == "rho" else scales.nu()
-            add(name, (i, 0), layout.response_name(i), response.unit if name == "sigma" else "-", prior)
+        for name, prior in NOISES[noise].priors(scales, i).items():
+            unit = response.unit if KINDS[name].noise == "scale" else "-"
+            add(name, (i, 0), layout.response_name(i), unit, prior)
     names = [row.name for row in rows]
     if len(set(names)) < len(names):
         twice = ", ".join(sorted({name for name in names if names.count(name) > 1}))
