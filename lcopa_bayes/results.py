@@ -22,6 +22,7 @@ def verdict(fit: Fit) -> str:
     if fit.cross_check is not None and fit.cross_check.agrees:  # a disagreement is part of the grade
         said = fit.cross_check.sentence
         parts.append(f"{said[0].upper()}{said[1:]}.")
+    parts.append(f"{fit.discretisation.sentence}.")
     worst = min((r for r in fit.residuals if not r.held_out), key=lambda r: r.p_white, default=None)
     if worst is not None and worst.p_white < WHITE_P:
         parts.append(
@@ -79,6 +80,7 @@ def results(fit: Fit) -> dict[str, Any]:
             "log_evidence_by_ensemble": fit.evidence.by_ensemble if fit.evidence else (),
             "log_evidence_grade": _evidence_grade(fit),
             "cross_check": None if fit.cross_check is None else fit.cross_check.as_json(),
+            "discretisation": fit.discretisation.as_json(),
             "residual_rms": residual_rms(fit),
             "held_out": scores(fit, held_out=True),
             "fit_scores": scores(fit, held_out=False),

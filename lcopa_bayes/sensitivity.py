@@ -14,9 +14,9 @@ from lcopa_bayes.arrays import Array, Matrix, Vector
 from lcopa_bayes.estimate import plain
 from lcopa_bayes.inference.draws import Draws
 from lcopa_bayes.inference.grade import Level
-from lcopa_bayes.inference.weights import smoothed, usable_k
 from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.weights import smoothed, usable_k
 
 Diagnosis = Literal["prior-data conflict", "weak likelihood: the prior decides", "-", "not trusted"]
 

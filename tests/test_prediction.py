@@ -20,8 +20,8 @@ from lcopa_bayes.comparison.prediction import left_out_weights, predictions
 from lcopa_bayes.comparison.priorwidth import widths
 from lcopa_bayes.comparison.sequential import known_before, log_densities
 from lcopa_bayes.fit import fit
-from lcopa_bayes.inference.weights import effective, smoothed
 from lcopa_bayes.inference.noise import AR1, Student, White
+from lcopa_bayes.inference.weights import effective, smoothed
 from lcopa_bayes.sensitivity import _weights as power_weights
 
 GAPS = np.array([1.0, 1.0, 2.0, 1.0, 0.5, 1.0, 1.0])

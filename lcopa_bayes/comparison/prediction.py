@@ -16,8 +16,8 @@ from lcopa_bayes.estimate import plain
 from lcopa_bayes.fit import Fit
 from lcopa_bayes.inference.data import Observed, Samples
 from lcopa_bayes.inference.grade import TENTATIVE_RHAT, Level
-from lcopa_bayes.inference.weights import FEWEST_EFFECTIVE, effective, smoothed, usable_k
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.weights import FEWEST_EFFECTIVE, effective, smoothed, usable_k
 from lcopa_bayes.plant.forward import ForwardModel
 from lcopa_bayes.predict import responses
 

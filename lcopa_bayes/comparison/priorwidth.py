@@ -13,10 +13,10 @@ from lcopa_bayes.comparison.carry import carried
 from lcopa_bayes.estimate import plain
 from lcopa_bayes.fit import Fit
 from lcopa_bayes.inference.evidence import evidence
-from lcopa_bayes.inference.weights import FEWEST_EFFECTIVE, smoothed, usable_k
 from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.priors import Prior
+from lcopa_bayes.inference.weights import FEWEST_EFFECTIVE, smoothed, usable_k
 
 FACTORS = (0.5, 2.0)
 """Widths tried, relative to the study's [-]."""

@@ -7,7 +7,9 @@ period, A = range of a response axis over the records, D = largest deviation of 
 parameter    prior                                   why
 ===========  ======================================  ============================================
 gain         normal(0, 5 A / D)                      either sign; a slow tail may hide most of it
-time         log-uniform(period / 10, 100 span)      from unresolved to far slower than the record
+time         log-uniform(period / pi, 100 span)      from a resonance 1 / T at the Nyquist frequency, below
+                                                     which samples tell it from an alias and blocks are
+                                                     stable, to far slower than the record
 order        uniform(0, 2), decreasing               where the element is passive
 delay        uniform(0, 0.4 span)                    later onset leaves too little record to fit
 offset       normal(mean response, 5 A (1 + U / D))  reading at zero drive; U = largest resting drive
@@ -110,7 +112,7 @@ class Scales:
 
     def time(self) -> Prior:
         """Prior of a time constant."""
-        return Prior("loguniform", {"a": self.period / 10, "b": 100 * self.span})
+        return Prior("loguniform", {"a": self.period / np.pi, "b": 100 * self.span})
 
     def order(self) -> Prior:
         """Prior of an order."""

@@ -10,19 +10,23 @@ narrow blocks would have had.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.draws import Draws
+from lcopa_bayes.inference.grade import Limitation
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.posterior import Posterior
 
 LARGEST = 0.1
 """Largest shift of a parameter by the width of the blocks that leaves a grade as it is [posterior sd]."""
+UNUSABLE = 1.0
+"""Shift at which numbers are not usable [posterior sd]."""
 _FACTORS = (2, 4)
 """How many times narrower the blocks are on which shifts are measured."""
 _REST = 16 / 15
@@ -31,7 +35,7 @@ _FINEST = 16
 """Most by which blocks are narrowed [-]."""
 _MOST_CELLS = 1 << 18
 """Blocks of all records together beyond which they are not narrowed."""
-_STARTS = 4
+_STARTS = 2
 """Starts of the search for the optimum."""
 _DRAWS = 400
 """Draws behind the measurement after sampling."""
@@ -51,10 +55,45 @@ class Discretisation:
     refinement: int
     """How many times narrower than the study's settings ask the blocks already are."""
 
+    blocks: int
+    """Blocks of all fit records together [-]."""
+
     @property
     def negligible(self) -> bool:
         """Whether no parameter moves by more than `LARGEST`, the error of the measurement aside."""
         return self.shift - 2 * self.error <= LARGEST
+
+    @property
+    def sentence(self) -> str:
+        """What was measured, a sentence without its full stop."""
+        return (
+            f"On blocks four times narrower than the {self.blocks} used the posterior mean of "
+            f"{self.parameter} moves by {self.shift:.2f} ± {self.error:.2f} sd, the largest shift of all"
+        )
+
+    @property
+    def limitations(self) -> tuple[Limitation, ...]:
+        """None where the shift is negligible."""
+        if self.negligible:
+            return ()
+        return (
+            Limitation(
+                "tentative" if self.shift < UNUSABLE else "unusable",
+                f"the width of the blocks moves {self.parameter} by {self.shift:.2g} posterior sd",
+                "set [model] blocks to a larger number, or leave out the samples of the fastest onset",
+            ),
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "parameter": self.parameter,
+            "shift_sd": self.shift,
+            "shift_error_sd": self.error,
+            "refinement": self.refinement,
+            "blocks": self.blocks,
+            "negligible": self.negligible,
+        }
 
 
 def resolved(problem: Problem) -> Problem:
@@ -63,18 +102,21 @@ def resolved(problem: Problem) -> Problem:
     Blocks are halved while it moves more; not beyond `_FINEST` or `_MOST_CELLS`, where the measurement after
     sampling says what is left. The same problem gives the same blocks.
     """
-    optima = find_optima(problem.posterior, np.random.default_rng([problem.study.seed, 6]), starts=_STARTS)
-    if not optima:
-        return problem
-    values = optima[0].values
-    while optimum_shift(problem, values) > LARGEST and _may_refine(problem):
-        problem = problem.refined(2)
+    rng = np.random.default_rng([problem.study.seed, 6])
+    with threadpool_limits(1):  # matrices are small: more threads only wait for each other
+        optima = find_optima(problem.posterior, rng, starts=_STARTS)
+        while optima and optimum_shift(problem, optima[0].values) > LARGEST and _may_refine(problem):
+            problem = problem.refined(2)
     return problem
 
 
 def _may_refine(problem: Problem) -> bool:
-    cells = sum(experiment.blocks for experiment in problem.posterior.model.experiments)
-    return problem.refinement < _FINEST and 2 * cells <= _MOST_CELLS
+    return problem.refinement < _FINEST and 2 * _cells(problem) <= _MOST_CELLS
+
+
+def _cells(problem: Problem) -> int:
+    """Blocks of all fit records together."""
+    return sum(experiment.blocks for experiment in problem.posterior.model.experiments)
 
 
 def optimum_shift(problem: Problem, values: Vector) -> float:
@@ -122,6 +164,7 @@ def discretisation(problem: Problem, draws: Draws) -> Discretisation:
         float(abs(shifts[worst])),
         float(errors[worst]),
         problem.refinement,
+        _cells(problem),
     )
 
 
