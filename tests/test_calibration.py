@@ -355,7 +355,7 @@ def test_both_engines_give_a_replica_the_same_posterior():
 
 def test_weights_that_are_not_good_lead_to_the_ensembles(alone, monkeypatch):
     assert results(alone)["engine"]["importance"] == 3
-    monkeypatch.setattr("lcopa_bayes.inference.importance.LARGEST_K", -9.0)
+    monkeypatch.setattr("lcopa_bayes.inference.importance.LEAST_EFFICIENCY", 9.0)
     made = calibrate(STUDY, replicas=2)
     counted = results(made)["engine"]
     assert (counted["wanted"], counted["importance"], counted["sampling"]) == ("importance", 0, 2)
@@ -569,7 +569,7 @@ def gathered(
         outcomes.append(
             Outcome(
                 *(number, made.seed_of(number), grade, "why", 400.0, 1.0, 0.1),
-                *(tuple(at), ranks, inside, "importance", 0.1),
+                *(tuple(at), ranks, inside, "importance", 0.1, 1, 0.02, True),
             )
         )
     return Calibration(made, tuple(outcomes), ())

@@ -20,7 +20,7 @@ from lcopa_bayes.inference.importance import (
     ImportancePlan,
     first_look,
     importance,
-    pareto_smoothed,
+    tail_smoothed,
     weighted_draws,
 )
 from lcopa_bayes.inference.optimum import Optimum
@@ -171,20 +171,20 @@ def test_where_nothing_has_a_density_nothing_is_good(rng):
 def test_k_is_that_of_the_tail_of_the_weights(rng, k):
     """Weights ``u^-k``, u uniform, have a Pareto tail of shape k; of their inverses it is negative."""
     raw = -k * np.log(rng.random(20_000))
-    smoothed, found = pareto_smoothed(raw)
+    smoothed, found = tail_smoothed(raw)
     assert abs(found - k) < 4 * (1 + k) / np.sqrt(3 * np.sqrt(raw.size))
     assert_allclose(logsumexp(smoothed), 0.0, atol=1e-9)
     assert (np.diff(smoothed[np.argsort(raw)]) >= -1e-9).all()
-    assert pareto_smoothed(-raw)[1] < 0
+    assert tail_smoothed(-raw)[1] < 0
 
 
 def test_weights_without_a_tail():
-    equal, k = pareto_smoothed(np.full(1000, 3.0))
+    equal, k = tail_smoothed(np.full(1000, 3.0))
     assert_allclose(equal, -np.log(1000))
-    assert k == 0.0
+    assert np.isnan(k)
     few = np.full(1000, -np.inf)
     few[:5] = 0.0
-    assert pareto_smoothed(few)[1] == np.inf
+    assert tail_smoothed(few)[1] == np.inf
 
 
 def test_resampling_takes_each_draw_as_often_as_its_weight(rng):
@@ -208,4 +208,4 @@ def test_the_same_randomness_gives_the_same_draws():
     assert_array_equal(posterior.log_density(one.coordinates), one.log_density)
     assert one.good(400)
     assert not replace(one, ess=0.39 * one.log_weights.size).good(400)
-    assert not replace(one, pareto_k=0.51).good(400)
+    assert not replace(one, pareto_k=0.71).good(400)

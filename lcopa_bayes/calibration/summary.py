@@ -15,7 +15,8 @@ from lcopa_bayes.calibration.ranks import SIMULTANEOUS, bin_limits, corridor, p_
 from lcopa_bayes.calibration.replica import ENGINES, RANKED, Outcome, Quantity
 from lcopa_bayes.calibration.truths import Truths
 from lcopa_bayes.estimate import plain
-from lcopa_bayes.inference.importance import LARGEST_K
+from lcopa_bayes.inference.discretisation import LARGEST
+from lcopa_bayes.inference.weights import LARGEST_K
 
 _BINS = (20, 10, 5)
 """Bins a rank histogram may have; they divide the `RANKED` + 1 rank values evenly [-]."""
@@ -68,6 +69,14 @@ def results(made: Calibration) -> dict[str, Any]:
             "median": np.median(gaps),
             "quantile_90": np.quantile(gaps, 0.9),
             "largest": gaps.max(),
+        },
+        "discretisation": {
+            "largest_negligible": LARGEST,
+            "unit": "posterior sd",
+            "negligible": sum(outcome.resolved for outcome in made.outcomes),
+            "median": np.median([outcome.shift for outcome in made.outcomes]),
+            "largest": max(outcome.shift for outcome in made.outcomes),
+            "largest_refinement": max(outcome.refinement for outcome in made.outcomes),
         },
         "seconds": {"total": spent.sum(), "median": np.median(spent), "largest": spent.max()},
     }
@@ -221,6 +230,9 @@ def tables(made: Calibration) -> dict[str, pd.DataFrame]:
                     "grade": o.grade,
                     "smallest_ess": o.ess,
                     "model_gap": o.gap,
+                    "block_shift": o.shift,
+                    "resolved": o.resolved,
+                    "refinement": o.refinement,
                     "engine": o.engine,
                     "pareto_k": o.pareto_k,
                     "seconds": o.seconds,

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import log10
 from typing import final
 
 import numpy as np
@@ -29,10 +28,9 @@ from lcopa_bayes.inference.evidence import charted_density
 from lcopa_bayes.inference.grade import Quality
 from lcopa_bayes.inference.optimum import Optimum, find_optima
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.inference.proposal import Seen, around, effective, fitted, split, weighty
+from lcopa_bayes.inference.proposal import Seen, around, fitted, split, weighty
+from lcopa_bayes.inference.weights import effective, smoothed, usable_k
 
-LARGEST_K = 0.5
-"""Largest Pareto k that is good: below it the variance of the weights is finite [-]."""
 LEAST_EFFICIENCY = 0.4
 """Effective draws per draw of a good result [-]. A small k alone is not enough: a two-term posterior gave
 k = 0.4 at an efficiency of 0.2 while a third of its mass had not been met."""
@@ -99,8 +97,7 @@ class Importance:
     def good(self, wanted: float) -> bool:
         """Whether averages converge, the proposal is close to the posterior, and enough draws count."""
         count = self.log_weights.size
-        limit = min(LARGEST_K, 1 - 1 / log10(max(count, 2)))
-        return self.pareto_k <= limit and self.ess >= max(wanted, LEAST_EFFICIENCY * count)
+        return self.pareto_k <= usable_k(count) and self.ess >= max(wanted, LEAST_EFFICIENCY * count)
 
     def resampled(self, count: int, rng: np.random.Generator, *, part: slice = slice(None)) -> Index:
         """Positions of `count` draws with equal weights, in random order, by systematic resampling.
@@ -148,7 +145,7 @@ def importance(
             log_weights = seen.log_weights()
             if np.isneginf(log_weights).all():
                 break
-            own, k = pareto_smoothed(seen.last_weights())
+            own, k = tail_smoothed(seen.last_weights())
             core, proposal = fitted(core, np.concatenate(seen.points), log_weights)
             if k <= _LIGHT and effective(own) > LEAST_EFFICIENCY * effort.learning:
                 break
@@ -167,7 +164,7 @@ def _weighed(posterior: Posterior, chart: Chart, y: Matrix, raw: Vector) -> Impo
     z, exists = chart.uncharted(y)
     density = np.full(len(y), -np.inf)
     density[exists] = posterior.log_density(z[exists])
-    log_weights, k = pareto_smoothed(raw)
+    log_weights, k = tail_smoothed(raw)
     if np.isneginf(raw).all():
         return Importance(z, density, log_weights, k, 0.0, -np.inf, np.inf, 0, 0)
     mean = float(logsumexp(raw) - np.log(raw.size))
@@ -175,21 +172,15 @@ def _weighed(posterior: Posterior, chart: Chart, y: Matrix, raw: Vector) -> Impo
     return Importance(z, density, log_weights, k, effective(log_weights), mean, error, 0, 0)
 
 
-def pareto_smoothed(log_weights: Vector) -> tuple[Vector, float]:
-    """Normalised log weights with a smoothed tail, and the Pareto k of that tail.
+def tail_smoothed(log_weights: Vector) -> tuple[Vector, float]:
+    """Normalised log weights with a smoothed tail, and its Pareto k; log weights of -inf are allowed.
 
-    Infinite k, and no smoothing, where so few weights are positive that there is no tail to fit; k is 0 where
-    the largest weights are all equal.
+    k is infinite, and nothing is smoothed, where so few weights are positive that there is no tail to fit.
     """
-    finite = np.sort(log_weights[np.isfinite(log_weights)])
-    tail = 1 + int(3 * np.sqrt(log_weights.size))  # what `psislw` fits, and the value below it
-    if finite.size <= max(tail, log_weights.size // 5):
-        return log_weights - (logsumexp(log_weights) if finite.size else 0.0), np.inf
-    if finite[-1] - finite[-tail] <= 1e-12:
-        return log_weights - logsumexp(log_weights), 0.0
-    # psislw takes log likelihoods that are left out: the negative of log weights
-    smoothed, k = array_stats.psislw(-log_weights)  # type: ignore[no-untyped-call]
-    return np.asarray(smoothed), float(k)
+    positive = np.count_nonzero(np.isfinite(log_weights))
+    if positive <= max(3 * np.sqrt(log_weights.size) + 1, log_weights.size // 5):
+        return log_weights - (logsumexp(log_weights) if positive else 0.0), np.inf
+    return smoothed(log_weights)
 
 
 def weighted_draws(

@@ -116,7 +116,9 @@ class NoiseFit:
         no direction is wider than a uniform density over the search."""
         low, high = self.ends
         x = np.array([self.coordinates(values[k : k + 1], self.rows[k])[0] for k in self.free])
-        x = np.clip(x, low + _STEP, high - _STEP)  # the curvature beside a bound stands for that at it
+        x = np.clip(
+            x, low + 2 * _STEP, high - 2 * _STEP
+        )  # the curvature beside a bound stands for that at it
         size = len(x)
         steps = _STEP * np.concatenate([np.eye(size), -np.eye(size)])
         corners = (x + steps[:, None] + steps).reshape(-1, size)

@@ -14,6 +14,7 @@ from lcopa_bayes.inference.chart import Chart
 from lcopa_bayes.inference.mixture import FREEDOM, Mixture
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.weights import effective
 
 _NEGLIGIBLE = 20.0
 """Optima whose Gaussian mass lies this far below the best one's are left out [nat]."""
@@ -39,11 +40,6 @@ _NO_WEIGHT = 1e-9
 """Draws with less than this share of the mean weight do not take part in the fit [-]."""
 _NO_MASS = 1e-4
 """Components with less than this share of the weight are left out [-]."""
-
-
-def effective(log_weights: Vector) -> float:
-    """Effective number of draws with these normalised weights [-]."""
-    return float(np.exp(-logsumexp(2 * log_weights)))
 
 
 def weighty(optima: Sequence[Optimum]) -> list[Optimum]:

@@ -171,7 +171,7 @@ def _difference(panel: Axes, row: Mapping[str, Any], told: Mapping[str, Any]) ->
 
 def _replicas(told: Mapping[str, Any]) -> Section:
     gap, seconds, counted = told["model_gap"], told["seconds"], told["grades"]
-    engine = told["engine"]
+    engine, width = told["engine"], told["discretisation"]
     rows = (
         ("replicas asked for", str(told["asked"])),
         *((f"graded {name}" if name != "failed" else "failed", str(n)) for name, n in counted.items()),
@@ -187,6 +187,9 @@ def _replicas(told: Mapping[str, Any]) -> Section:
         ("forward model from bench at the truth, median [noise sd]", figures(gap["median"])),
         ("forward model from bench at the truth, 90 % quantile [noise sd]", figures(gap["quantile_90"])),
         ("forward model from bench at the truth, largest [noise sd]", figures(gap["largest"])),
+        ("shift by the width of the blocks is negligible", f"{width['negligible']} replicas"),
+        ("shift by the width of the blocks, median [posterior sd]", figures(width["median"], 2)),
+        ("shift by the width of the blocks, largest [posterior sd]", figures(width["largest"], 2)),
         *((name.replace("_", " "), str(value)) for name, value in told["sampler"].items()),
     )
     lists = [Table((Column("replicas"), Column("value", "number")), rows)]
