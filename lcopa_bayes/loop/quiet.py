@@ -209,8 +209,8 @@ def _dependence(pieces: Sequence[Vector], coloured: Autoregression) -> float:
 
 
 def _repeated(posterior: NoisePosterior, repeats: Sequence[Vector]) -> tuple[float, float]:
-    """Root mean square of repeats whitened by the noise, and the p-value of noise alone, averaged over all noise
-    that its posterior leaves plausible [-]."""
+    """Root mean square of repeats whitened by the noise, and the p-value of noise alone, averaged over all
+    noise that its posterior leaves plausible [-]."""
     count = sum(piece.size - 1 for piece in repeats)
     drawn = posterior.draw(_REPEATED, np.random.default_rng(_SEED))
     powers = np.array([_power(process, repeats) for process in drawn])
