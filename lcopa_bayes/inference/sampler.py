@@ -23,6 +23,7 @@ from lcopa_bayes.inference.knownmodes import around
 from lcopa_bayes.inference.lessons import LEARNING, taught
 from lcopa_bayes.inference.mixture import Mixture
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.ridges import Ridges, ridges
 
 _ROUND = 20
 """Draws kept per round and walker."""
@@ -147,7 +148,8 @@ def _store(chain_file: Path | None, ensembles: Sequence[Ensemble], fingerprint: 
 
 
 def finished(posterior: Posterior, run: Run, bar: tqdm[Any] | None = None) -> bool:
-    """Whether every sampled parameter agrees between ensembles and has its effective sample size.
+    """Whether every sampled parameter agrees between ensembles and has its effective sample size, and the
+    shares of its modes have.
 
     Walkers travel a little further than a grade asks, so that the linear parameters, which are drawn
     afterwards, have too.
@@ -160,19 +162,30 @@ def finished(posterior: Posterior, run: Run, bar: tqdm[Any] | None = None) -> bo
         bar.set_postfix(
             acceptance=f"{acceptance:.2f}", ess=f"{ess:.0f}", rhat=f"{rhat:.3f}", memory=f"{memory:.2f}"
         )
-    return all(
-        quality.grade(run.plan.target_ess).level == "reliable" and quality.memory <= _MEMORY
-        for quality in found
-    )
+    target = run.plan.target_ess
+    good = all(q.grade(target).level == "reliable" and q.memory <= _MEMORY for q in found)
+    return good and all(one.ess >= target for one in _sampled_ridges(posterior, run))
 
 
 def sampled_qualities(posterior: Posterior, run: Run) -> tuple[Quality, ...]:
     """Quality of the sampled parameters over the kept part of a run."""
-    coordinates, _ = run.kept()
-    shape = coordinates.shape
-    values = posterior.values(coordinates.reshape(-1, shape[-1]))[:, posterior.sampled]
     names = [posterior.table.names[k] for k in posterior.sampled]
-    return qualities(names, values.reshape(*shape[:3], -1))
+    return qualities(names, _sampled_values(posterior, run))
+
+
+def _sampled_ridges(posterior: Posterior, run: Run) -> Iterator[Ridges]:
+    """Modes of the sampled parameters over the kept part of a run."""
+    values = _sampled_values(posterior, run)
+    for column, k in enumerate(posterior.sampled):
+        row = posterior.table.rows[k]
+        yield ridges(row.name, row.unit, values[..., column], log_scale=row.log_scale)
+
+
+def _sampled_values(posterior: Posterior, run: Run) -> Array:
+    """Kept values of the sampled parameters, (ensembles, walkers, draws, parameters)."""
+    coordinates, _ = run.kept()
+    values = posterior.values(coordinates.reshape(-1, coordinates.shape[-1]))[:, posterior.sampled]
+    return values.reshape(*coordinates.shape[:3], -1)
 
 
 @final
