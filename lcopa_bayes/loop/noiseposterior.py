@@ -16,7 +16,8 @@ import numpy as np
 from scipy.special import gammaln, logsumexp
 
 from lcopa_bayes.arrays import Matrix, Vector
-from lcopa_bayes.loop.autoregression import Autoregression, Mode, NoisePieces
+from lcopa_bayes.loop.autoregression import Autoregression
+from lcopa_bayes.loop.noisepieces import Mode, NoisePieces
 
 _PROPOSED = 600
 """Proposals per order [-]."""
