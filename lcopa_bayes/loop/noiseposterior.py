@@ -19,7 +19,7 @@ from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.loop.autoregression import Autoregression
 from lcopa_bayes.loop.noisepieces import Mode, NoisePieces
 
-_PROPOSED = 600
+_PROPOSED = 400
 """Proposals per order [-]."""
 _TAIL = 4.0
 """Degrees of freedom of the proposals [-]: their tails are wider than those of any posterior here."""

@@ -24,8 +24,8 @@ LEAST = 3.0
 QUANTILE = 0.99
 LEVEL = 0.5
 """Difference of log evidence up to which instances of an effect are level [nat]."""
-_DRAWS = 4000
-"""Chance residuals: the threshold is exceeded with a probability known to 0.002 [-]."""
+_DRAWS = 2000
+"""Chance residuals: the probability beyond the threshold is known to 0.002 [-]."""
 _TAIL = 0.05
 """Probability outside the interval of a threshold [-]."""
 _BATCH = 200
