@@ -9,7 +9,7 @@ from typing import Any, Literal, final
 
 from lcopa_bayes.checks import file_names, one_of, rebuilt, refuse_if
 from lcopa_bayes.problems import InputError
-from lcopa_bayes.settings import ModelSettings, NoiseSettings, PriorSettings, settings_from
+from lcopa_bayes.settings import NOISE_KINDS, ModelSettings, NoiseSettings, PriorSettings, settings_from
 
 IMPROPER = frozenset({"flat", "improper", "jeffreys"})
 """Words for a prior that is no distribution."""
@@ -50,7 +50,7 @@ class CandidateSettings:
     """Which paths share a delay."""
     offset: Literal["record", "shared", "none"] | None = None
     """Which records share an offset."""
-    noise: Literal["white", "ar1", "student"] | None = None
+    noise: Literal["white", "ar1", "white+ar1", "student"] | None = None
     """Noise model."""
     cross: bool = True
     """Whether a drive moves other axes than its own."""
@@ -66,7 +66,7 @@ class CandidateSettings:
         if not isinstance(self.cross, bool):
             problems.append(f"`cross` must be true or false; got {self.cross!r}")
         if self.noise is not None:
-            problems += one_of("noise", self.noise, ("white", "ar1", "student"))
+            problems += one_of("noise", self.noise, NOISE_KINDS)
         refuse_if(problems)
         self.model(ModelSettings())  # refuses wrong values
         object.__setattr__(self, "priors", MappingProxyType(dict(self.priors)))

@@ -11,7 +11,7 @@ from scipy import signal, stats
 
 from lcopa_bayes.arrays import Vector
 from lcopa_bayes.inference.draws import Draws
-from lcopa_bayes.inference.noise import AR1, GaussianNoise, Noise
+from lcopa_bayes.inference.noise import Noise
 from lcopa_bayes.predict import Band
 
 _LAGS = 40
@@ -70,10 +70,7 @@ def _residual(band: Band, draws: Draws, axis: int, noise: Noise, period: float) 
     gaps = np.concatenate(([1.0], np.diff(band.time) / period))
     middle = np.median(draws.flat, axis=0)
     parameters = middle[[draws.table.at(name, axis) for name in noise.names]][None]
-    if isinstance(noise, GaussianNoise):
-        innovations = noise.whiten(values[None, None], parameters, gaps)[0][0, 0]
-    else:
-        innovations = values / parameters[0, 0]
+    innovations = noise.standard(values[None], parameters, gaps)[0]
     centred = innovations - innovations.mean()
     n = centred.size
     full = signal.correlate(centred, centred, method="fft")[n - 1 :]
@@ -91,7 +88,7 @@ def _residual(band: Band, draws: Draws, axis: int, noise: Noise, period: float) 
         autocorrelation,
         frequency[1:],
         power[1:] / (2 * centred.var() / rate),
-        ljung_box(autocorrelation, n, fitted=int(isinstance(noise, AR1))),
+        ljung_box(autocorrelation, n, fitted=noise.memory),
     )
 
 

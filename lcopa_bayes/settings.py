@@ -24,6 +24,8 @@ from lcopa_bayes.record import TIME_UNITS
 
 STAGES: Mapping[str, frozenset[str]] = MappingProxyType({"fit": frozenset(), "rival": frozenset()})
 """Stages a study may name, each with the keys of its settings."""
+NOISE_KINDS = ("white", "ar1", "white+ar1", "student")
+"""Noise models by the name a study gives them."""
 S = TypeVar("S")
 
 
@@ -34,8 +36,9 @@ class HeadingSettings:
 
     name: str | None = None
     """Also the name of the run folder; None: the name of the study's folder."""
-    time_unit: str = "ms"
-    """s, ms or us: the unit of every time in the study, its priors and its results."""
+    time_unit: str | None = None
+    """s, ms or us: the unit of every time in the study, its priors and its results; None: the unit of the
+    time column of the first fit record."""
     seed: int = 0
     """Seed of every random number of the study."""
 
@@ -43,9 +46,9 @@ class HeadingSettings:
         bad = self.name is not None and not (isinstance(self.name, str) and self.name.strip(" ."))
         bad = bad or any(mark in (self.name or "") for mark in "/\\\0\n")
         problems = [f"`name` must be text fit for a folder; got {self.name!r}"] if bad else []
-        refuse_if(
-            [*problems, *one_of("time_unit", self.time_unit, TIME_UNITS), *whole_number("seed", self.seed, 0)]
-        )
+        if self.time_unit is not None:
+            problems += one_of("time_unit", self.time_unit, TIME_UNITS)
+        refuse_if([*problems, *whole_number("seed", self.seed, 0)])
 
 
 @final
@@ -122,11 +125,11 @@ class ModelSettings:
 class NoiseSettings:
     """Table ``[noise]``."""
 
-    kind: Literal["white", "ar1", "student"] = "ar1"
-    """Independent Gaussian, first-order autoregressive or independent Student noise."""
+    kind: Literal["white", "ar1", "white+ar1", "student"] = "white+ar1"
+    """Independent Gaussian, first-order autoregressive, the sum of both, or independent Student noise."""
 
     def __post_init__(self) -> None:
-        refuse_if(one_of("kind", self.kind, ("white", "ar1", "student")))
+        refuse_if(one_of("kind", self.kind, NOISE_KINDS))
 
 
 @final

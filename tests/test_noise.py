@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from lcopa_bayes.inference.noise import AR1, NOISES, Student, White
+from lcopa_bayes.inference.kinds import KINDS
+from lcopa_bayes.inference.noise import AR1, NOISES, Student, White, WhiteAR1
+from lcopa_bayes.settings import NOISE_KINDS
 
 gaps_lists = st.lists(st.floats(0.05, 20.0), min_size=1, max_size=12).map(np.array)
 sigmas = st.floats(1e-6, 1e3)
@@ -79,6 +81,71 @@ def test_whitening_is_linear_and_scales_add_up(gaps, rho, factor):
     assert_allclose(scale, AR1().log_scales(parameters, gaps).sum(axis=1), rtol=1e-12)
 
 
+def mixed(sigma: float, sigma_ar: float, rho: float, gaps: np.ndarray) -> np.ndarray:
+    """Dense covariance of white noise plus a correlated part."""
+    return sigma**2 * np.eye(gaps.size) + dense(sigma_ar, rho, gaps)
+
+
+SPACINGS = {
+    "equal": np.ones(60),
+    "missing samples": np.random.default_rng(1).choice([1.0, 1.0, 1.0, 2.0, 7.0], 60),
+    "irregular": np.random.default_rng(2).uniform(0.05, 20.0, 60),
+}
+MIXTURES = [(0.3, 0.8, 0.97), (1e-3, 1.0, 0.999), (1.0, 1e-3, 0.5), (0.02, 0.5, 0.01), (2.0, 0.1, 0.9999)]
+
+
+@pytest.mark.parametrize("gaps", SPACINGS.values(), ids=SPACINGS.keys())
+def test_white_and_correlated_noise_is_whitened_by_the_factor_of_its_dense_covariance(gaps):
+    """All parameter sets at once, several columns each: innovations, their scales, the joint density."""
+    parameters, n = np.array(MIXTURES), gaps.size
+    columns = np.random.default_rng(3).normal(size=(len(MIXTURES), 3, n))
+    white, scale = WhiteAR1().whiten(columns, parameters, gaps)
+    told = WhiteAR1().pointwise(columns[:, 0], parameters, gaps)
+    for row, values in enumerate(MIXTURES):
+        covariance = mixed(*values, gaps)
+        low = np.linalg.cholesky(covariance)
+        assert_allclose(white[row], np.linalg.solve(low, columns[row].T).T, rtol=1e-9, atol=1e-9)
+        assert_allclose(scale[row], np.log(np.diagonal(low)).sum(), rtol=1e-9, atol=1e-9)
+        whole = stats.multivariate_normal(np.zeros(n), covariance).logpdf(columns[row, 0])
+        assert_allclose(told[row].sum(), whole, rtol=1e-9)
+
+
+@given(st.floats(1e-3, 1e3), st.floats(1e-3, 1e3), st.floats(0.0, 0.995), gaps_lists, st.floats(1e-6, 1e3))
+def test_each_sample_of_white_and_correlated_noise_has_its_density_given_those_before(s, c, rho, gaps, unit):
+    residual = residual_of(gaps.size, max(s, c) * unit)
+    told = WhiteAR1().pointwise(residual, np.array([[s * unit, c * unit, rho]]), gaps)[0]
+    low = np.linalg.cholesky(mixed(s, c, rho, gaps))
+    exact = stats.norm.logpdf(np.linalg.solve(low, residual[0] / unit)) - np.log(unit * np.diagonal(low))
+    assert_allclose(told, exact, rtol=1e-7, atol=1e-7)
+
+
+@given(sigmas, st.floats(0.0, 0.995), gaps_lists)
+def test_white_and_correlated_noise_without_either_part_is_the_other(sigma, rho, gaps):
+    columns = residual_of(gaps.size, sigma, batch=2)[None]
+    alone = WhiteAR1().whiten(columns, np.array([[sigma, 0.0, rho]]), gaps)
+    faint = WhiteAR1().whiten(columns, np.array([[1e-9 * sigma, sigma, rho]]), gaps)
+    white, ar1 = (
+        White().whiten(columns, np.array([[sigma]]), gaps),
+        AR1().whiten(columns, np.array([[sigma, rho]]), gaps),
+    )
+    for found, exact in ((alone, white), (faint, ar1)):
+        assert_allclose(found[0], exact[0], rtol=1e-9, atol=1e-9)
+        assert_allclose(found[1], exact[1], rtol=1e-9, atol=1e-9)
+
+
+def test_one_column_is_whitened_for_many_parameter_sets_and_many_columns_for_one():
+    gaps, parameters = GAPS, np.array(MIXTURES)
+    column = np.random.default_rng(0).normal(size=(1, 1, gaps.size))
+    white, scales = WhiteAR1().whiten(column, parameters, gaps)
+    for row, values in enumerate(parameters):
+        one, scale = WhiteAR1().whiten(column, values[None], gaps)
+        assert_allclose(white[row], one[0], rtol=1e-12)
+        assert_allclose(scales[row], scale[0], rtol=1e-12)
+    many = np.repeat(column, 3, axis=0)
+    assert WhiteAR1().whiten(many, parameters[:1], gaps)[1].shape == (1,)
+    assert_allclose(WhiteAR1().whiten(many, parameters[:1], gaps)[0][2], white[0], rtol=1e-12)
+
+
 COUNT, GAPS = 20_000, np.array([1.0, 1.0, 0.3, 2.5, 1.0])
 
 
@@ -90,6 +157,32 @@ def test_ar1_draws_have_the_dense_covariance(rho):
     error = np.sqrt((np.outer(variances, variances) + exact**2) / COUNT)
     assert np.all(np.abs(drawn.mean(axis=0)) < 4 * np.sqrt(variances / COUNT))
     assert np.all(np.abs(drawn.T @ drawn / COUNT - exact) < 4 * error)
+
+
+def test_white_and_correlated_draws_have_the_dense_covariance():
+    values = (0.3, 0.5, 0.8)
+    drawn = WhiteAR1().draw(np.tile(values, (COUNT, 1)), GAPS, np.random.default_rng(3))
+    exact = mixed(*values, GAPS)
+    variances = np.diagonal(exact)
+    error = np.sqrt((np.outer(variances, variances) + exact**2) / COUNT)
+    assert np.all(np.abs(drawn.mean(axis=0)) < 4 * np.sqrt(variances / COUNT))
+    assert np.all(np.abs(drawn.T @ drawn / COUNT - exact) < 4 * error)
+    assert (
+        deviation_from_white(WhiteAR1().whiten(drawn[:, None], np.tile(values, (COUNT, 1)), GAPS)[0][:, 0])
+        < 4
+    )
+
+
+@pytest.mark.parametrize(
+    ("noise", "values"), [(White(), (0.3,)), (AR1(), (0.3, 0.7)), (WhiteAR1(), (0.2, 0.3, 0.9))]
+)
+def test_starting_values_come_from_the_autocovariances(noise, values):
+    """Of 300 records of 400 samples; errors by the spread between them."""
+    drawn = noise.draw(np.tile(values, (300, 1)), np.ones(400), np.random.default_rng(0))
+    groups = [noise.estimate(list(part)) for part in np.split(drawn, 10)]
+    for name, value in zip(noise.names, values, strict=True):
+        each = np.array([found[name] for found in groups])
+        assert abs(each.mean() - value) < 4 * each.std() / np.sqrt(10) + 0.01 * value
 
 
 def deviation_from_white(white: np.ndarray) -> float:
@@ -116,8 +209,15 @@ def test_white_and_student_draws_follow_their_distributions():
 
 
 def test_every_noise_is_known_by_its_kind():
-    assert {kind: noise.kind for kind, noise in NOISES.items()} == {k: k for k in ("white", "ar1", "student")}
+    assert {kind: noise.kind for kind, noise in NOISES.items()} == {
+        k: k for k in ("white", "ar1", "white+ar1", "student")
+    }
+    assert set(NOISES) == set(NOISE_KINDS)
     for noise in NOISES.values():
+        assert KINDS[noise.names[0]].noise == "scale"
+        assert (
+            set(noise.nearly_white(0.4)) == set(noise.estimate([np.ones(3), np.ones(1)])) == set(noise.names)
+        )
         parameters = np.full((3, len(noise.names)), 0.5)
         for n in (0, 1, 4):
             assert noise().pointwise(np.ones((3, n)), parameters, np.ones(n)).shape == (3, n)

@@ -32,9 +32,9 @@ class Freedom:
     @classmethod
     def of(cls, posterior: Posterior) -> Freedom:
         """Of a posterior's likelihood; samples of all axes count as one."""
-        free = [row.kind for row in posterior.table.rows if row.free]
-        plant = sum(kind not in ("sigma", "rho", "nu") for kind in free)
-        return cls(posterior.size, plant, "sigma" not in free)
+        free = [row for row in posterior.table.rows if row.free]
+        plant = sum(not row.noise for row in free)
+        return cls(posterior.size, plant, not any(row.declared.noise == "scale" for row in free))
 
     def fall_at(self, level: float) -> float:
         """Fall of twice the log likelihood at the ends of a two-sided interval of one parameter [nat].

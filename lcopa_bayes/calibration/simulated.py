@@ -96,6 +96,6 @@ def model_gap(problem: Problem, truth: Vector, exact: Sequence[Matrix]) -> float
         for axis, observed in enumerate(samples.axes):
             offset = posterior.table.offset(values, axis, r)
             gap = modelled[r][axis][0][observed.index] + offset - clean[observed.index, axis]
-            sigma = posterior.noise_parameters(values, axis)[0, 0]
-            total += float(np.sum((gap / sigma) ** 2))
+            parameters = posterior.noise_parameters(values, axis)
+            total += float(np.sum(posterior.noise.standard(gap[None], parameters, observed.gaps) ** 2))
     return float(np.sqrt(total))

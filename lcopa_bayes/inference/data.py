@@ -59,6 +59,19 @@ class Samples:
             axes.append(Observed(index, record.response[rows[index], axis], gaps))
         return cls(record, times, tuple(axes))
 
+    @cached_property
+    def first_change(self) -> float:
+        """Time of the first drive change, infinite when there is none [time unit]."""
+        drive = self.record.drive
+        moved = np.flatnonzero((drive != drive[0]).any(axis=1))
+        return float(self.record.time[moved[0]]) if moved.size else np.inf
+
+    def quiet(self, axis: int) -> Observed:
+        """Samples of an axis taken before any drive change can have acted, that at the change included."""
+        observed = self.axes[axis]
+        n = int(np.searchsorted(self.times[observed.index], self.first_change, side="right"))
+        return Observed(observed.index[:n], observed.values[:n], observed.gaps[:n])
+
     def matrix(self) -> Matrix:
         """Responses at `times`, (samples, axes), NaN where missing [response unit]."""
         out = np.full((self.times.size, len(self.axes)), np.nan)

@@ -13,6 +13,7 @@ from scipy.optimize import least_squares
 
 from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.inference.noise import GaussianNoise, White
+from lcopa_bayes.inference.noisefit import NoiseFit
 from lcopa_bayes.inference.posterior import Posterior
 
 _EDGE = 1e-6
@@ -37,7 +38,7 @@ class LeastSquares:
     def columns(self) -> list[int]:
         """Table positions of the free plant parameters."""
         rows = self.posterior.table.rows
-        return [k for k, row in enumerate(rows) if row.free and row.kind not in ("sigma", "rho", "nu")]
+        return [k for k, row in enumerate(rows) if row.free and not row.noise]
 
     @cached_property
     def bounds(self) -> tuple[Vector, Vector]:
@@ -171,34 +172,30 @@ class LeastSquares:
         solution = self.posterior.table.canonical(self.values(found.x, values)[None])[0]
         return solution, np.asarray(found.jac)
 
-    def with_noise(self, values: Vector) -> Vector:
-        """The same plant with noise parameters estimated from its residual, where these are free."""
+    def noise_fits(self, values: Vector) -> list[NoiseFit]:
+        """Posterior of the noise parameters of each response axis given the residual of a plant."""
         posterior, table = self.posterior, self.posterior.table
-        out = values.copy()
         units = posterior.model.unit_responses(table.dynamics(values[None]))
-        for axis in range(len(table.layout.responses)):
-            residuals = [
-                posterior.residual(axis, r, samples.axes[axis], values[None], units[r])[0]
-                for r, samples in enumerate(posterior.samples)
-            ]
-            power = sum(float(residual @ residual) for residual in residuals)
-            count = sum(residual.size for residual in residuals)
-            lagged = sum(float(residual[1:] @ residual[:-1]) for residual in residuals)
-            estimates = {"sigma": np.sqrt(power / count), "rho": lagged / power if power else 0.0, "nu": 10.0}
-            for name in posterior.noise.names:
-                k = table.at(name, axis)
-                if table.rows[k].free:
-                    out[k] = _inside(estimates[name], table.rows[k].domain)
+        return [
+            NoiseFit(
+                posterior.noise,
+                tuple(table.rows[table.at(name, axis)] for name in posterior.noise.names),
+                [
+                    posterior.residual(axis, r, samples.axes[axis], values[None], units[r])[0]
+                    for r, samples in enumerate(posterior.samples)
+                ],
+                [samples.axes[axis].gaps for samples in posterior.samples],
+            )
+            for axis in range(len(table.layout.responses))
+        ]
+
+    def with_noise(self, values: Vector) -> Vector:
+        """The same plant with noise parameters fitted to its residual, where these are free."""
+        table, out = self.posterior.table, values.copy()
+        for axis, fit in enumerate(self.noise_fits(values)):
+            where = [table.at(name, axis) for name in self.posterior.noise.names]
+            out[where] = fit.best(values[where])
         return out
-
-
-def _inside(value: float, domain: tuple[float, float]) -> float:
-    """A starting value moved off the ends of its domain (starts only: never a density)."""
-    low, high = domain
-    if low > 0:  # a domain of decades
-        return float(np.clip(value, 1.01 * low, max(1.01 * low, high / 1.01)))
-    margin = 1e-3 * (high - low) if np.isfinite(high - low) else 1e-12
-    return float(np.clip(value, low + margin, high - margin))
 
 
 def apart(

@@ -1,53 +1,23 @@
-"""Noise models: what is left when the plant has been taken off."""
+"""Noise models, and all of them by the name a study gives them."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from typing import ClassVar, final
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 from scipy.special import gammaln
 from scipy.stats import t as student_t
 
 from lcopa_bayes.arrays import Array, Matrix, Vector
+from lcopa_bayes.inference.mixednoise import WhiteAR1
+from lcopa_bayes.inference.noisemodel import SLIGHT, products, root_mean_square
+from lcopa_bayes.inference.noisemodel import GaussianNoise as GaussianNoise
+from lcopa_bayes.inference.noisemodel import Noise as Noise
+from lcopa_bayes.inference.priors import Prior
 
-_LOG_2PI = float(np.log(2 * np.pi))
-
-
-class Noise(ABC):
-    """Density of one response axis' residual on one record, batched over parameter sets.
-
-    `parameters` (batch, len(names)) in the order of `names`; `gaps` (n,) time since the previous
-    sample in sampling periods (its first entry is not used).
-    """
-
-    kind: ClassVar[str]
-    names: ClassVar[tuple[str, ...]]
-
-    @abstractmethod
-    def pointwise(self, residual: Matrix, parameters: Matrix, gaps: Vector) -> Matrix:
-        """Log density of each sample given those before it, (batch, n)."""
-
-    @abstractmethod
-    def draw(self, parameters: Matrix, gaps: Vector, rng: np.random.Generator) -> Matrix:
-        """Noise for each parameter set, (batch, n) [response unit]."""
-
-
-class GaussianNoise(Noise):
-    """Noise that a linear map makes white with unit variance."""
-
-    @abstractmethod
-    def whiten(self, columns: Array, parameters: Matrix, gaps: Vector) -> tuple[Array, Vector]:
-        """Whitened columns (batch, k, n) and the sum over samples of log innovation sd, (batch,)."""
-
-    def pointwise(self, residual: Matrix, parameters: Matrix, gaps: Vector) -> Matrix:
-        """Log density of each sample given those before it, (batch, n)."""
-        white, _ = self.whiten(residual[:, None, :], parameters, gaps)
-        return -0.5 * (white[:, 0] ** 2 + _LOG_2PI) - self.log_scales(parameters, gaps)
-
-    @abstractmethod
-    def log_scales(self, parameters: Matrix, gaps: Vector) -> Matrix:
-        """Log innovation sd of each sample, broadcastable to (batch, n)."""
+if TYPE_CHECKING:
+    from lcopa_bayes.inference.defaults import Scales
 
 
 @final
@@ -70,6 +40,16 @@ class White(GaussianNoise):
         """Noise for each parameter set, (batch, n) [response unit]."""
         return parameters[:, :1] * rng.standard_normal((parameters.shape[0], gaps.size))
 
+    @staticmethod
+    def priors(scales: Scales, axis: int) -> Mapping[str, Prior]:
+        """Default prior of each parameter on a response axis."""
+        return {"sigma": scales.sigma(axis)}
+
+    @staticmethod
+    def nearly_white(sd: float) -> Mapping[str, float]:
+        """White noise of `sd`."""
+        return {"sigma": sd}
+
 
 @final
 class AR1(GaussianNoise):
@@ -80,6 +60,7 @@ class AR1(GaussianNoise):
 
     kind = "ar1"
     names = ("sigma", "rho")
+    memory = 1
 
     def whiten(self, columns: Array, parameters: Matrix, gaps: Vector) -> tuple[Array, Vector]:
         """Whitened columns (batch, k, n) and the sum over samples of log innovation sd, (batch,)."""
@@ -103,6 +84,22 @@ class AR1(GaussianNoise):
         return out
 
     @staticmethod
+    def priors(scales: Scales, axis: int) -> Mapping[str, Prior]:
+        """Default prior of each parameter on a response axis."""
+        return {"sigma": scales.sigma(axis), "rho": scales.rho()}
+
+    @staticmethod
+    def nearly_white(sd: float) -> Mapping[str, float]:
+        """A slight correlation, so that it can grow."""
+        return {"sigma": sd, "rho": SLIGHT}
+
+    @classmethod
+    def estimate(cls, residuals: Sequence[Vector]) -> Mapping[str, float]:
+        """Standard deviation and first autocorrelation."""
+        power, lagged = (products(residuals, lag) for lag in (0, 1))
+        return {"sigma": root_mean_square(residuals), "rho": lagged / power if power else 0.0}
+
+    @staticmethod
     def _transition(parameters: Matrix, gaps: Vector) -> tuple[Matrix, Matrix]:
         """Correlation with the previous sample, (batch, n-1), and log innovation sd, (batch, n)."""
         link = parameters[:, 1:2] ** gaps[1:]
@@ -124,11 +121,27 @@ class Student(Noise):
         level = gammaln((nu + 1) / 2) - gammaln(nu / 2) - 0.5 * np.log(nu * np.pi) - np.log(sigma)
         return level - (nu + 1) / 2 * np.log1p((residual / sigma) ** 2 / nu)
 
+    @staticmethod
+    def information(nu: Vector) -> Vector:
+        """Fisher information of a sample about its location, over that of a Gaussian of scale `sigma` [-]
+        (Lange, Little and Taylor 1989, J. Am. Stat. Assoc. 84)."""
+        return np.asarray((nu + 1) / (nu + 3))
+
     def draw(self, parameters: Matrix, gaps: Vector, rng: np.random.Generator) -> Matrix:
         """Noise for each parameter set, (batch, n) [response unit]."""
         shape = (parameters.shape[0], gaps.size)
         return parameters[:, :1] * np.asarray(student_t.rvs(parameters[:, 1:2], size=shape, random_state=rng))
 
+    @staticmethod
+    def priors(scales: Scales, axis: int) -> Mapping[str, Prior]:
+        """Default prior of each parameter on a response axis."""
+        return {"sigma": scales.sigma(axis), "nu": scales.nu()}
 
-NOISES: dict[str, type[Noise]] = {noise.kind: noise for noise in (White, AR1, Student)}
+    @staticmethod
+    def nearly_white(sd: float) -> Mapping[str, float]:
+        """Nearly Gaussian noise of scale `sd`."""
+        return {"sigma": sd, "nu": 10.0}
+
+
+NOISES: dict[str, type[Noise]] = {noise.kind: noise for noise in (White, AR1, WhiteAR1, Student)}
 """Noise models by the name a study gives them."""

@@ -9,7 +9,6 @@ import numpy as np
 
 from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.inference.leastsquares import LeastSquares
-from lcopa_bayes.inference.noise import AR1
 from lcopa_bayes.inference.posterior import Posterior
 
 _SCREENED = 1024
@@ -40,16 +39,19 @@ def find_optima(posterior: Posterior, rng: np.random.Generator, *, starts: int =
     table, problem = posterior.table, LeastSquares(posterior)
     drawn = table.draw(_SCREENED, rng)
     for axis, scale in enumerate(_spread(posterior)):
-        for name, value in (("sigma", 0.05 * scale), ("rho", 0.1), ("nu", 10.0)):
-            if name in posterior.noise.names and table.rows[table.at(name, axis)].free:
+        for name, value in posterior.noise.nearly_white(0.05 * scale).items():
+            if table.rows[table.at(name, axis)].free:
                 drawn[:, table.at(name, axis)] = value
     chosen = drawn[np.argsort(-posterior.log_likelihood(drawn), kind="stable")]
     optima: list[Optimum] = []
     for values in _distinct(posterior, chosen, starts):
         values = posterior.complete(posterior.coordinates(values[None]), None)[0]
         for _ in range(2):
-            values, jacobian = problem.solve(values)
+            values, _ = problem.solve(values)
             values = problem.with_noise(values)
+        # at the solution itself: its terms may stand in another order than the search left them in, and the
+        # noise is that of its own residual
+        _, jacobian = problem.residual(problem.coordinates(values), values)
         optima.append(_describe(posterior, problem, values, jacobian))
     optima.sort(key=lambda optimum: -optimum.log_density)
     kept: list[Optimum] = []
@@ -84,28 +86,21 @@ def _distinct(posterior: Posterior, ranked: Matrix, count: int) -> list[Vector]:
 
 
 def _describe(posterior: Posterior, problem: LeastSquares, values: Vector, jacobian: Matrix) -> Optimum:
-    """Optimum with the covariance of the sampled coordinates; noise parameters by their own curvature."""
+    """Optimum with the covariance of the sampled coordinates: the plant's at this noise, the noise's at this
+    plant."""
     coordinates = posterior.coordinates(values[None])
     information = jacobian.T @ jacobian
     widths = np.where(np.isfinite(problem.bounds[1] - problem.bounds[0]), 1.0, np.inf)
     information += np.diag(1.0 / np.minimum(widths, 1e9) ** 2)  # no direction wider than a unit prior
-    plant = np.linalg.pinv(information, hermitian=True)
+    blocks = [(problem.columns, np.linalg.pinv(information, hermitian=True))]
+    for axis, fit in enumerate(problem.noise_fits(values)):
+        where = [posterior.table.at(name, axis) for name in posterior.noise.names]
+        if fit.free:
+            blocks.append(([where[k] for k in fit.free], fit.covariance(values[where])))
     covariance = np.zeros((posterior.dimension, posterior.dimension))
-    where = {k: position for position, k in enumerate(problem.columns)}
-    count = posterior.size / max(1, len(posterior.table.layout.responses))
-    for a, k in enumerate(posterior.sampled):
-        for b, other in enumerate(posterior.sampled):
-            if k in where and other in where:
-                covariance[a, b] = plant[where[k], where[other]]
-        if k not in where:
-            kind = posterior.table.rows[k].kind
-            rho = values[k] if kind == "rho" else 0.0
-            steep = (1 - rho**2 + 1e-4) / (rho * (1 - rho)) ** 2 if kind == "rho" else 0.0
-            covariance[a, a] = {"sigma": 0.5 / count, "rho": steep / count, "nu": 0.25}[kind]
-    if isinstance(posterior.noise, AR1):
-        for a, k in enumerate(posterior.sampled):
-            row = posterior.table.rows[k]
-            if row.kind == "sigma":
-                rho = values[posterior.table.at("rho", row.place.first)]
-                covariance[a, a] *= (1 + rho) / max(1 - rho, 1e-3)
+    for columns, block in blocks:
+        shared = [k for k in columns if k in posterior.sampled]
+        inside = [columns.index(k) for k in shared]
+        at = [posterior.sampled.index(k) for k in shared]
+        covariance[np.ix_(at, at)] = block[np.ix_(inside, inside)]
     return Optimum(values, covariance, float(posterior.log_density(coordinates)[0]))

@@ -10,24 +10,10 @@ from typing import NamedTuple, final
 import numpy as np
 from scipy.special import logit
 
-from lcopa_bayes.arrays import Flags, Vector
+from lcopa_bayes.arrays import Vector
+from lcopa_bayes.inference.kinds import KINDS, Kind
 from lcopa_bayes.inference.priors import Prior
 
-_DOMAIN = {
-    "gain": (-inf, inf),
-    "time": (0.0, inf),
-    "order": (0.0, 2.0),
-    "delay": (0.0, inf),
-    "offset": (-inf, inf),
-    "sigma": (0.0, inf),
-    "rho": (0.0, 1.0),
-    "nu": (0.0, inf),
-}
-"""Where each kind of parameter must lie; ends are excluded but for the order 2."""
-_MAY_BE_ZERO = frozenset({"delay", "rho"})
-"""Kinds that may be fixed at 0: no delay, no correlation."""
-_LOG_KINDS = frozenset({"time", "sigma", "nu"})
-"""Kinds sampled by their logarithm."""
 _LEAST_MASS = 1e-9
 """A prior with less mass in its parameter's domain is a mistake [-]."""
 _REJECTION = 0.1
@@ -59,6 +45,16 @@ class Parameter:
     """Whether the prior is the default one."""
 
     @property
+    def declared(self) -> Kind:
+        """What all parameters of this kind have in common."""
+        return KINDS[self.kind]
+
+    @property
+    def noise(self) -> bool:
+        """Whether it belongs to the noise model."""
+        return self.declared.noise != ""
+
+    @property
     def free(self) -> bool:
         """Whether the parameter is inferred."""
         return self.prior is not None
@@ -67,18 +63,17 @@ class Parameter:
     def log_scale(self) -> bool:
         """Whether it is sampled by its logarithm."""
         positive = self.prior is not None and self.prior.dist == "loguniform" and self.prior.support[0] >= 0
-        return self.kind in _LOG_KINDS or (positive and not self.logit_scale)
+        return self.declared.scale == "log" or (positive and not self.logit_scale)
 
     @property
     def logit_scale(self) -> bool:
-        """Whether it is sampled by its logit: near 1 a noise correlation and the logarithm of the noise
-        scale then trade off along a straight line."""
-        return self.kind == "rho"
+        """Whether it is sampled by its logit."""
+        return self.declared.scale == "logit"
 
     @property
     def domain(self) -> tuple[float, float]:
         """Interval on which the posterior can be positive: the prior's support within the kind's."""
-        low, high = _DOMAIN[self.kind]
+        low, high = self.declared.low, self.declared.high
         support = (low, high) if self.prior is None else self.prior.support
         return max(low, support[0]), min(high, support[1])
 
@@ -97,29 +92,34 @@ class Parameter:
         assert self.prior is not None
         # also for a prior within the domain: far logits and logarithms round to its ends, where there
         # is no likelihood (a correlation of 1) or a density may be infinite (a scale of 0)
-        return np.where(_inside(self.kind, x), self.prior.log_density(x) - self._log_mass, -np.inf)
+        return np.where(self.declared.contains(x), self.prior.log_density(x) - self._log_mass, -np.inf)
+
+    def mass_below(self, x: float) -> float:
+        """Prior probability of values below `x`, within the domain."""
+        assert self.prior is not None
+        low, high, at = (float(self.prior.frozen.cdf(end)) for end in (*self.domain, x))
+        return float(np.clip((at - low) / (high - low), 0.0, 1.0))
 
     def draw(self, size: int, rng: np.random.Generator) -> Vector:
         """Draws from the prior within the domain, or copies of the fixed value."""
         if self.prior is None:
             return np.full(size, self.value)
-        low, high = (float(self.prior.frozen.cdf(end)) for end in _DOMAIN[self.kind])
+        low, high = (float(self.prior.frozen.cdf(end)) for end in self._ends)
         if high - low < _REJECTION:
             return np.asarray(self.prior.frozen.ppf(rng.uniform(low, high, size)), dtype=float)
         out = np.empty(0)
         while out.size < size:
             drawn = self.prior.draw(2 * size, rng)
-            out = np.concatenate([out, drawn[_inside(self.kind, drawn)]])
+            out = np.concatenate([out, drawn[self.declared.contains(drawn)]])
         return out[:size]
 
     @property
     def problems(self) -> list[str]:
         """What is wrong with the prior or the fixed value for this kind of parameter."""
-        low, high = _DOMAIN[self.kind]
-        zero = self.kind in _MAY_BE_ZERO
-        where = f"{'[' if zero else '('}{low:g}, {high:g}{']' if self.kind == 'order' else ')'}"
+        zero, where = self.declared.zero, self.declared.interval
+        where += "" if self.unit == "-" else f" {self.unit}"
         if self.prior is None:
-            fits = bool(_inside(self.kind, np.array(self.value))) or (zero and self.value == 0)
+            fits = bool(self.declared.contains(np.array(self.value))) or (zero and self.value == 0)
             return [] if fits else [f"[priors] {self.name} = {self.value:g}: must lie in {where}"]
         if self._mass >= _LEAST_MASS:
             return []
@@ -128,24 +128,22 @@ class Parameter:
             "shift or widen it"
         ]
 
+    @property
+    def _ends(self) -> tuple[float, float]:
+        """Ends of the domain of the kind."""
+        return self.declared.low, self.declared.high
+
     @cached_property
     def _mass(self) -> float:
         """Prior mass inside the domain of the kind."""
         assert self.prior is not None
-        low, high = _DOMAIN[self.kind]
+        low, high = self._ends
         return float(self.prior.frozen.cdf(high) - self.prior.frozen.cdf(low))
 
     @cached_property
     def _log_mass(self) -> float:
         """Logarithm of the mass; exactly 0 when the support lies within the domain of the kind."""
         assert self.prior is not None
-        low, high = _DOMAIN[self.kind]
+        low, high = self._ends
         within = self.prior.support[0] >= low and self.prior.support[1] <= high
         return 0.0 if within else log(self._mass)
-
-
-def _inside(kind: str, x: Vector) -> Flags:
-    """Whether values lie in the domain of a kind."""
-    low, high = _DOMAIN[kind]
-    inside: Flags = (x > low) & ((x <= high) if kind == "order" else (x < high))
-    return inside

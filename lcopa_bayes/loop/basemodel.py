@@ -66,9 +66,9 @@ class BaseModel:
 
     @cached_property
     def template(self) -> Vector:
-        """Fixed values, unit noise scale, zero correlation, (rows,)."""
+        """Fixed values, unit noise scale, (rows,); of the noise only that counts."""
         table = self.posterior.table
-        unit = {"sigma": 1.0, "rho": 0.0, "nu": 10.0}
+        unit = self.posterior.noise.nearly_white(1.0)
         return np.array([unit.get(row.kind, row.value) for row in table.rows])
 
     @cached_property

@@ -31,9 +31,8 @@ def screened(posterior: Posterior, rng: np.random.Generator, *, count: int) -> l
     for axis in range(len(table.layout.responses)):
         pooled = np.concatenate([samples.axes[axis].values for samples in posterior.samples])
         scale = _SCREEN_NOISE * (float(pooled.std()) or 1.0)
-        for name, value in (("sigma", scale), ("rho", 0.1), ("nu", 10.0)):
-            if name in posterior.noise.names:
-                drawn[:, table.at(name, axis)] = value
+        for name, value in posterior.noise.nearly_white(scale).items():
+            drawn[:, table.at(name, axis)] = value
     density = posterior.log_likelihood(drawn)
     ranked = drawn[np.argsort(-np.where(np.isnan(density), -np.inf, density), kind="stable")]
     return [_completed(posterior, values) for values in _distinct(posterior, ranked, count)]
@@ -56,7 +55,7 @@ def _classical(posterior: Posterior, drawn: Matrix, rng: np.random.Generator) ->
                 low, high = table.rows[k].domain
                 inside = (low <= values) & (values <= high) & table.rows[k].free
                 out[inside, k] = values[inside]
-    legal = table.ordered(out)
+    legal = table.supported(out)
     out[~legal] = drawn[~legal]
     return table.canonical(out)
 

@@ -1,0 +1,149 @@
+"""Noise parameters that fit given residuals best, and how well these know them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import final
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import expit, log_expit, logit
+
+from lcopa_bayes.arrays import Matrix, Vector
+from lcopa_bayes.inference.noisemodel import Noise
+from lcopa_bayes.inference.parameter import Parameter
+
+_TAIL = 1e-9
+"""Prior mass beyond either end of the search [-]."""
+_EDGE = 1e-6
+"""Distance kept from the ends of the search, relative to its width [-]."""
+_SHIFT = 1e-5
+"""Shift of the differences that give a gradient [natural log or logit]."""
+_STEP = 0.05
+"""Step of the differences that give the curvature [natural log or logit]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class NoiseFit:
+    """Posterior of the free noise parameters of one response axis given its residuals.
+
+    Works in the sampled coordinates: logarithms of scales, logits of correlations.
+    """
+
+    noise: Noise
+    rows: tuple[Parameter, ...]
+    """One per name of the noise."""
+    residuals: Sequence[Vector]
+    """Of each record, (n,) [response unit]."""
+    gaps: Sequence[Vector]
+    """Of each record, (n,) [sampling periods]."""
+
+    @cached_property
+    def free(self) -> tuple[int, ...]:
+        """Positions of the free parameters among `rows`."""
+        return tuple(k for k, row in enumerate(self.rows) if row.free)
+
+    @cached_property
+    def ends(self) -> tuple[Vector, Vector]:
+        """Ends of the search: the support of each prior, or where all but 2e-9 of its mass lies."""
+        low, high = [], []
+        for k in self.free:
+            row = self.rows[k]
+            assert row.prior is not None
+            tails = row.prior.frozen.ppf((_TAIL, 1 - _TAIL))
+            a, b = row.domain
+            at = self.coordinates(np.array([max(a, tails[0]), min(b, tails[1])]), row)
+            edge = _EDGE * (at[1] - at[0])
+            low.append(at[0] + edge)
+            high.append(at[1] - edge)
+        return np.array(low), np.array(high)
+
+    @staticmethod
+    def coordinates(values: Vector, row: Parameter) -> Vector:
+        """Sampled coordinates of values of one parameter."""
+        return np.asarray(np.log(values) if row.log_scale else logit(values) if row.logit_scale else values)
+
+    def values(self, x: Matrix, template: Vector) -> Matrix:
+        """Noise parameters at coordinates, (batch, names), fixed ones from `template`."""
+        out = np.tile(template, (len(x), 1))
+        for column, k in enumerate(self.free):
+            row = self.rows[k]
+            at = x[:, column]
+            out[:, k] = np.exp(at) if row.log_scale else expit(at) if row.logit_scale else at
+        return out
+
+    def log_density(self, x: Matrix, template: Vector) -> Vector:
+        """Log density of the coordinates up to a constant, (batch,)."""
+        values = self.values(x, template)
+        total = np.zeros(len(x))
+        for residual, gaps in zip(self.residuals, self.gaps, strict=True):
+            seen = np.broadcast_to(residual, (len(x), residual.size))
+            total += self.noise.pointwise(seen, values, gaps).sum(axis=1)
+        for column, k in enumerate(self.free):
+            row, at = self.rows[k], x[:, column]
+            total += row.log_prior(values[:, k])
+            total += at if row.log_scale else log_expit(at) + log_expit(-at) if row.logit_scale else 0.0
+        return total
+
+    def best(self, template: Vector) -> Vector:
+        """Noise parameters of the largest density, (names,), the fixed ones from `template`.
+
+        The better end of two searches: from moments of the residuals, and from nearly white noise.
+        """
+        power = sum(float(residual @ residual) for residual in self.residuals)
+        if not self.free or power == 0.0:
+            return template
+        sd = float(np.sqrt(power / sum(residual.size for residual in self.residuals)))
+        found = [
+            minimize(
+                self._cost,
+                self._start(told),
+                args=(template,),
+                jac=True,
+                method="L-BFGS-B",
+                bounds=list(zip(*self.ends, strict=True)),
+            )
+            for told in (self.noise.estimate(self.residuals), self.noise.nearly_white(sd))
+        ]
+        x = min(found, key=lambda one: float(one.fun)).x
+        return np.asarray(self.values(x[None], template)[0])
+
+    def covariance(self, values: Vector) -> Matrix:
+        """Inverse curvature of the log density at values (names,) in the coordinates of the free parameters;
+        no direction is wider than a uniform density over the search."""
+        low, high = self.ends
+        x = np.array([self.coordinates(values[k : k + 1], self.rows[k])[0] for k in self.free])
+        step = np.minimum(_STEP, (high - low) / 8)
+        x = np.clip(x, low + 2 * step, high - 2 * step)  # the curvature beside a bound stands for that at it
+        steps = np.concatenate([np.diag(step), -np.diag(step)])
+        size, corners = len(x), (x + steps[:, None] + steps).reshape(-1, len(x))
+        at = self.log_density(corners, values).reshape(2 * size, 2 * size)
+        bent = at[:size, size:] + at[size:, :size] - at[:size, :size] - at[size:, size:]
+        bent /= 4 * np.outer(step, step)
+        sizes, directions = np.linalg.eigh((bent + bent.T) / 2)
+        sizes = np.maximum(sizes, 12 / np.square(high - low).max(initial=0.0))
+        return np.asarray(directions / sizes @ directions.T)
+
+    def _start(self, told: Mapping[str, float]) -> Vector:
+        """Coordinates of starting values, moved inside the ends of the search."""
+        out = []
+        for column, k in enumerate(self.free):
+            row, ends = self.rows[k], [end[column] for end in self.ends]
+            value = np.array([told[self.noise.names[k]]])
+            inside = row.domain[0] < value[0] < row.domain[1]
+            at = self.coordinates(value, row)[0] if inside else ends[int(value[0] >= row.domain[1])]
+            out.append(float(np.clip(at, *ends)))
+        return np.array(out)
+
+    def _cost(self, x: Vector, template: Vector) -> tuple[float, Vector]:
+        """Negative log density and its gradient by central differences."""
+        shift = _SHIFT * np.eye(len(x))
+        low, high = self.ends
+        points = np.concatenate([x[None], np.minimum(x + shift, high), np.maximum(x - shift, low)])
+        at = self.log_density(points, template)
+        plus, minus = np.split(points[1:], 2)
+        width = np.diagonal(plus - minus)
+        return -float(at[0]), -(at[1 : len(x) + 1] - at[len(x) + 1 :]) / width
