@@ -117,7 +117,8 @@ def _gain(base: Base, wider: Base) -> float:
     """Log evidence of the wider model over the other under the wider one's noise [nat]."""
     quiet = float(sum(wider.fit.noise_samples))
     same = Regression(base.fit.model, wider.fit.regression.whitening).descend(base.fit.optimum.x)
-    return log_bayes_factor(same, wider.fit.optimum, quiet)
+    ordering = wider.fit.model.log_ordering - base.fit.model.log_ordering
+    return log_bayes_factor(same, wider.fit.optimum, quiet) + ordering
 
 
 def _named(base: Base, library: Sequence[type[Effect]], rng: np.random.Generator, draws: int) -> float:
