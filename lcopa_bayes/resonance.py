@@ -11,6 +11,7 @@ import numpy as np
 from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.inference.draws import Draws
 from lcopa_bayes.inference.grade import Limitation
+from lcopa_bayes.inference.parameter import Parameter
 
 PEAK = 10.0
 """Response at a resonance over that at rest from which it is undamped [-]: that of one term is
@@ -31,14 +32,18 @@ _DRAWS = 400
 class Resonance:
     """An undamped resonance of one element that the samples do not resolve."""
 
-    element: int
-    """Position among the elements of the plant."""
     name: str
     """Name of the element; empty when the plant has one."""
+    parameters: tuple[str, ...]
+    """Times and orders of the element, and the gains of its paths."""
     share: float
     """Share of the draws that have it [-]."""
     samples: float
     """Median of its period over the sampling period [-]."""
+
+    def concerns(self, row: Parameter) -> bool:
+        """Whether a parameter is one of the disturbance."""
+        return row.name in self.parameters
 
     def sentence(self, period: float, time_unit: str) -> str:
         """What it is, without a full stop."""
@@ -59,12 +64,19 @@ def unresolved(draws: Draws, period: float) -> tuple[Resonance, ...]:
     """
     dynamics = draws.table.dynamics(draws.thinned(_DRAWS))
     out = []
-    for number, slot in enumerate(draws.table.layout.elements):
+    layout, rows = draws.table.layout, draws.table.rows
+    for number, slot in enumerate(layout.elements):
         peak, at = peaks(dynamics.times[number] / period, dynamics.orders[number])
         undamped = peak >= PEAK
         share = float(undamped.mean())
         if share >= SHARE:
-            out.append(Resonance(number, slot.name, share, float(2 * np.pi / np.median(at[undamped]))))
+            own = tuple(
+                row.name
+                for row in rows
+                if (row.kind in ("time", "order") and row.place.first == number)
+                or (row.kind == "gain" and layout.element_of[row.place.first][row.place.second] == number)
+            )
+            out.append(Resonance(slot.name, own, share, float(2 * np.pi / np.median(at[undamped]))))
     return tuple(out)
 
 

@@ -137,7 +137,7 @@ def test_a_noise_parameter_at_the_end_of_its_prior_is_named():
 
 
 def thermal(seed: int = 3) -> Record:
-    """Three lags of 60, 35 and 20 s, gain 0.8, after a step at 60 s, in samples of 2 s with noise of 0.003."""
+    """Three lags of 60, 35 and 20 s, gain 0.8, after a step at 60 s, sampled every 2 s, noise 0.003."""
     lags, gain = np.array([60.0, 35.0, 20.0]), 0.8
     time = np.arange(0.0, 600.0, 2.0)
     after = np.maximum(time - 60.0, 0.0)[:, None]
