@@ -9,6 +9,8 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.adequacy import limitations
+from lcopa_bayes.arrays import Matrix
+from lcopa_bayes.checks import refuse_if
 from lcopa_bayes.estimate import Estimate
 from lcopa_bayes.files import writable_folder
 from lcopa_bayes.inference.assembly import Problem, problem_of
@@ -19,8 +21,9 @@ from lcopa_bayes.inference.evidence import Evidence, evidence
 from lcopa_bayes.inference.nested import NestedPlan, nested
 from lcopa_bayes.inference.sampler import Run, SamplePlan, sample
 from lcopa_bayes.predict import Band, bands
-from lcopa_bayes.provenance import fingerprint
+from lcopa_bayes.provenance import digest_of, fingerprint
 from lcopa_bayes.residuals import Residual, residuals
+from lcopa_bayes.rest import not_at_rest
 from lcopa_bayes.sensitivity import Sensitivity, sensitivity
 from lcopa_bayes.stepmetrics import StepCurves, step_curves, step_metrics
 from lcopa_bayes.study import Study
@@ -63,16 +66,21 @@ def fit(
     quick: bool = False,
     cross_check: bool = False,
     quiet: bool = True,
+    starts: Matrix | None = None,
 ) -> Fit:
     """Sample the posterior of a study and derive what it predicts.
+
+    `starts`, table values (starts, rows), are modes known from elsewhere that sampling proposes too.
 
     With `folder`, sampling is stored there in `chain.h5` and `resume` goes on from it; the result is
     the same as without interruption. With `cross_check` the posterior is also sampled by nested sampling,
     always from the start, and where the two disagree every grade is lowered. Blocks are narrowed until their
     width does not move the optimum; how far it moves the posterior is measured and, where too far, lowers the
     grade. So does what speaks against the model itself (`adequacy`). InputError when the study does not fit
-    its records or the folder cannot be written to; then nothing is written.
+    its records, a record moves before its drive does or the folder cannot be written to; then nothing is
+    written.
     """
+    refuse_if(not_at_rest(study.fit, study.held_out))
     problem = problem_of(study)
     if folder:
         writable_folder(folder)
@@ -83,9 +91,10 @@ def fit(
         plan,
         jobs=jobs,
         chain_file=folder / "chain.h5" if folder else None,
-        fingerprint=fingerprint(study, plan),
+        fingerprint=fingerprint(study, plan) + ("" if starts is None else digest_of(starts)),
         resume=resume,
         quiet=quiet,
+        starts=starts,
     )
     draws, check = gather(problem.posterior, run), None
     weighed = evidence(problem.posterior, run.kept()[0], draws.ess, plan.seed)
