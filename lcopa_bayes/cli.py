@@ -169,6 +169,19 @@ def _calibrate_options(parser: argparse.ArgumentParser) -> None:
         help="draw truths from the posterior of a fit, not the prior",
     )
     parser.add_argument(
+        "--truth",
+        nargs="+",
+        default=[],
+        metavar="NAME=VALUE",
+        help="parameters with the same true value in every replica, in their units",
+    )
+    parser.add_argument(
+        "--engine",
+        choices=["importance", "sampling"],
+        default="importance",
+        help="importance sampling, the ensembles where it does not hold; or always the ensembles",
+    )
+    parser.add_argument(
         "--dask", metavar="ADDRESS", help="scheduler of a Dask cluster that does the replicas"
     )
 

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
 import numpy as np
 
+from lcopa_bayes.arrays import Matrix
+from lcopa_bayes.checks import refuse_if
 from lcopa_bayes.estimate import Estimate
 from lcopa_bayes.files import writable_folder
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.crosscheck import CrossCheck
+from lcopa_bayes.inference.discretisation import Discretisation, discretisation, resolved
 from lcopa_bayes.inference.draws import Draws, gather
 from lcopa_bayes.inference.evidence import Evidence, evidence
 from lcopa_bayes.inference.nested import NestedPlan, nested
 from lcopa_bayes.inference.sampler import Run, SamplePlan, sample
 from lcopa_bayes.predict import Band, bands
-from lcopa_bayes.provenance import fingerprint
+from lcopa_bayes.provenance import digest_of, fingerprint
 from lcopa_bayes.residuals import Residual, residuals
+from lcopa_bayes.rest import not_at_rest
 from lcopa_bayes.sensitivity import Sensitivity, sensitivity
 from lcopa_bayes.stepmetrics import StepCurves, step_curves, step_metrics
 from lcopa_bayes.study import Study
@@ -42,6 +46,8 @@ class Fit:
     sensitivity: tuple[Sensitivity, ...]
     evidence: Evidence | None
     """None for a single ensemble, which cannot tell its error."""
+    discretisation: Discretisation
+    """How far the width of the blocks moves the posterior."""
     cross_check: CrossCheck | None = None
 
     @property
@@ -59,26 +65,34 @@ def fit(
     quick: bool = False,
     cross_check: bool = False,
     quiet: bool = True,
+    starts: Matrix | None = None,
 ) -> Fit:
     """Sample the posterior of a study and derive what it predicts.
 
+    `starts`, table values (starts, rows), are modes known from elsewhere that sampling proposes too.
+
     With `folder`, sampling is stored there in `chain.h5` and `resume` goes on from it; the result is
     the same as without interruption. With `cross_check` the posterior is also sampled by nested sampling,
-    always from the start, and where the two disagree every grade is lowered. InputError when the study
-    does not fit its records or the folder cannot be written to; then nothing is written.
+    always from the start, and where the two disagree every grade is lowered. Blocks are narrowed until their
+    width does not move the optimum; how far it moves the posterior is measured and, where too far, lowers the
+    grade. InputError when the study does not fit its records, a record moves before its drive does or the
+    folder cannot be written to; then nothing is written.
     """
+    refuse_if(not_at_rest(study.fit, study.held_out))
     problem = problem_of(study)
     if folder:
         writable_folder(folder)
+    problem = resolved(problem)
     plan = plan_of(problem, quick=quick)
     run = sample(
         problem.posterior,
         plan,
         jobs=jobs,
         chain_file=folder / "chain.h5" if folder else None,
-        fingerprint=fingerprint(study, plan),
+        fingerprint=fingerprint(study, plan) + ("" if starts is None else digest_of(starts)),
         resume=resume,
         quiet=quiet,
+        starts=starts,
     )
     draws, check = gather(problem.posterior, run), None
     weighed = evidence(problem.posterior, run.kept()[0], draws.ess, plan.seed)
@@ -90,7 +104,9 @@ def fit(
             log_evidence=weighed.value if weighed else None,
             log_evidence_sd=weighed.sd if weighed else None,
         )
-        draws = draws if check.agrees else replace(draws, cap=check.lowered(draws.grade))
+        draws = draws.limited(check.limitations(draws.grade))
+    width = discretisation(problem, draws)
+    draws = draws.limited(width.limitations)
     noise, rng = problem.posterior.noise, np.random.default_rng([plan.seed, 2])
     shown = bands(draws, problem.posterior.model, problem.posterior.samples, noise, held_out=False, rng=rng)
     if study.held_out:
@@ -100,7 +116,19 @@ def fit(
     metrics = step_metrics(draws, curves, time_unit=study.time_unit)
     left = residuals(draws, shown, noise, problem.scales.period)
     moved = sensitivity(draws, problem.posterior)
-    return Fit(problem, run, draws, tuple(shown), tuple(left), curves, tuple(metrics), moved, weighed, check)
+    return Fit(
+        problem,
+        run,
+        draws,
+        tuple(shown),
+        tuple(left),
+        curves,
+        tuple(metrics),
+        moved,
+        weighed,
+        width,
+        check,
+    )
 
 
 def plan_of(problem: Problem, *, quick: bool) -> SamplePlan:

@@ -1,4 +1,4 @@
-"""What the posterior says a record looks like: credible bands, held-out scores."""
+"""What the posterior says a record looks like: pointwise credible bands, held-out scores."""
 
 from __future__ import annotations
 
@@ -11,23 +11,30 @@ import numpy as np
 from lcopa_bayes.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.data import Observed, Samples
 from lcopa_bayes.inference.draws import Draws
-from lcopa_bayes.inference.noise import GaussianNoise, Noise, White
+from lcopa_bayes.inference.noise import GaussianNoise, Noise
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.plant.forward import ForwardModel
 
 LEVELS = (0.5, 0.9)
 """Probabilities inside the bands [-]."""
+KIND = "pointwise"
+"""Kind of the bands: at each time by itself a band holds the response with its probability; a whole curve
+lies within it throughout with a smaller one."""
+BEFORE_DRIVE = "samples before the drive acts"
+"""Source of an offset."""
 _QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 _CELLS = 2_000_000
 """Draws times samples behind the bands of one axis of one record."""
 _FEWEST = 200
 """Draws behind a band at least."""
+_SWEEPS = 20
+"""Sweeps after which a Gibbs chain of a level has forgotten its start [-]: 1e-6 of it is left at nu = 1."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Band:
-    """Bands of one response axis of one record, at the record's sample times."""
+    """Pointwise bands of one response axis of one record, at the record's sample times."""
 
     record: str
     axis: str
@@ -43,8 +50,15 @@ class Band:
     """The same with noise, (5, n) [response unit]."""
     offset_from: str
     """Where the record's offset comes from."""
+    offset_samples: int
+    """Samples of a held-out record that its own offset was taken from [-]; 0 for an offset of the fit."""
     draws: int
     """Draws behind the quantiles."""
+
+    @property
+    def own_offset(self) -> bool:
+        """Whether every sample that is scored has served to set the offset: a constant error cannot show."""
+        return self.offset_samples == self.time.size
 
     @property
     def rmse(self) -> float:
@@ -79,11 +93,11 @@ def bands(
     held_out: bool,
     rng: np.random.Generator,
 ) -> list[Band]:
-    """50 and 90 % bands of every axis of every record, for the plant alone and with noise.
+    """Pointwise 50 and 90 % bands of every axis of every record, for the plant alone and with noise.
 
     `model` simulates the records of `samples` at their sample times. An offset per record is not
     known for a held-out record: it is taken from the samples before the drive can have acted, else
-    from the record itself (integrated out given its samples), and the band says which.
+    from the record itself (integrated out given its samples), and the band says which and from how many.
     """
     out = []
     for r, record in enumerate(samples):
@@ -96,7 +110,7 @@ def bands(
                 continue
             response = plant[axis][:, observed.index]
             parameters = values[:, [draws.table.at(name, axis) for name in noise.names]]
-            offset, source = offset_draws(
+            offset, source, used = offset_draws(
                 draws.table, values, axis, r, record, response, noise, held_out=held_out, rng=rng
             )
             response = response + offset[:, None]
@@ -113,6 +127,7 @@ def bands(
                     np.quantile(response, _QUANTILES, axis=0),
                     np.quantile(noisy, _QUANTILES, axis=0),
                     source,
+                    used,
                     values.shape[0],
                 )
             )
@@ -130,27 +145,24 @@ def offset_draws(
     *,
     held_out: bool,
     rng: np.random.Generator,
-) -> tuple[Vector, str]:
-    """Offset of a record for each draw, and where it comes from."""
+) -> tuple[Vector, str, int]:
+    """Offset of a record for each draw, where it comes from, and from how many samples of the record."""
     places = {(table.rows[k].place.first, table.rows[k].place.second): k for k in table.of_kind("offset")}
     if not places:
-        return np.zeros(values.shape[0]), "no offset"
+        return np.zeros(values.shape[0]), "no offset", 0
     if (axis, -1) in places:
-        return values[:, places[axis, -1]], "shared with the fit records"
+        return values[:, places[axis, -1]], "shared with the fit records", 0
     if not held_out:
-        return values[:, places[axis, r]], "fitted"
+        return values[:, places[axis, r]], "fitted", 0
     observed = record.axes[axis]
     quiet = record.times[observed.index] <= record.first_change
-    if quiet.any():
-        return (
-            _given(observed, quiet, response, noise, table, values, axis, rng),
-            "samples before the drive acts",
-        )
-    everything = np.ones_like(quiet)
-    return (
-        _given(observed, everything, response, noise, table, values, axis, rng),
-        "integrated out given the held-out record itself",
-    )
+    used, source = quiet, BEFORE_DRIVE
+    if quiet.all():
+        source = "all samples of the held-out record, whose drive does not change before the last of them"
+    elif not quiet.any():
+        used, source = ~quiet, "all samples of the held-out record, none of which is before the drive acts"
+    offset = _given(observed, used, response, noise, table, values, axis, rng)
+    return offset, source, int(used.sum())
 
 
 def _given(
@@ -163,12 +175,31 @@ def _given(
     axis: int,
     rng: np.random.Generator,
 ) -> Vector:
-    """Draws of an offset from its Gaussian conditional (flat prior) given some samples."""
-    gaussian = noise if isinstance(noise, GaussianNoise) else White()
-    parameters = values[:, [table.at(name, axis) for name in gaussian.names]]
+    """Draws of an offset given some samples, under a flat prior."""
+    parameters = values[:, [table.at(name, axis) for name in noise.names]]
     misfit = (observed.values - response)[:, used]
+    if not isinstance(noise, GaussianNoise):
+        return _student_levels(misfit, parameters, rng)
     columns = np.stack([np.ones_like(misfit), misfit], axis=1)
-    white, _ = gaussian.whiten(columns, parameters, observed.gaps[used])
+    white, _ = noise.whiten(columns, parameters, observed.gaps[used])
     precision = np.einsum("bn,bn->b", white[:, 0], white[:, 0])
     mean = np.einsum("bn,bn->b", white[:, 0], white[:, 1]) / precision
     return np.asarray(mean + rng.standard_normal(mean.size) / np.sqrt(precision))
+
+
+def _student_levels(misfit: Matrix, parameters: Matrix, rng: np.random.Generator) -> Vector:
+    """One draw of the level of every row of `misfit` (batch, n) [response unit] under Student noise.
+
+    Gibbs sampling of a Student law as normal laws whose precisions are Gamma distributed (Andrews and
+    Mallows 1974, J. R. Stat. Soc. B 36). A sweep forgets at the share of the information that the unknown
+    precisions hide, ``2 / (nu + 3)``; rows are chains of their own, and only their last state is kept.
+    """
+    sigma, nu = parameters[:, :1], parameters[:, 1:2]
+    level = np.median(misfit, axis=1)
+    for _ in range(_SWEEPS):
+        power = ((misfit - level[:, None]) / sigma) ** 2
+        precision = rng.gamma((nu + 1) / 2, 2 / (nu + power)) / sigma**2
+        total = precision.sum(axis=1)
+        mean = np.einsum("bn,bn->b", precision, misfit) / total
+        level = mean + rng.standard_normal(mean.size) / np.sqrt(total)
+    return np.asarray(level)

@@ -140,8 +140,8 @@ def _numbers(table: CellTable, column: int, *, missing: bool) -> Vector:
     return out
 
 
-def load_record(path: Path, time_unit: str | None = "ms") -> Record:
-    """Read a record from CSV or Parquet; times come out in `time_unit` (None: the unit of the file).
+def load_record(path: Path, time_unit: str | None = None) -> Record:
+    """Read a record from CSV or Parquet; times come out in `time_unit`, by default the unit of the file.
 
     Raises InputError with everything wrong in the file: place (file, line and column; in Parquet the
     row, counted from 1), what was found and what was expected, at most five per column and kind.

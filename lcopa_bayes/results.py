@@ -10,7 +10,7 @@ import numpy as np
 from lcopa_bayes.estimate import plain
 from lcopa_bayes.fit import Fit
 from lcopa_bayes.inference.grade import Grade, shares_grade
-from lcopa_bayes.predict import Band
+from lcopa_bayes.predict import KIND, Band
 from lcopa_bayes.residuals import WHITE_P
 from lcopa_bayes.stepmetrics import share_unsettled
 
@@ -22,6 +22,7 @@ def verdict(fit: Fit) -> str:
     if fit.cross_check is not None and fit.cross_check.agrees:  # a disagreement is part of the grade
         said = fit.cross_check.sentence
         parts.append(f"{said[0].upper()}{said[1:]}.")
+    parts.append(f"{fit.discretisation.sentence}.")
     worst = min((r for r in fit.residuals if not r.held_out), key=lambda r: r.p_white, default=None)
     if worst is not None and worst.p_white < WHITE_P:
         parts.append(
@@ -46,10 +47,11 @@ def _held_out_sentence(fit: Fit) -> list[str]:
         return ["No record was held out, so prediction is untested."]
     said = ", ".join(
         f"{band.record}/{band.axis} RMSE {band.rmse:.3g} {band.unit} with {100 * band.coverage(0.9):.0f} % "
-        "of samples in the 90 % band"
+        f"of samples in the pointwise 90 % band{' (offset from these samples)' if band.own_offset else ''}"
         for band in outside
     )
-    return [f"Held out: {said}."]
+    own = "A constant error of a record whose offset comes from its scored samples cannot show."
+    return [f"Held out: {said}.", *([own] if any(band.own_offset for band in outside) else [])]
 
 
 def results(fit: Fit) -> dict[str, Any]:
@@ -65,6 +67,7 @@ def results(fit: Fit) -> dict[str, Any]:
             "verdict": verdict(fit),
             "grade": grade.level,
             "grade_reason": grade.reason,
+            "limitations": [one.as_json() for one in fit.draws.limitations],
             "time_unit": fit.study.time_unit,
             "parameters": parameters,
             "fixed": [
@@ -77,11 +80,13 @@ def results(fit: Fit) -> dict[str, Any]:
             "log_evidence_by_ensemble": fit.evidence.by_ensemble if fit.evidence else (),
             "log_evidence_grade": _evidence_grade(fit),
             "cross_check": None if fit.cross_check is None else fit.cross_check.as_json(),
+            "discretisation": fit.discretisation.as_json(),
             "residual_rms": residual_rms(fit),
             "held_out": scores(fit, held_out=True),
             "fit_scores": scores(fit, held_out=False),
             "ridges": [
-                r.as_json() | {"grade": fit.draws.capped(shares_grade(r)).level} for r in fit.draws.ridges
+                r.as_json() | {"grade": fit.draws.level(r.parameter, shares_grade(r))}
+                for r in fit.draws.ridges
             ],
             "sensitivity": [moved.as_json() for moved in fit.sensitivity],
             "step_metrics": [metric.as_json() for metric in fit.metrics],
@@ -128,8 +133,10 @@ def _score(band: Band) -> dict[str, Any]:
         "rmse": band.rmse,
         "coverage_50": band.coverage(0.5),
         "coverage_90": band.coverage(0.9),
+        "bands": KIND,
         "samples": band.time.size,
         "offset_from": band.offset_from,
+        "offset_samples": band.offset_samples,
         "draws": band.draws,
     }
 

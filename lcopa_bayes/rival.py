@@ -44,7 +44,8 @@ class Rival:
         held = ", ".join(f"{name} = {order:g}" for name, order in self.orders.items())
         pairs = zip(self.fit.bands, self.against.bands, strict=True)
         said = ", ".join(
-            f"{rival.record}/{rival.axis} RMSE {rival.rmse:.3g} {rival.unit} (free orders: {own.rmse:.3g})"
+            f"{rival.record}/{rival.axis} RMSE {rival.rmse:.3g} {rival.unit} (free orders: {own.rmse:.3g}"
+            f"{'; offset from these samples' if rival.own_offset else ''})"
             for rival, own in pairs
             if rival.held_out
         )

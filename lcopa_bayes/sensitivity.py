@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from math import log10
 from typing import Any, Literal, final
 
 import numpy as np
@@ -17,6 +16,7 @@ from lcopa_bayes.inference.draws import Draws
 from lcopa_bayes.inference.grade import Level
 from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.weights import smoothed, usable_k
 
 Diagnosis = Literal["prior-data conflict", "weak likelihood: the prior decides", "-", "not trusted"]
 
@@ -25,8 +25,6 @@ THRESHOLD = 0.05
 shift of the mean by about a quarter of a standard deviation per doubling of the power."""
 ALPHAS = (0.99, 1.01)
 """Powers at which the posterior is compared with itself [-]."""
-LARGEST_K = 0.7
-"""Largest Pareto k of usable importance weights [-] (Vehtari et al. 2024, JMLR 25)."""
 _PORTION = 64
 """Draws whose likelihood is evaluated at once."""
 _STRETCHES = 5
@@ -118,7 +116,7 @@ def power_scaled(
     distance is never negative, so near 0 it is too large by about its error.
     """
     prior, likelihood = (_scale(values, density) for density in (log_prior, log_likelihood))
-    limit = min(LARGEST_K, 1 - 1 / log10(max(log_prior.size, 2)))
+    limit = usable_k(log_prior.size)
     found = []
     for k, (name, grade) in enumerate(zip(names, grades, strict=True)):
         (a, a_error), (b, b_error) = ((side.value[k], side.error[k]) for side in (prior, likelihood))
@@ -214,14 +212,11 @@ def _scale(values: Array, log_density: Matrix) -> _Scale:
 
 def _weights(log_density: Matrix, alpha: float) -> tuple[Matrix, float]:
     """Normalised weights that raise a density to the power alpha, smoothed, and their Pareto k."""
-    raw = (alpha - 1) * log_density
-    largest = np.sort(raw.ravel())[-max(5, raw.size // 50) :]
-    if largest[-1] - largest[0] <= 1e-12:  # many equal largest weights, as of a density with a plateau
-        weights, k = np.exp(raw - raw.max()), np.nan
-    else:
-        weights = np.exp(array_stats.power_scale_lw(log_density, alpha=alpha, axis=(0, 1)))  # type: ignore[no-untyped-call]
-        r_eff = float(array_stats.ess(log_density, method="tail", prob=(0.05, 0.95), relative=True))  # type: ignore[no-untyped-call]
-        k = float(array_stats.psislw(-raw, r_eff=r_eff, axis=(0, 1))[1])  # type: ignore[no-untyped-call]
+    r_eff = float(array_stats.ess(log_density, method="tail", prob=(0.05, 0.95), relative=True))  # type: ignore[no-untyped-call]
+    log_weights, k = smoothed((alpha - 1) * log_density.ravel(), r_eff=r_eff)
+    if np.isnan(k):  # many equal largest weights, as of a density with a plateau
+        return np.exp(log_weights).reshape(log_density.shape), k
+    weights = np.exp(array_stats.power_scale_lw(log_density, alpha=alpha, axis=(0, 1)))  # type: ignore[no-untyped-call]
     return weights / weights.sum(), k
 
 

@@ -36,8 +36,9 @@ class HeadingSettings:
 
     name: str | None = None
     """Also the name of the run folder; None: the name of the study's folder."""
-    time_unit: str = "ms"
-    """s, ms or us: the unit of every time in the study, its priors and its results."""
+    time_unit: str | None = None
+    """s, ms or us: the unit of every time in the study, its priors and its results; None: the unit of the
+    time column of the first fit record."""
     seed: int = 0
     """Seed of every random number of the study."""
 
@@ -45,9 +46,9 @@ class HeadingSettings:
         bad = self.name is not None and not (isinstance(self.name, str) and self.name.strip(" ."))
         bad = bad or any(mark in (self.name or "") for mark in "/\\\0\n")
         problems = [f"`name` must be text fit for a folder; got {self.name!r}"] if bad else []
-        refuse_if(
-            [*problems, *one_of("time_unit", self.time_unit, TIME_UNITS), *whole_number("seed", self.seed, 0)]
-        )
+        if self.time_unit is not None:
+            problems += one_of("time_unit", self.time_unit, TIME_UNITS)
+        refuse_if([*problems, *whole_number("seed", self.seed, 0)])
 
 
 @final

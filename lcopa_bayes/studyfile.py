@@ -149,14 +149,15 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
     records = _read(fit, apart, heading.time_unit, problems)
     if problems:
         raise InputError(problems)
+    time_unit = records["fit"][0].time_unit  # stated, or that of the first fit record
     return Study(
         heading.name or folder.resolve().name,
         folder,
-        heading.time_unit,
+        time_unit,
         heading.seed,
         tuple(records["fit"]),
         tuple(records["held_out"]),
-        replace(model, exposure=float(in_time_unit(model.exposure, "ms", heading.time_unit))),
+        replace(model, exposure=float(in_time_unit(model.exposure, "ms", time_unit))),
         priors,
         noise,
         sampler,
@@ -171,9 +172,10 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
 def load_study(source: Path | Sequence[Path], *, held_out: Sequence[Path] = ()) -> Study:
     """The study in a folder or study file, or a study of default settings made from record files.
 
-    From record files the name is the first stems joined by ``-``, the time unit that of the first file and
-    the seed 0. `held_out` adds records to hold out. Raises InputError with everything wrong in the
-    study file and all its records together; nothing is written.
+    The time unit is the one the study file states, else that of the first fit record; records in other units
+    are converted. From record files the name is the first stems joined by ``-`` and the seed 0. `held_out`
+    adds records to hold out. Raises InputError with everything wrong in the study file and all its records
+    together; nothing is written.
     """
     sources = [Path(source)] if isinstance(source, (str, Path)) else [Path(path) for path in source]
     apart = [Path(path) for path in held_out]

@@ -17,7 +17,7 @@ ORDER = (
     ("record",),
     ("settings",),
     ("candidatesettings",),
-    ("study",),
+    ("study", "rest"),
     ("studyfile",),
     ("operational",),
     ("plant",),
@@ -45,7 +45,7 @@ ORDER = (
 """Rows from the door to the command line; a module imports only from rows above its own, or from its
 own folder."""
 PLOTTING = {"matplotlib", "corner"}
-LONGEST = 250
+LONGEST = 400
 
 
 def row_of(part: str) -> int:

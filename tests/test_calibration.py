@@ -18,20 +18,22 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 from small import ONE, TRUTH, TWO, problem, record, row_values, study
+from test_importance import same_quantiles
 from test_verbs import check_page
 
 from lcopa_bayes.bench.command import on_off
 from lcopa_bayes.calibration.calibrate import Calibration, calibrate
 from lcopa_bayes.calibration.coverage import Coverage
 from lcopa_bayes.calibration.ranks import bin_limits, corridor, p_uniform, rank_of
-from lcopa_bayes.calibration.replica import RANKED, Failure, Outcome, Replication, holds
+from lcopa_bayes.calibration.replica import ENGINES, RANKED, Failure, Outcome, Replication, holds
 from lcopa_bayes.calibration.simulated import command_of, device_of, exact_responses, measured, model_gap
 from lcopa_bayes.calibration.store import Store
 from lcopa_bayes.calibration.summary import results
-from lcopa_bayes.calibration.truths import Truths, truths_around
+from lcopa_bayes.calibration.truths import Truths, truths_around, truths_stated
 from lcopa_bayes.cli import main
 from lcopa_bayes.fit import fit, plan_of
 from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.inference.data import Samples
 from lcopa_bayes.problems import InputError
 from lcopa_bayes.record import Record, save_record
 from lcopa_bayes.runfolder import save_fit
@@ -261,7 +263,7 @@ def test_priors_stay_the_studys_own(monkeypatch):
 
     seen = []
     monkeypatch.setattr(replica, "sample", lambda posterior, plan: seen.append((posterior, plan)) or 1 / 0)
-    made = replication(study(record(camera=0.6), noise="white", sampler=BRIEF))
+    made = replace(replication(study(record(camera=0.6), noise="white", sampler=BRIEF)), engine="sampling")
     for number in (0, 1):
         assert isinstance(made.attempt(number), Failure)
     (first, plan), (second, other) = seen
@@ -326,6 +328,100 @@ def test_a_replica_that_fails_is_told(monkeypatch, alone):
     monkeypatch.setattr(Replication, "__call__", dead)
     with pytest.raises(InputError, match="not one of 2 replicas"):
         calibrate(STUDY, replicas=2)
+
+
+# -- engines ---------------------------------------------------------------------------------------
+
+
+def test_both_engines_give_a_replica_the_same_posterior():
+    told = study(record(camera=0.6), noise="white", sampler={"ensembles": 2, "walkers": 32})
+    found = {}
+    for engine in ENGINES:
+        made = replace(replication(told), engine=engine)
+        seed = made.seed_of(0)
+        truth = made.truths.draw(np.random.default_rng(1))
+        truth[made.problem.posterior.table.of_kind("sigma")] = 0.02
+        noise = np.random.default_rng(2)
+        records = measured(made.problem, truth, exact_responses(made.problem, truth), noise)
+        samples = tuple(Samples.of(one, made.problem.scales.period) for one in records)
+        posterior = replace(made.problem.posterior, samples=samples)
+        draws, used, k = made._inferred(posterior, seed, np.random.default_rng(3))
+        assert used == engine
+        assert (k is not None) == (engine == "importance")
+        assert draws.grade.level == "reliable"
+        found[engine] = draws
+    assert same_quantiles(found["importance"], found["sampling"])
+
+
+def test_weights_that_are_not_good_lead_to_the_ensembles(alone, monkeypatch):
+    assert results(alone)["engine"]["importance"] == 3
+    monkeypatch.setattr("lcopa_bayes.inference.importance.LEAST_EFFICIENCY", 9.0)
+    made = calibrate(STUDY, replicas=2)
+    counted = results(made)["engine"]
+    assert (counted["wanted"], counted["importance"], counted["sampling"]) == ("importance", 0, 2)
+    assert all(outcome.pareto_k is not None for outcome in made.outcomes)
+    forced = calibrate(STUDY, replicas=2, engine="sampling")
+    assert [replace(o, seconds=0.0, pareto_k=None) for o in made.outcomes] == [
+        replace(o, seconds=0.0) for o in forced.outcomes
+    ]
+    assert results(forced)["engine"]["largest_k"] is None
+
+
+# -- a stated truth --------------------------------------------------------------------------------
+
+
+STATED = {"gain": 2.1, "time_1": 1.4, "offset": 0.3, "sigma": 0.1}
+
+
+def test_a_stated_truth_is_the_same_in_every_replica():
+    made = calibrate(STUDY, replicas=3, truth=STATED)
+    names = [quantity.name for quantity in made.replication.quantities]
+    for outcome in made.outcomes:
+        assert {name: outcome.truths[names.index(name)] for name in STATED} == STATED
+    assert len({outcome.ranks for outcome in made.outcomes}) == 3  # the noise differs
+    told = results(made)
+    assert told["truths"] == {"from": "stated", "folder": None, "grade": None, "stated": STATED}
+    assert "The truth was the same in every replica" in told["verdict"]
+    assert "Ranks are" not in told["verdict"]
+    json.dumps(told, allow_nan=False)
+
+
+def test_what_is_not_stated_is_drawn_from_the_prior():
+    made = calibrate(STUDY, replicas=2, truth={"time_1": 1.4})
+    at = [quantity.name for quantity in made.replication.quantities].index("time_1")
+    assert [outcome.truths[at] for outcome in made.outcomes] == [1.4, 1.4]
+    assert made.outcomes[0].truths[0] != made.outcomes[1].truths[0]
+    assert results(made)["truths"]["from"] == "stated and prior"
+
+
+def test_a_stated_order_keeps_the_terms_in_their_order():
+    table = problem(record(), terms=2).posterior.table
+    truths = truths_stated({"order_1": 1.0}, table)
+    drawn = np.array([truths.draw(np.random.default_rng(seed)) for seed in range(20)])
+    assert (drawn[:, table.at("order", 0, 0)] == 1.0).all()
+    assert (drawn[:, table.at("order", 0, 1)] < 1.0).all()
+    with pytest.raises(InputError, match="state them all"):
+        truths_stated({"order_1": 0.5, "order_2": 0.9}, table)
+
+
+@pytest.mark.parametrize(
+    ("truth", "said"),
+    [
+        ({"delay": 1.0}, "'delay' is stated, but this study does not infer it"),
+        ({"gian": 1.0}, "gain"),
+        ({"time_1": 9.0}, "time_1 = 9 is excluded by the prior"),
+    ],
+)
+def test_a_truth_that_cannot_be_is_refused(truth, said):
+    with pytest.raises(InputError, match=said):
+        calibrate(STUDY, replicas=1, truth=truth)
+
+
+def test_a_store_of_another_truth_or_engine_is_refused(tmp_path):
+    calibrate(STUDY, replicas=1, folder=tmp_path, truth=STATED)
+    for options in ({}, {"truth": STATED | {"gain": 2.2}}, {"truth": STATED, "engine": "sampling"}):
+        with pytest.raises(InputError, match="made from other records"):
+            calibrate(STUDY, replicas=1, folder=tmp_path, resume=True, **options)
 
 
 # -- the same numbers however they are made --------------------------------------------------------
@@ -426,7 +522,8 @@ def test_truths_around_a_posterior_are_its_draws(fitted):
     assert truth[table.at("delay", 0)] == TRUTH["delay"]
     made = calibrate(STUDY, replicas=1, around=fitted)
     told = results(made)
-    assert told["truths"] == {"from": "posterior", "folder": str(fitted), "grade": truths.grade}
+    source = {"from": "posterior", "folder": str(fitted), "grade": truths.grade, "stated": None}
+    assert told["truths"] == source
     assert "inferred under the prior of the study" in told["verdict"]
     assert made.replication.truths.digest
 
@@ -470,7 +567,10 @@ def gathered(
         inside = tuple((bool(abs(u - 0.5) < 0.25), bool(abs(u - 0.5) < 0.45)) for u in at)
         ranks = tuple(int(u * (RANKED + 1)) for u in at)
         outcomes.append(
-            Outcome(number, made.seed_of(number), grade, "why", 400.0, 1.0, 0.1, tuple(at), ranks, inside)
+            Outcome(
+                *(number, made.seed_of(number), grade, "why", 400.0, 1.0, 0.1),
+                *(tuple(at), ranks, inside, "importance", 0.1, 1, 0.02, True),
+            )
         )
     return Calibration(made, tuple(outcomes), ())
 
@@ -505,12 +605,12 @@ def test_intervals_that_are_too_narrow_are_named(rng):
     assert "gain" not in told["verdict"]
 
 
-def test_few_or_unreliable_replicas_are_graded_so(rng, alone):
+def test_few_or_unreliable_replicas_are_graded_so(rng):
     made = replication()
     assert results(gathered(rng, made, 20))["grade"] == "tentative"
     assert results(gathered(rng, made, 60, reliable=0.8))["grade"] == "tentative"
     assert results(gathered(rng, made, 60, reliable=0.3))["grade"] == "unusable"
-    told = results(alone)
+    told = results(calibrate(STUDY, replicas=3, engine="sampling"))
     assert told["grade"] == "unusable"
     assert told["reliable"] is None
     assert told["replicas"] == 3
@@ -590,6 +690,11 @@ def test_a_killed_calibration_resumes_to_the_same_result(written, tmp_path):
         (("--replicas", 0), "`replicas` must be a whole number from 1"),
         (("--replicas", -3), "`replicas`"),
         (("--around", "nowhere"), "holds no posterior.nc"),
+        (("--around", "nowhere", "--truth", "gain=2"), "both say where truths come from"),
+        (("--truth", "gain"), "--truth gain: give NAME=VALUE"),
+        (("--truth", "gain=2", "gain=3"), "--truth gain=3: give NAME=VALUE, a number, each name once"),
+        (("--truth", "gain=nan"), "--truth gain=nan"),
+        (("--truth", "gian=2"), "gain"),
         (("--dask", "tcp://127.0.0.1:1"), "no Dask scheduler answers there"),
         (("--dask", "not an address"), "no Dask scheduler answers there"),
     ],

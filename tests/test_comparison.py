@@ -8,7 +8,7 @@ from math import log
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
-from scipy.stats import multivariate_normal, norm
+from scipy.stats import norm
 from small import Toy, problem, record
 
 from lcopa_bayes.comparison.carry import carried
@@ -17,11 +17,9 @@ from lcopa_bayes.comparison.differences import stretches, total_sd
 from lcopa_bayes.comparison.integerorder import savage_dickey
 from lcopa_bayes.comparison.judgement import judged
 from lcopa_bayes.comparison.parts import CUTS, parts_of, predicted, without
-from lcopa_bayes.comparison.prediction import _densities
 from lcopa_bayes.comparison.priorwidth import _scaled
 from lcopa_bayes.comparison.stacking import probabilities, stacking_weights
 from lcopa_bayes.estimate import Estimate
-from lcopa_bayes.inference.noise import AR1, Student, White
 from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.priors import Prior
 
@@ -82,6 +80,23 @@ def test_far_from_the_integer_the_tail_is_normal_and_says_so(rng):
     assert found.road == "normal tail"
     assert found.answer == "not an integer"
     assert abs(found.log_bayes_factor - norm.logpdf(1, 0.8, 0.02) - log(2)) < 4 * found.log_sd
+
+
+@pytest.mark.parametrize("sd", [0.0005, 0.0008, 0.002])
+@pytest.mark.parametrize("apart", [0.0, 3.0, 6.0])
+def test_a_sharply_known_order_is_not_an_integer_because_it_is_near_one(rng, sd, apart):
+    """Windows follow the posterior however narrow: 6 standard deviations off are 6 standard deviations."""
+    draws, prior = rng.normal(1 + apart * sd, sd, 4_000), rng.uniform(0, 2, 200_000)
+    found = savage_dickey(draws, prior, estimate(draws, 4_000))
+    exact = norm.logpdf(apart) - log(sd) + log(2)
+    assert abs(found.log_bayes_factor - exact) < 4 * found.log_sd + 0.02
+    assert found.answer == {0.0: "integer", 3.0: "integer", 6.0: "not an integer"}[apart]
+
+
+def test_draws_that_do_not_vary_say_nothing(rng):
+    draws = np.ones(4_000)
+    found = savage_dickey(draws, rng.uniform(0, 2, 200_000), estimate(draws, 4_000))
+    assert (found.road, found.answer) == ("undefined", "undecided")
 
 
 def test_an_order_at_an_end_of_its_domain_is_compared_with_the_prior_there(rng):
@@ -152,28 +167,6 @@ def test_of_one_record_the_future_is_predicted_stretch_by_stretch():
     for part in parts:
         known = without(one.posterior, part)
         assert known.size == part.known
-
-
-def test_correlated_noise_remembers_the_last_known_sample(rng):
-    """Against the conditional of the joint normal distribution."""
-    sigma, rho, n = 0.7, 0.8, 6
-    gaps = np.array([1.0, 1.0, 2.0, 1.0, 0.5, 1.0])
-    at = np.cumsum(gaps)
-    covariance = sigma**2 * rho ** np.abs(at[:, None] - at)
-    residual = rng.multivariate_normal(np.zeros(n), covariance)
-    chosen = np.array([3, 4, 5])
-    told = _densities(AR1(), residual[None], np.array([[sigma, rho]]), gaps, chosen, 3)[0]
-    for value, k in zip(told, chosen, strict=True):
-        pair = np.ix_([2, k], [2, k])
-        joint = multivariate_normal.logpdf(residual[[2, k]], cov=covariance[pair])
-        assert value == pytest.approx(joint - norm.logpdf(residual[2], scale=sigma), rel=1e-10)
-    alone = _densities(AR1(), residual[None], np.array([[sigma, rho]]), gaps, chosen, 0)[0]
-    np.testing.assert_allclose(alone, norm.logpdf(residual[chosen], scale=sigma))
-    for noise, row in ((White(), [[sigma]]), (Student(), [[sigma, 5.0]])):
-        plain = noise.pointwise(residual[None], np.array(row), gaps)[0, chosen]
-        np.testing.assert_allclose(
-            _densities(noise, residual[None], np.array(row), gaps, chosen, 3)[0], plain
-        )
 
 
 def test_the_error_of_a_total_knows_that_neighbours_err_together():
@@ -250,6 +243,14 @@ def test_orders_and_noise_keep_their_priors():
 # -- decisions -------------------------------------------------------------------------------------
 
 
+def prior_widths(half: float | None, twice: float | None) -> list[dict]:
+    """Log evidence under priors half and twice as wide; None: it could not be had."""
+    return [
+        {"factor": factor, "log_evidence": value, "sd": None if value is None else 0.1}
+        for factor, value in ((0.5, half), (2.0, twice))
+    ]
+
+
 def card(name: str, evidence: float | None, lpd: float, **told: object) -> dict:
     """A card whose 40 predicted samples share `lpd` evenly, with a small fixed wobble."""
     wobble = 0.01 * np.sin(np.arange(40.0) * (1 + len(name)))
@@ -265,7 +266,7 @@ def card(name: str, evidence: float | None, lpd: float, **told: object) -> dict:
         "log_evidence": evidence,
         "log_evidence_sd": None if evidence is None else 0.1,
         "evidence_undefined": "",
-        "prior_widths": [],
+        "prior_widths": [] if evidence is None else prior_widths(evidence, evidence),
         "pointwise": {
             "part": ["b"] * 40,
             "axis": ["y"] * 40,
@@ -278,6 +279,7 @@ def card(name: str, evidence: float | None, lpd: float, **told: object) -> dict:
         "fit_scores": scores,
         "held_out": [],
         "order_is_integer": [],
+        "containment": {"contains": [], "sampled_again": False, "met": True},
     }
     return base | told
 
@@ -344,10 +346,28 @@ def test_a_fractional_win_needs_evidence_and_prediction():
 
 
 def test_a_win_that_hangs_on_the_prior_is_not_claimed():
-    wide = {"factor": 2.0, "log_evidence": 1.0, "sd": 0.1}
-    free = card("free", 20.0, 10.0, parameters=6, prior_widths=[wide])
-    whole = card("first-order", 0.0, 0.0, prior_widths=[wide | {"log_evidence": 0.0}])
+    free = card("free", 20.0, 10.0, parameters=6, prior_widths=prior_widths(20.0, 1.0))
+    whole = card("first-order", 0.0, 0.0)
     assert outcome(free, whole)["fractional"]["verdict"] == "not shown"
+
+
+@pytest.mark.parametrize(("half", "twice", "said"), [(None, 20.0, "0.5"), (20.0, None, "2")])
+def test_a_width_that_could_not_be_computed_is_told_and_no_win_claimed(half, twice, said):
+    """Such a width is no width at which the win holds."""
+    whole = card("first-order", 0.0, 0.0)
+    known = outcome(card("free", 20.0, 10.0, parameters=6, prior_widths=prior_widths(20.0, 19.0)), whole)
+    assert known["fractional"]["verdict"] == "warranted"
+    assert "least over priors half and twice as wide +19.0" in known["fractional"]["sentence"]
+    free = card("free", 20.0, 10.0, parameters=6, prior_widths=prior_widths(half, twice))
+    found = outcome(free, whole)["fractional"]
+    assert found["verdict"] == "not shown"
+    assert f"under priors {said} times as wide free gave no evidence" in found["sentence"]
+    other = outcome(
+        card("free", 20.0, 10.0, parameters=6), whole | {"prior_widths": prior_widths(half, twice)}
+    )
+    assert "first-order gave no evidence" in other["fractional"]["prior_widths_unknown"][0]
+    lost = outcome(card("free", -20.0, -20.0, parameters=6, prior_widths=prior_widths(half, twice)), whole)
+    assert lost["fractional"]["verdict"] == "not warranted"
 
 
 def test_a_high_order_over_a_residual_that_is_not_white_is_flagged():

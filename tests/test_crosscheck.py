@@ -15,7 +15,7 @@ from lcopa_bayes.cli import main
 from lcopa_bayes.fit import Fit, fit
 from lcopa_bayes.inference.crosscheck import ALARM, CrossCheck, holm
 from lcopa_bayes.inference.draws import Draws
-from lcopa_bayes.inference.grade import Grade, Quality
+from lcopa_bayes.inference.grade import Grade, Quality, limited
 from lcopa_bayes.inference.nested import Nested, NestedPlan
 from lcopa_bayes.problems import InputError
 from lcopa_bayes.record import save_record
@@ -131,20 +131,20 @@ def test_holm_by_hand():
 )
 def test_disagreement_lowers_a_grade_by_one(before, after):
     grade = Grade(before, "the reason before")
-    lowered = CrossCheck.of(ours(), shifted(0.5)).lowered(grade)
+    lowered = limited(grade, CrossCheck.of(ours(), shifted(0.5)).limitations(grade))
     assert lowered.level == after
     assert "order_2" in lowered.reason
     assert "sample more steps" in lowered.reason
     assert "the reason before" in lowered.reason
-    assert CrossCheck.of(ours(), theirs()).lowered(grade) is grade
+    assert CrossCheck.of(ours(), theirs()).limitations(grade) == ()
 
 
-def test_no_number_of_capped_draws_is_graded_better():
+def test_no_number_of_limited_draws_is_graded_better():
     draws = ours()
     assert draws.grade.level == "reliable"
-    capped = replace(draws, cap=CrossCheck.of(draws, shifted(0.5)).lowered(draws.grade))
-    assert capped.grade is capped.cap
-    assert {estimate.grade for estimate in capped.estimates()} == {"tentative"}
+    doubtful = draws.limited(CrossCheck.of(draws, shifted(0.5)).limitations(draws.grade))
+    assert doubtful.grade.level == "tentative"
+    assert {estimate.grade for estimate in doubtful.estimates()} == {"tentative"}
     assert {estimate.grade for estimate in draws.estimates()} == {"reliable"}
 
 
@@ -164,7 +164,7 @@ def checked() -> Fit:
 def test_a_simple_posterior_passes(checked):
     assert checked.cross_check is not None
     assert checked.cross_check.agrees
-    assert checked.draws.cap is None
+    assert not [one for one in checked.draws.limitations if "ested" in one.reason]
     assert "Nested sampling, an independent method, agrees" in verdict(checked)
     told = results(checked)["cross_check"]
     assert json.loads(json.dumps(told, allow_nan=False)) == told

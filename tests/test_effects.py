@@ -50,7 +50,7 @@ def two_axes() -> tuple[Effected, np.ndarray, list[np.ndarray]]:
     """Base model of two records, its values, and its responses by `predict`."""
 
     def path(gain: float, terms: tuple[tuple[float, float], ...]) -> TransferPath:
-        return TransferPath(gain, 0.43, tuple(t**a for t, a in terms), tuple(a for _, a in terms), 1.0)
+        return TransferPath(gain, 0.3873, tuple(t**a for t, a in terms), tuple(a for _, a in terms), 1.0)
 
     direct, cross = ((1.2, 1.7), (1.6, 0.7)), ((2.0, 0.9),)
     axes = (Axis("x", "rad"), Axis("y", "rad"))
@@ -70,7 +70,7 @@ def two_axes() -> tuple[Effected, np.ndarray, list[np.ndarray]]:
         "gain": lambda p: paths[p.first][p.second].gain,
         "time": lambda p: (direct, cross)[p.first][p.second][0],
         "order": lambda p: (direct, cross)[p.first][p.second][1],
-        "delay": lambda p: 0.43,
+        "delay": lambda p: 0.3873,
         "offset": lambda p: 0.1,
     }
     values = np.array([told.get(row.kind, lambda p: 0.01)(row.place) for row in table.rows])

@@ -47,6 +47,17 @@ def test_predicts_the_record_it_never_saw(fitted):
     assert all(left.p_white > 1e-3 for left in fitted.residuals)
 
 
+def test_scores_say_what_kind_of_band_and_from_how_many_samples_the_offset_comes(fitted):
+    (told,) = results(fitted)["held_out"]
+    assert (told["bands"], told["offset_samples"]) == ("pointwise", 7)  # samples until 1.3, one per 0.2
+    assert "pointwise 90 % band" in verdict(fitted)
+    assert "constant error" not in verdict(fitted)
+    alone = [replace(b, offset_samples=b.time.size) if b.held_out else b for b in fitted.bands]
+    said = verdict(replace(fitted, bands=tuple(alone)))
+    assert "(offset from these samples)" in said
+    assert "A constant error of a record whose offset comes from its scored samples cannot show." in said
+
+
 def test_results_have_the_keys_that_other_tools_rely_on(fitted):
     told = results(fitted)
     assert {

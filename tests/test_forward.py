@@ -77,7 +77,7 @@ def test_reference_of_the_paper_at_1024_blocks():
     read = gain * respond(both, path.delay, UNIT_STEP, times, blocks=1024)
     off = [(read[round(2 * t) - 1] - value) / gain for t, value in exact.items()]
     assert np.abs(off).max() < 1e-5  # 6.3e-6 at 3.5, right after the onset
-    assert np.abs(off[2:]).max() < 2e-6
+    assert np.abs(off[2:]).max() < 3e-6
 
 
 @pytest.mark.parametrize(
@@ -109,8 +109,9 @@ def test_step_responses_are_second_order(element):
         exact = on_bench(element, 0.0, step(1.0), times)
     errors = [
         np.abs(respond(element, 0.0, UNIT_STEP, times, blocks=blocks) - exact).max()
-        for blocks in (125, 250, 500, 1000)
+        for blocks in (250, 500, 1000, 2000)
     ]
+    assert errors[0] < 7e-5
     assert 1.9 < order_of(errors) < 2.1
 
 
@@ -171,8 +172,8 @@ def test_exposure_agrees_with_the_bench(exposure):
         np.abs(respond(KELVIN, 2.2, drive_of(command), times, blocks=blocks, exposure=exposure) - exact).max()
         for blocks in (250, 500, 1000, 2000, 4000)
     ]
-    assert errors[2] < 1e-4
-    assert 1.6 < order_of(errors) < 2.4
+    assert errors[0] < 5e-5
+    assert 1.6 < order_of(errors[2:]) < 2.4
 
 
 def test_irregular_samples_agree_with_the_bench(rng):
@@ -271,7 +272,9 @@ def two_axes(share: str, delay: str, rng: np.random.Generator) -> tuple[ForwardM
     orders = tuple(
         np.column_stack([rng.uniform(1.2, 1.9, batch), rng.uniform(0.4, 1.0, batch)]) for _ in times
     )
-    delays = rng.uniform(0.192, 0.208, (batch, len(layout.delays)))  # between two edges
+    delays = rng.uniform(
+        0.2630, 0.2636, (batch, len(layout.delays))
+    )  # no sample on an onset or where levels meet
     return model, Dynamics(times, orders, delays)
 
 

@@ -99,6 +99,7 @@ def test_errors_fall_to_the_noise_floor(bent):
     assert after < before
     assert after < 1.15
     assert 0.8 < told["after"]["held_out_coverage_90"] < 0.97
+    assert told["after"]["held_out_level_from"] == ["the fit records"]  # one offset for all records
 
 
 def test_what_leaves_is_plain_json_with_grades(bent):

@@ -156,6 +156,21 @@ def test_optima_are_distinct_finite_sorted_and_describe_their_surroundings():
         assert np.linalg.eigvalsh(optimum.covariance).min() > 0
 
 
+@pytest.mark.parametrize("case", ["one path, two terms", "Student noise"])
+def test_the_covariance_is_that_of_the_optimum_itself(case):
+    """Not of the order its terms had on the way, nor of the noise of an earlier round."""
+    posterior = CASES[case]
+    least = LeastSquares(posterior)
+    plant = [k for k, row in enumerate(posterior.sampled) if row in least.columns]
+    columns = [least.columns.index(posterior.sampled[k]) for k in plant]
+    for optimum in find_optima(posterior, np.random.default_rng(0), starts=8):
+        jacobian = least.residual(least.coordinates(optimum.values), optimum.values)[1]
+        unit = np.isfinite(least.bounds[1] - least.bounds[0]).astype(float)
+        exact = np.linalg.pinv(jacobian.T @ jacobian + np.diag(unit), hermitian=True)
+        widths = np.sqrt(np.diag(exact)[columns])
+        assert_allclose(np.sqrt(np.diag(optimum.covariance)[plant]), widths, rtol=1e-3)
+
+
 def test_the_linearised_covariance_is_the_curvature_of_the_log_density():
     posterior = made(record(camera=0.1), priors={"sigma": TRUTH["sigma"]})
     optimum = find_optima(posterior, np.random.default_rng(0), starts=3)[0]
@@ -185,7 +200,7 @@ def test_terms_that_cannot_be_exchanged_stay_in_order(priors):
         start = start.copy()
         start[posterior.table.of_kind("sigma")] = 0.05
         ends.append(least.solve(start)[0])
-    assert posterior.table.ordered(np.array(ends)).all()
+    assert posterior.table.supported(np.array(ends)).all()
     assert find_optima(posterior, rng, starts=4)
 
 

@@ -109,7 +109,8 @@ def test_an_offset_is_read_from_samples_before_the_drive_acts():
     (band,) = predicted(held, count=2000)
     assert band.offset_from == "samples before the drive acts"
     quiet_samples = band.observed[band.time <= 4.05]
-    assert quiet_samples.size == 21
+    assert quiet_samples.size == band.offset_samples == 21
+    assert not band.own_offset
     drawn = band.plant[:, 0]  # at rest under zero drive the plant shows its offset alone
     error = TRUTH["sigma"] / np.sqrt(21)
     assert drawn[2] == pytest.approx(quiet_samples.mean(), abs=4 * 1.25 * error / np.sqrt(2000))
@@ -122,7 +123,9 @@ def test_an_offset_without_quiet_samples_is_integrated_out():
     held = Record("held", held.time, held.drive, np.where(held.time[:, None] > 0.05, held.response, np.nan),
                   held.drive_axes, held.response_axes, held.time_unit)  # fmt: skip
     (band,) = predicted(held)
-    assert band.offset_from == "integrated out given the held-out record itself"
+    assert band.offset_from == "all samples of the held-out record, none of which is before the drive acts"
+    assert band.own_offset
+    assert band.offset_samples == band.time.size
     assert np.abs(band.plant[2] - band.observed).max() < 6e-3
     assert np.ptp(band.plant, axis=0).max() < 8 * TRUTH["sigma"] / np.sqrt(band.time.size)
 
@@ -130,14 +133,15 @@ def test_an_offset_without_quiet_samples_is_integrated_out():
 def test_a_drive_that_never_moves_is_all_quiet():
     held = record(2, device=replace(ONE, offsets=(0.4,)), command=quiet(0.5), noise_sd=0.0, name="held")
     (band,) = predicted(held)
-    assert band.offset_from == "samples before the drive acts"
+    assert "whose drive does not change" in band.offset_from
+    assert band.own_offset
     assert_allclose(band.plant[2], 0.4 + 0.5 * TRUTH["gain"], atol=2e-3)
 
 
 def test_no_offset_is_no_offset():
     held = record(2, device=replace(ONE, offsets=(0.0,)), noise_sd=0.0, name="held")
     (band,) = predicted(held, offset="none")
-    assert band.offset_from == "no offset"
+    assert (band.offset_from, band.offset_samples) == ("no offset", 0)
     assert np.abs(band.plant[2] - band.observed).max() < 5e-3
 
 

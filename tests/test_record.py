@@ -72,7 +72,7 @@ def test_times_are_converted(tmp_path, column, unit, time):
     path = written(tmp_path, GOOD.replace("time_ms", f"time_{column}"))
     got = load_record(path, unit)
     assert (got.time[2], got.time_unit) == (time, unit)
-    assert load_record(path, None).time_unit == column
+    assert load_record(path).time_unit == column
 
 
 BAD_CELLS = [

@@ -233,6 +233,8 @@ def test_captions_carry_scores_and_mark_held_out_records(html):
     assert "held out</span>" not in fitted
     assert "held out</span>" in held
     assert "Offset: integrated out." in held
+    assert all("pointwise 90\u00a0% band" in caption for caption in (fitted, held))
+    assert any("median, pointwise 50 and 90\u00a0% bands" in caption for caption in captions)
     assert any("p\u00a0=\u00a03.2×10⁻⁷, not white" in c for c in captions)  # noqa: RUF001
 
 

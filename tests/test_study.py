@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy import stats
 
+from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.problems import InputError
 from lcopa_bayes.record import Axis
 from lcopa_bayes.settings import (
@@ -63,6 +65,56 @@ def test_three_lines_are_a_study(tmp_path):
 
 def test_an_empty_study_file_is_a_study(tmp_path):
     assert load_study(folder_of(tmp_path, "")).name == "bench"
+
+
+SECONDS = STEP.replace("time_ms", "time_s")
+
+
+def test_times_are_in_the_unit_of_the_records_unless_the_study_states_one(tmp_path):
+    """A record means the same alone and beside a study file; the exposure stays in ms in the file."""
+    alone = load_study([folder_of(tmp_path, "", step=SECONDS) / "step.csv"])
+    beside = load_study(folder_of(tmp_path, "[model]\nexposure_ms = 250\n", step=SECONDS))
+    stated = load_study(
+        folder_of(tmp_path, '[study]\ntime_unit = "ms"\n[model]\nexposure_ms = 250\n', step=SECONDS)
+    )
+    assert (alone.time_unit, beside.time_unit, stated.time_unit) == ("s", "s", "ms")
+    for study, last, exposure in ((alone, 1.5, 0.0), (beside, 1.5, 0.25), (stated, 1500.0, 250.0)):
+        assert study.fit[0].time_unit == study.time_unit
+        assert study.fit[0].time[-1] == last
+        assert study.model.exposure == exposure
+
+
+def test_priors_of_a_study_are_in_the_unit_of_its_records(tmp_path):
+    """Default priors and stated ones speak of the same seconds: the study in ms has them a thousandfold."""
+
+    def table(text):
+        study = load_study(folder_of(tmp_path, text, step=LONGER))
+        return {row.name: row for row in problem_of(study).posterior.table.rows}
+
+    own = table("[priors]\ntime_1 = 0.7\n")
+    milli = table('[study]\ntime_unit = "ms"\n[priors]\ntime_1 = 700\n')
+    assert (own["time_1"].unit, own["delay"].unit, milli["delay"].unit) == ("s", "s", "ms")
+    assert (own["time_1"].value, milli["time_1"].value) == (0.7, 700.0)
+    assert milli["delay"].domain[1] == pytest.approx(1000 * own["delay"].domain[1], rel=1e-12)
+
+
+LONGER = "time_s,drive_x_rad,response_x_rad\n0,0,\n" + "".join(f"{k},1,{1 - 0.8**k}\n" for k in range(1, 20))
+
+
+def test_records_in_other_units_are_converted_to_that_of_the_first(tmp_path):
+    folder = folder_of(tmp_path, '[records]\nfit = ["b.csv", "a.csv"]\n', a=STEP, b=SECONDS)
+    study = load_study(folder)
+    assert study.time_unit == "s"
+    assert_allclose(study.fit[1].time, [0, 0.0005, 0.0015], rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "path",
+    sorted((Path(__file__).parents[1] / "studies").rglob("study.toml")),
+    ids=lambda path: path.parent.name,
+)
+def test_bundled_studies_are_in_milliseconds(path):
+    assert load_study(path).time_unit == "ms"
 
 
 FULL = """

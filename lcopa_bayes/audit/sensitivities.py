@@ -9,12 +9,17 @@ import numpy as np
 
 from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.audit.landscape import Landscape
+from lcopa_bayes.inference.noise import Student
+from lcopa_bayes.inference.posterior import Posterior
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Sensitivities:
-    """Derivatives of the samples, made white by the noise model, at one set of values."""
+    """Derivatives of the samples, made white by the noise model, at one set of values.
+
+    Their products are the Fisher information, under Student noise too.
+    """
 
     names: tuple[str, ...]
     matrix: Matrix
@@ -37,9 +42,19 @@ def sensitivities(landscape: Landscape, values: Vector) -> Sensitivities:
     """
     least, rows = landscape.least, landscape.posterior.table.rows
     _, jacobian = least.residual(least.coordinates(values), values)
+    white = jacobian[: landscape.posterior.size]
+    if isinstance(landscape.posterior.noise, Student):
+        white = white * np.sqrt(_information(landscape.posterior, values))[:, None]
     return Sensitivities(
         tuple(rows[k].name for k in least.columns),
-        jacobian[: landscape.posterior.size],
+        white,
         values[least.columns],
         tuple(rows[k].log_scale for k in least.columns),
     )
+
+
+def _information(posterior: Posterior, values: Vector) -> Vector:
+    """Information of every sample over that of a Gaussian of its scale, (samples,) [-]."""
+    nu = [values[posterior.table.at("nu", axis)] for axis in range(len(posterior.table.layout.responses))]
+    sizes = [axis.values.size for samples in posterior.samples for axis in samples.axes]
+    return np.repeat(Student.information(np.tile(nu, len(posterior.samples))), sizes)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import final
@@ -10,10 +11,10 @@ from typing import final
 from tqdm import tqdm
 
 from lcopa_bayes.calibration.crew import crew
-from lcopa_bayes.calibration.replica import Failure, Outcome, Replication
+from lcopa_bayes.calibration.replica import ENGINES, Engine, Failure, Outcome, Replication
 from lcopa_bayes.calibration.store import Store
-from lcopa_bayes.calibration.truths import Truths, truths_around
-from lcopa_bayes.checks import refuse_if, whole_number
+from lcopa_bayes.calibration.truths import Truths, truths_around, truths_stated
+from lcopa_bayes.checks import one_of, refuse_if, whole_number
 from lcopa_bayes.fit import plan_of
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.problems import InputError
@@ -45,6 +46,8 @@ def calibrate(
     *,
     replicas: int,
     around: Path | None = None,
+    truth: Mapping[str, float] | None = None,
+    engine: Engine = "importance",
     jobs: int = 1,
     dask: str | None = None,
     folder: Path | None = None,
@@ -54,20 +57,26 @@ def calibrate(
 ) -> Calibration:
     """Draw truths, simulate the study's records from them, infer, and rank the truths (Talts et al. 2018).
 
-    Truths come from the study's prior, or from the posterior in the run folder `around`. Every replica is
-    inferred with the study's sampler, model and priors, but for at most `ENOUGH` effective draws; priors
-    derived from its records stay as they are. Replica k depends on the study, its seed and k alone: neither
-    on `jobs` processes nor on the cluster at the address `dask`, nor on interruptions. With `folder`,
-    finished replicas are stored in its `replicas/`, and `resume` goes on from them. InputError for input that
-    cannot be used, when a worker is lost, and when not one replica could be done.
+    Truths come from the study's prior, or from the posterior in the run folder `around`; parameters named in
+    `truth` have that value in every replica, each in its unit. Every replica is inferred with the study's
+    model and priors; priors derived from its records stay as they are. Draws come from importance sampling
+    around the optima (`inference.importance`) and, where its weights are not good or `engine` says so, from
+    the study's sampler, for at most `ENOUGH` effective draws. Replica k depends on the study, its seed and k
+    alone: neither on `jobs` processes nor on the cluster at the address `dask`, nor on interruptions. With
+    `folder`, finished replicas are stored in its `replicas/`, and `resume` goes on from them. InputError
+    for input that cannot be used, when a worker is lost, and when not one replica could be done.
     """
-    refuse_if(whole_number("replicas", replicas, 1, MOST))
+    both = ["`around` and `truth` both say where truths come from; give one"] if around and truth else []
+    refuse_if([*whole_number("replicas", replicas, 1, MOST), *one_of("engine", engine, ENGINES), *both])
     problem = problem_of(study)
     table = problem.posterior.table
-    truths = truths_around(around, table) if around is not None else Truths(table)
+    if around is not None:
+        truths = truths_around(around, table)
+    else:
+        truths = truths_stated(truth, table) if truth else Truths(table)
     plan = plan_of(problem, quick=quick)
     plan = replace(plan, target_ess=min(plan.target_ess, ENOUGH))
-    replication = Replication(problem, plan, truths)
+    replication = Replication(problem, plan, truths, engine)
     with crew(replication, jobs=min(jobs, replicas), dask=dask) as perform:
         store = Store.within(folder, replication) if folder is not None else None
         done = store.load(replicas) if store and resume else {}

@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple, final
+from typing import Literal, NamedTuple, final, get_args
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -16,11 +16,14 @@ from lcopa_bayes.calibration.coverage import LEVELS
 from lcopa_bayes.calibration.ranks import rank_of
 from lcopa_bayes.calibration.simulated import device_of, exact_responses, measured, model_gap
 from lcopa_bayes.calibration.truths import Truths
-from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.data import Samples
+from lcopa_bayes.inference.discretisation import discretisation, resolved
 from lcopa_bayes.inference.draws import Draws, gather
+from lcopa_bayes.inference.importance import Effort, ImportancePlan, first_look, weighted_draws
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.sampler import SamplePlan, sample
+from lcopa_bayes.record import Record
 from lcopa_bayes.stepmetrics import StepCurves, step_curves
 
 RANKED = 99
@@ -29,6 +32,12 @@ _SHARES = (0.125, 0.25, 0.5, 1.0)
 """Where step responses are looked at: shares of the time between the longest delay and the span [-]."""
 _LATEST = 0.999
 """Prior probability that a delay is shorter than what counts as the longest [-]."""
+Engine = Literal["importance", "sampling"]
+"""Importance sampling around the optima, with the ensembles where its weights are not good; or always the
+ensembles."""
+ENGINES: tuple[Engine, ...] = get_args(Engine)
+_LOOK = ImportancePlan((Effort(3_000, 1_000, 6), Effort(8_000, 3_000, 6)), starts=3)
+"""Work for importance sampling of a replica."""
 _STREAM = 4
 """Marks the randomness of truth, noise and ranks apart from that of sampling."""
 
@@ -64,6 +73,16 @@ class Outcome:
     """0 to `RANKED`."""
     inside: tuple[tuple[bool, ...], ...]
     """Whether the central interval of each of `LEVELS` holds the truth."""
+    engine: Engine
+    """What gave the draws."""
+    pareto_k: float | None
+    """Of the importance weights [-]; None where none were tried or k is not finite."""
+    refinement: int
+    """How many times narrower the blocks became than the study asks [-]."""
+    shift: float
+    """Largest shift of a posterior mean by the width of the blocks, as the fit measures it [posterior sd]."""
+    resolved: bool
+    """Whether the fit takes that shift for negligible."""
 
 
 @final
@@ -84,6 +103,7 @@ class Replication:
     problem: Problem
     plan: SamplePlan
     truths: Truths
+    engine: Engine = "importance"
 
     def seed_of(self, number: int) -> int:
         """Root of all randomness of a replica."""
@@ -127,17 +147,16 @@ class Replication:
     def __call__(self, number: int) -> Outcome:
         """Draw, simulate, infer, rank."""
         start, seed = time.thread_time(), self.seed_of(number)
-        drawing, noise, ranking = map(np.random.default_rng, np.random.SeedSequence([seed, _STREAM]).spawn(3))
+        streams = np.random.SeedSequence([seed, _STREAM]).spawn(4)
+        drawing, noise, ranking, looking = map(np.random.default_rng, streams)
         truth = self.truths.draw(drawing)
         exact = exact_responses(self.problem, truth)
         records = measured(self.problem, truth, exact, noise)
-        # only the samples change: table and priors stay those the truth comes from, also where the study's
-        # priors were derived from its own records
-        period = self.problem.scales.period
-        posterior = replace(
-            self.problem.posterior, samples=tuple(Samples.of(record, period) for record in records)
-        )
-        draws = gather(posterior, sample(posterior, replace(self.plan, seed=seed)))
+        problem = resolved(self._measured_again(records))
+        posterior = problem.posterior
+        draws, engine, pareto_k = self._inferred(posterior, seed, looking)
+        width = discretisation(problem, draws)
+        draws = draws.limited(width.limitations)
         curves = step_curves(draws, self.problem.scales.span)
         at = [int(np.abs(curves.time - moment).argmin()) for moment in self.step_times]
         true = self._true(posterior, truth, curves.time[at])
@@ -149,7 +168,7 @@ class Replication:
             draws.grade.reason,
             draws.ess,
             time.thread_time() - start,
-            model_gap(self.problem, truth, exact),
+            model_gap(problem, truth, exact),
             tuple(true),
             tuple(
                 rank_of(value, ranking.choice(column, RANKED, replace=False), ranking)
@@ -159,7 +178,35 @@ class Replication:
                 tuple(holds(column, value, level) for level in LEVELS)
                 for value, column in zip(true, drawn, strict=True)
             ),
+            engine,
+            pareto_k,
+            problem.refinement,
+            width.shift,
+            width.negligible,
         )
+
+    def _measured_again(self, records: tuple[Record, ...]) -> Problem:
+        """The problem of a replica's records.
+
+        Where truths are drawn only the samples change: table and priors stay those a truth comes from. A
+        stated truth has no such prior, and default priors are derived from the new records, as a fit does.
+        """
+        study = replace(self.problem.study, fit=records)
+        if self.truths.fixed:
+            return problem_of(study)
+        samples = tuple(Samples.of(record, self.problem.scales.period) for record in records)
+        return replace(self.problem, study=study, posterior=replace(self.problem.posterior, samples=samples))
+
+    def _inferred(
+        self, posterior: Posterior, seed: int, rng: np.random.Generator
+    ) -> tuple[Draws, Engine, float | None]:
+        """Draws, what gave them, and the Pareto k of the importance weights that were tried."""
+        look = first_look(posterior, rng, _LOOK) if self.engine == "importance" else None
+        if look is not None and look.good(self.plan.target_ess):
+            draws = weighted_draws(posterior, look, rng, target_ess=self.plan.target_ess)
+            return draws, "importance", look.pareto_k
+        draws = gather(posterior, sample(posterior, replace(self.plan, seed=seed)))
+        return draws, "sampling", look.pareto_k if look is not None and np.isfinite(look.pareto_k) else None
 
     def _true(self, posterior: Posterior, truth: Vector, times: Vector) -> list[float]:
         """True value of each quantity; step responses by the bench."""

@@ -21,6 +21,7 @@ def store_fingerprint(replication: Replication) -> str:
     told = (
         fingerprint(replication.problem.study, replication.plan),
         replication.truths.digest,
+        replication.engine,
         [list(quantity) for quantity in replication.quantities],
     )
     return hashlib.sha256(json.dumps(told).encode()).hexdigest()

@@ -12,8 +12,11 @@ import pandas as pd
 from lcopa_bayes.calibration.calibrate import Calibration
 from lcopa_bayes.calibration.coverage import LEVELS, Coverage
 from lcopa_bayes.calibration.ranks import SIMULTANEOUS, bin_limits, corridor, p_uniform
-from lcopa_bayes.calibration.replica import RANKED, Outcome, Quantity
+from lcopa_bayes.calibration.replica import ENGINES, RANKED, Outcome, Quantity
+from lcopa_bayes.calibration.truths import Truths
 from lcopa_bayes.estimate import plain
+from lcopa_bayes.inference.discretisation import LARGEST
+from lcopa_bayes.inference.weights import LARGEST_K
 
 _BINS = (20, 10, 5)
 """Bins a rank histogram may have; they divide the `RANKED` + 1 rank values evenly [-]."""
@@ -55,15 +58,25 @@ def results(made: Calibration) -> dict[str, Any]:
         ],
         "failures": [{"replica": f.replica, "seed": f.seed, "error": f.error} for f in made.failures],
         "truths": {
-            "from": "prior" if truths.pool is None else "posterior",
+            "from": _origin(truths),
             "folder": truths.folder or None,
             "grade": truths.grade or None,
+            "stated": dict(truths.stated) or None,
         },
+        "engine": engines(made),
         "model_gap": {
             "unit": "noise scale",
             "median": np.median(gaps),
             "quantile_90": np.quantile(gaps, 0.9),
             "largest": gaps.max(),
+        },
+        "discretisation": {
+            "largest_negligible": LARGEST,
+            "unit": "posterior sd",
+            "negligible": sum(outcome.resolved for outcome in made.outcomes),
+            "median": np.median([outcome.shift for outcome in made.outcomes]),
+            "largest": max(outcome.shift for outcome in made.outcomes),
+            "largest_refinement": max(outcome.refinement for outcome in made.outcomes),
         },
         "seconds": {"total": spent.sum(), "median": np.median(spent), "largest": spent.max()},
     }
@@ -110,6 +123,24 @@ def over(outcomes: Sequence[Outcome], quantities: Sequence[Quantity]) -> dict[st
     }
 
 
+def _origin(truths: Truths) -> str:
+    if truths.pool is not None:
+        return "posterior"
+    return "stated" if truths.fixed else "stated and prior" if truths.stated else "prior"
+
+
+def engines(made: Calibration) -> dict[str, Any]:
+    """Number of replicas that each engine gave the draws of, and the Pareto k of importance weights."""
+    known = [outcome.pareto_k for outcome in made.outcomes if outcome.pareto_k is not None]
+    return {
+        "wanted": made.replication.engine,
+        **{name: sum(outcome.engine == name for outcome in made.outcomes) for name in ENGINES},
+        "largest_good_k": LARGEST_K,
+        "median_k": np.median(known) if known else None,
+        "largest_k": max(known, default=None),
+    }
+
+
 def grades(made: Calibration) -> dict[str, int]:
     """Number of replicas of each grade."""
     found = Counter(outcome.grade for outcome in made.outcomes)
@@ -152,24 +183,35 @@ def verdict(told: dict[str, Any], made: Calibration) -> str:
             f"Coverage of {levels} intervals is within {band} for every one of {parameters} parameters "
             "and every step response."
         ]
+    truths = made.replication.truths
+    if truths.stated:
+        parts.append(
+            f"The truth was {'' if truths.fixed else 'in part '}the same in every replica: coverage is then "
+            "as stated as far as the priors are wide beside the posterior, and ranks need not be uniform."
+        )
+        return " ".join([*parts, *_failed(made)])
     uneven = [row["parameter"] for row in told["ranks"] if len(told["ranks"]) * row["p_value"] < SMALL_P]
     parts.append(
         f"Ranks are not uniform (overall p = {p:.2g}): {', '.join(uneven)}."
         if p < SMALL_P
         else f"Ranks are uniform as far as so many replicas tell (overall p = {p:.2g})."
     )
-    if made.replication.truths.pool is not None:
+    if truths.pool is not None:
         parts.append(
             "Truths came from an earlier posterior while every replica was inferred under the prior of the "
             "study: exact coverage is expected only where that prior is flat over the posterior."
         )
-    if made.failures:
-        first = made.failures[0]
-        parts.append(
-            f"{len(made.failures)} of {made.asked} replicas failed and are not counted, the first being "
-            f"number {first.replica} (seed {first.seed}): {first.error}."
-        )
-    return " ".join(parts)
+    return " ".join([*parts, *_failed(made)])
+
+
+def _failed(made: Calibration) -> list[str]:
+    if not made.failures:
+        return []
+    first = made.failures[0]
+    return [
+        f"{len(made.failures)} of {made.asked} replicas failed and are not counted, the first being "
+        f"number {first.replica} (seed {first.seed}): {first.error}."
+    ]
 
 
 def _percent(share: float) -> str:
@@ -188,6 +230,11 @@ def tables(made: Calibration) -> dict[str, pd.DataFrame]:
                     "grade": o.grade,
                     "smallest_ess": o.ess,
                     "model_gap": o.gap,
+                    "block_shift": o.shift,
+                    "resolved": o.resolved,
+                    "refinement": o.refinement,
+                    "engine": o.engine,
+                    "pareto_k": o.pareto_k,
                     "seconds": o.seconds,
                 }
                 for o in made.outcomes

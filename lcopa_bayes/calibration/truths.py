@@ -1,9 +1,11 @@
-"""Where truths come from: the prior of a study, or the posterior of an earlier run."""
+"""Where truths come from: the prior of a study, the posterior of an earlier run, or stated values."""
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import final
 
@@ -12,7 +14,10 @@ import xarray as xr
 
 from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.inference.parameters import ParameterTable
-from lcopa_bayes.problems import InputError
+from lcopa_bayes.problems import InputError, nearest
+
+_TRIES = 1_000
+"""Draws from the prior within which the orders must once decrease beside stated ones."""
 
 
 @final
@@ -28,18 +33,56 @@ class Truths:
     grade: str = ""
     """Grade of the pool."""
 
+    stated: Mapping[str, float] = field(default_factory=dict)
+    """Values that are the same in every replica, by name, each in its parameter's unit."""
+
     def draw(self, rng: np.random.Generator) -> Vector:
         """One truth: canonical table values, (rows,)."""
-        if self.pool is None:
-            return np.asarray(self.table.draw(1, rng)[0])
-        return np.asarray(self.pool[rng.integers(self.pool.shape[0])])
+        if self.pool is not None:
+            return np.asarray(self.pool[rng.integers(self.pool.shape[0])])
+        for _ in range(_TRIES if self.stated else 1):
+            truth = self.table.draw(1, rng)[0]
+            truth[[self.table.names.index(name) for name in self.stated]] = list(self.stated.values())
+            if self.table.supported(truth[None]).all():
+                return np.asarray(truth)
+        raise InputError("orders drawn from the prior do not decrease beside those stated; state them all")
+
+    @property
+    def fixed(self) -> bool:
+        """Whether every free parameter is stated: one truth, and no randomness in it."""
+        return bool(self.stated) and all(row.name in self.stated for row in self.table.rows if row.free)
 
     @property
     def digest(self) -> str:
-        """Hash of the pool; empty for the prior."""
+        """Hash of the pool or of what is stated; empty for the prior."""
+        if self.stated:
+            return hashlib.sha256(json.dumps(dict(self.stated), sort_keys=True).encode()).hexdigest()
         return (
             "" if self.pool is None else hashlib.sha256(np.ascontiguousarray(self.pool).tobytes()).hexdigest()
         )
+
+
+def truths_stated(stated: Mapping[str, float], table: ParameterTable) -> Truths:
+    """Truths with values that are stated, the other parameters drawn from the prior.
+
+    InputError for a name that is no free parameter, a value the prior excludes, or orders that do not
+    decrease.
+    """
+    rows = {row.name: row for row in table.rows if row.free}
+    problems = [
+        f"the truth of {name!r} is stated, but this study does not infer it{nearest(name, set(rows))}"
+        for name in stated.keys() - rows.keys()
+    ]
+    problems += [
+        f"the truth {name} = {stated[name]:g} is excluded by the prior of the study, {rows[name].prior}"
+        for name in stated.keys() & rows.keys()
+        if not np.isfinite(rows[name].log_prior(np.array([stated[name]]))).all()
+    ]
+    if problems:
+        raise InputError(sorted(problems))
+    truths = Truths(table, stated={name: float(stated[name]) for name in rows if name in stated})
+    truths.draw(np.random.default_rng(0))
+    return truths
 
 
 def truths_around(folder: Path, table: ParameterTable) -> Truths:
@@ -81,7 +124,7 @@ def truths_around(folder: Path, table: ParameterTable) -> Truths:
             problems.append(f"{path}: {name!r} has no draws, or draws that the prior of this study excludes")
         else:
             pool[:, free[name]] = values
-    if not problems and not table.ordered(pool).all():
+    if not problems and not table.supported(pool).all():
         problems.append(f"{path}: has draws whose orders do not decrease, as they must in this study")
     if problems:
         raise InputError([*sorted(problems), f"{folder}: {advice}"])

@@ -16,7 +16,11 @@ DECISIVE = 3.0
 """Bayes factor from which it counts as more than worth a bare mention [-] (Jeffreys 1961, App. B)."""
 _WIDEST = 0.1
 """Widest distance from the integer that counts as at it [-]: no record tells such an order from it."""
-_NARROWEST = 0.005
+_SHARE = 0.25
+"""Half width of the window in posterior standard deviations [-]: 3 of them off, the mean density in it is
+8 % above that at the integer."""
+_PRIOR_NARROWEST = 0.005
+"""Narrowest window in which prior draws are counted [-]: no prior of an order varies within it."""
 _FEWEST = 10.0
 """Effective draws at the integer below which the tail is extrapolated [-]."""
 _PRIOR_DRAWS = 200_000
@@ -86,26 +90,33 @@ def savage_dickey(posterior: Vector, prior: Vector, estimate: Estimate) -> Integ
     """Ratio of posterior to prior density at the integer nearest to the median.
 
     ``B = p(order | y) / p(order)`` there (Dickey 1971, Ann. Math. Statist. 42). Densities are shares of
-    draws within a window of half a posterior standard deviation, 0.005 to 0.1. Where fewer than ten
-    effective draws stand in it, the posterior density is that of a normal distribution of the draws' mean
-    and standard deviation: good enough to say that the integer lies far out, and its error grows with the
-    distance as that of both moments does. `prior` draws are independent; those of the posterior are worth
-    the effective sample size of `estimate`.
+    draws within a window per width of the window: a quarter of a posterior standard deviation, 0.1 at most,
+    for the posterior, and 0.005 at least for the prior. Where fewer than ten effective draws stand in it, the
+    posterior density is that of a normal distribution of the draws' mean and standard deviation: good
+    enough to say that the integer lies far out, and its error grows with the distance as that of both
+    moments does. `prior` draws are independent; those of the posterior are worth the effective sample size
+    of `estimate`. Draws that do not vary leave the ratio undefined.
     """
     nearest = max(1, round(float(np.median(posterior))))
     mean, sd, ess = float(posterior.mean()), float(posterior.std()), max(float(estimate.ess), 2.0)
-    window = float(np.clip(0.5 * sd, _NARROWEST, _WIDEST))
-    after, before = (float(np.mean(np.abs(draws - nearest) <= window)) for draws in (posterior, prior))
-    if before == 0.0:
+    window = min(_SHARE * sd, _WIDEST)
+    wide = max(window, _PRIOR_NARROWEST)
+    after = float(np.mean(np.abs(posterior - nearest) <= window))
+    before = float(np.mean(np.abs(prior - nearest) <= wide))
+    if before == 0.0 or sd == 0.0:
         return IntegerOrder(estimate.name, nearest, np.nan, np.nan, "undefined", window, estimate)
     prior_error = (1 - before) / (before * prior.size)
+    log_prior = log(before / _width(nearest, wide))
     if after * ess >= _FEWEST:
         error = sqrt((1 - after) / (after * ess) + prior_error)
-        value = log(after / before)
+        value = log(after / _width(nearest, window)) - log_prior
         return IntegerOrder(estimate.name, nearest, value, error, "draws at the integer", window, estimate)
     beyond = (nearest - mean) / sd
-    width = min(nearest + window, 2.0) - (nearest - window)  # an order has nothing beyond 2
     density = -0.5 * beyond**2 - log(sd * sqrt(2 * np.pi))
-    value = density + log(width / before)
     error = sqrt(beyond**2 / ess + (beyond**2 - 1) ** 2 / (2 * ess) + prior_error)
-    return IntegerOrder(estimate.name, nearest, value, error, "normal tail", window, estimate)
+    return IntegerOrder(estimate.name, nearest, density - log_prior, error, "normal tail", window, estimate)
+
+
+def _width(nearest: int, window: float) -> float:
+    """Width of a window about an integer, of which nothing lies beyond an order of 2 [-]."""
+    return min(nearest + window, 2.0) - (nearest - window)

@@ -1,32 +1,30 @@
-"""Expected log predictive density of what was left out, and the road by which it was computed."""
+"""Expected log predictive density of what was left out, and the way by which it was computed."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, final
 
 import numpy as np
-from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 from scipy.special import logsumexp
 
-from lcopa_bayes.arrays import Array, Flags, Index, Matrix, Vector
+from lcopa_bayes.arrays import Array, Matrix, Vector
 from lcopa_bayes.comparison.carry import carried
 from lcopa_bayes.comparison.parts import Part, parts_of, predicted, without
+from lcopa_bayes.comparison.sequential import LevelFrom, known_before, level_of, log_densities
 from lcopa_bayes.estimate import plain
 from lcopa_bayes.fit import Fit
-from lcopa_bayes.inference.data import Samples
+from lcopa_bayes.inference.data import Observed, Samples
 from lcopa_bayes.inference.grade import TENTATIVE_RHAT, Level
-from lcopa_bayes.inference.noise import AR1, Noise, White
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.weights import FEWEST_EFFECTIVE, effective, smoothed, usable_k
 from lcopa_bayes.plant.forward import ForwardModel
-from lcopa_bayes.predict import offset_draws, responses
+from lcopa_bayes.predict import responses
 
-LARGEST_K = 0.7
-"""Largest Pareto k of importance weights that are used [-] (Vehtari et al. 2024, JMLR 25)."""
-_FEWEST = 100.0
-"""Effective draws below which importance weights are not used [-]."""
 _DRAWS = 600
 """Draws behind a predictive density."""
+_BEYOND = 3.0
+"""Standard errors by which a density of what was left out may exceed that of what was fitted [-]."""
 
 Road = Literal["exact", "importance weights", "refit"]
 
@@ -42,7 +40,7 @@ class Predicted:
     time: Vector
     """(n,) [time unit]."""
     log_density: Vector
-    """Of each sample given the known samples alone, (n,) [nat]."""
+    """Of each sample given the known samples and those of its record before it, (n,) [nat]."""
     error: float
     """Monte Carlo standard error of the sum, by the spread between parts of the draws [nat]."""
     road: Road
@@ -51,12 +49,29 @@ class Predicted:
     ess: float
     """Draws the densities are worth [-]."""
     rhat: float
-    """Between the ensembles of a refit [-]; NaN on the other roads."""
+    """Between the ensembles of a refit [-]; NaN otherwise."""
+    level_from: tuple[LevelFrom, ...]
+    """Where the level of each axis comes from."""
+    in_sample: float = np.nan
+    """Sum of the densities of the same samples under draws that have seen them [nat]; NaN for what none
+    has seen."""
+    in_sample_error: float = np.nan
+    """Its Monte Carlo standard error [nat]."""
+
+    @property
+    def plausible(self) -> bool:
+        """Whether the density is no larger than where the samples themselves were fitted; else the draws
+        do not stand for the posterior without them."""
+        if np.isnan(self.in_sample):
+            return True
+        excess = float(self.log_density.sum()) - self.in_sample
+        return bool(excess <= _BEYOND * np.hypot(self.error, self.in_sample_error))
 
     def grade(self, fitted: Level) -> Level:
-        """That of the draws, lowered where a refit's populations disagree or are small."""
-        agree = self.road != "refit" or (self.rhat <= TENTATIVE_RHAT and self.ess >= _FEWEST)
-        return fitted if agree or fitted == "unusable" else "tentative"
+        """That of the draws, lowered where a refit's populations disagree or are small, and where what was
+        left out is predicted better than it was fitted."""
+        agree = self.road != "refit" or (self.rhat <= TENTATIVE_RHAT and self.ess >= FEWEST_EFFECTIVE)
+        return fitted if (agree and self.plausible) or fitted == "unusable" else "tentative"
 
     def as_json(self) -> dict[str, Any]:
         """Plain values, without the samples."""
@@ -67,54 +82,71 @@ class Predicted:
                 "samples": self.time.size,
                 "elpd": float(self.log_density.sum()),
                 "monte_carlo_sd": self.error,
+                "in_sample": self.in_sample,
+                "plausible": self.plausible,
                 "road": self.road,
                 "pareto_k": self.pareto_k,
                 "ess": self.ess,
                 "rhat": self.rhat,
+                "level_from": list(dict.fromkeys(self.level_from)),
             }
         )
         return told
 
 
 def predictions(fit: Fit, *, held_out_only: bool = False) -> tuple[Predicted, ...]:
-    """Every part of a fitted study (`parts_of`), each sample given the known samples only.
+    """Every part of a fitted study (`parts_of`), each sample given the known ones (`sequential`).
 
-    ``sum_i log p(y_i | known)``: each sample by itself, since the joint density of a long record is beyond
-    importance sampling. Held-out records come from the draws as they are. What was fitted is taken away
-    again by importance weights when their Pareto k is at most 0.7 and 100 draws or more stay effective, else
-    by a refit (`carry`).
+    ``sum_i log E[p(y_i | y_1 .. y_i-1, theta) | known]``, i over the samples of a part: the log density of
+    one forecast of the record by the posterior of its shared parameters given what is known. Held-out
+    records come from the draws as they are. What was fitted is taken away again by importance weights when
+    their Pareto k is at most 0.7 and 100 draws or more stay effective, else by a refit (`carry`).
     """
     posterior, study = fit.problem.posterior, fit.study
     positions = _walkers(fit)
-    out = []
+    out: list[Predicted] = []
     source = posterior
     for part in parts_of(posterior, [record.name for record in study.held_out]):
         if part.kind == "held-out record":
             samples, model = fit.problem.simulated(study.held_out)
-            values = fit.draws.thinned(_DRAWS)
-            out.append(
-                _scored(fit, part, samples[part.record], _one(model, part.record), values, None, "exact")
-            )
+            scored = _Scored(fit, part, samples[part.record], _one(model, part.record))
+            out.append(scored(fit.draws.thinned(_DRAWS), None, "exact"))
             continue
         if held_out_only:
             continue
-        own, model = posterior.samples[part.record], _one(posterior.model, part.record)
+        scored = _Scored(fit, part, posterior.samples[part.record], _one(posterior.model, part.record))
+        seen = scored(fit.draws.thinned(_DRAWS), None, "exact")
         values = fit.draws.thinned(2 * _DRAWS)
         target = without(posterior, part)
-        weights, k = _weights(posterior, target, values)
-        if k <= LARGEST_K and float(np.exp(-logsumexp(2 * weights))) >= _FEWEST:
-            out.append(_scored(fit, part, own, model, values, weights, "importance weights", k=k))
-            continue
-        seed = fit.run.plan.seed + 7_000 + len(out)
-        found = carried(source, target, positions, seed, jump=False)
-        if part.kind == "future of the record":  # the next part knows still less
-            source, positions = target, found.coordinates[:, :, -1]
-        rng = np.random.default_rng([seed, 5])
-        flat = found.coordinates.reshape(-1, posterior.dimension)
-        chosen = np.linspace(0, len(flat) - 1, min(_DRAWS, len(flat))).astype(int)
-        values = target.complete(flat[chosen], rng)
-        out.append(_scored(fit, part, own, model, values, None, "refit", k=k, ess=found.ess, rhat=found.rhat))
+        weights, k = left_out_weights(posterior, target, values, fit.draws.ess / len(fit.draws.flat))
+        rng = np.random.default_rng([fit.run.plan.seed, 5, len(out)])
+        if k <= usable_k(len(values)) and effective(weights) >= FEWEST_EFFECTIVE:
+            # gains and levels are drawn anew: those of the draws have seen what is to be predicted
+            values = target.complete(posterior.coordinates(values), rng)
+            found = scored(values, weights, "importance weights", k=k)
+        else:
+            seed = fit.run.plan.seed + 7_000 + len(out)
+            moved = carried(source, target, positions, seed, jump=False)
+            if part.kind == "future of the record":  # the next part knows still less
+                source, positions = target, moved.coordinates[:, :, -1]
+            flat = moved.coordinates.reshape(-1, posterior.dimension)
+            chosen = np.linspace(0, len(flat) - 1, min(_DRAWS, len(flat))).astype(int)
+            values = target.complete(flat[chosen], rng)
+            found = scored(values, None, "refit", k=k, ess=moved.ess, rhat=moved.rhat)
+        total = float(seen.log_density.sum())
+        out.append(replace(found, in_sample=total, in_sample_error=seen.error))
     return tuple(out)
+
+
+def left_out_weights(
+    posterior: Posterior, target: Posterior, values: Matrix, r_eff: float = 1.0
+) -> tuple[Vector, float]:
+    """Normalised log weights (draws,) that turn draws of a posterior into draws of one that knows less,
+    smoothed, and their Pareto k.
+
+    Gains and levels that are integrated out do not count: the weights are those of the sampled coordinates.
+    """
+    return smoothed(target.log_likelihood(values) - posterior.log_likelihood(values), r_eff=r_eff)
 
 
 def _one(model: ForwardModel, number: int) -> ForwardModel:
@@ -126,114 +158,68 @@ def _walkers(fit: Fit) -> Array:
     return fit.run.kept()[0][:, :, -1]
 
 
-def _weights(posterior: Posterior, target: Posterior, values: Matrix) -> tuple[Vector, float]:
-    """Smoothed log weights that take the left-out samples away, and their Pareto k."""
-    removed = _log_likelihood(posterior, values) - _log_likelihood(target, values)
-    log_weights, k = array_stats.psislw(-removed)  # type: ignore[no-untyped-call]
-    return np.asarray(log_weights, dtype=float), float(k)
-
-
-def _log_likelihood(posterior: Posterior, values: Matrix) -> Vector:
-    total = np.zeros(len(values))
-    for portion in np.array_split(np.arange(len(values)), max(1, len(values) // 64)):
-        records = posterior.pointwise(values[portion])
-        total[portion] = np.sum([axis.sum(axis=1) for record in records for axis in record], axis=0)
-    return total
-
-
-def _scored(
-    fit: Fit,
-    part: Part,
-    samples: Samples,
-    model: ForwardModel,
-    values: Matrix,
-    log_weights: Vector | None,
-    road: Road,
-    *,
-    k: float = np.nan,
-    ess: float | None = None,
-    rhat: float = np.nan,
-) -> Predicted:
+@final
+@dataclass(frozen=True, eq=False)
+class _Scored:
     """Densities of the samples of a part under weighted draws."""
-    table, noise = fit.draws.table, fit.problem.posterior.noise
-    rng = np.random.default_rng([fit.run.plan.seed, 6, part.record, part.known])
-    plant = np.concatenate(
-        [responses(table, model, piece)[0] for piece in np.array_split(values, max(1, len(values) // 64))],
-        axis=1,
-    )
-    axes: list[str] = []
-    times: list[Vector] = []
-    densities: list[Matrix] = []
-    for axis, observed in enumerate(samples.axes):
-        chosen = predicted(observed, part)
-        if not chosen.size:
-            continue
-        response = plant[axis][:, observed.index]
-        offset, source = offset_draws(
-            table,
-            values,
-            axis,
-            part.record,
-            samples,
-            response,
-            noise,
-            held_out=part.known == 0,
-            rng=rng,
+
+    fit: Fit
+    part: Part
+    samples: Samples
+    model: ForwardModel
+
+    def __call__(
+        self,
+        values: Matrix,
+        log_weights: Vector | None,
+        road: Road,
+        *,
+        k: float = np.nan,
+        ess: float | None = None,
+        rhat: float = np.nan,
+    ) -> Predicted:
+        table, pieces = self.fit.draws.table, np.array_split(values, max(1, len(values) // 64))
+        plant = np.concatenate([responses(table, self.model, piece)[0] for piece in pieces], axis=1)
+        axes: list[str] = []
+        times: list[Vector] = []
+        densities: list[Matrix] = []
+        sources: list[LevelFrom] = []
+        for axis, observed in enumerate(self.samples.axes):
+            if not predicted(observed, self.part).size:
+                continue
+            each, source, index = self._axis(axis, observed, values, plant[axis])
+            densities.append(each)
+            sources.append(source)
+            axes += [self.samples.record.response_axes[axis].name] * index.size
+            times.append(self.samples.times[index])
+        every = np.concatenate(densities, axis=1) if densities else np.empty((len(values), 0))
+        level = np.full(len(values), -np.log(len(values))) if log_weights is None else log_weights
+        return Predicted(
+            self.part,
+            tuple(axes),
+            np.concatenate(times) if times else np.empty(0),
+            logsumexp(every + level[:, None], axis=0),
+            _error(every, level),
+            road,
+            k,
+            min(effective(level), ess if ess is not None else self.fit.draws.ess),
+            rhat,
+            tuple(sources),
         )
-        residual = observed.values - response - offset[:, None]
-        if source == "samples before the drive acts":  # these set the offset: no prediction
-            begin = _quiet(samples, observed.index)
-            chosen = chosen[~begin[chosen]]
+
+    def _axis(
+        self, axis: int, observed: Observed, values: Matrix, plant: Matrix
+    ) -> tuple[Matrix, LevelFrom, np.ndarray[tuple[int], np.dtype[np.intp]]]:
+        """Densities (draws, predicted), where the level comes from, and the predicted samples' places."""
+        table, noise = self.fit.draws.table, self.fit.problem.posterior.noise
+        last = int(np.count_nonzero(observed.index < self.part.until))
+        first = known_before(self.samples, axis, self.part)
+        index = observed.index[:last]
+        residual = observed.values[:last] - plant[:, index]
         parameters = values[:, [table.at(name, axis) for name in noise.names]]
-        densities.append(_densities(noise, residual, parameters, observed.gaps, chosen, part.known))
-        axes += [samples.record.response_axes[axis].name] * chosen.size
-        times.append(samples.times[observed.index[chosen]])
-    every = np.concatenate(densities, axis=1) if densities else np.empty((len(values), 0))
-    level = np.full(len(values), -np.log(len(values))) if log_weights is None else log_weights
-    level = level - logsumexp(level)
-    effective = float(np.exp(-logsumexp(2 * level)))
-    return Predicted(
-        part,
-        tuple(axes),
-        np.concatenate(times) if times else np.empty(0),
-        logsumexp(every + level[:, None], axis=0),
-        _error(every, level),
-        road,
-        k,
-        min(effective, ess if ess is not None else fit.draws.ess),
-        rhat,
-    )
-
-
-def _densities(
-    noise: Noise, residual: Matrix, parameters: Matrix, gaps: Vector, chosen: Index, known: int
-) -> Matrix:
-    """Log density of each chosen sample given the last known one, (draws, chosen).
-
-    Correlated noise remembers the last known sample over the gap; what is predicted tells nothing.
-    """
-    wanted = residual[:, chosen]
-    if not isinstance(noise, AR1):
-        return noise.pointwise(wanted, parameters, np.ones(wanted.shape[1]))
-    sigma, rho = parameters[:, :1], parameters[:, 1:2]
-    link = np.zeros_like(wanted)
-    before = int(chosen[0]) - 1
-    if known and before >= 0 and chosen.size:
-        since = np.cumsum(gaps)[chosen] - np.cumsum(gaps)[before]
-        link = rho**since
-    middle = link * residual[:, [max(before, 0)]]
-    scale = sigma * np.sqrt(1 - link**2)
-    return White().pointwise((wanted - middle) / scale, np.ones((len(wanted), 1)), gaps[chosen]) - np.log(
-        scale
-    )
-
-
-def _quiet(samples: Samples, index: Index) -> Flags:
-    """Samples taken before any drive changes."""
-    drive = samples.record.drive
-    moved = np.flatnonzero((drive != drive[0]).any(axis=1))
-    begin = samples.record.time[moved[0]] if moved.size else np.inf
-    return np.asarray(samples.times[index] <= begin)
+        level = level_of(table, values, axis, self.part, self.samples)
+        each = log_densities(noise, residual, parameters, observed.gaps[:last], level.value, first)
+        return each, level.source, index[first:]
 
 
 def _error(every: Matrix, level: Vector, groups: int = 4) -> float:

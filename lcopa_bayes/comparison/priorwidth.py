@@ -7,25 +7,22 @@ from math import exp, log, sqrt
 from typing import Any, Literal, final
 
 import numpy as np
-from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 from scipy.special import logsumexp
 
 from lcopa_bayes.comparison.carry import carried
-from lcopa_bayes.comparison.prediction import LARGEST_K
 from lcopa_bayes.estimate import plain
 from lcopa_bayes.fit import Fit
 from lcopa_bayes.inference.evidence import evidence
 from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.priors import Prior
+from lcopa_bayes.inference.weights import FEWEST_EFFECTIVE, smoothed, usable_k
 
 FACTORS = (0.5, 2.0)
 """Widths tried, relative to the study's [-]."""
 _WIDENED = frozenset({"gain", "time", "delay"})
 """Kinds whose priors are changed: orders and correlations have the ends of their domain, and offset and
 noise scale are alike in all candidates."""
-_FEWEST = 100.0
-"""Effective draws below which weights are not used [-]."""
 
 
 @final
@@ -87,10 +84,10 @@ def _width(fit: Fit, factor: float) -> Width:
     share = float(np.isfinite(ratio).mean())
     inside = all(_contains(posterior.table.rows[k], new) for k, new in changed)
     if inside and share > 0:
-        k_hat = _pareto(ratio[np.isfinite(ratio)])
+        k_hat = smoothed(ratio[np.isfinite(ratio)])[1]
         mean = float(logsumexp(ratio) - log(ratio.size))
         ess = float(np.exp(2 * logsumexp(ratio) - logsumexp(2 * ratio))) * fit.draws.ess / ratio.size
-        if (np.isnan(k_hat) or k_hat <= LARGEST_K) and ess >= _FEWEST:
+        if (np.isnan(k_hat) or k_hat <= usable_k(ratio.size)) and ess >= FEWEST_EFFECTIVE:
             weights = np.exp(ratio - mean)
             error = sqrt(float(np.var(weights)) / fit.draws.ess)
             sd = float(np.hypot(weighed.sd, error))
@@ -144,11 +141,3 @@ def _scaled(row: Parameter, factor: float) -> Parameter:
     else:
         return row
     return replace(row, prior=Prior(row.prior.dist, told))
-
-
-def _pareto(ratio: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
-    """Pareto k of weights; NaN when the largest are all equal."""
-    largest = np.sort(ratio)[-max(5, ratio.size // 50) :]
-    if ratio.size < 50 or largest[-1] - largest[0] <= 1e-12:
-        return float("nan")
-    return float(array_stats.psislw(ratio)[1])  # type: ignore[no-untyped-call]

@@ -13,7 +13,7 @@ import numpy as np
 from lcopa_bayes.arrays import Array, Matrix, Vector
 from lcopa_bayes.bench.command import Command
 from lcopa_bayes.inference.assembly import Problem
-from lcopa_bayes.inference.noise import GaussianNoise
+from lcopa_bayes.inference.noise import GaussianNoise, Student
 from lcopa_bayes.operational.series import Circle, Spectrum
 from lcopa_bayes.operational.transfer import TransferSlopes, transfer_slopes
 from lcopa_bayes.plant.drive import Drive
@@ -145,9 +145,9 @@ class Bench:
         stacked: Array = np.concatenate([rows, np.ones((1, rows.shape[1]))])
         if isinstance(noise, GaussianNoise):
             white = noise.whiten(stacked[None], parameters, np.ones(rows.shape[1]))[0][0]
-        else:  # Fisher information of a Student location: (nu + 1) / (nu + 3) that of a Gaussian
+        else:
             sigma, nu = parameters[0]
-            white = stacked * (np.sqrt((nu + 1) / (nu + 3)) / sigma)
+            white = stacked * np.sqrt(Student.information(nu)) / sigma
         table = posterior.table
         offsets = [table.rows[k] for k in table.of_kind("offset")]
         if not any(row.free and row.place.first == axis for row in offsets):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 from lcopa_bayes.inference.data import Samples
@@ -26,10 +26,19 @@ class Problem:
     study: Study
     posterior: Posterior
     scales: Scales
+    refinement: int = 1
+    """Blocks are narrower by this factor than the study's settings make them [-]."""
 
     def simulated(self, records: Sequence[Record]) -> tuple[tuple[Samples, ...], ForwardModel]:
         """Samples of other records of the same axes, and the model that simulates them."""
-        return prepared(self.study, self.posterior.table.layout, records, self.scales.period)
+        layout, period = self.posterior.table.layout, self.scales.period
+        return prepared(self.study, layout, records, period, refinement=self.refinement)
+
+    def refined(self, factor: int) -> Problem:
+        """The same problem on blocks narrower by a further factor."""
+        problem = replace(self, refinement=self.refinement * factor)
+        _, model = problem.simulated(self.study.fit)
+        return replace(problem, posterior=replace(self.posterior, model=model))
 
 
 def problem_of(study: Study) -> Problem:
@@ -55,12 +64,12 @@ def problem_of(study: Study) -> Problem:
         )
     if posterior.dimension == 0:
         raise InputError(f"{study.name}: every parameter is fixed or linear; leave at least one free")
-    table.log_ordering  # noqa: B018 - raises when no prior mass has decreasing orders
+    table.log_support  # noqa: B018 - raises when no prior mass has decreasing orders
     return Problem(study, posterior, scales)
 
 
 def prepared(
-    study: Study, layout: Layout, records: Sequence[Record], period: float
+    study: Study, layout: Layout, records: Sequence[Record], period: float, *, refinement: int = 1
 ) -> tuple[tuple[Samples, ...], ForwardModel]:
     """Samples of records and the model that simulates them with a study's settings."""
     samples = tuple(Samples.of(record, period) for record in records)
@@ -70,5 +79,6 @@ def prepared(
         [one.times for one in samples],
         blocks=study.model.blocks,
         exposure=study.model.exposure,
+        refinement=refinement,
     )
     return samples, model

@@ -13,7 +13,7 @@ from scipy.stats import kstwobign, norm
 from lcopa_bayes.arrays import Vector
 from lcopa_bayes.estimate import EQUAL_TAILED, LEVEL, plain
 from lcopa_bayes.inference.draws import Draws
-from lcopa_bayes.inference.grade import Grade, Level
+from lcopa_bayes.inference.grade import Grade, Level, Limitation
 from lcopa_bayes.inference.nested import Nested
 
 ALARM = 0.01
@@ -184,13 +184,9 @@ class CrossCheck:
             f"{self.nested.log_evidence:.2f} ± {self.nested.log_evidence_sd:.2f}"
         )
 
-    def lowered(self, grade: Grade) -> Grade:
-        """`grade` itself when the methods agree; else one level lower, with the reason and a remedy."""
-        if self.agrees:
-            return grade
-        return Grade(
-            _LOWER[grade.level], f"{self.sentence}; {_REMEDY}; the ensembles by themselves: {grade.reason}"
-        )
+    def limitations(self, grade: Grade) -> tuple[Limitation, ...]:
+        """None when the methods agree; else one that lowers draws of this grade by one level."""
+        return () if self.agrees else (Limitation(_LOWER[grade.level], self.sentence, _REMEDY),)
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""

@@ -31,6 +31,10 @@ rho          uniform(exp(-1), exp(-20 / N)),         from one sampling period, a
                                                      trend, and the plant's to explain
 ===========  ======================================  ============================================
 
+Terms of order above 1 resonate near 1 / T. Faster than the Nyquist frequency of the samples such a resonance
+is an alias of whatever is periodic in the record, and blocks as wide as a sample cannot follow it: where both
+priors are default ones, terms of order above 1 have time constants of period / pi or longer (`resolution`).
+
 The end of `sigma_ar` is hard. A tail, however thin, would not hold: noise of 0.05 at rest under a misfit of
 0.5 gains thousands of nats by growing tenfold, and what the plant lacks is then called noise.
 """
@@ -112,6 +116,11 @@ class Scales:
     def time(self) -> Prior:
         """Prior of a time constant."""
         return Prior("loguniform", {"a": self.period / 10, "b": 100 * self.span})
+
+    @property
+    def resolution(self) -> float:
+        """Shortest time constant whose resonance 1 / T samples tell from an alias [time unit]."""
+        return self.period / float(np.pi)
 
     def order(self) -> Prior:
         """Prior of an order."""

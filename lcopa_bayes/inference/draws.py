@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import final
 
@@ -10,7 +11,17 @@ import numpy as np
 
 from lcopa_bayes.arrays import Array, Matrix, Vector
 from lcopa_bayes.estimate import Estimate
-from lcopa_bayes.inference.grade import Grade, Quality, overall, qualities, shares_grade
+from lcopa_bayes.inference.grade import (
+    Grade,
+    Level,
+    Limitation,
+    Quality,
+    limited,
+    overall,
+    qualities,
+    shares_grade,
+    with_shares,
+)
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.ridges import Ridges, ridges
@@ -40,17 +51,26 @@ class Draws:
     """Effective sample size asked for [draws]."""
     ridges: tuple[Ridges, ...] = ()
     """Of the sampled parameters whose marginal has more than one hill."""
-    cap: Grade | None = None
-    """No number from these draws is graded better, because of what a second method found."""
+    limitations: tuple[Limitation, ...] = ()
+    """Conditions under which the intervals hold: each caps the grades of the numbers it concerns."""
 
     @cached_property
     def grade(self) -> Grade:
         """Grade of the whole run."""
-        return self.capped(overall(self.qualities, self.target_ess, self.ridges))
+        return limited(self.sampling_grade, self.limitations)
 
-    def capped(self, grade: Grade) -> Grade:
-        """`grade`, or the cap where that is lower or as low."""
-        return grade if self.cap is None else Grade.worst([self.cap, grade])
+    @cached_property
+    def sampling_grade(self) -> Grade:
+        """Grade of the sampling alone, whatever limits the numbers beside it."""
+        return overall(self.qualities, self.target_ess, self.ridges)
+
+    def limited(self, limitations: Sequence[Limitation]) -> Draws:
+        """The same draws under further limitations."""
+        return replace(self, limitations=(*self.limitations, *limitations))
+
+    def level(self, parameter: str, grade: Grade) -> Level:
+        """Level of a number of a parameter graded `grade`, under the limitations that concern it."""
+        return limited(grade, [one for one in self.limitations if one.concerns(parameter)]).level
 
     @property
     def flat(self) -> Matrix:
@@ -80,9 +100,10 @@ class Draws:
                 self.table.rows[self.table.names.index(quality.name)].unit,
                 self.column(quality.name),
                 ess=quality.ess,
-                grade=self.capped(
-                    Grade.worst([quality.grade(self.target_ess), *shares.get(quality.name, [])])
-                ).level,
+                grade=self.level(
+                    quality.name,
+                    Grade.worst([quality.grade(self.target_ess), *shares.get(quality.name, [])]),
+                ),
             )
             for quality in self.qualities
         )
@@ -103,10 +124,11 @@ def gather(posterior: Posterior, run: Run) -> Draws:
     if posterior.linear:
         names = [posterior.table.names[k] for k in posterior.linear]
         found |= {q.name: q for q in qualities(names, values[..., posterior.linear])}
-    ordered = tuple(found[name] for name in posterior.table.names if name in found)
     rows = [(k, posterior.table.rows[k]) for k in posterior.sampled]
     hills = [ridges(row.name, row.unit, values[..., k], log_scale=row.log_scale) for k, row in rows]
-    several = tuple(found for found in hills if found.boundaries)
+    several = tuple(one for one in hills if one.boundaries)
+    free = [name for name in posterior.table.names if name in found]
+    ordered = tuple(with_shares(found[name], several) for name in free)
     by_draw = values.swapaxes(1, 2).reshape(ensembles, -1, values.shape[-1])
     densities = log_density.swapaxes(1, 2).reshape(ensembles, -1)
     picked = np.linspace(0, by_draw.shape[1] - 1, min(_PER_ENSEMBLE, by_draw.shape[1])).astype(int)

@@ -71,7 +71,7 @@ def evidence(posterior: Posterior, coordinates: Array, ess: float, seed: int) ->
         found.append(
             bridge(
                 own - mixture.log_density(y),
-                _charted_density(posterior, chart, drawn) - mixture.log_density(drawn),
+                charted_density(posterior, chart, drawn) - mixture.log_density(drawn),
                 ess / ensembles,
             )
         )
@@ -106,7 +106,7 @@ def _relative_variance(log_terms: Vector) -> float:
     return float(np.var(terms) / np.mean(terms) ** 2)
 
 
-def _charted_density(posterior: Posterior, chart: Chart, y: Matrix) -> Vector:
+def charted_density(posterior: Posterior, chart: Chart, y: Matrix) -> Vector:
     """Log posterior density of charted coordinates, (batch,); -inf where the chart has no point."""
     z, exists = chart.uncharted(y)
     out = np.full(len(y), -np.inf)

@@ -19,7 +19,7 @@ _COMPONENTS = 20
 """Most components of a mixture."""
 _FITTED = 6_000
 """Most points a mixture is fitted to."""
-_FREEDOM = 5.0
+FREEDOM = 5.0
 """Degrees of freedom of the components: tails heavy enough to cover what the fit has not seen [-]."""
 _ROUNDS = 60
 """Most rounds of expectation maximisation: a good cover is wanted, not the maximum."""
@@ -77,10 +77,10 @@ class Mixture:
         return int(self.means.shape[1])
 
     def draw(self, count: int, random: Any) -> Matrix:
-        """Independent draws, (count, dimension), from a legacy generator."""
+        """Independent draws, (count, dimension), from a generator of either kind of numpy's."""
         component = random.choice(self.weights.size, size=count, p=self.weights / self.weights.sum())
-        normal = random.randn(count, self.dimension)
-        stretch = np.sqrt(_FREEDOM / random.chisquare(_FREEDOM, size=count))
+        normal = random.standard_normal((count, self.dimension))
+        stretch = np.sqrt(FREEDOM / random.chisquare(FREEDOM, size=count))
         steps = np.einsum("nij,nj->ni", self.factors[component], normal)
         return np.asarray(self.means[component] + stretch[:, None] * steps)
 
@@ -92,17 +92,21 @@ class Mixture:
         """Log density of each component times its weight, (components, n)."""
         dimension = self.dimension
         level = (
-            gammaln((_FREEDOM + dimension) / 2)
-            - gammaln(_FREEDOM / 2)
-            - 0.5 * dimension * np.log(_FREEDOM * np.pi)
+            gammaln((FREEDOM + dimension) / 2)
+            - gammaln(FREEDOM / 2)
+            - 0.5 * dimension * np.log(FREEDOM * np.pi)
         )
-        parts = np.empty((self.weights.size, len(points)))
-        for k, whitener in enumerate(self._whiteners):
-            distance = ((points @ whitener - self.means[k] @ whitener) ** 2).sum(axis=1)
-            parts[k] = -0.5 * (_FREEDOM + dimension) * np.log1p(distance / _FREEDOM)
+        parts = -0.5 * (FREEDOM + dimension) * np.log1p(self.distances(points) / FREEDOM)
         scale = np.log(np.diagonal(self.factors, axis1=1, axis2=2)).sum(axis=1)
         with np.errstate(divide="ignore"):
             return np.asarray(parts + (level - scale + np.log(self.weights))[:, None])
+
+    def distances(self, points: Matrix) -> Matrix:
+        """Squared Mahalanobis distance from every component, (components, n) [-]."""
+        out = np.empty((self.weights.size, len(points)))
+        for k, whitener in enumerate(self._whiteners):
+            out[k] = ((points @ whitener - self.means[k] @ whitener) ** 2).sum(axis=1)
+        return out
 
     def log_shares(self, points: Matrix) -> Matrix:
         """Log probability of each component given a point, (components, n)."""

@@ -121,6 +121,12 @@ class Student(Noise):
         level = gammaln((nu + 1) / 2) - gammaln(nu / 2) - 0.5 * np.log(nu * np.pi) - np.log(sigma)
         return level - (nu + 1) / 2 * np.log1p((residual / sigma) ** 2 / nu)
 
+    @staticmethod
+    def information(nu: Vector) -> Vector:
+        """Fisher information of a sample about its location, over that of a Gaussian of scale `sigma` [-]
+        (Lange, Little and Taylor 1989, J. Am. Stat. Assoc. 84)."""
+        return np.asarray((nu + 1) / (nu + 3))
+
     def draw(self, parameters: Matrix, gaps: Vector, rng: np.random.Generator) -> Matrix:
         """Noise for each parameter set, (batch, n) [response unit]."""
         shape = (parameters.shape[0], gaps.size)

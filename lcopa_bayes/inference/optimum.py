@@ -47,8 +47,11 @@ def find_optima(posterior: Posterior, rng: np.random.Generator, *, starts: int =
     for values in _distinct(posterior, chosen, starts):
         values = posterior.complete(posterior.coordinates(values[None]), None)[0]
         for _ in range(2):
-            values, jacobian = problem.solve(values)
+            values, _ = problem.solve(values)
             values = problem.with_noise(values)
+        # at the solution itself: its terms may stand in another order than the search left them in, and the
+        # noise is that of its own residual
+        _, jacobian = problem.residual(problem.coordinates(values), values)
         optima.append(_describe(posterior, problem, values, jacobian))
     optima.sort(key=lambda optimum: -optimum.log_density)
     kept: list[Optimum] = []

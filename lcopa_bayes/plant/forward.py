@@ -10,11 +10,12 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.arrays import Array, Matrix, Vector
-from lcopa_bayes.operational.series import Circle, Spectrum
-from lcopa_bayes.operational.transfer import TransferSlopes, transfer, transfer_slopes
+from lcopa_bayes.operational.series import Circle
+from lcopa_bayes.operational.stepresponse import StepResponse, step_response
 from lcopa_bayes.plant.drive import Drive
 from lcopa_bayes.plant.grid import Mesh
 from lcopa_bayes.plant.layout import Layout
+from lcopa_bayes.plant.superposition import Phase, Superposition, blocks_of, phases
 from lcopa_bayes.record import Record
 
 _CELLS = 3 << 13
@@ -47,8 +48,8 @@ class Dynamics:
         return Dynamics(times, orders, self.delays[plants])
 
 
-Spectra = dict[tuple[int, int, float], Spectrum]
-"""Transfer functions by element, number of blocks and block width."""
+StepResponses = dict[tuple[int, float], StepResponse]
+"""Step responses by element and block width."""
 
 
 @final
@@ -64,12 +65,18 @@ class Experiment:
 
     @classmethod
     def of(
-        cls, record: Record, times: Vector, *, blocks: int | None = None, exposure: float = 0.0
+        cls,
+        record: Record,
+        times: Vector,
+        *,
+        blocks: int | None = None,
+        exposure: float = 0.0,
+        refinement: int = 1,
     ) -> Experiment:
         """For reading `record` at `times` [time unit]; see `Mesh.of_samples` for the options."""
         drives = tuple(Drive.of_rows(record.time, column) for column in record.drive.T)
         begin = min((drive.times[0] for drive in drives if drive.moves), default=times[0])
-        mesh = Mesh.of_samples(times, float(begin), blocks=blocks, exposure=exposure)
+        mesh = Mesh.of_samples(times, float(begin), blocks=blocks, exposure=exposure, refinement=refinement)
         return cls(record.name, mesh, drives, record.drive[0])
 
     @cached_property
@@ -82,6 +89,17 @@ class Experiment:
         """Block edges [time unit]."""
         return self.mesh.grid.edges
 
+    @cached_property
+    def phases(self) -> tuple[tuple[Phase, ...], ...]:
+        """Changes of every drive by phase; none for a drive that never moves."""
+        return tuple(phases(drive, self.mesh.lattice.step) if drive.moves else () for drive in self.drives)
+
+    @cached_property
+    def blocks(self) -> int:
+        """Blocks of the step responses that simulate the record."""
+        begin = min((float(drive.times[0]) for drive in self.drives if drive.moves), default=np.inf)
+        return blocks_of(self.mesh.lattice, begin) if begin < np.inf else 0
+
 
 @final
 @dataclass(frozen=True, eq=False)
@@ -91,52 +109,68 @@ class ForwardModel:
     layout: Layout
     experiments: tuple[Experiment, ...]
 
-    def unit_responses(self, dynamics: Dynamics, spectra: Spectra | None = None) -> list[Array]:
+    def unit_responses(self, dynamics: Dynamics, known: StepResponses | None = None) -> list[Array]:
         """Deviation from rest per unit gain, for each experiment (units, batch, samples) [drive unit].
 
         The response of axis i is ``offset_i + sum_j gain_ij (rest_j + unit_ij)``. Second order in the
-        block width; see `operational.transfer`. `spectra` are transfer functions of these very dynamics, a
+        block width; see `operational.stepresponse`. `known` are step responses of these very dynamics, a
         batch of one, under other commands; those that lack are added.
         """
         shapes = [(len(self.layout.units), dynamics.batch, e.mesh.reading.samples) for e in self.experiments]
         out = [np.zeros(shape) for shape in shapes]
         for plants in self._portions(dynamics.batch):
-            own = {} if spectra is None else spectra
+            own = {} if known is None else known
             self._respond(dynamics[plants], [read[:, plants] for read in out], own)
         return out
 
     def _portions(self, batch: int) -> Iterator[slice]:
         """Slices of a batch that are small enough to be fast."""
-        blocks = max(experiment.mesh.grid.n for experiment in self.experiments)
+        blocks = max((circle.n for circle in self.circles.values()), default=1)
         terms = max(element.terms for element in self.layout.elements)
         size = max(_ABREAST, _CELLS // (blocks * terms) // _ABREAST * _ABREAST)
         return (slice(first, first + size) for first in range(0, batch, size))
 
-    def _respond(self, dynamics: Dynamics, out: list[Array], spectra: Spectra) -> None:
+    @cached_property
+    def circles(self) -> dict[float, Circle]:
+        """Where the step responses of each block width are evaluated: long enough for every record."""
+        longest: dict[float, int] = {}
+        for experiment in self.experiments:
+            step = experiment.mesh.lattice.step
+            longest[step] = max(longest.get(step, 0), experiment.blocks)
+        return {step: Circle(blocks) for step, blocks in longest.items() if blocks}
+
+    def _respond(self, dynamics: Dynamics, out: list[Array], known: StepResponses) -> None:
         """Write the unit responses of a few plants into `out`."""
-        known: dict[tuple[int, int, int, int], Array] = {}
-        for number, (experiment, read) in enumerate(zip(self.experiments, out, strict=True)):
-            grid, circle = experiment.mesh.grid, experiment.circle
+        read: dict[tuple[int, int, int, int], Array] = {}
+        superposed = {step: Superposition(circle) for step, circle in self.circles.items()}
+        for number, (experiment, target) in enumerate(zip(self.experiments, out, strict=True)):
+            lattice, first = experiment.mesh.lattice, experiment.mesh.reading.first
             for index, (element, delay, axis) in enumerate(self.layout.units):
-                drive = experiment.drives[axis]
-                if not drive.moves:
+                if not experiment.phases[axis]:
                     continue
-                first, first_axis, scale = self._alike[number][axis]
-                same = (element, delay, first, first_axis)
-                if same in known:
-                    np.multiply(scale, known[same], out=read[index])
+                place, place_axis, scale = self._alike[number][axis]
+                same = (element, delay, place, place_axis)
+                if same in read:
+                    np.multiply(scale, read[same], out=target[index])
                     continue
-                key = (element, grid.n, grid.step)
-                if key not in spectra:
-                    spectra[key] = transfer(
-                        dynamics.times[element], dynamics.orders[element], circle, grid.step
-                    )
-                means, _ = drive.block_means(experiment.edges, dynamics.delays[:, delay])
-                read[index] = experiment.mesh.reading(
-                    circle.coefficients(spectra[key] * circle.spectrum(means))
-                )
+                response = self._step_response(dynamics, element, lattice.step, known)
+                late = dynamics.delays[:, delay]
+                target[index][:, first:] = superposed[lattice.step](
+                    response, experiment.phases[axis], lattice, late, (element, delay)
+                )[0]
                 if scale == 1.0:
-                    known[same] = read[index]
+                    read[same] = target[index]
+
+    def _step_response(
+        self, dynamics: Dynamics, element: int, step: float, known: StepResponses, *, slopes: bool = False
+    ) -> StepResponse:
+        """Step response of an element, from `known` or added to it."""
+        circle = self.circles[step]
+        found = known.get((element, step))
+        if found is None or found.coarse.shape[2] < circle.n:
+            times, orders = dynamics.times[element], dynamics.orders[element]
+            found = known[element, step] = step_response(times, orders, circle, step, slopes=slopes)
+        return found.first(circle.n)
 
     @cached_property
     def _alike(self) -> list[list[tuple[int, int, float]]]:
@@ -164,35 +198,27 @@ class ForwardModel:
         The second entry holds one array per unit, (2 terms + 1, batch, samples): derivatives in the
         logarithms of the time constants, the orders, and the delay [per time unit].
         """
-        spectra: dict[tuple[int, int, float], tuple[Spectrum, TransferSlopes]] = {}
+        known: StepResponses = {}
+        superposed = {step: Superposition(circle) for step, circle in self.circles.items()}
         out = []
         for experiment in self.experiments:
-            grid, circle = experiment.mesh.grid, experiment.circle
-            samples = experiment.mesh.reading.samples
-            read = np.zeros((len(self.layout.units), dynamics.batch, samples))
+            lattice, reading = experiment.mesh.lattice, experiment.mesh.reading
+            value = np.zeros((len(self.layout.units), dynamics.batch, reading.samples))
             slopes = []
             for index, (element, delay, axis) in enumerate(self.layout.units):
-                drive = experiment.drives[axis]
                 terms = dynamics.times[element].shape[1]
-                slopes.append(np.zeros((2 * terms + 1, dynamics.batch, samples)))
-                if not drive.moves:
+                slopes.append(np.zeros((2 * terms + 1, dynamics.batch, reading.samples)))
+                if not experiment.phases[axis]:
                     continue
-                key = (element, grid.n, grid.step)
-                if key not in spectra:
-                    spectra[key] = transfer_slopes(
-                        dynamics.times[element], dynamics.orders[element], circle, grid.step
-                    )
-                value, parts = spectra[key]
-                means, by_delay = drive.block_means(experiment.edges, dynamics.delays[:, delay])
-                drive_spectrum = circle.spectrum(means)
-                products = [
-                    *(part * drive_spectrum for part in (value, *parts.log_times, *parts.orders)),
-                    value * circle.spectrum(by_delay),
-                ]
-                rows = [experiment.mesh.reading(circle.coefficients(product)) for product in products]
-                read[index] = rows[0]
-                slopes[index][:] = rows[1:]
-            out.append((read, slopes))
+                response = self._step_response(dynamics, element, lattice.step, known, slopes=True)
+                superpose, changes = superposed[lattice.step], experiment.phases[axis]
+                late, key = dynamics.delays[:, delay], (element, delay)
+                rows = superpose(response, changes, lattice, late, key)
+                value[index][:, reading.first :] = rows[0]
+                slopes[index][:-1, :, reading.first :] = rows[1:]
+                by_block = superpose(response, changes, lattice, late, key, "slope")
+                slopes[index][-1:, :, reading.first :] = -by_block / lattice.step
+            out.append((value, slopes))
         return out
 
 
@@ -203,10 +229,11 @@ def forward_model(
     *,
     blocks: int | None = None,
     exposure: float = 0.0,
+    refinement: int = 1,
 ) -> ForwardModel:
     """Forward model of `records`, each read at its own `times` [time unit]."""
     experiments = (
-        Experiment.of(record, at, blocks=blocks, exposure=exposure)
+        Experiment.of(record, at, blocks=blocks, exposure=exposure, refinement=refinement)
         for record, at in zip(records, times, strict=True)
     )
     return ForwardModel(layout, tuple(experiments))

@@ -1,4 +1,9 @@
-"""The blocks a record is simulated on, and how its samples are read from them."""
+"""Block widths of a record, where its samples lie on them, and reading from blocks that stand still.
+
+Responses are computed on blocks that begin at the delayed change of the drive, wherever it falls (`Lattice`
+says how the samples lie on them). Effects that act between drive and reading are computed on blocks at fixed
+times (`Grid`), and only the change they make is read from there (`Reading`).
+"""
 
 from __future__ import annotations
 
@@ -80,11 +85,37 @@ class Reading:
 
 @final
 @dataclass(frozen=True, eq=False)
+class Lattice:
+    """Sample times in units of the block width."""
+
+    step: float
+    """Width of a block [time unit]."""
+    times: Vector
+    """Sample times after the first drive change, (n,) [time unit]."""
+    slots: Index | None
+    """Whole blocks from the first of them to each; None when they are not equidistant."""
+    exposure: float
+    """Time over which a sample is a mean [time unit]."""
+
+    @cached_property
+    def chosen(self) -> Index | slice:
+        """`slots`, as a slice where it is one."""
+        assert self.slots is not None
+        if self.slots.size < 2:
+            return slice(0, 1)
+        gaps = np.diff(self.slots)
+        even = (gaps == gaps[0]).all()
+        return slice(0, int(self.slots[-1]) + 1, int(gaps[0])) if even else self.slots
+
+
+@final
+@dataclass(frozen=True, eq=False)
 class Mesh:
-    """Grid of a record with the reading of its sample times."""
+    """Blocks of a record and the reading of its sample times."""
 
     grid: Grid
     reading: Reading
+    lattice: Lattice
 
     def reads_like(self, other: Mesh) -> bool:
         """Whether both simulate the same blocks and read the same samples from block midpoints."""
@@ -93,12 +124,19 @@ class Mesh:
         return (
             whole
             and self.grid == other.grid
+            and self.lattice.exposure == other.lattice.exposure
             and (mine.samples, mine.first, mine.blocks) == (its.samples, its.first, its.blocks)
         )
 
     @classmethod
     def of_samples(
-        cls, times: Vector, begin: float, *, blocks: int | None = None, exposure: float = 0.0
+        cls,
+        times: Vector,
+        begin: float,
+        *,
+        blocks: int | None = None,
+        exposure: float = 0.0,
+        refinement: int = 1,
     ) -> Mesh:
         """For samples at `times`, when nothing moves before `begin` (the first drive change).
 
@@ -108,46 +146,60 @@ class Mesh:
         mean over ``[t - exposure, t]``.
 
         Parameters: times (samples,) increasing [time unit]; blocks: at least so many blocks, or
-        chosen from the samples; exposure [time unit] >= 0.
+        chosen from the samples; exposure [time unit] >= 0; refinement: blocks are narrower by this factor.
         """
         if times[-1] <= begin:
             begin = times[0]
         span = float(times[-1] - begin)
+        first = int(np.searchsorted(times, begin, side="right"))
         if span == 0.0:  # a single sample, at rest
-            return cls(Grid(begin, 1.0, 1), Reading(1, 1, slice(1, 1), None))
+            nothing = Lattice(1.0, times[:0], times[:0].astype(int), exposure)
+            return cls(Grid(begin, 1.0, 1), Reading(1, 1, slice(1, 1), None), nothing)
         reach = float(times[-1] - times[0]) or span
         closest = float(np.diff(times).min()) if times.size > 1 else span
         period = reach / round(reach / closest)  # of the lattice the samples may lie on
         slots = (times - times[-1]) / period
         equidistant = np.abs(slots - np.round(slots)).max() < _ALIGNED
         wanted = blocks or FEWEST_BLOCKS
-        if equidistant and exposure == 0.0 and span / period < max(8 * MOST_BLOCKS, 2 * times.size):
-            return cls._aligned(times, begin, period, max(1, ceil(wanted * period / span)))
-        if blocks is None:
-            wanted = int(np.clip(ceil(2 * span / closest), FEWEST_BLOCKS, max(MOST_BLOCKS, times.size)))
-        grid = Grid(begin, span / wanted, wanted + 2)  # two spare blocks so that the last sample is interior
-        first = int(np.searchsorted(times, begin, side="right"))
-        return cls(grid, Reading(times.size, first, None, _weights(grid, times[first:], exposure)))
+        later = times[first:]
+        if equidistant and span / period < max(8 * MOST_BLOCKS, 2 * times.size):
+            split = refinement * max(1, ceil(wanted * period / span))
+            places = np.round((later - later[0]) / period).astype(int) * split
+            lattice = Lattice(_rounded(period / split), later, places, exposure)
+            if exposure == 0.0:
+                return cls._aligned(times, begin, period / split, lattice, first)
+        else:
+            if blocks is None:
+                typical = float(np.median(np.diff(later))) if later.size > 1 else span
+                wanted = int(np.clip(ceil(span / typical), FEWEST_BLOCKS, max(MOST_BLOCKS, times.size)))
+            wanted *= refinement
+            lattice = Lattice(_rounded(span / wanted), later, None, exposure)
+        step = span / ceil(span / lattice.step - 1e-6)
+        grid = Grid(begin, step, round(span / step) + 2)  # two spare blocks: the last sample is interior
+        return cls(grid, Reading(times.size, first, None, _weights(grid, later, exposure)), lattice)
 
     @classmethod
-    def _aligned(cls, times: Vector, begin: float, period: float, split: int) -> Mesh:
-        step = period / split
-        slots = np.round((times - times[-1]) / period).astype(int) * split
+    def _aligned(cls, times: Vector, begin: float, step: float, lattice: Lattice, first: int) -> Mesh:
+        slots = lattice.slots
+        assert slots is not None
         # blocks from the one that holds `begin` to the last sample's
         back = ceil((times[-1] - begin) / step - 0.5 + 1e-9)
-        first = int(np.searchsorted(times, begin, side="right"))
-        kept = slots[first:] + back + 1  # a spare block on either side, so that every sample has neighbours
+        kept = slots - slots[-1] + back + 1  # a spare block on either side: every sample has neighbours
         grid = Grid(times[-1] - (back + 1.5) * step, step, back + 3)
-        if (np.diff(kept) == split).all():
-            blocks = slice(int(kept[0]), int(kept[-1]) + 1, split)
-            return cls(grid, Reading(times.size, first, blocks, None))
+        gaps = np.diff(kept)
+        if (gaps == gaps[:1]).all():
+            blocks = slice(int(kept[0]), int(kept[-1]) + 1, int(gaps[0]) if gaps.size else 1)
+            return cls(grid, Reading(times.size, first, blocks, None), lattice)
         row = np.repeat(np.arange(kept.size), 3)
         column = (kept[:, None] + np.arange(-1, 2)).ravel()
         weight = np.tile([-1 / 24, 26 / 24, -1 / 24], kept.size)
-        return cls(
-            grid,
-            Reading(times.size, first, None, csr_array((weight, (row, column)), shape=(kept.size, grid.n))),
-        )
+        weights = csr_array((weight, (row, column)), shape=(kept.size, grid.n))
+        return cls(grid, Reading(times.size, first, None, weights), lattice)
+
+
+def _rounded(step: float) -> float:
+    """The same width for records whose sample times differ by rounding alone: they share step responses."""
+    return float(f"{step:.11g}")
 
 
 _CUBIC = np.linalg.inv(np.vander(np.arange(4.0), increasing=True))

@@ -15,7 +15,7 @@ from lcopa_bayes.report.sections import calibration
 _NEEDS = (
     *("study", "verdict", "grade", "grade_reason", "seed", "asked", "replicas", "coverage", "simultaneous"),
     *("p_value", "p_value_of", "ranks", "rank_bins", "rank_corridor", "reliable", "grades", "not_reliable"),
-    *("failures", "truths", "model_gap", "seconds", "sampler"),
+    *("failures", "truths", "model_gap", "seconds", "sampler", "engine", "discretisation"),
 )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from lcopa_bayes.bench.plan import load_plan
 from lcopa_bayes.calibration.calibrate import calibrate
 from lcopa_bayes.calibration.summary import results as calibration_results
 from lcopa_bayes.calibration.summary import tables
+from lcopa_bayes.checks import refuse_if
 from lcopa_bayes.cores import cores
 from lcopa_bayes.files import writable_folder
 from lcopa_bayes.fit import fit
@@ -95,6 +97,23 @@ def simulate(options: argparse.Namespace, command: list[str]) -> Told:
     return Told({"verdict": verdict, "files": [str(path) for path in paths]}, (verdict,))
 
 
+def stated_values(words: Sequence[str]) -> dict[str, float]:
+    """Values by name from words such as ``delay=1.0``; InputError where a word is none or a name twice."""
+    out: dict[str, float] = {}
+    problems = []
+    for word in words:
+        name, mark, value = word.partition("=")
+        try:
+            number = float(value)
+        except ValueError:
+            number = np.nan
+        if not (name and mark and np.isfinite(number)) or name in out:
+            problems.append(f"--truth {word}: give NAME=VALUE, a number, each name once")
+        out[name] = number
+    refuse_if(problems)
+    return out
+
+
 def calibrate_study(options: argparse.Namespace, command: list[str]) -> Told:
     """Coverage and ranks of truths over many simulated replicas of a study, with a report."""
     study = study_of(options)
@@ -103,6 +122,8 @@ def calibrate_study(options: argparse.Namespace, command: list[str]) -> Told:
         study,
         replicas=options.replicas,
         around=options.around,
+        truth=stated_values(options.truth),
+        engine=options.engine,
         jobs=options.jobs or cores(),
         dask=options.dask,
         folder=folder,

@@ -39,6 +39,8 @@ class CrossFade(ReadoutEffect):
         """Segment by segment between commands."""
         out = y.copy()
         changes = np.unique(np.concatenate([drive.times for drive in scene.drives]))
+        if not changes.size:  # no drive moves: there is no transition
+            return out
         for axis in range(y.shape[1]):
             starts = changes + scene.direct(axis)[3]
             origins = np.interp(starts, scene.times, y[:, axis])

@@ -22,7 +22,7 @@ from lcopa_bayes.plant.effects.effect import (
     UnstableError,
 )
 from lcopa_bayes.plant.effects.resting import resting
-from lcopa_bayes.plant.forward import Dynamics, Experiment, ForwardModel, Spectra
+from lcopa_bayes.plant.forward import Dynamics, Experiment, ForwardModel, StepResponses
 from lcopa_bayes.plant.layout import Layout
 
 Acting = Sequence[tuple[Effect, Vector]]
@@ -61,10 +61,12 @@ class Moved(NamedTuple):
     """(samples, axes) [response unit]."""
 
 
-def linear(model: ForwardModel, scenes: Sequence[Scene], plant: Plant, spectra: Spectra) -> list[Moved]:
-    """Every record of the linear plant, by the forward model; `spectra` as there."""
+def linear(
+    model: ForwardModel, scenes: Sequence[Scene], plant: Plant, known: StepResponses | None = None
+) -> list[Moved]:
+    """Every record of the linear plant, by the forward model; `known` as there."""
     out = []
-    for scene, units in zip(scenes, model.unit_responses(plant.dynamics, spectra), strict=True):
+    for scene, units in zip(scenes, model.unit_responses(plant.dynamics, known), strict=True):
         rows = [
             np.sum(
                 [plant.gains[i, j] * (scene.rest[j] + units[unit, 0]) for j, unit in enumerate(row)], axis=0
@@ -78,11 +80,17 @@ def linear(model: ForwardModel, scenes: Sequence[Scene], plant: Plant, spectra: 
 def passed(
     model: ForwardModel, scenes: Sequence[Scene], plant: Plant, acting: Sequence[Acting]
 ) -> list[Moved]:
-    """Every record with effects on elements, forces and sensors; raises UnstableError."""
+    """Every record with effects on elements, forces and sensors; raises UnstableError.
+
+    The effects are simulated on blocks at fixed times, which misread the kink at an onset. So only the change
+    they make there is taken, and added to the response of the linear plant.
+    """
     spectra: dict[tuple[int, int, float, float], Spectrum] = {}
     return [
-        _Passage(model.layout, experiment, scene, plant, told, spectra).moved()
-        for experiment, scene, told in zip(model.experiments, scenes, acting, strict=True)
+        _Passage(model.layout, experiment, scene, plant, told, spectra).moved(without)
+        for experiment, scene, told, without in zip(
+            model.experiments, scenes, acting, linear(model, scenes, plant), strict=True
+        )
     ]
 
 
@@ -98,8 +106,8 @@ class _Passage:
     acting: Acting
     spectra: dict[tuple[int, int, float, float], Spectrum]
 
-    def moved(self) -> Moved:
-        """Deflection at the samples."""
+    def moved(self, without: Moved) -> Moved:
+        """Deflection at the samples, from that of the linear plant."""
         scene, gains = self.scene, self.plant.gains
         bent = [(effect, own) for effect, own in self.acting if isinstance(effect, ForceEffect)]
         at_rest = gains @ scene.rest
@@ -107,7 +115,7 @@ class _Passage:
         for i, row in enumerate(self.layout.unit_of):
             for j, unit in enumerate(row):
                 if not (bent and j == scene.ranges.direct[i]):
-                    change[i] += gains[i, j] * self._unit(unit)
+                    change[i] += gains[i, j] * self._unit(unit, self._stretch)
         if bent:
             level, moving = self._balance(bent)
             own = np.array([gains[i, j] * scene.rest[j] for i, j in enumerate(scene.ranges.direct)])
@@ -115,10 +123,19 @@ class _Passage:
         for effect, own in self.acting:
             if isinstance(effect, SensorEffect):
                 change = effect.filtered(change, scene, own)
-        read = self.experiment.mesh.reading(change).T + at_rest
+        rest_change, change = at_rest - gains @ scene.rest, change - self._linear()
+        read = without.deflection + self.experiment.mesh.reading(change).T + rest_change
         if not np.isfinite(read).all():
             raise self._unstable("the response is not finite")
         return Moved(scene, read)
+
+    def _linear(self) -> Matrix:
+        """Block means of the linear plant's deviation from rest, (axes, blocks)."""
+        gains, units = self.plant.gains, self.layout.unit_of
+        rows = [
+            [gains[i, j] * self._unit(unit, 1.0) for j, unit in enumerate(row)] for i, row in enumerate(units)
+        ]
+        return np.asarray(np.sum(rows, axis=1))
 
     @cached_property
     def _stretch(self) -> float:
@@ -129,12 +146,12 @@ class _Passage:
             raise self._unstable(f"its time constants would be multiplied by {stretch:.3g}")
         return stretch
 
-    def _spectrum(self, element: int) -> Spectrum:
+    def _spectrum(self, element: int, stretch: float) -> Spectrum:
         grid = self.experiment.mesh.grid
-        key = (element, grid.n, grid.step, self._stretch)
+        key = (element, grid.n, grid.step, stretch)
         if key not in self.spectra:
             times, orders = self.plant.dynamics.times[element], self.plant.dynamics.orders[element]
-            self.spectra[key] = transfer(self._stretch * times, orders, self.experiment.circle, grid.step)[0]
+            self.spectra[key] = transfer(stretch * times, orders, self.experiment.circle, grid.step)[0]
         return self.spectra[key]
 
     def _means(self, unit: int) -> Vector:
@@ -144,13 +161,13 @@ class _Passage:
         means, _ = self.scene.drives[axis].block_means(self.experiment.edges, late)
         return np.asarray(means[0])
 
-    def _unit(self, unit: int) -> Array:
-        """Block means of a unit response [drive unit]."""
+    def _unit(self, unit: int, stretch: float) -> Array:
+        """Block means of a unit response with all time constants times `stretch` [drive unit]."""
         element, _, axis = self.layout.units[unit]
         if not self.scene.drives[axis].moves:
             return np.zeros(self.experiment.mesh.grid.n)
         circle = self.experiment.circle
-        return circle.coefficients(self._spectrum(element) * circle.spectrum(self._means(unit)))
+        return circle.coefficients(self._spectrum(element, stretch) * circle.spectrum(self._means(unit)))
 
     def _balance(self, bent: Sequence[tuple[ForceEffect, Vector]]) -> tuple[Vector, Matrix]:
         """Deflection of the direct paths at rest, (axes,), and deviation from it, (axes, blocks)."""
@@ -160,7 +177,10 @@ class _Passage:
         f0 = gains * scene.rest[scene.ranges.direct][:, None]
         f = f0 + gains * np.stack([self._means(self.layout.unit_of[i][j]) for i, j in direct])
         kernel = np.stack(
-            [circle.coefficients(self._spectrum(self.layout.element_of[i][j])) for i, j in direct]
+            [
+                circle.coefficients(self._spectrum(self.layout.element_of[i][j], self._stretch))
+                for i, j in direct
+            ]
         )
 
         def acting(f: Matrix, y: Matrix, rate: Matrix) -> Matrix:

@@ -23,7 +23,7 @@ from lcopa_bayes.plant.effects.effect import (
     SensorEffect,
 )
 from lcopa_bayes.plant.effects.passage import Moved, Plant, linear, passed
-from lcopa_bayes.plant.forward import ForwardModel, Spectra
+from lcopa_bayes.plant.forward import ForwardModel, StepResponses
 
 UPSTREAM = (DriveEffect, ElementEffect, ForceEffect, SensorEffect)
 """Places before the reading."""
@@ -46,8 +46,8 @@ class Simulator:
     """Place of each record in the campaign, (records,), -1/2 to 1/2 [-]."""
     times: tuple[Vector, ...]
     """Sample times of each record [time unit]."""
-    spectra: OrderedDict[bytes, Spectra] = field(default_factory=OrderedDict)
-    """Transfer functions of the latest plants; shared with simulators of other effects, for most
+    step_responses: OrderedDict[bytes, StepResponses] = field(default_factory=OrderedDict)
+    """Step responses of the latest plants; shared with simulators of other effects, for most
     simulations differ in the commands alone."""
 
     @cached_property
@@ -121,19 +121,19 @@ class Simulator:
             made = (
                 passed(model, scenes, plant, [self._acting(acting, psi, r) for r in range(len(scenes))])
                 if any(acting)
-                else linear(model, scenes, plant, self._spectra(plant))
+                else linear(model, scenes, plant, self._known(plant))
             )
             self._kept[key] = made
             while len(self._kept) > _KEPT:
                 self._kept.popitem(last=False)
         return self._kept[key]
 
-    def _spectra(self, plant: Plant) -> Spectra:
-        """Transfer functions of a plant's elements."""
-        own = self.spectra.setdefault(plant.elements, {})
-        self.spectra.move_to_end(plant.elements)
-        while len(self.spectra) > _KEPT:
-            self.spectra.popitem(last=False)
+    def _known(self, plant: Plant) -> StepResponses:
+        """Step responses of a plant's elements."""
+        own = self.step_responses.setdefault(plant.elements, {})
+        self.step_responses.move_to_end(plant.elements)
+        while len(self.step_responses) > _KEPT:
+            self.step_responses.popitem(last=False)
         return own
 
     def _bending(self, psi: Vector) -> list[bool]:

@@ -22,9 +22,10 @@ def summed(
     """``sum_k jumps_k shape(t - t_k - delay)``, (samples,); shape is 0 before 0.
 
     Many changes under evenly spaced samples are one convolution: a change between two samples is then shared
-    by them, which is of second order in the sampling period and exact for changes at samples.
+    by them, which is of second order in the sampling period and exact for changes at samples. Samples fewer
+    than the changes are too coarse for that, and are summed one change at a time.
     """
-    if drive.times.size > _MANY and _even(times):
+    if _MANY < drive.times.size <= times.size and _even(times):
         return _convolved(times, drive.times, delay, jumps, shape)
     out = np.zeros(times.size)
     for at, jump in zip(drive.times + delay, jumps, strict=True):

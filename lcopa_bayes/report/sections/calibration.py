@@ -100,7 +100,8 @@ def _ranks(told: Mapping[str, Any]) -> Section:
     )
     text = (
         "Ranks heaped in the middle mean intervals that are too wide, heaped at both ends too narrow, at "
-        "one end biased. Of truths from the prior they are uniform if the whole procedure is exact.",
+        "one end biased. Of truths from the prior they are uniform if the whole procedure is exact; of a "
+        "truth that is the same in every replica they need not be.",
         f"Overall {probability(told['p_value'])}: {told['p_value_of']}.",
     )
     return Section("Ranks", text, _pages(told, "calibration_ranks", caption, 1.35, _histogram))
@@ -170,16 +171,15 @@ def _difference(panel: Axes, row: Mapping[str, Any], told: Mapping[str, Any]) ->
 
 def _replicas(told: Mapping[str, Any]) -> Section:
     gap, seconds, counted = told["model_gap"], told["seconds"], told["grades"]
-    source = told["truths"]
-    origin = (
-        "the prior of the study"
-        if source["from"] == "prior"
-        else f"the posterior in {source['folder']} (grade {source['grade']})"
-    )
+    engine, width = told["engine"], told["discretisation"]
     rows = (
         ("replicas asked for", str(told["asked"])),
         *((f"graded {name}" if name != "failed" else "failed", str(n)) for name, n in counted.items()),
-        ("truths drawn from", origin),
+        ("truths", _origin(told["truths"])),
+        ("draws by importance sampling", f"{engine['importance']}"),
+        ("draws by ensembles", f"{engine['sampling']}"),
+        ("Pareto k of importance weights, median", _number(engine["median_k"])),
+        ("Pareto k of importance weights, largest", _number(engine["largest_k"])),
         ("seed", str(told["seed"])),
         ("processor time of a replica, median [s]", figures(seconds["median"])),
         ("processor time of a replica, largest [s]", figures(seconds["largest"])),
@@ -187,6 +187,9 @@ def _replicas(told: Mapping[str, Any]) -> Section:
         ("forward model from bench at the truth, median [noise sd]", figures(gap["median"])),
         ("forward model from bench at the truth, 90 % quantile [noise sd]", figures(gap["quantile_90"])),
         ("forward model from bench at the truth, largest [noise sd]", figures(gap["largest"])),
+        ("shift by the width of the blocks is negligible", f"{width['negligible']} replicas"),
+        ("shift by the width of the blocks, median [posterior sd]", figures(width["median"], 2)),
+        ("shift by the width of the blocks, largest [posterior sd]", figures(width["largest"], 2)),
         *((name.replace("_", " "), str(value)) for name, value in told["sampler"].items()),
     )
     lists = [Table((Column("replicas"), Column("value", "number")), rows)]
@@ -220,9 +223,26 @@ def _replicas(told: Mapping[str, Any]) -> Section:
     text = (
         "No replica is left out of what is said above but those that failed. The distance of the forward "
         "model from the bench, root sum of squares over all samples, bounds by how many posterior standard "
-        "deviations discretisation alone can shift a result.",
+        "deviations discretisation alone can shift a result. Draws come from importance sampling around the "
+        f"optima where the Pareto k of the weights is at most {figures(engine['largest_good_k'])} and enough "
+        "draws are effective, else from ensembles of walkers.",
     )
     return Section("Replicas", text, tables=tuple(lists))
+
+
+def _origin(source: Mapping[str, Any]) -> str:
+    """Where truths come from, in words."""
+    stated = ", ".join(f"{name} = {value:g}" for name, value in (source["stated"] or {}).items())
+    return {
+        "prior": "drawn from the prior of the study",
+        "posterior": f"drawn from the posterior in {source['folder']} (grade {source['grade']})",
+        "stated": f"the same in every replica: {stated}",
+        "stated and prior": f"the same in every replica: {stated}; the others drawn from the prior",
+    }[source["from"]]
+
+
+def _number(value: float | None) -> str:
+    return "none" if value is None else figures(value, 2)
 
 
 def _further(count: int) -> str:

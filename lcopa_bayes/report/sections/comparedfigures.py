@@ -9,6 +9,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
+from lcopa_bayes.predict import KIND
 from lcopa_bayes.report.canvas import CYCLE, HELD_OUT, NOISE, SEEN, blank, label, plain, svg_of
 from lcopa_bayes.report.decimation import extremes
 from lcopa_bayes.report.section import Drawing, Section
@@ -149,5 +150,5 @@ def _caption(rows: Sequence[Mapping[str, Any]], record: str, axis: str, *, held:
         for one in row[key]:
             if (one["record"], one["axis"]) == (record, axis):
                 told.append(f"{row['name']} {figures(one['rmse'])} {one['unit']}")
-    bands = "the 90 % bands with noise of all" if held else "the 90 % band with noise of the preferred one"
+    bands = f"the {KIND} 90 % band" + ("s with noise of all" if held else " with noise of the preferred one")
     return f"Medians of the rivals, {bands}, and residuals below. RMSE: {', '.join(told)}."

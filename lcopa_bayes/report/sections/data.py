@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
+from lcopa_bayes.predict import KIND
 from lcopa_bayes.report.canvas import BAND, CYCLE, HELD_OUT, NOISE, SEEN, blank, label, plain, svg_of
 from lcopa_bayes.report.decimation import extremes, said
 from lcopa_bayes.report.saved import SavedRun
@@ -46,6 +47,7 @@ def section(run: SavedRun) -> Section:
         "Data and bands",
         (
             "The plant bands hold the response without noise, the grey band the samples themselves. "
+            f"Bands are {KIND}: each holds at every time by itself, and a whole curve leaves it more often. "
             "A model that is right has about 50 and 90 % of the samples in its bands with noise.",
         ),
         tuple(drawings),
@@ -115,8 +117,8 @@ def _caption(score: Mapping[str, Any], record: str, axis: str, size: int, *, hel
     if score:
         parts.append(
             f"RMSE {figures(score['rmse'])} {score['unit']}; {percent(score['coverage_90'])} of the "
-            f"{score['samples']} samples lie in the 90 % band with noise, {percent(score['coverage_50'])} in "
-            f"the 50 % band. Offset: {score['offset_from']}."
+            f"{score['samples']} samples lie in the {KIND} 90 % band with noise, "
+            f"{percent(score['coverage_50'])} in the 50 % band. Offset: {score['offset_from']}."
         )
     return " ".join([*parts, *filter(None, [said(size)])])
 
@@ -146,5 +148,9 @@ def _scores(run: SavedRun) -> Table:
         for row in run.results[key]
     )
     return Table(
-        columns, rows, "RMSE is against the median of the plant; coverage is by the bands with noise."
+        columns,
+        rows,
+        f"RMSE is against the median of the plant; coverage is by the {KIND} bands with noise. Where an "
+        "offset comes from all samples of a held-out record, a constant error of it cannot show in its "
+        "scores.",
     )

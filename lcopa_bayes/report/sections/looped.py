@@ -64,25 +64,27 @@ def _errors(told: Mapping[str, Any]) -> Section:
             Column("after / noise", "number"),
             Column("90 % band before", "number"),
         ),
-        *(Column("90 % band after", "number"), Column("unit")),
+        *(Column("90 % band after", "number"), Column("unit"), Column("level from", "prose")),
     )
     rows = tuple(
         (
             *(str(a["record"]), str(a["axis"]), "yes" if a["held_out"] else ""),
             *(figures(a["rmse"]), figures(b["rmse"]), figures(b["rmse_over_noise"])),
             *(percent(a["coverage_90"]), percent(b["coverage_90"]), str(a["unit"])),
+            str(b["level_from"]),
         )
         for a, b in zip(before["scores"], after["scores"], strict=True)
     )
     text = (
-        f"Unseen records were predicted by {told['unseen_by']}. 90 % bands hold "
+        f"Unseen records were predicted by {told['unseen_by']}. Pointwise 90 % bands hold "
         f"{percent(before['held_out_coverage_90'])} of their samples before and "
         f"{percent(after['held_out_coverage_90'])} after; log evidence "
         f"{figures(before['log_evidence'], 6)} before and {figures(after['log_evidence'], 6)} after "
         "(Laplace approximation, noise held at its estimate)."
     )
     caption = (
-        "Root mean square of observed minus predicted, and the share of samples inside the band with noise."
+        "Root mean square of observed minus predicted, and the share of samples inside the pointwise band "
+        "with noise. Where the level comes from the record itself, a constant error of it cannot show."
     )
     return Section("Errors before and after", (text,), (), (Table(columns, rows, caption),))
 

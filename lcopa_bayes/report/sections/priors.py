@@ -34,7 +34,11 @@ def section(run: SavedRun) -> Section:
     )
     return Section(
         "Priors and posteriors",
-        ("A histogram that follows the line was not moved by the data.",),
+        (
+            "A histogram that follows the line was not moved by the data.",
+            f"Times, those in priors included, are in {run.time_unit}: the `time_unit` of the study, by "
+            "default the unit of the first fit record.",
+        ),
         drawings,
         (_table(run),),
         inspect.cleandoc(defaults.__doc__ or ""),

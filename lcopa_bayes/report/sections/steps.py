@@ -8,6 +8,7 @@ from typing import Any
 import pandas as pd
 from matplotlib.axes import Axes
 
+from lcopa_bayes.predict import KIND
 from lcopa_bayes.report.canvas import BAND, STEADY, grid, plain, svg_of
 from lcopa_bayes.report.decimation import extremes
 from lcopa_bayes.report.saved import SavedRun
@@ -33,8 +34,8 @@ def section(run: SavedRun) -> Section:
     paths = list(dict.fromkeys(curves["path"]))
     pages = [paths[k : k + _PER_FIGURE] for k in range(0, len(paths), _PER_FIGURE)]
     caption = (
-        "Response of the plant to a unit step at time 0, over the longest record: median, 50 and 90 % bands. "
-        "Dashed: median and 90 % band of the steady state it tends to."
+        "Response of the plant to a unit step at time 0, over the longest record: median, "
+        f"{KIND} 50 and 90 % bands. Dashed: median and 90 % interval of the steady state it tends to."
     )
     drawings = tuple(
         Drawing(f"step_{number:02d}", _drawn(run, curves, page), caption)
@@ -81,7 +82,8 @@ def _metrics(metrics: Sequence[Mapping[str, Any]]) -> Table:
         columns,
         tuple(_row(metric) for metric in metrics),
         "Times count from the step. Intervals are 90 % equal-tailed credible; where they are open, the "
-        "response of that share of the draws does not get there within the record.",
+        "response of that share of the draws does not get there within the record, or does not stay there "
+        "after it.",
     )
 
 

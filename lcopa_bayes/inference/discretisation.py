@@ -1,0 +1,174 @@
+"""How far the width of the blocks moves a posterior, and narrower blocks where that is too far.
+
+Two measures. Before sampling, at the best least-squares optimum: with W the whitening of the noise, J the
+whitened Jacobian and d the change of the whitened response on narrower blocks, the optimum moves by
+``(J' J + prior)^-1 J' d`` to first order. After sampling, at draws of the posterior, whatever its shape:
+draws weighted by the ratio of the likelihoods on narrow and on used blocks have the mean that sampling on
+narrow blocks would have had.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from lcopa_bayes.arrays import Matrix, Vector
+from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.draws import Draws
+from lcopa_bayes.inference.grade import Limitation
+from lcopa_bayes.inference.leastsquares import LeastSquares
+from lcopa_bayes.inference.optimum import find_optima
+from lcopa_bayes.inference.posterior import Posterior
+
+LARGEST = 0.1
+"""Largest shift of a parameter by the width of the blocks that leaves a grade as it is [posterior sd]."""
+UNUSABLE = 1.0
+"""Shift at which numbers are not usable [posterior sd]."""
+_FACTORS = (2, 4)
+"""How many times narrower the blocks are on which shifts are measured."""
+_REST = 16 / 15
+"""What is left from blocks four times narrower to none, by the second order of the scheme."""
+_FINEST = 16
+"""Most by which blocks are narrowed [-]."""
+_MOST_CELLS = 1 << 18
+"""Blocks of all records together beyond which they are not narrowed."""
+_STARTS = 2
+"""Starts of the search for the optimum."""
+_DRAWS = 400
+"""Draws behind the measurement after sampling."""
+
+
+@final
+@dataclass(frozen=True)
+class Discretisation:
+    """Shift of the posterior means by the width of the blocks."""
+
+    parameter: str
+    """The one that moves most."""
+    shift: float
+    """How far and to which side, on blocks without width [posterior sd]."""
+    error: float
+    """Standard error of `shift` from the number of draws [posterior sd]."""
+    refinement: int
+    """How many times narrower than the study's settings ask the blocks already are."""
+
+    blocks: int
+    """Blocks of all fit records together [-]."""
+
+    @property
+    def negligible(self) -> bool:
+        """Whether no parameter moves by more than `LARGEST`, the error of the measurement aside."""
+        return abs(self.shift) - 2 * self.error <= LARGEST
+
+    @property
+    def sentence(self) -> str:
+        """What was measured, a sentence without its full stop."""
+        return (
+            f"The {self.blocks} blocks used move the posterior mean of {self.parameter} by "
+            f"{abs(self.shift):.2f} ± {self.error:.2f} sd, that of every other parameter by less"
+        )
+
+    @property
+    def limitations(self) -> tuple[Limitation, ...]:
+        """None where the shift is negligible."""
+        if self.negligible:
+            return ()
+        return (
+            Limitation(
+                "tentative" if abs(self.shift) < UNUSABLE else "unusable",
+                f"the width of the blocks moves {self.parameter} by {abs(self.shift):.2g} posterior sd",
+                "set [model] blocks to a larger number, or leave out the samples of the fastest onset",
+            ),
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "parameter": self.parameter,
+            "shift_sd": self.shift,
+            "shift_error_sd": self.error,
+            "refinement": self.refinement,
+            "blocks": self.blocks,
+            "negligible": self.negligible,
+        }
+
+
+def resolved(problem: Problem) -> Problem:
+    """The problem on blocks so narrow that the optimum moves by at most `LARGEST` sd on narrower ones.
+
+    Blocks are halved while it moves more; not beyond `_FINEST` or `_MOST_CELLS`, where the measurement after
+    sampling says what is left. The same problem gives the same blocks.
+    """
+    rng = np.random.default_rng([problem.study.seed, 6])
+    with threadpool_limits(1):  # matrices are small: more threads only wait for each other
+        optima = find_optima(problem.posterior, rng, starts=_STARTS)
+        while optima and optimum_shift(problem, optima[0].values) > LARGEST and _may_refine(problem):
+            problem = problem.refined(2)
+    return problem
+
+
+def _may_refine(problem: Problem) -> bool:
+    return problem.refinement < _FINEST and 2 * _cells(problem) <= _MOST_CELLS
+
+
+def _cells(problem: Problem) -> int:
+    """Blocks of all fit records together."""
+    return sum(experiment.blocks for experiment in problem.posterior.model.experiments)
+
+
+def optimum_shift(problem: Problem, values: Vector) -> float:
+    """Largest shift of a free plant parameter at an optimum on narrower blocks [posterior sd].
+
+    Parameters: values (rows,) of the table at the optimum. First order in the change of the response.
+    """
+    here = LeastSquares(problem.posterior)
+    x = here.coordinates(values)
+    residual, jacobian = here.residual(x, values)
+    covariance = np.linalg.pinv(jacobian.T @ jacobian + _prior_precision(here), hermitian=True)
+    sd = np.sqrt(np.diag(covariance))
+    largest = 0.0
+    for factor in _FACTORS:
+        finer = LeastSquares(problem.refined(factor).posterior)
+        change = finer.residual(x, values)[0] - residual
+        moved = np.abs(covariance @ (jacobian.T @ change)) / np.where(sd > 0, sd, np.inf)
+        largest = max(largest, float(moved.max(initial=0.0)))
+    return largest * _REST
+
+
+def _prior_precision(problem: LeastSquares) -> Matrix:
+    """No direction is wider than its prior: precision of a uniform law between the bounds."""
+    low, high = problem.bounds
+    width = high - low
+    return np.diag(np.where(np.isfinite(width), 12.0 / np.where(width > 0, width, 1.0) ** 2, 0.0))
+
+
+def discretisation(problem: Problem, draws: Draws) -> Discretisation:
+    """Shift of the posterior mean of every free parameter on blocks four times narrower."""
+    finer = problem.refined(_FACTORS[-1]).posterior
+    values = draws.thinned(_DRAWS)
+    change = _log_likelihood(finer, values) - _log_likelihood(problem.posterior, values)
+    weights = np.exp(change - change.max())
+    weights /= weights.sum()
+    rows = [k for k, row in enumerate(draws.table.rows) if row.free]
+    columns = values[:, rows]
+    sd = columns.std(axis=0)
+    scaled = (columns - columns.mean(axis=0)) / np.where(sd > 0, sd, np.inf)
+    shifts = weights @ scaled * _REST
+    errors = np.sqrt(np.mean(((weights * weights.size - 1.0)[:, None] * scaled) ** 2, axis=0) / weights.size)
+    worst = int(np.abs(shifts).argmax())
+    return Discretisation(
+        draws.table.names[rows[worst]],
+        float(shifts[worst]),
+        float(errors[worst]),
+        problem.refinement,
+        _cells(problem),
+    )
+
+
+def _log_likelihood(posterior: Posterior, values: Matrix) -> Vector:
+    """Joint log likelihood of table values, linear parameters included, (batch,) [nat]."""
+    each = [axis.sum(axis=1) for record in posterior.pointwise(values) for axis in record]
+    return np.asarray(np.sum(each, axis=0))
