@@ -8,6 +8,7 @@ from typing import final
 
 import numpy as np
 
+from lcopa_bayes.arrays import Matrix
 from lcopa_bayes.estimate import Estimate
 from lcopa_bayes.files import writable_folder
 from lcopa_bayes.inference.assembly import Problem, problem_of
@@ -18,7 +19,7 @@ from lcopa_bayes.inference.evidence import Evidence, evidence
 from lcopa_bayes.inference.nested import NestedPlan, nested
 from lcopa_bayes.inference.sampler import Run, SamplePlan, sample
 from lcopa_bayes.predict import Band, bands
-from lcopa_bayes.provenance import fingerprint
+from lcopa_bayes.provenance import digest_of, fingerprint
 from lcopa_bayes.residuals import Residual, residuals
 from lcopa_bayes.sensitivity import Sensitivity, sensitivity
 from lcopa_bayes.stepmetrics import StepCurves, step_curves, step_metrics
@@ -62,8 +63,11 @@ def fit(
     quick: bool = False,
     cross_check: bool = False,
     quiet: bool = True,
+    starts: Matrix | None = None,
 ) -> Fit:
     """Sample the posterior of a study and derive what it predicts.
+
+    `starts`, table values (starts, rows), are modes known from elsewhere that sampling proposes too.
 
     With `folder`, sampling is stored there in `chain.h5` and `resume` goes on from it; the result is
     the same as without interruption. With `cross_check` the posterior is also sampled by nested sampling,
@@ -82,9 +86,10 @@ def fit(
         plan,
         jobs=jobs,
         chain_file=folder / "chain.h5" if folder else None,
-        fingerprint=fingerprint(study, plan),
+        fingerprint=fingerprint(study, plan) + ("" if starts is None else digest_of(starts)),
         resume=resume,
         quiet=quiet,
+        starts=starts,
     )
     draws, check = gather(problem.posterior, run), None
     weighed = evidence(problem.posterior, run.kept()[0], draws.ess, plan.seed)

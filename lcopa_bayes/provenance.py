@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from lcopa_bayes.arrays import Array
 from lcopa_bayes.estimate import plain
 from lcopa_bayes.inference.sampler import SamplePlan
 from lcopa_bayes.record import Record
@@ -62,6 +63,12 @@ def digest(record: Record) -> str:
     held = hashlib.sha256(repr((record.drive_axes, record.response_axes, record.time_unit)).encode())
     for array in (record.time, record.drive, record.response):
         held.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
+    return held.hexdigest()
+
+
+def digest_of(array: Array) -> str:
+    """Hash of an array."""
+    held = hashlib.sha256(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
     return held.hexdigest()
 
 

@@ -279,6 +279,7 @@ def card(name: str, evidence: float | None, lpd: float, **told: object) -> dict:
         "fit_scores": scores,
         "held_out": [],
         "order_is_integer": [],
+        "containment": {"contains": [], "sampled_again": False, "met": True},
     }
     return base | told
 

@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 from small import draws_of, problem
 
-from lcopa_bayes.inference.grade import Grade, Limitation, Quality, limited, overall, qualities
+from lcopa_bayes.inference.grade import (
+    Grade,
+    Limitation,
+    Quality,
+    between,
+    limited,
+    overall,
+    qualities,
+    with_shares,
+)
+from lcopa_bayes.inference.ridges import Ridges
 
 SHAPE = (4, 16, 60)
 """Ensembles, walkers, draws."""
@@ -153,3 +163,69 @@ def test_a_limitation_that_names_parameters_leaves_the_others():
     assert grades["gain"] == "tentative"
     assert {grade for name, grade in grades.items() if name != "gain"} == {"reliable"}
     assert draws.limited([Limitation("unusable", "B")]).limitations[0] is one
+
+
+# -- the grade as a decision ------------------------------------------------------------------------
+
+
+def share_reliable(ensembles: int, error: float, trials: int = 100, draws: int = 60) -> float:
+    """Of `trials` runs whose ensembles are off by normal errors of `error` standard deviations each."""
+    rng = np.random.default_rng([ensembles, round(100 * error)])
+    reliable = 0
+    for _ in range(trials):
+        off = error * rng.standard_normal((ensembles, 1, 1))
+        reliable += one(rng.standard_normal((ensembles, 16, draws)) + off).grade(400).level == "reliable"
+    return reliable / trials
+
+
+@pytest.mark.parametrize("ensembles", [2, 3, 4, 8])
+def test_errors_that_an_ensemble_shares_are_rarely_called_reliable(ensembles):
+    """0.3 posterior standard deviations each: promised is one in ten, four errors of a share are granted."""
+    assert share_reliable(ensembles, 0.3) <= 0.1 + 4 * np.sqrt(0.1 * 0.9 / 100)
+
+
+@pytest.mark.parametrize(("ensembles", "draws"), [(2, 240), (3, 60), (4, 60), (8, 60)])
+def test_independent_draws_are_nearly_always_called_reliable(ensembles, draws):
+    """As many draws as the docstring of the bound promises nine of ten for, and more."""
+    assert share_reliable(ensembles, 0.0, draws=draws) >= 0.9 - 4 * np.sqrt(0.1 * 0.9 / 100)
+    assert ensembles == 2 or share_reliable(ensembles, 0.0, draws=draws) >= 0.99
+
+
+@pytest.mark.parametrize("ensembles", [2, 4, 8])
+def test_scatter_of_ensemble_means_is_worth_as_many_draws_as_they_scatter(ensembles):
+    """The reciprocal of the effective sample size is without bias: error**2 / ensembles."""
+    rng, error, trials = np.random.default_rng(ensembles), 0.2, 400
+    worth = []
+    for _ in range(trials):
+        off = error * rng.standard_normal((ensembles, 1, 1))
+        worth.append(between(rng.standard_normal((ensembles, 16, 60)) + off)[0])
+    exact = error**2 / ensembles + 1 / (960 * ensembles)
+    mean = np.mean(1 / np.array(worth))
+    assert mean == pytest.approx(exact, rel=0.05 + 4 * np.sqrt(2 / (ensembles - 1) / trials))
+
+
+def test_the_bound_on_the_scatter_holds_as_often_as_promised():
+    rng, error, trials = np.random.default_rng(9), 0.3, 300
+    held = 0
+    for _ in range(trials):
+        off = error * rng.standard_normal((3, 1, 1))
+        held += between(rng.standard_normal((3, 16, 60)) + off)[1] >= error / np.sqrt(1 + error**2)
+    assert held / trials == pytest.approx(0.9, abs=4 * np.sqrt(0.9 * 0.1 / trials))
+
+
+def test_ensembles_that_scatter_too_much_say_so_and_what_to_do():
+    quality = Quality("it", 900.0, 900.0, 1.01, 0.0, 60.0, 0.5)
+    grade = quality.grade(400)
+    assert (grade.level, quality.ess) == ("tentative", 60.0)
+    assert "off by 0.50 standard deviations" in quality.remedy(400)
+    assert "more ensembles" in quality.remedy(400)
+
+
+def test_slow_exchange_between_modes_counts():
+    """A mean that is known well beside shares of modes that are not."""
+    shares = np.array([[0.02, 0.98], [0.04, 0.96], [0.06, 0.94], [0.04, 0.96]])
+    found = Ridges("it", "-", (1.0,), shares, np.full((4, 2), 0.001))
+    exact = 0.04 * 0.96 / (shares[:, 0].var(ddof=1) / 4)
+    assert found.ess == pytest.approx(exact)
+    assert with_shares(Quality("it", 900.0, 900.0, 1.0), [found]).ess == pytest.approx(exact)
+    assert with_shares(Quality("other", 900.0, 900.0, 1.0), [found]).ess == 900.0

@@ -310,7 +310,7 @@ def test_the_evidence_is_of_the_prior_with_decreasing_orders(alike):
     assert error < 0.05
     assert found.log_evidence_sd < 0.3
     assert abs(found.log_evidence - exact) < 4 * np.hypot(found.log_evidence_sd, error)
-    assert posterior.table.ordered(found.values).all()
+    assert posterior.table.supported(found.values).all()
 
 
 def test_seed_and_plan_decide_the_result_and_jobs_do_not():

@@ -200,7 +200,7 @@ def test_terms_that_cannot_be_exchanged_stay_in_order(priors):
         start = start.copy()
         start[posterior.table.of_kind("sigma")] = 0.05
         ends.append(least.solve(start)[0])
-    assert posterior.table.ordered(np.array(ends)).all()
+    assert posterior.table.supported(np.array(ends)).all()
     assert find_optima(posterior, rng, starts=4)
 
 

@@ -155,8 +155,11 @@ def test_orders_fixed_for_another_number_of_terms_are_refused():
 
 def test_a_study_may_fix_equal_orders():
     made = table(orders=(2.0, 1.0, 1.0), terms=3)
-    assert made.log_ordering == made.log_permutations == 0.0
-    assert made.ordered(made.draw(20, np.random.default_rng(0))).all()
+    assert made.log_permutations == 0.0
+    fast = made.rows[made.at("time", 0, 0)].mass_below(made.resolution)  # only order 2 can be an alias
+    assert 0 < fast < 1
+    assert made.log_support == pytest.approx(-log(1 - fast))
+    assert made.supported(made.draw(20, np.random.default_rng(0))).all()
 
 
 NARROW = {"order_1": ("norm", {"loc": 1.3, "scale": 0.2}), "order_2": ("norm", {"loc": 1.1, "scale": 0.3})}
@@ -165,7 +168,9 @@ NARROW = {"order_1": ("norm", {"loc": 1.3, "scale": 0.2}), "order_2": ("norm", {
 def test_exchangeable_terms_count_their_permutations():
     three = table(terms=3)
     assert three.exchangeable == (True,)
-    assert three.log_ordering == three.log_permutations == pytest.approx(log(factorial(3)))
+    assert three.log_permutations == pytest.approx(log(factorial(3)))
+    resolved = 1 - three.rows[three.at("time", 0, 0)].mass_below(three.resolution) / 2
+    assert three.log_support == pytest.approx(log(factorial(3)) - 3 * log(resolved))
     own = table(terms=2, priors=NARROW)
     assert own.exchangeable == (False,)
     assert own.log_permutations == 0.0
@@ -174,17 +179,15 @@ def test_exchangeable_terms_count_their_permutations():
 def test_prior_mass_on_decreasing_orders_is_the_normal_probability():
     share = stats.norm.cdf((1.3 - 1.1) / np.hypot(0.2, 0.3))  # the cut at 0 and 2 moves it by less than 1e-3
     own = table(terms=2, priors=NARROW)
-    assert np.exp(-own.log_ordering) == pytest.approx(
-        share, abs=4 * np.sqrt(share * (1 - share) / 2e5) + 1e-3
-    )
+    assert np.exp(-own.log_support) == pytest.approx(share, abs=4 * np.sqrt(share * (1 - share) / 2e5) + 1e-3)
     drawn = own.draw(500, np.random.default_rng(0))
-    assert own.ordered(drawn).all()
+    assert own.supported(drawn).all()
     alike = dict(NARROW, order_2=NARROW["order_1"])
     assert table(terms=2, priors=alike).exchangeable == (True,)
     apart = alike | {"time_2": ("lognorm", {"s": 1.0})}
     half = table(terms=2, priors=apart)
     assert half.exchangeable == (False,)
-    assert half.log_ordering == pytest.approx(log(2), abs=4 * 0.5 / np.sqrt(2e5) * 2)
+    assert half.log_support == pytest.approx(log(2), abs=4 * 0.5 / np.sqrt(2e5) * 2)
 
 
 def test_orders_that_cannot_decrease_are_refused():
@@ -208,19 +211,39 @@ def test_canonical_does_not_depend_on_the_order_of_terms(rank, seed):
     assert_array_equal(sorted_, values)
     assert_array_equal(made.canonical(mixed), values)
     assert_array_equal(np.take_along_axis(sorted_, source, axis=1), mixed)
-    assert made.ordered(values).all()
+    assert made.supported(values).all()
 
 
 THREE = table(terms=3)
 
 
 def test_draws_follow_the_ordered_prior():
-    drawn = THREE.draw(4000, np.random.default_rng(2))
+    times = ("loguniform", {"a": 1.0, "b": 100.0})
+    own = table(terms=3, priors={f"time_{k}": times for k in (1, 2, 3)})
+    drawn = own.draw(4000, np.random.default_rng(2))
     for k in range(3):  # the k-th largest of three uniform numbers
-        order = drawn[:, THREE.at("order", 0, k)] / 2
+        order = drawn[:, own.at("order", 0, k)] / 2
         assert stats.kstest(order, stats.beta(3 - k, 1 + k).cdf).pvalue > 1e-3
-        time = drawn[:, THREE.at("time", 0, k)]
-        assert stats.kstest(time, THREE.rows[THREE.at("time", 0, k)].prior.frozen.cdf).pvalue > 1e-3
+        time = drawn[:, own.at("time", 0, k)]
+        assert stats.kstest(time, own.rows[own.at("time", 0, k)].prior.frozen.cdf).pvalue > 1e-3
+
+
+def test_default_priors_hold_no_alias():
+    """A term of order above 1 resonates below the Nyquist frequency, unless its study says otherwise."""
+    nyquist = np.pi / 0.2  # of samples every 0.2
+    for terms, narrow in ((1, {}), (3, {}), (2, {"order_2": ("uniform", {"loc": 0.2, "scale": 1.5})})):
+        made = table(terms=terms, priors=narrow)
+        drawn = made.draw(4000, np.random.default_rng(3))
+        assert made.supported(drawn).all()
+        fast = drawn.copy()
+        fast[:, made.at("time", 0, 0)] = 0.99 / nyquist
+        resonates = fast[:, made.at("order", 0, 0)] > 1
+        assert 0 < resonates.mean() < 1
+        assert_array_equal(made.supported(fast), ~resonates)
+        assert (1 / drawn[drawn[:, made.at("order", 0, 0)] > 1, made.at("time", 0, 0)] <= nyquist).all()
+    own = table(terms=1, priors={"time_1": ("loguniform", {"a": 0.001, "b": 1.0})})
+    assert own.log_support == 0.0
+    assert own.draw(4000, np.random.default_rng(4))[:, own.at("time", 0, 0)].min() < 0.01
 
 
 def test_views_of_values():

@@ -94,9 +94,9 @@ def test_what_is_known_of_a_record_depends_on_the_record_alone():
     own = one.posterior.samples[0]
     part = parts_of(one.posterior, [])[0]
     moved = own.record.time[np.flatnonzero(own.record.drive[:, 0] != own.record.drive[0, 0])[0]]
-    assert known_before(own, own.axes[0], part) == np.count_nonzero(own.times <= moved) > 1
+    assert known_before(own, 0, part) == np.count_nonzero(own.times <= moved) > 1
     never = replace(own, record=replace(own.record, drive=np.zeros_like(own.record.drive)))
-    assert known_before(never, never.axes[0], part) == 1
+    assert known_before(never, 0, part) == 1
 
 
 # -- signs of weights ------------------------------------------------------------------------------

@@ -124,7 +124,7 @@ def truths_around(folder: Path, table: ParameterTable) -> Truths:
             problems.append(f"{path}: {name!r} has no draws, or draws that the prior of this study excludes")
         else:
             pool[:, free[name]] = values
-    if not problems and not table.ordered(pool).all():
+    if not problems and not table.supported(pool).all():
         problems.append(f"{path}: has draws whose orders do not decrease, as they must in this study")
     if problems:
         raise InputError([*sorted(problems), f"{folder}: {advice}"])

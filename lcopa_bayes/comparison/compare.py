@@ -15,6 +15,7 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from lcopa_bayes.comparison.candidates import Candidate
+from lcopa_bayes.comparison.containment import Check
 from lcopa_bayes.comparison.contender import Contender, contender
 from lcopa_bayes.comparison.judgement import judged
 from lcopa_bayes.files import writable_folder
@@ -32,6 +33,9 @@ def compare(
     quiet: bool = True,
 ) -> dict[str, Any]:
     """Fit every candidate, score it, and say which is warranted; plain values as `compare.json` holds them.
+
+    A candidate that contains another is held against it, and sampled again where it has missed a mode that
+    the smaller one has found (`containment`).
 
     Candidates are fitted in `jobs` processes; what they give is the same. With `folder` each has a folder
     of its own under `candidates/`, and `resume` goes on from what is there. InputError for fewer than two
@@ -51,7 +55,34 @@ def compare(
         for told in _performed(tasks, jobs):
             cards[str(told["name"])] = told
             bar.update()
+        bar.set_description("holding against contained models")
+        for wave in _by_size(tasks, cards):
+            checks = [
+                Check(
+                    task,
+                    cards[task.candidate.name],
+                    tuple(
+                        (other.candidate, cards[other.candidate.name])
+                        for other in tasks
+                        if _size(cards, other) < _size(cards, task)
+                    ),
+                )
+                for task in wave
+            ]
+            for told in _performed(checks, jobs):
+                cards[str(told["name"])] = told
     return judged([cards[one.name] for one in candidates], candidates[0].study)
+
+
+def _size(cards: Mapping[str, Mapping[str, Any]], task: Contender) -> int:
+    return int(cards[task.candidate.name]["parameters"])
+
+
+def _by_size(tasks: Sequence[Contender], cards: Mapping[str, Mapping[str, Any]]) -> Iterator[list[Contender]]:
+    """Candidates of equally many parameters together, the smallest first: what one has found, the richer
+    ones are held against."""
+    for size in sorted({_size(cards, task) for task in tasks}):
+        yield [task for task in tasks if _size(cards, task) == size]
 
 
 def folder_name(name: str) -> str:
@@ -100,7 +131,7 @@ def _same_data(one: Candidate, other: Candidate) -> bool:
     return held(one) == held(other) and len(one.study.fit) == len(other.study.fit)
 
 
-def _performed(tasks: Sequence[Contender], jobs: int) -> Iterator[Mapping[str, Any]]:
+def _performed(tasks: Sequence[Contender | Check], jobs: int) -> Iterator[Mapping[str, Any]]:
     """Cards as they are finished, the largest model begun first."""
     ranked = sorted(tasks, key=lambda task: -problem_of(task.candidate.study).posterior.dimension)
     if min(jobs, len(tasks)) <= 1:
@@ -124,5 +155,5 @@ def _take_up() -> None:
     threadpool_limits(1)
 
 
-def _perform(task: Contender) -> Mapping[str, Any]:
+def _perform(task: Contender | Check) -> Mapping[str, Any]:
     return task()

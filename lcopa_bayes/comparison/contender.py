@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
@@ -14,6 +14,8 @@ import numpy as np
 import pandas as pd
 from threadpoolctl import threadpool_limits
 
+from lcopa_bayes.arrays import Matrix
+from lcopa_bayes.audit.landscape import Peak
 from lcopa_bayes.comparison.candidates import Candidate
 from lcopa_bayes.comparison.integerorder import integer_orders
 from lcopa_bayes.comparison.likelihood import criteria
@@ -33,10 +35,12 @@ from lcopa_bayes.study import Study
 
 CARD = "candidate.json"
 """File of a candidate's scores inside its folder."""
-ENSEMBLES, WALKERS, TARGET_ESS = 2, 32, 100
-"""How a comparison samples what the study leaves open [-]: an evidence is wanted to a tenth of a nat or
-two, not a marginal to a percent."""
-_VERSION = 1
+WALKERS = 32
+"""Walkers of a comparison where the study leaves their number open, if the dimension does not ask for more
+[-]. Ensembles and effective draws are those of a fit, so that a grade means the same."""
+_STARTS = 64
+"""Draws kept as starts of richer models [-]."""
+_VERSION = 2
 """Raised when what a card holds changes."""
 
 
@@ -91,48 +95,59 @@ class Contender:
             if made.draws.grade.level == "unusable" and self.patient != self.candidate.study.sampler:
                 longer = replace(self.candidate.study, sampler=self.patient)
                 made = self._fitted(longer, None if self.folder is None else self.folder / "longer")
-            told, found_parts = card(self.candidate, made)
-            told = told | {
-                "fingerprint": self.fingerprint,
-                "seconds": time.perf_counter() - began,
-                "pointwise": _pointwise(found_parts),
-                "curves": _curves(made),
-            }
+            told = self.scored(made) | {"seconds": time.perf_counter() - began}
+        self.store(told)
+        return told
+
+    def fitted_from(self, starts: Matrix) -> Fit:
+        """The candidate fitted as its study asks, with modes known from elsewhere, table values
+        (starts, rows), among the proposals."""
+        study = replace(self.candidate.study, sampler=self.patient)
+        return self._fitted(study, None if self.folder is None else self.folder / "again", starts)
+
+    def scored(self, made: Fit, also: Sequence[Peak] = ()) -> dict[str, Any]:
+        """The card of a fit; `also` are maxima of its likelihood known from elsewhere."""
+        told, found_parts = card(self.candidate, made, also)
+        return told | {
+            "fingerprint": self.fingerprint,
+            "pointwise": _pointwise(found_parts),
+            "curves": _curves(made),
+        }
+
+    def store(self, told: Mapping[str, Any]) -> None:
+        """Keep a card and its tables in the folder, where there is one."""
         if self.folder is not None:
             tables = writable_folder(self.folder / "tables")
             save_table(pd.DataFrame(told["curves"]), tables / "curves.csv")
             save_table(pd.DataFrame(told["pointwise"]), tables / "pointwise.csv")
             save_json(told, self.folder / CARD)
-        return told
 
-    def _fitted(self, study: Study, folder: Path | None) -> Fit:
-        return fit(study, folder=folder, resume=self.resume, quick=self.quick, quiet=True)
+    def _fitted(self, study: Study, folder: Path | None, starts: Matrix | None = None) -> Fit:
+        return fit(study, folder=folder, resume=self.resume, quick=self.quick, quiet=True, starts=starts)
 
 
 def contender(candidate: Candidate, folder: Path | None, *, quick: bool, resume: bool) -> Contender:
-    """A candidate with a plan shorter than that of a fit; what the study's ``[sampler]`` states is kept.
+    """A candidate with fewer walkers than a fit has; what the study's ``[sampler]`` states is kept.
 
     Where the short plan leaves a posterior that is unusable it is sampled again as a fit would.
     """
-    study, own, free = candidate.study, candidate.study.sampler, SamplerSettings()
-    sampler = replace(
-        own,
-        ensembles=ENSEMBLES if own.ensembles == free.ensembles else own.ensembles,
-        walkers=own.walkers or WALKERS,
-        target_ess=min(own.target_ess, TARGET_ESS),
-    )
+    study, own = candidate.study, candidate.study.sampler
+    sampler = replace(own, walkers=own.walkers or WALKERS)
     # the study file may name candidates that say nothing of this one
     return Contender(
         replace(candidate, study=replace(study, sampler=sampler, inputs={})), own, folder, quick, resume
     )
 
 
-def card(candidate: Candidate, made: Fit) -> tuple[dict[str, Any], tuple[Predicted, ...]]:
+def card(
+    candidate: Candidate, made: Fit, also: Sequence[Peak] = ()
+) -> tuple[dict[str, Any], tuple[Predicted, ...]]:
     """Everything a comparison needs of a fitted candidate, as plain values, and its predictions."""
     grade = made.draws.grade
     usable = grade.level != "unusable"
     weighed = None if candidate.improper else made.evidence
     parts = predictions(made) if usable else ()
+    found = criteria(made, also)
     told: dict[str, Any] = plain(
         {
             "name": candidate.name,
@@ -152,7 +167,9 @@ def card(candidate: Candidate, made: Fit) -> tuple[dict[str, Any], tuple[Predict
                 f"improper prior of {', '.join(candidate.improper)}" if candidate.improper else ""
             ),
             "prior_widths": [one.as_json() for one in widths(made)] if usable and weighed else [],
-            **criteria(made).as_json(),
+            **found.as_json(),
+            "starts": {"optimum": found.values, "draws": made.draws.thinned(_STARTS)},
+            "refinement": made.problem.refinement,
             "residual_rms": residual_rms(made),
             "fit_scores": scores(made, held_out=False),
             "held_out": scores(made, held_out=True),

@@ -43,6 +43,11 @@ def decided(rows: Sequence[Row]) -> dict[str, Any]:
     if agree is False and unseen and predictive is not None:
         preferred = predictive
     why = _why(preferred, evident, usable, agree, sentence, unseen)
+    why += "".join(
+        f" {row['name']} is not ranked: it has not met a mode of a model that it contains."
+        for row in rows
+        if not row["containment"]["met"]
+    )
     return told | {
         "preferred": None if preferred is None else preferred["name"],
         "why": why,

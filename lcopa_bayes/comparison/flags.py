@@ -16,6 +16,7 @@ def flags(rows: Sequence[Row]) -> list[dict[str, str]]:
     """What a reader must not overlook, per candidate."""
     out: list[dict[str, str]] = []
     for row in rows:
+        out += missed_modes(row)
         if not row["usable"]:
             continue
         left = [one for one in row["residual_tests"] if not one["held_out"]]
@@ -53,3 +54,20 @@ def flags(rows: Sequence[Row]) -> list[dict[str, str]]:
                 }
             )
     return out
+
+
+def missed_modes(row: Row) -> list[dict[str, str]]:
+    """That a candidate was sampled again because a model it contains had found a mode it had missed."""
+    held = row["containment"]
+    missed = [one for one in held["contains"] if one["missed"]]
+    if not missed:
+        return []
+    best = max(missed, key=lambda one: one["reached"])
+    said = (
+        f"its first sampling missed a mode that {best['model']}, which it contains, had found (best log "
+        f"likelihood {best['own']:.1f} against {best['reached']:.1f} there); it was sampled again with that "
+        "mode among the proposals"
+    )
+    if not held["met"]:
+        said += ", and still has not met it: it is ranked nowhere"
+    return [{"model": row["name"], "kind": "missed mode", "sentence": said}]

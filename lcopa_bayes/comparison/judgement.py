@@ -39,7 +39,7 @@ def judged(cards: Sequence[Card], study: Study) -> dict[str, Any]:
                 {"model": row["name"]} | dict(one) for row in fractional for one in row["order_is_integer"]
             ],
             "models": [
-                {key: value for key, value in row.items() if key not in ("pointwise", "curves")}
+                {key: value for key, value in row.items() if key not in ("pointwise", "curves", "starts")}
                 for row in rows
             ],
         }

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import log
 from typing import Any, final
 
 import numpy as np
 
+from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.audit.landscape import Landscape, Peak
 from lcopa_bayes.estimate import plain
 from lcopa_bayes.fit import Fit
@@ -21,6 +23,8 @@ _CLIMBED = 4
 class Criteria:
     """AIC and BIC, for those who want them: they know neither priors nor ridges."""
 
+    values: Vector
+    """Table values at the maximum, (rows,)."""
     log_likelihood: float
     """Maximum [nat]."""
     parameters: int
@@ -52,13 +56,16 @@ class Criteria:
         return told
 
 
-def criteria(fit: Fit) -> Criteria:
-    """From the highest of a few draws, climbed."""
-    posterior = fit.problem.posterior
-    landscape = Landscape(posterior)
-    values = fit.draws.thinned(200)
+def criteria(fit: Fit, also: Sequence[Peak] = ()) -> Criteria:
+    """From the highest of a few draws, climbed, and maxima `also` known."""
+    landscape = Landscape(fit.problem.posterior)
+    peak = max([highest(landscape, fit.draws.thinned(200)), *also], key=lambda one: one.log_likelihood)
+    return Criteria(peak.values, peak.log_likelihood, len(landscape.free), fit.problem.posterior.size)
+
+
+def highest(landscape: Landscape, values: Matrix) -> Peak:
+    """The highest maximum of the likelihood reached from the best of some table values (n, rows)."""
     heights = landscape.log_likelihood(values)
-    starts = values[np.argsort(-heights)[:_CLIMBED]]
-    peak: Peak = max((landscape.climb(start) for start in starts), key=lambda one: one.log_likelihood)
-    best = max(peak.log_likelihood, float(heights.max()))
-    return Criteria(best, len(landscape.free), posterior.size)
+    best = np.argsort(-heights)[:_CLIMBED]
+    peaks = [landscape.climb(values[k]) for k in best]
+    return max([Peak(values[best[0]], float(heights[best[0]])), *peaks], key=lambda one: one.log_likelihood)

@@ -213,11 +213,11 @@ class _Scored:
         """Densities (draws, predicted), where the level comes from, and the predicted samples' places."""
         table, noise = self.fit.draws.table, self.fit.problem.posterior.noise
         last = int(np.count_nonzero(observed.index < self.part.until))
-        first = known_before(self.samples, observed, self.part)
+        first = known_before(self.samples, axis, self.part)
         index = observed.index[:last]
         residual = observed.values[:last] - plant[:, index]
         parameters = values[:, [table.at(name, axis) for name in noise.names]]
-        level = level_of(table, values, axis, self.part, self.samples, observed)
+        level = level_of(table, values, axis, self.part, self.samples)
         each = log_densities(noise, residual, parameters, observed.gaps[:last], level.value, first)
         return each, level.source, index[first:]
 

@@ -16,7 +16,7 @@ from scipy.special import logsumexp
 
 from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.comparison.parts import Part
-from lcopa_bayes.inference.data import Observed, Samples
+from lcopa_bayes.inference.data import Samples
 from lcopa_bayes.inference.noise import GaussianNoise, Noise
 from lcopa_bayes.inference.parameters import ParameterTable
 
@@ -36,24 +36,21 @@ LevelFrom = Literal[
 """Where the level of a predicted record comes from."""
 
 
-def known_before(samples: Samples, observed: Observed, part: Part) -> int:
+def known_before(samples: Samples, axis: int, part: Part) -> int:
     """Samples of an axis that are known when the first of a part is predicted [-].
 
     Of a whole record those at rest, up to the first change of any drive, and one at least: they set its
     level. The record alone decides, not the model, so that all candidates predict the same samples.
     """
+    observed = samples.axes[axis]
     if part.known:
         return int(np.count_nonzero(observed.index < part.known))
-    resting = int(np.count_nonzero(at_rest(samples, observed)))
-    return 1 if resting in (0, observed.values.size) else resting
+    return _resting(samples, axis) or min(1, observed.values.size)
 
 
-def at_rest(samples: Samples, observed: Observed) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Samples of an axis taken before any drive changes."""
-    drive = samples.record.drive
-    moved = np.flatnonzero((drive != drive[0]).any(axis=1))
-    begin = samples.record.time[moved[0]] if moved.size else np.inf
-    return np.asarray(samples.times[observed.index] <= begin)
+def _resting(samples: Samples, axis: int) -> int:
+    """Samples of an axis before any drive changes; 0 where none ever does [-]."""
+    return samples.quiet(axis).values.size if np.isfinite(samples.first_change) else 0
 
 
 @final
@@ -66,9 +63,7 @@ class Level:
     source: LevelFrom
 
 
-def level_of(
-    table: ParameterTable, values: Matrix, axis: int, part: Part, samples: Samples, observed: Observed
-) -> Level:
+def level_of(table: ParameterTable, values: Matrix, axis: int, part: Part, samples: Samples) -> Level:
     """Level of an axis under draws (draws, rows) of what is known when a part is predicted."""
     places = {
         table.rows[k].place.second: k for k in table.of_kind("offset") if table.rows[k].place.first == axis
@@ -82,8 +77,7 @@ def level_of(
     row = places.get(part.record) if part.kind == "record left out" else None
     if row is not None and not table.rows[row].free:
         return Level(values[:, row], "fixed by the study")
-    resting = np.count_nonzero(at_rest(samples, observed))
-    if 0 < resting < observed.values.size:
+    if _resting(samples, axis):
         return Level(None, "its samples at rest, then each one as it has been predicted")
     return Level(None, "its first sample, then each one as it has been predicted: it has none at rest")
 

@@ -64,7 +64,7 @@ def problem_of(study: Study) -> Problem:
         )
     if posterior.dimension == 0:
         raise InputError(f"{study.name}: every parameter is fixed or linear; leave at least one free")
-    table.log_ordering  # noqa: B018 - raises when no prior mass has decreasing orders
+    table.log_support  # noqa: B018 - raises when no prior mass has decreasing orders
     return Problem(study, posterior, scales)
 
 

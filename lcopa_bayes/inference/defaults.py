@@ -7,9 +7,7 @@ period, A = range of a response axis over the records, D = largest deviation of 
 parameter    prior                                   why
 ===========  ======================================  ============================================
 gain         normal(0, 5 A / D)                      either sign; a slow tail may hide most of it
-time         log-uniform(period / pi, 100 span)      from a resonance 1 / T at the Nyquist frequency, below
-                                                     which samples tell it from an alias and blocks are
-                                                     stable, to far slower than the record
+time         log-uniform(period / 10, 100 span)      from unresolved to far slower than the record
 order        uniform(0, 2), decreasing               where the element is passive
 delay        uniform(0, 0.4 span)                    later onset leaves too little record to fit
 offset       normal(mean response, 5 A (1 + U / D))  reading at zero drive; U = largest resting drive
@@ -32,6 +30,10 @@ rho          uniform(exp(-1), exp(-20 / N)),         from one sampling period, a
              upper end not below exp(-1 / 2)         to a twentieth of a record: what lasts longer is a
                                                      trend, and the plant's to explain
 ===========  ======================================  ============================================
+
+Terms of order above 1 resonate near 1 / T. Faster than the Nyquist frequency of the samples such a resonance
+is an alias of whatever is periodic in the record, and blocks as wide as a sample cannot follow it: where both
+priors are default ones, terms of order above 1 have time constants of period / pi or longer (`resolution`).
 
 The end of `sigma_ar` is hard. A tail, however thin, would not hold: noise of 0.05 at rest under a misfit of
 0.5 gains thousands of nats by growing tenfold, and what the plant lacks is then called noise.
@@ -112,7 +114,12 @@ class Scales:
 
     def time(self) -> Prior:
         """Prior of a time constant."""
-        return Prior("loguniform", {"a": self.period / np.pi, "b": 100 * self.span})
+        return Prior("loguniform", {"a": self.period / 10, "b": 100 * self.span})
+
+    @property
+    def resolution(self) -> float:
+        """Shortest time constant whose resonance 1 / T samples tell from an alias [time unit]."""
+        return self.period / float(np.pi)
 
     def order(self) -> Prior:
         """Prior of an order."""

@@ -49,7 +49,7 @@ class Discretisation:
     parameter: str
     """The one that moves most."""
     shift: float
-    """How far, on blocks four times narrower [posterior sd]."""
+    """How far and to which side, on blocks without width [posterior sd]."""
     error: float
     """Standard error of `shift` from the number of draws [posterior sd]."""
     refinement: int
@@ -61,14 +61,14 @@ class Discretisation:
     @property
     def negligible(self) -> bool:
         """Whether no parameter moves by more than `LARGEST`, the error of the measurement aside."""
-        return self.shift - 2 * self.error <= LARGEST
+        return abs(self.shift) - 2 * self.error <= LARGEST
 
     @property
     def sentence(self) -> str:
         """What was measured, a sentence without its full stop."""
         return (
-            f"On blocks four times narrower than the {self.blocks} used the posterior mean of "
-            f"{self.parameter} moves by {self.shift:.2f} ± {self.error:.2f} sd, the largest shift of all"
+            f"The {self.blocks} blocks used move the posterior mean of {self.parameter} by "
+            f"{abs(self.shift):.2f} ± {self.error:.2f} sd, that of every other parameter by less"
         )
 
     @property
@@ -78,8 +78,8 @@ class Discretisation:
             return ()
         return (
             Limitation(
-                "tentative" if self.shift < UNUSABLE else "unusable",
-                f"the width of the blocks moves {self.parameter} by {self.shift:.2g} posterior sd",
+                "tentative" if abs(self.shift) < UNUSABLE else "unusable",
+                f"the width of the blocks moves {self.parameter} by {abs(self.shift):.2g} posterior sd",
                 "set [model] blocks to a larger number, or leave out the samples of the fastest onset",
             ),
         )
@@ -161,7 +161,7 @@ def discretisation(problem: Problem, draws: Draws) -> Discretisation:
     worst = int(np.abs(shifts).argmax())
     return Discretisation(
         draws.table.names[rows[worst]],
-        float(abs(shifts[worst])),
+        float(shifts[worst]),
         float(errors[worst]),
         problem.refinement,
         _cells(problem),

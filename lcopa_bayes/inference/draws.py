@@ -20,6 +20,7 @@ from lcopa_bayes.inference.grade import (
     overall,
     qualities,
     shares_grade,
+    with_shares,
 )
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
@@ -123,10 +124,11 @@ def gather(posterior: Posterior, run: Run) -> Draws:
     if posterior.linear:
         names = [posterior.table.names[k] for k in posterior.linear]
         found |= {q.name: q for q in qualities(names, values[..., posterior.linear])}
-    ordered = tuple(found[name] for name in posterior.table.names if name in found)
     rows = [(k, posterior.table.rows[k]) for k in posterior.sampled]
     hills = [ridges(row.name, row.unit, values[..., k], log_scale=row.log_scale) for k, row in rows]
-    several = tuple(found for found in hills if found.boundaries)
+    several = tuple(one for one in hills if one.boundaries)
+    free = [name for name in posterior.table.names if name in found]
+    ordered = tuple(with_shares(found[name], several) for name in free)
     by_draw = values.swapaxes(1, 2).reshape(ensembles, -1, values.shape[-1])
     densities = log_density.swapaxes(1, 2).reshape(ensembles, -1)
     picked = np.linspace(0, by_draw.shape[1] - 1, min(_PER_ENSEMBLE, by_draw.shape[1])).astype(int)

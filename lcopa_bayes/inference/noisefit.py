@@ -116,14 +116,13 @@ class NoiseFit:
         no direction is wider than a uniform density over the search."""
         low, high = self.ends
         x = np.array([self.coordinates(values[k : k + 1], self.rows[k])[0] for k in self.free])
-        x = np.clip(
-            x, low + 2 * _STEP, high - 2 * _STEP
-        )  # the curvature beside a bound stands for that at it
-        size = len(x)
-        steps = _STEP * np.concatenate([np.eye(size), -np.eye(size)])
-        corners = (x + steps[:, None] + steps).reshape(-1, size)
+        step = np.minimum(_STEP, (high - low) / 8)
+        x = np.clip(x, low + 2 * step, high - 2 * step)  # the curvature beside a bound stands for that at it
+        steps = np.concatenate([np.diag(step), -np.diag(step)])
+        size, corners = len(x), (x + steps[:, None] + steps).reshape(-1, len(x))
         at = self.log_density(corners, values).reshape(2 * size, 2 * size)
-        bent = (at[:size, size:] + at[size:, :size] - at[:size, :size] - at[size:, size:]) / (4 * _STEP**2)
+        bent = at[:size, size:] + at[size:, :size] - at[:size, :size] - at[size:, size:]
+        bent /= 4 * np.outer(step, step)
         sizes, directions = np.linalg.eigh((bent + bent.T) / 2)
         sizes = np.maximum(sizes, 12 / np.square(high - low).max(initial=0.0))
         return np.asarray(directions / sizes @ directions.T)

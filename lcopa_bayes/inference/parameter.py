@@ -94,6 +94,12 @@ class Parameter:
         # is no likelihood (a correlation of 1) or a density may be infinite (a scale of 0)
         return np.where(self.declared.contains(x), self.prior.log_density(x) - self._log_mass, -np.inf)
 
+    def mass_below(self, x: float) -> float:
+        """Prior probability of values below `x`, within the domain."""
+        assert self.prior is not None
+        low, high, at = (float(self.prior.frozen.cdf(end)) for end in (*self.domain, x))
+        return float(np.clip((at - low) / (high - low), 0.0, 1.0))
+
     def draw(self, size: int, rng: np.random.Generator) -> Vector:
         """Draws from the prior within the domain, or copies of the fixed value."""
         if self.prior is None:

@@ -22,7 +22,7 @@ from lcopa_bayes.problems import InputError, nearest
 from lcopa_bayes.settings import ModelSettings, PriorSettings
 
 _ORDERED_DRAWS = 200_000
-"""Prior draws that measure how much mass an unexchangeable prior puts on decreasing orders."""
+"""Prior draws that measure how much mass an unexchangeable prior has where orders decrease."""
 _LEAST_ORDERED = 1e-3
 """Below this mass the share is not measured to 7 % and draws are rejected for ever [-]."""
 
@@ -34,6 +34,8 @@ class ParameterTable:
 
     layout: Layout
     rows: tuple[Parameter, ...]
+    resolution: float = 0.0
+    """Shortest time constant of a term of order above 1 under default priors [time unit]."""
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -75,15 +77,38 @@ class ParameterTable:
         return tuple(out)
 
     @cached_property
-    def log_ordering(self) -> float:
-        """Log of 1 / (prior mass on decreasing orders), summed over elements."""
+    def log_support(self) -> float:
+        """Log of 1 / (prior mass where orders decrease and terms are resolved), summed over elements."""
         total = 0.0
-        for (_, orders), exchangeable in zip(self._columns, self.exchangeable, strict=True):
-            if exchangeable:
-                total += lgamma(len(orders) + 1)
-            elif len(orders) > 1:
-                total -= log(self._ordered_share(orders))
+        for (times, orders), exchangeable in zip(self._columns, self.exchangeable, strict=True):
+            if exchangeable or sum(self.rows[k].free for k in orders) <= (len(orders) == 1):
+                masses = [self._resolved_mass(t, o) for t, o in zip(times, orders, strict=True)]
+                total += (lgamma(len(orders) + 1) if exchangeable else 0.0) - sum(map(log, masses))
+            else:
+                total -= log(self._supported_share(times, orders))
         return total
+
+    def _limited(self, time: int, order: int) -> bool:
+        """Whether a term must be resolved: its priors are the default ones."""
+        rows = self.rows[time], self.rows[order]
+        return self.resolution > 0 and rows[0].free and all(row.default for row in rows)
+
+    def _resolved_mass(self, time: int, order: int) -> float:
+        """Prior mass of a term where it is resolved."""
+        if not self._limited(time, order):
+            return 1.0
+        row = self.rows[order]
+        fast = self.rows[time].mass_below(self.resolution)
+        return 1.0 - fast * (1.0 - row.mass_below(1.0) if row.free else float(row.value > 1.0))
+
+    def _resolved(self, values: Matrix) -> Flags:
+        """Whether every term that must be is resolved, (batch,)."""
+        out = np.ones(values.shape[0], dtype=bool)
+        for times, orders in self._columns:
+            for t, o in zip(times, orders, strict=True):
+                if self._limited(t, o):
+                    out &= (values[:, o] <= 1.0) | (values[:, t] >= self.resolution)
+        return out
 
     @cached_property
     def log_permutations(self) -> float:
@@ -91,10 +116,14 @@ class ParameterTable:
         terms = (slot.terms for slot in self.layout.elements)
         return sum(lgamma(n + 1) for n, same in zip(terms, self.exchangeable, strict=True) if same)
 
-    def _ordered_share(self, orders: list[int]) -> float:
+    def _supported_share(self, times: list[int], orders: list[int]) -> float:
         rng = np.random.default_rng(0)
-        drawn = [self.rows[k].draw(_ORDERED_DRAWS, rng) for k in orders]
-        share = float(np.mean(np.all(np.diff(drawn, axis=0) <= 0, axis=0)))
+        drawn = {k: self.rows[k].draw(_ORDERED_DRAWS, rng) for k in (*orders, *times)}
+        decreasing = np.all(np.diff([drawn[k] for k in orders], axis=0) <= 0, axis=0)
+        for t, o in zip(times, orders, strict=True):
+            if self._limited(t, o):
+                decreasing &= (drawn[o] <= 1.0) | (drawn[t] >= self.resolution)
+        share = float(np.mean(decreasing))
         if share < _LEAST_ORDERED:
             names = ", ".join(self.rows[k].name for k in orders)
             raise InputError(
@@ -145,9 +174,9 @@ class ParameterTable:
                 return values[:, self.at("offset", response, second)]
         return np.zeros(values.shape[0])
 
-    def ordered(self, values: Matrix) -> Flags:
-        """Whether the orders of every element decrease, (batch,)."""
-        out = np.ones(values.shape[0], dtype=bool)
+    def supported(self, values: Matrix) -> Flags:
+        """Whether the orders of every element decrease and its terms are resolved, (batch,)."""
+        out = self._resolved(values)
         for _, orders in self._columns:
             out &= np.all(np.diff(values[:, orders], axis=1) <= 0, axis=1)
         return out
@@ -158,7 +187,7 @@ class ParameterTable:
         while out.shape[0] < size:
             values = np.stack([row.draw(size, rng) for row in self.rows], axis=1)
             values = self.canonical(values)
-            out = np.concatenate([out, values[self.ordered(values)]])
+            out = np.concatenate([out, values[self.supported(values)]])
         return out[:size]
 
 
@@ -207,7 +236,7 @@ def parameter_table(
         twice = ", ".join(sorted({name for name in names if names.count(name) > 1}))
         raise InputError(f"{twice}: axes and records together name two parameters alike; rename a record")
     rows = _fix_orders(rows, layout, model)
-    return ParameterTable(layout, tuple(_with_priors(rows, priors)))
+    return ParameterTable(layout, tuple(_with_priors(rows, priors)), scales.resolution)
 
 
 def _fix_orders(rows: list[Parameter], layout: Layout, model: ModelSettings) -> list[Parameter]:

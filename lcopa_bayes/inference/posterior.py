@@ -93,7 +93,7 @@ class Posterior:
     def log_prior(self, coordinates: Matrix) -> Vector:
         """Log prior density of the sampled coordinates, (batch,); the only source of -inf."""
         values = self.values(coordinates)
-        total = np.where(self.table.ordered(values), self._log_order_level, -np.inf)
+        total = np.where(self.table.supported(values), self._log_order_level, -np.inf)
         for k in self.sampled:
             total = total + self.table.rows[k].log_prior(values[:, k])
         steep = coordinates[:, self._logits]
@@ -103,7 +103,7 @@ class Posterior:
     @cached_property
     def _log_order_level(self) -> float:
         # sampled unordered, an exchangeable element covers each ordered point in every permutation
-        return self.table.log_ordering - self.table.log_permutations
+        return self.table.log_support - self.table.log_permutations
 
     def log_density(self, coordinates: Matrix, *, heat: float = 1.0) -> Vector:
         """Log of prior times likelihood^heat, (batch,); FloatingPointError with the values where NaN."""

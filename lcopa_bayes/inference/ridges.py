@@ -70,6 +70,12 @@ class Ridges:
         return np.asarray(np.maximum(within, between))
 
     @property
+    def ess(self) -> float:
+        """Number of independent draws that would know the shares as well, of the mode known worst [draws]."""
+        share = self.pooled
+        return float(np.min(share * (1 - share) / self.pooled_errors**2)) if self.boundaries else np.inf
+
+    @property
     def spread(self) -> float:
         """Largest difference of a hill's share between two ensembles beyond Monte Carlo error [-]: of those
         above `CERTAINTY` standard errors; 0 when there is none."""

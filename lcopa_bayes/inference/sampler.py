@@ -15,13 +15,15 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from lcopa_bayes.arrays import Array
+from lcopa_bayes.arrays import Array, Matrix
 from lcopa_bayes.inference.chainfile import load_chain, save_chain
 from lcopa_bayes.inference.ensemble import Ensemble, advance
 from lcopa_bayes.inference.grade import Quality, qualities
+from lcopa_bayes.inference.knownmodes import around
+from lcopa_bayes.inference.lessons import LEARNING, taught
 from lcopa_bayes.inference.mixture import Mixture
-from lcopa_bayes.inference.mixturemove import learned
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.ridges import Ridges, ridges
 
 _ROUND = 20
 """Draws kept per round and walker."""
@@ -29,10 +31,6 @@ _MEMORY = 0.4
 """Largest memory of a walker at which sampling stops [-]."""
 _SWEEPS = 80
 """Most moves of every walker at each temperature on the way from the prior."""
-_LEARNING = 2
-"""Rounds before the mixture is learned from the draws of all ensembles; and again at each doubling."""
-_WIDE = 0.5
-"""Share of the mixture that is learned from the way from the prior [-]."""
 _LEAST = 5
 """Rounds before sampling may stop: what is kept of them comes after the first learning."""
 _AS_LONG = 0.4
@@ -109,12 +107,16 @@ def sample(
     fingerprint: str = "",
     resume: bool = False,
     quiet: bool = True,
+    starts: Matrix | None = None,
 ) -> Run:
     """Sample a posterior: populations tempered from the prior, then rounds of emcee.
 
-    The draws depend on posterior and plan alone, not on `jobs` nor on interruptions: with `resume`, a
-    run killed at any moment continues from the last complete round in `chain_file`.
+    The draws depend on the arguments alone, not on `jobs` nor on interruptions: with `resume`, a run
+    killed at any moment continues from the last complete round in `chain_file`. `starts`, table values
+    (starts, rows), are modes known from elsewhere, which moves propose too (`knownmodes`); InputError when
+    none lies inside the prior.
     """
+    known = None if starts is None else around(posterior, starts, plan.seed)
     ensembles = load_chain(chain_file, fingerprint) if resume and chain_file else ()
     rounds = max(2, -(-plan.steps // (_ROUND * plan.thin)))
     done = ensembles[0].steps // (_ROUND * plan.thin) if ensembles else 0
@@ -127,33 +129,17 @@ def sample(
             ensembles = tuple(crew(_Birth(plan.walkers, _SWEEPS), seeds))
             _store(chain_file, ensembles, fingerprint)
         bar.set_description("sampling")
-        mixture = _taught(posterior, ensembles, plan)
+        mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
         hardest = max(ensemble.way for ensemble in ensembles)
         least = max(_LEAST, round(_AS_LONG * hardest / (_ROUND * plan.thin)))
         while done < rounds and not (done >= least and finished(posterior, Run(ensembles, plan), bar)):
-            if done >= _LEARNING and done.bit_count() == 1:
-                mixture = _taught(posterior, ensembles, plan)
+            if done >= LEARNING and done.bit_count() == 1:
+                mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
             ensembles = tuple(crew(_Round(plan.thin, mixture), ensembles))
             done += 1
             _store(chain_file, ensembles, fingerprint)
             bar.update()
     return Run(ensembles, plan)
-
-
-def _taught(posterior: Posterior, ensembles: Sequence[Ensemble], plan: SamplePlan) -> Mixture:
-    """The mixture that moves follow: learned from the later half of the draws at the last power of two,
-    and in part from the populations' way from the prior, which saw hills that few walkers stand on.
-
-    A function of the chains alone, so that a resumed run learns the same; learning thins out, as the
-    ergodicity of adaptive sampling asks (Roberts and Rosenthal 2007, J. Appl. Probab. 44).
-    """
-    wide = learned(posterior, [ensemble.trail for ensemble in ensembles], plan.seed).levelled()
-    done = ensembles[0].chain.shape[0] // _ROUND
-    if done < _LEARNING:
-        return wide
-    lesson = _ROUND << (done.bit_length() - 1)
-    own = learned(posterior, [ensemble.chain[lesson // 2 : lesson] for ensemble in ensembles], plan.seed)
-    return own.levelled().blended(wide, _WIDE)
 
 
 def _store(chain_file: Path | None, ensembles: Sequence[Ensemble], fingerprint: str) -> None:
@@ -162,7 +148,8 @@ def _store(chain_file: Path | None, ensembles: Sequence[Ensemble], fingerprint: 
 
 
 def finished(posterior: Posterior, run: Run, bar: tqdm[Any] | None = None) -> bool:
-    """Whether every sampled parameter agrees between ensembles and has its effective sample size.
+    """Whether every sampled parameter agrees between ensembles and has its effective sample size, and the
+    shares of its modes have.
 
     Walkers travel a little further than a grade asks, so that the linear parameters, which are drawn
     afterwards, have too.
@@ -175,19 +162,30 @@ def finished(posterior: Posterior, run: Run, bar: tqdm[Any] | None = None) -> bo
         bar.set_postfix(
             acceptance=f"{acceptance:.2f}", ess=f"{ess:.0f}", rhat=f"{rhat:.3f}", memory=f"{memory:.2f}"
         )
-    return all(
-        quality.grade(run.plan.target_ess).level == "reliable" and quality.memory <= _MEMORY
-        for quality in found
-    )
+    target = run.plan.target_ess
+    good = all(q.grade(target).level == "reliable" and q.memory <= _MEMORY for q in found)
+    return good and all(one.ess >= target for one in _sampled_ridges(posterior, run))
 
 
 def sampled_qualities(posterior: Posterior, run: Run) -> tuple[Quality, ...]:
     """Quality of the sampled parameters over the kept part of a run."""
-    coordinates, _ = run.kept()
-    shape = coordinates.shape
-    values = posterior.values(coordinates.reshape(-1, shape[-1]))[:, posterior.sampled]
     names = [posterior.table.names[k] for k in posterior.sampled]
-    return qualities(names, values.reshape(*shape[:3], -1))
+    return qualities(names, _sampled_values(posterior, run))
+
+
+def _sampled_ridges(posterior: Posterior, run: Run) -> Iterator[Ridges]:
+    """Modes of the sampled parameters over the kept part of a run."""
+    values = _sampled_values(posterior, run)
+    for column, k in enumerate(posterior.sampled):
+        row = posterior.table.rows[k]
+        yield ridges(row.name, row.unit, values[..., column], log_scale=row.log_scale)
+
+
+def _sampled_values(posterior: Posterior, run: Run) -> Array:
+    """Kept values of the sampled parameters, (ensembles, walkers, draws, parameters)."""
+    coordinates, _ = run.kept()
+    values = posterior.values(coordinates.reshape(-1, coordinates.shape[-1]))[:, posterior.sampled]
+    return values.reshape(*coordinates.shape[:3], -1)
 
 
 @final

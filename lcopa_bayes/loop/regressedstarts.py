@@ -46,7 +46,7 @@ def regressed(posterior: Posterior, drawn: Matrix) -> Matrix:
                 low, high = table.rows[k].domain
                 if table.rows[k].free and low <= value <= high:
                     row[k] = value
-    legal = table.ordered(out)
+    legal = table.supported(out)
     out[~legal] = drawn[:_LAGS][~legal]
     return np.asarray(table.canonical(out))
 

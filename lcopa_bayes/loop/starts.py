@@ -55,7 +55,7 @@ def _classical(posterior: Posterior, drawn: Matrix, rng: np.random.Generator) ->
                 low, high = table.rows[k].domain
                 inside = (low <= values) & (values <= high) & table.rows[k].free
                 out[inside, k] = values[inside]
-    legal = table.ordered(out)
+    legal = table.supported(out)
     out[~legal] = drawn[~legal]
     return table.canonical(out)
 

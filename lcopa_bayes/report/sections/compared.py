@@ -48,13 +48,19 @@ def _scores(told: Mapping[str, Any]) -> Section:
     caption = (
         "± is a standard error: of the evidence by bridge sampling, of predictive densities by the spread "
         "over stretches of the records. The Bayes factor is against the best, the probability among these "
-        "models alone, equally likely before. elpd is the expected log predictive density of what was "
-        "left out. AIC and BIC are from the maximum of the likelihood and know neither priors nor ridges."
+        "models alone, equally likely before. elpd is the log density of one forecast of what was left out, "
+        "each sample predicted from those before it. AIC and BIC are from the maximum of the likelihood and "
+        "know neither priors nor ridges."
     )
     text = [str(told["agreement"]["sentence"])]
     text += [f"{one['name']} is ranked nowhere: {one['reason']}." for one in told["unranked"]]
     text += [f"{one['name']}: {one['reason']}; the other scores stand." for one in told["evidence_undefined"]]
     text += [f"{row['name']} {note}." for row in told["models"] for note in row["notes"]]
+    text += [
+        f"{row['name']} contains {', '.join(names)} and is at least as likely as what it contains."
+        for row in told["models"]
+        if (names := [one["model"] for one in row["containment"]["contains"]]) and row["containment"]["met"]
+    ]
     return Section("Scores", tuple(text), (), (Table(columns, rows), Table(other_columns, others, caption)))
 
 
@@ -82,8 +88,8 @@ def _priors(told: Mapping[str, Any]) -> Section:
     text = (
         "An evidence moves with the width of the priors. Here gains, times and delays have priors half and "
         "twice as wide; orders keep theirs, which are the ends of their domain. Importance weights use the "
-        "draws that are there; a refit carries them to the new posterior and bridges anew; undefined are "
-        "narrower priors that exclude what the data show."
+        "draws that are there; a refit moves them to the new posterior and bridges anew; undefined are "
+        "narrower priors that exclude what the data show: with one of these no win is claimed."
     )
     tables = (Table(columns, tuple(rows)),) if rows else ()
     return Section("The prior's part", (text,), (), tables)
@@ -92,14 +98,16 @@ def _priors(told: Mapping[str, Any]) -> Section:
 def _predicted(told: Mapping[str, Any]) -> Section:
     columns = (
         *(Column("model", "code"), Column("predicted", "code"), Column("how")),
-        *(Column("samples", "number"), Column("log density [nat]", "number"), Column("road")),
-        *(Column("Pareto k", "number"), Column("ESS", "number"), Column("grade", "grade")),
+        *(Column("samples", "number"), Column("log density [nat]", "number"), Column("if fitted", "number")),
+        *(Column("road"), Column("Pareto k", "number"), Column("ESS", "number"), Column("grade", "grade")),
+        Column("level from", "prose"),
     )
     rows = tuple(
         (
             *(str(row["name"]), str(one["part"]), str(one["kind"]), str(one["samples"])),
             _with_error(one["elpd"], one["monte_carlo_sd"], 1),
-            *(str(one["road"]), figures(one["pareto_k"], 2), f"{one['ess']:.0f}", str(one["grade"])),
+            *(_plain(one["in_sample"], 1), str(one["road"]), figures(one["pareto_k"], 2)),
+            *(f"{one['ess']:.0f}", str(one["grade"]), "; ".join(one["level_from"])),
         )
         for row in told["models"]
         for one in row["predictions"]
@@ -115,13 +123,18 @@ def _predicted(told: Mapping[str, Any]) -> Section:
     )
     errors = (
         *(Column("model", "code"), Column("record", "code"), Column("axis", "code"), Column("use")),
-        *(Column("RMSE", "number"), Column("unit"), Column("in 90 % band", "number")),
-        Column("in 50 % band", "number"),
+        *(Column("RMSE", "number"), Column("unit"), Column("in pointwise 90 % band", "number")),
+        Column("in pointwise 50 % band", "number"),
     )
     text = (
         "Whole records are predicted from the others, and the future of a record from its past where it is "
-        "the only one; single points are never left out, since their neighbours tell them. ± is the Monte "
-        "Carlo error of the density."
+        "the only one; single points are never left out, since their neighbours tell them. The log density "
+        "is that of one forecast: each sample given those before it, the noise and, where a model gives every "
+        "record a level of its own, the level following the record, all else fixed by the other records. "
+        "Samples at rest are known, the first one at least; all models predict the same samples. ± is the "
+        "Monte Carlo error. 'if fitted' is the density of the same samples under draws that have seen them, "
+        "which is larger; where it is not, the grade is lowered. Bands are pointwise: of every 100 samples "
+        "90 are expected inside, not whole curves."
     )
     return Section("Prediction", (text,), (), (Table(columns, rows), Table(errors, held)))
 

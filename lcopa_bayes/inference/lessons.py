@@ -1,0 +1,39 @@
+"""When the mixture that moves follow is learned, and from what."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from lcopa_bayes.inference.ensemble import Ensemble
+from lcopa_bayes.inference.mixture import Mixture
+from lcopa_bayes.inference.mixturemove import learned
+from lcopa_bayes.inference.posterior import Posterior
+
+LEARNING = 2
+"""Rounds before the mixture is learned from the draws of all ensembles; and again at each doubling."""
+_WIDE = 0.5
+"""Share of the mixture that is learned from the populations on their way from the prior [-]."""
+_KNOWN = 0.2
+"""Share of modes that are known from elsewhere, where there are any [-]."""
+
+
+def taught(
+    posterior: Posterior, ensembles: Sequence[Ensemble], per_round: int, seed: int, known: Mixture | None
+) -> Mixture:
+    """The mixture that moves follow: learned from the later half of the draws at the last power of two,
+    and in part from the populations on their way from the prior, which saw modes that few walkers stand
+    on; blended with the modes `known` from elsewhere.
+
+    `per_round` draws are kept of each walker in a round. A function of the chains alone, so that a resumed
+    run learns the same; learning thins out, as the ergodicity of adaptive sampling asks (Roberts and
+    Rosenthal 2007, J. Appl. Probab. 44).
+    """
+    wide = learned(posterior, [ensemble.trail for ensemble in ensembles], seed).levelled()
+    done = ensembles[0].chain.shape[0] // per_round
+    if done < LEARNING:
+        found = wide
+    else:
+        lesson = per_round << (done.bit_length() - 1)
+        own = learned(posterior, [ensemble.chain[lesson // 2 : lesson] for ensemble in ensembles], seed)
+        found = own.levelled().blended(wide, _WIDE)
+    return found if known is None else found.blended(known, _KNOWN)
