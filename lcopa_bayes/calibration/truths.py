@@ -43,9 +43,12 @@ class Truths:
         for _ in range(_TRIES if self.stated else 1):
             truth = self.table.draw(1, rng)[0]
             truth[[self.table.names.index(name) for name in self.stated]] = list(self.stated.values())
-            if self.table.ordered(truth[None]).all():
+            if self.table.supported(truth[None]).all():
                 return np.asarray(truth)
-        raise InputError("orders drawn from the prior do not decrease beside those stated; state them all")
+        raise InputError(
+            "no draw of the prior has decreasing orders and resolved terms beside what is stated; "
+            "state the orders and times of all terms, orders decreasing"
+        )
 
     @property
     def fixed(self) -> bool:

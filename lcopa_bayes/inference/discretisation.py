@@ -9,6 +9,7 @@ narrow blocks would have had.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -20,7 +21,7 @@ from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.draws import Draws
 from lcopa_bayes.inference.grade import Limitation
 from lcopa_bayes.inference.leastsquares import LeastSquares
-from lcopa_bayes.inference.optimum import find_optima
+from lcopa_bayes.inference.optimum import Optimum, find_optima
 from lcopa_bayes.inference.posterior import Posterior
 
 LARGEST = 0.1
@@ -96,15 +97,17 @@ class Discretisation:
         }
 
 
-def resolved(problem: Problem) -> Problem:
+def resolved(problem: Problem, optima: Sequence[Optimum] | None = None) -> Problem:
     """The problem on blocks so narrow that the optimum moves by at most `LARGEST` sd on narrower ones.
 
     Blocks are halved while it moves more; not beyond `_FINEST` or `_MOST_CELLS`, where the measurement after
-    sampling says what is left. The same problem gives the same blocks.
+    sampling says what is left. The same problem gives the same blocks. `optima` are those of the problem, best first,
+    where they are known already.
     """
     rng = np.random.default_rng([problem.study.seed, 6])
     with threadpool_limits(1):  # matrices are small: more threads only wait for each other
-        optima = find_optima(problem.posterior, rng, starts=_STARTS)
+        if optima is None:
+            optima = find_optima(problem.posterior, rng, starts=_STARTS)
         while optima and optimum_shift(problem, optima[0].values) > LARGEST and _may_refine(problem):
             problem = problem.refined(2)
     return problem
