@@ -101,7 +101,7 @@ def resolved(problem: Problem, optima: Sequence[Optimum] | None = None) -> Probl
     """The problem on blocks so narrow that the optimum moves by at most `LARGEST` sd on narrower ones.
 
     Blocks are halved while it moves more; not beyond `_FINEST` or `_MOST_CELLS`, where the measurement after
-    sampling says what is left. The same problem gives the same blocks. `optima` are those of the problem, best first,
+    sampling says what is left. The same problem gives the same blocks. `optima` are its own, best first,
     where they are known already.
     """
     rng = np.random.default_rng([problem.study.seed, 6])

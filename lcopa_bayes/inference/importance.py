@@ -188,8 +188,9 @@ def weighted_draws(
 ) -> Draws:
     """Draws of every parameter from weighted ones, linear parameters drawn exactly, with their grade.
 
-    Parts of the weighted draws stand for the ensembles of a sampler: they are independent, so R-hat between
-    them sees a mean that hangs on a few of them. The effective sample size is that of the weights.
+    Parts of the weighted draws stand for the ensembles of a sampler: they are independent, so R-hat and scatter
+    between them see a mean that hangs on a few of them. The effective sample size is that of the weights: it
+    is known here, and need not be judged by four means.
     """
     count = found.log_weights.size
     parts = [slice(k * count // _BATCHES, (k + 1) * count // _BATCHES) for k in range(_BATCHES)]
@@ -204,8 +205,7 @@ def weighted_draws(
             found.ess,
             found.ess,
             float(array_stats.rhat_nested(values[..., k], np.arange(_BATCHES))),  # type: ignore[no-untyped-call]
-            0.0,
-            *between(values[:, None, :, k]),
+            scatter=between(values[:, None, :, k])[1],
         )
         for k, row in enumerate(rows)
         if row.free

@@ -243,8 +243,8 @@ def table_of(told: dict[str, Any]) -> str:
         "",
         f"Replicas in all: {told['replicas']}, of them {told['sampled']} by ensembles, "
         f"{told['not_reliable']} not graded reliable, {told['failed']} failed. `block shift`: largest shift "
-        "of a posterior mean by the width of the blocks over the replicas [posterior sd]; `s`: median processor "
-        "time of a replica.",
+        "of a posterior mean by the width of the blocks over the replicas [posterior sd]; `s`: median "
+        "processor time of a replica.",
         "",
     ]
     return "\n".join(lines)
