@@ -188,8 +188,8 @@ def weighted_draws(
 ) -> Draws:
     """Draws of every parameter from weighted ones, linear parameters drawn exactly, with their grade.
 
-    Parts of the weighted draws stand for the ensembles of a sampler: they are independent, so R-hat and scatter
-    between them see a mean that hangs on a few of them. The effective sample size is that of the weights: it
+    Parts of the weighted draws stand for the ensembles of a sampler: being independent, they let R-hat and
+    scatter see a mean that hangs on a few draws. The effective sample size is that of the weights: it
     is known here, and need not be judged by four means.
     """
     count = found.log_weights.size
