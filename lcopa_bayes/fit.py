@@ -9,6 +9,7 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.arrays import Matrix
+from lcopa_bayes.checks import refuse_if
 from lcopa_bayes.estimate import Estimate
 from lcopa_bayes.files import writable_folder
 from lcopa_bayes.inference.assembly import Problem, problem_of
@@ -21,6 +22,7 @@ from lcopa_bayes.inference.sampler import Run, SamplePlan, sample
 from lcopa_bayes.predict import Band, bands
 from lcopa_bayes.provenance import digest_of, fingerprint
 from lcopa_bayes.residuals import Residual, residuals
+from lcopa_bayes.rest import not_at_rest
 from lcopa_bayes.sensitivity import Sensitivity, sensitivity
 from lcopa_bayes.stepmetrics import StepCurves, step_curves, step_metrics
 from lcopa_bayes.study import Study
@@ -73,9 +75,10 @@ def fit(
     the same as without interruption. With `cross_check` the posterior is also sampled by nested sampling,
     always from the start, and where the two disagree every grade is lowered. Blocks are narrowed until their
     width does not move the optimum; how far it moves the posterior is measured and, where too far, lowers the
-    grade. InputError when the study
-    does not fit its records or the folder cannot be written to; then nothing is written.
+    grade. InputError when the study does not fit its records, a record moves before its drive does or the
+    folder cannot be written to; then nothing is written.
     """
+    refuse_if(not_at_rest(study.fit, study.held_out))
     problem = problem_of(study)
     if folder:
         writable_folder(folder)

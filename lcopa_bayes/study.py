@@ -136,7 +136,8 @@ def together(fit: Sequence[Record], held_out: Sequence[Record], *, complete: boo
     if complete and fit and not any(_tells(record) for record in fit):
         problems.append(
             "the drive is constant throughout the fit records up to their last response sample: nothing can "
-            "be learned about the dynamics; add a record in which a drive changes"
+            "be learned about the dynamics; add a record in which a drive changes, or, where a drive was "
+            "switched on as a record began, a row before its first with the drive before and empty responses"
         )
     for axis in fit[0].response_axes if complete and fit and alike else ():
         columns = (record.response[:, record.response_axes.index(axis)] for record in fit)

@@ -17,7 +17,7 @@ ORDER = (
     ("record",),
     ("settings",),
     ("candidatesettings",),
-    ("study",),
+    ("study", "rest"),
     ("studyfile",),
     ("operational",),
     ("plant",),

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import pairwise
 from typing import final
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.signal import lfilter
+from scipy.signal import lfilter, lfiltic
 
 from lcopa_bayes.arrays import Array, Matrix, Vector, frozen
 
@@ -101,14 +101,28 @@ class Autoregression:
             out[:, p:] = drawn[0] if drawn is not None else self.innovation_sd * z
         return out
 
+    def correlated(self, lags: int) -> float:
+        """Samples of a long stretch that count as one independent sample of a power [-], 1 or more.
+
+        ``1 + 2 sum_k rho_k^2`` (Bayley and Hammersley 1946, J. R. Stat. Soc. Suppl. 8), rho_k the
+        autocorrelation at lag k, summed over `lags` lags with weights ``1 - k / (lags + 1)``: the mean
+        square of ``lags + 1`` samples scatters as that of so many times fewer independent ones.
+        """
+        rho = self.autocovariance(lags) / self.sd**2
+        weights = 1.0 - np.arange(1, lags + 1) / (lags + 1)
+        return float(1.0 + 2.0 * (weights * rho[1:] ** 2).sum())
+
     def autocovariance(self, lags: int) -> Vector:
         """Autocovariance at lags 0..lags [response unit^2]."""
         out = np.empty(lags + 1)
         out[0] = self.sd**2
-        for k in range(1, lags + 1):
-            order = min(k, self.order)
-            head = self.predictors[order]
-            out[k] = head @ out[k - 1 :: -1][:order] if order else 0.0
+        first = min(lags, self.order)
+        for k in range(1, first + 1):
+            out[k] = self.predictors[k] @ out[k - 1 :: -1][:k]
+        if lags > first:
+            weights = np.concatenate([[1.0], -self.predictors[self.order]])
+            state = lfiltic([1.0], weights, out[first::-1][: self.order])
+            out[first + 1 :] = lfilter([1.0], weights, np.zeros(lags - first), zi=state)[0]
         return out
 
 
@@ -119,55 +133,105 @@ def unbroken(gaps: Vector) -> list[slice]:
     return [slice(a, b) for a, b in pairwise(edges) if b > a]
 
 
-def estimated(pieces: Sequence[Vector], *, largest: int = _LARGEST_ORDER) -> Autoregression:
-    """Order and scale from pieces of noise, each about a level of its own.
+@final
+@dataclass(frozen=True, eq=False)
+class Mode:
+    """Most likely autoregression of one order."""
 
-    Restricted maximum likelihood (levels integrated out under a flat prior), order by the corrected Akaike
-    criterion, since an order too small costs false alarms and one too large next to nothing. ValueError
-    with fewer than three samples beyond the number of pieces.
-    """
-    pieces = [piece for piece in pieces if piece.size > 1]
-    total = sum(piece.size for piece in pieces)
-    if total - len(pieces) < 3:
-        raise ValueError(f"{total} samples in {len(pieces)} pieces cannot give the scale of the noise")
-    best, start = (np.inf, np.empty(0), 1.0), np.empty(0)
-    longest = max(piece.size for piece in pieces)
-    alike = [np.array([p for p in pieces if p.size == n]) for n in sorted({p.size for p in pieces})]
-    for order in range(min(largest, longest - 2, total // _PER_COEFFICIENT) + 1):
-        if order:
-            found = minimize(
-                partial(_negative, alike=alike),
-                np.concatenate([start, [0.0]]),
-                method="BFGS",
-                options={"gtol": 1e-4, "maxiter": 60},
-            )
-            start = np.clip(found.x, -6.0, 6.0)  # a start for the next order; 6 is a correlation of 0.99999
-        cost, sd = _cost(np.tanh(start), alike)
-        count = order + 1
-        criterion = 2 * cost + 2 * count * total / max(total - count - 1, 1)
-        if criterion < best[0] - 1e-9:
-            best = (criterion, np.tanh(start), sd)
-        elif order >= best[1].size + _PATIENCE:
-            break
-    return Autoregression(best[1], best[2])
+    partial: Vector
+    """Partial autocorrelations [-], (order,)."""
+    cost: float
+    """Negative restricted log likelihood at the best innovation sd [nat]."""
+    innovation_sd: float
+    """[response unit]."""
+    criterion: float
+    """Corrected Akaike criterion [-]."""
 
 
-def _negative(x: Vector, alike: Sequence[Matrix]) -> float:
-    """Cost of the inverse hyperbolic tangents of partial autocorrelations."""
-    return _cost(np.tanh(x), alike)[0]
+@final
+@dataclass(frozen=True, eq=False)
+class NoisePieces:
+    """Pieces of noise, each about a level of its own that is integrated out under a flat prior."""
+
+    pieces: tuple[Vector, ...]
+    """Each (n,), n > 1 [response unit]."""
+
+    @classmethod
+    def of(cls, pieces: Sequence[Vector]) -> NoisePieces:
+        """Pieces of two samples and more; ValueError with fewer than three samples beyond their number."""
+        kept = tuple(piece for piece in pieces if piece.size > 1)
+        total = sum(piece.size for piece in kept)
+        if total - len(kept) < 3:
+            raise ValueError(f"{total} samples in {len(kept)} pieces cannot give the scale of the noise")
+        return cls(kept)
+
+    @cached_property
+    def freedom(self) -> int:
+        """Samples beyond the levels [-]."""
+        return sum(piece.size - 1 for piece in self.pieces)
+
+    @cached_property
+    def _alike(self) -> list[Matrix]:
+        """Pieces by length."""
+        return [
+            np.array([p for p in self.pieces if p.size == n]) for n in sorted({p.size for p in self.pieces})
+        ]
+
+    def cost(self, partial: Vector) -> tuple[float, float]:
+        """Negative restricted log likelihood at the best innovation sd [nat], and that sd.
+
+        With the sd integrated out under ``1 / sd`` it is the same up to a constant.
+        """
+        unit = Autoregression(np.clip(partial, -1 + 1e-9, 1 - 1e-9), 1.0)
+        squares, levels, scales = 0.0, 0.0, 0.0
+        for pieces in self._alike:
+            number, n = pieces.shape
+            white, ones = unit.whiten(pieces), unit.whiten(np.ones(n))
+            power = float(ones @ ones)
+            squares += float((white**2).sum()) - float(((white @ ones) ** 2).sum()) / power
+            levels += 0.5 * number * np.log(power)
+            scales += number * unit.log_scale(n)
+        sd = float(np.sqrt(max(squares, 1e-300) / self.freedom))
+        return self.freedom * np.log(sd) + scales + levels, sd
+
+    def _stretched(self, x: Vector) -> float:
+        """Cost of the inverse hyperbolic tangents of partial autocorrelations."""
+        return self.cost(np.tanh(x))[0]
+
+    @cached_property
+    def modes(self) -> tuple[Mode, ...]:
+        """The mode of every order from 0 to three beyond that of the least criterion, at most 8."""
+        total, longest = sum(p.size for p in self.pieces), max(p.size for p in self.pieces)
+        start, out, best = np.empty(0), [], 0
+        for order in range(min(_LARGEST_ORDER, longest - 2, total // _PER_COEFFICIENT) + 1):
+            if order:
+                found = minimize(
+                    self._stretched,
+                    np.concatenate([start, [0.0]]),
+                    method="BFGS",
+                    options={"gtol": 1e-4, "maxiter": 60},
+                )
+                start = np.clip(
+                    found.x, -6.0, 6.0
+                )  # a start for the next order; 6 is a correlation of 0.99999
+            cost, sd = self.cost(np.tanh(start))
+            count = order + 1
+            criterion = 2 * cost + 2 * count * total / max(total - count - 1, 1)
+            out.append(Mode(np.tanh(start), cost, sd, criterion))
+            if criterion < out[best].criterion - 1e-9:
+                best = order
+            elif order >= best + _PATIENCE:
+                break
+        return tuple(out)
+
+    @property
+    def estimate(self) -> Autoregression:
+        """Restricted maximum likelihood, order by the corrected Akaike criterion: an order too small costs
+        false alarms, one too large next to nothing."""
+        best = min(self.modes, key=lambda one: one.criterion)
+        return Autoregression(best.partial, best.innovation_sd)
 
 
-def _cost(correlations: Vector, alike: Sequence[Matrix]) -> tuple[float, float]:
-    """Negative restricted log likelihood at the best innovation sd, and that sd, of pieces by length."""
-    unit = Autoregression(np.clip(correlations, -1 + 1e-9, 1 - 1e-9), 1.0)
-    squares, levels, scales, count = 0.0, 0.0, 0.0, 0
-    for pieces in alike:
-        number, n = pieces.shape
-        white, ones = unit.whiten(pieces), unit.whiten(np.ones(n))
-        power = float(ones @ ones)
-        squares += float((white**2).sum()) - float(((white @ ones) ** 2).sum()) / power
-        levels += 0.5 * number * np.log(power)
-        scales += number * unit.log_scale(n)
-        count += number * (n - 1)
-    sd = float(np.sqrt(max(squares, 1e-300) / count))
-    return count * np.log(sd) + scales + levels, sd
+def estimated(pieces: Sequence[Vector]) -> Autoregression:
+    """Order and scale from pieces of noise (`NoisePieces`)."""
+    return NoisePieces.of(pieces).estimate

@@ -120,11 +120,9 @@ def measured(posterior: Posterior, residual: Vector, delay: float) -> tuple[Axis
 def whitening(model: BaseModel, noise: Sequence[AxisNoise]) -> Whitening:
     """The whitening operator of the fit records."""
     processes = tuple(one.process for one in noise)
-    if all(one.known for one in noise):
-        return Whitening(model.posterior.samples, processes)
-    dependence = tuple(one.dependence for one in noise)
-    coloured = tuple(one.coloured or one.process for one in noise)
-    return Whitening(model.posterior.samples, processes, dependence, coloured)
+    known = tuple(one.posterior for one in noise)
+    dependence = () if all(one.known for one in noise) else tuple(one.dependence for one in noise)
+    return Whitening(model.posterior.samples, processes, dependence, known)
 
 
 def renewed(model: BaseModel, optimum: Optimum, known: Whitening) -> Whitening:
@@ -185,7 +183,7 @@ def _failure(model: BaseModel, optimum: Optimum) -> str:
 
 
 def _cautions(noise: Sequence[AxisNoise], optimum: Optimum) -> tuple[str, ...]:
-    out = [one.sentence for one in noise if not one.known]
+    out = [one.caution for one in noise if one.caution]
     if optimum.at_bound:
         out.append(
             f"{', '.join(optimum.at_bound)} stand(s) at the end of its prior in the base fit; widen the "

@@ -141,7 +141,7 @@ def loop(
 def _looped(
     study: Study, kinds: Sequence[type[Effect]], *, jobs: int, sample: bool, quick: bool, as_stated: bool
 ) -> Loop:
-    draws = 200 if quick else 400
+    draws = 1000 if quick else 4000
     problem, base, start, enlarged = fitted_base(study, kinds, as_stated=as_stated, draws=draws)
     outliers = outlying(study, base)
     if outliers is not None:

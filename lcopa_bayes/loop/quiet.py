@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import final
 
 import numpy as np
-from scipy import stats
 from scipy.signal import correlate
+from scipy.stats import chi2
 
 from lcopa_bayes.arrays import Vector
 from lcopa_bayes.inference.data import Samples
-from lcopa_bayes.loop.autoregression import Autoregression, estimated, unbroken
+from lcopa_bayes.loop.autoregression import Autoregression, NoisePieces, unbroken
+from lcopa_bayes.loop.noiseposterior import NoisePosterior
 
 FEWEST = 50
 """Fewer quiet samples than this know the noise scale to worse than a tenth [-]."""
@@ -24,6 +26,9 @@ _WINDOW = 5.0
 """Lags over which autocorrelations are summed, over that sum (Sokal 1997, NATO ASI B 361) [-]."""
 _ALIKE = 1e-3
 """p-value below which repeats differ by more than the quiet noise [-]."""
+_REPEATED = 200
+"""Plausible noise processes over which a number is averaged [-]."""
+_SEED = 5
 
 
 @final
@@ -32,6 +37,8 @@ class AxisNoise:
     """Noise of one response axis and where it is known from."""
 
     process: Autoregression
+    posterior: NoisePosterior
+    """What the samples leave plausible."""
     samples: int
     """Samples it was estimated from [-]."""
     source: str
@@ -39,8 +46,30 @@ class AxisNoise:
     sentence: str
     dependence: float = 1.0
     """Samples that count as one independent sample [-]; above 1 only when fitted jointly."""
-    coloured: Autoregression | None = None
-    """Coloured noise that the residual may be, from which chance is drawn when fitted jointly."""
+
+    @classmethod
+    def of(cls, posterior: NoisePosterior, samples: int, source: str, sentence: str) -> AxisNoise:
+        """Noise measured apart from the fit, at the estimate from its pieces."""
+        return cls(posterior.pieces.estimate, posterior, samples, source, sentence)
+
+    @cached_property
+    def independent(self) -> float:
+        """Independent samples that the samples are worth for the noise scale, median of the posterior [-]."""
+        drawn = self.posterior.draw(_REPEATED, np.random.default_rng(_SEED))
+        return self.samples / float(np.median([one.correlated(self.samples) for one in drawn]))
+
+    @property
+    def caution(self) -> str:
+        """Why no verdict is better than tentative beside this noise; empty when it is known well."""
+        if not self.known:
+            return self.sentence
+        if self.independent >= FEWEST:
+            return ""
+        return (
+            f"{self.sentence.rstrip('.')}; successive ones are so alike that they count as "
+            f"{self.independent:.0f} independent ones ({FEWEST} are needed): what is slow in the noise is "
+            "known too roughly for a firm verdict. Record a longer stretch before the first command."
+        )
 
     @property
     def known(self) -> bool:
@@ -110,25 +139,27 @@ def axis_noise(samples: Sequence[Samples], axis: int, delay: float, name: str) -
     again = sum(piece.size - 1 for piece in repeats)
     usable = [piece for piece in quiet if np.ptp(piece) > 0]
     if count >= FEWEST and usable:
-        process = estimated(usable)
-        said = f"{name}: AR({process.order}) noise of sd {process.sd:.3g} from {count} quiet samples"
+        alone = NoisePosterior(NoisePieces.of(usable))
+        said = f"{name}: {_named(alone)} from {count} quiet samples"
         if not again:
-            return AxisNoise(process, count, "quiet", f"{said}.")
-        ratio = _power(process, repeats)
-        p = float(2 * min(stats.f.sf(ratio, again, count), stats.f.cdf(ratio, again, count)))
+            return AxisNoise.of(alone, count, "quiet", f"{said}.")
+        ratio, p = _repeated(alone, repeats)
         if p > _ALIKE:
-            both = estimated([*usable, *repeats])
-            told = (
-                f"{name}: AR({both.order}) noise of sd {both.sd:.3g} from {count} quiet samples and {again}"
-            )
-            return AxisNoise(both, count + again, "quiet", f"{told} differences of repeats, which agree.")
-        differ = f"repeats differ by {np.sqrt(ratio):.2f} times the quiet noise (p = {p:.1g})"
-        return AxisNoise(process, count, "quiet", f"{said}; {differ}: something varies between records.")
+            both = NoisePosterior(NoisePieces.of([*usable, *repeats]))
+            told = f"{name}: {_named(both)} from {count} quiet samples and {again} differences of repeats"
+            return AxisNoise.of(both, count + again, "quiet", f"{told}, which agree.")
+        differ = f"repeats differ by {ratio:.2f} times the quiet noise (p = {p:.1g})"
+        return AxisNoise.of(alone, count, "quiet", f"{said}; {differ}: something varies between records.")
     if again >= FEWEST:
-        process = estimated([piece for piece in repeats if np.ptp(piece) > 0])
-        told = f"{name}: AR({process.order}) noise of sd {process.sd:.3g} from {again} differences of repeats"
-        return AxisNoise(process, again, "repeats", f"{told}; {count} quiet samples are too few.")
+        alone = NoisePosterior(NoisePieces.of([piece for piece in repeats if np.ptp(piece) > 0]))
+        told = f"{name}: {_named(alone)} from {again} differences of repeats"
+        return AxisNoise.of(alone, again, "repeats", f"{told}; {count} quiet samples are too few.")
     return None
+
+
+def _named(posterior: NoisePosterior) -> str:
+    process = posterior.pieces.estimate
+    return f"AR({process.order}) noise of sd {process.sd:.3g}"
 
 
 def joint_noise(residual: Sequence[Vector], name: str, quiet: int) -> AxisNoise:
@@ -142,8 +173,8 @@ def joint_noise(residual: Sequence[Vector], name: str, quiet: int) -> AxisNoise:
     count = sum(piece.size for piece in residual)
     power = sum(float(((piece - piece.mean()) ** 2).sum()) for piece in residual)
     process = Autoregression(np.empty(0), max(float(np.sqrt(power / count)), 1e-300))
-    coloured = estimated(residual)
-    dependence = _dependence(residual, coloured)
+    coloured = NoisePieces.of(residual)
+    dependence = _dependence(residual, coloured.estimate)
     sentence = (
         f"{name}: {quiet} quiet samples and no repeats are too few to know the noise ({FEWEST} are needed), "
         f"so noise of sd {process.sd:.3g} is fitted to the residual together with the plant, and {count} "
@@ -151,7 +182,7 @@ def joint_noise(residual: Sequence[Vector], name: str, quiet: int) -> AxisNoise:
         "effect, so no verdict is better than tentative. Record a stretch before the first command, or a "
         "repeat."
     )
-    return AxisNoise(process, count, "joint", sentence, dependence, coloured)
+    return AxisNoise(process, NoisePosterior(coloured), count, "joint", sentence, dependence)
 
 
 def _dependence(pieces: Sequence[Vector], coloured: Autoregression) -> float:
@@ -177,11 +208,21 @@ def _dependence(pieces: Sequence[Vector], coloured: Autoregression) -> float:
     return min(own, regressed)
 
 
+def _repeated(posterior: NoisePosterior, repeats: Sequence[Vector]) -> tuple[float, float]:
+    """Root mean square of repeats whitened by the noise, and the p-value of noise alone, averaged over all
+    noise that its posterior leaves plausible [-]."""
+    count = sum(piece.size - 1 for piece in repeats)
+    drawn = posterior.draw(_REPEATED, np.random.default_rng(_SEED))
+    powers = np.array([_power(process, repeats) for process in drawn])
+    above, below = chi2.sf(powers, count).mean(), chi2.cdf(powers, count).mean()
+    ratio = np.sqrt(_power(posterior.pieces.estimate, repeats) / count)
+    return float(ratio), float(2 * min(above, below))
+
+
 def _power(process: Autoregression, pieces: Sequence[Vector]) -> float:
-    """Mean square of whitened pieces about their own levels [-]."""
-    squares, count = 0.0, 0
+    """Squares of whitened pieces about their own levels [-]."""
+    squares = 0.0
     for piece in pieces:
         white, ones = process.whiten(np.stack([piece, np.ones_like(piece)]))
         squares += float(white @ white) - float(ones @ white) ** 2 / float(ones @ ones)
-        count += piece.size - 1
-    return squares / count
+    return squares

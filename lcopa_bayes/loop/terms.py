@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lcopa_bayes.checks import refuse_if
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.loop.basefit import BaseFit, base_fit
 from lcopa_bayes.loop.basemodel import BaseModel
@@ -20,6 +21,7 @@ from lcopa_bayes.loop.scores import State
 from lcopa_bayes.loop.startlevel import Mended, started
 from lcopa_bayes.loop.trace import trace
 from lcopa_bayes.plant.effects.effect import Effect
+from lcopa_bayes.rest import not_at_rest
 from lcopa_bayes.settings import PriorSettings
 from lcopa_bayes.study import Study
 
@@ -49,11 +51,14 @@ def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: boo
 
     A plant with too few terms is no undeclared effect, and would be named as one; one with a term too many
     may imitate an effect. So a further term is a candidate like any other: it is added when it is worth more
-    than the best named effect, or more together with what it leaves to be named.
+    than the best named effect, or more together with what it leaves to be named. InputError when a record
+    moves before its drive does and no drive before the first row explains that.
     """
     base = _based(study)
     for mended in (started, _later):
         better = mended(study, base.fit)
+        if mended is started and better is None:
+            refuse_if(not_at_rest(study.fit, study.held_out))
         if better is not None:
             study = better.study
             base = _based(study)._replace(sentence=f"{base.sentence} {better.sentence}".strip())

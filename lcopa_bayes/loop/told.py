@@ -243,9 +243,7 @@ def words(told: dict[str, Any]) -> Sequence[str]:
         )
     coverage = [told[side]["held_out_coverage_90"] for side in ("before", "after")]
     if None not in coverage:
-        out.append(
-            f"pointwise 90 % bands hold {100 * coverage[0]:.0f} % of unseen samples before, "
-            f"{100 * coverage[1]:.0f} % after"
-        )
+        first, last = (f"{100 * share:.0f} %" for share in coverage)
+        out.append(f"pointwise 90 % bands hold {first} of unseen samples before, {last} after")
     out += [f"next measurement: {told['next_measurement']}"] if told["next_measurement"] else []
     return out

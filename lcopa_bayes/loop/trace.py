@@ -23,7 +23,10 @@ LEAST = 3.0
 QUANTILE = 0.99
 LEVEL = 0.5
 """Difference of log evidence up to which instances of an effect are level [nat]."""
-_DRAWS = 400
+_DRAWS = 4000
+"""Chance residuals: the threshold is exceeded with a probability known to 0.002 [-]."""
+_BATCH = 200
+"""Chance residuals drawn at once [-]."""
 _NONE = 0.5
 """Prior probability that nothing is missing [-]; the effects share the rest evenly."""
 MOST_COMMANDS = 400
@@ -155,7 +158,7 @@ def trace(
             found.append(Traced(kind.card, (), -np.inf, 0, why))
             continue
         found.append(_traced(state, project, residual, scale, kind))
-    maxima = _chance(project, whitening, found, rng, noise_samples, draws, scale)
+    maxima = _chance(project, whitening, found, rng, draws, scale)
     found.sort(key=lambda one: -one.log_bayes_factor)
     threshold = max(LEAST, float(np.quantile(maxima, QUANTILE))) if maxima.size else LEAST
     made = Trace(tuple(found), threshold, np.nan, draws, residual, scale)
@@ -189,7 +192,6 @@ def _chance(
     whitening: Whitening,
     found: Sequence[Traced],
     rng: np.random.Generator,
-    noise_samples: Sequence[int],
     draws: int,
     scale: Scale,
 ) -> Vector:
@@ -201,18 +203,8 @@ def _chance(
     edges = np.cumsum([0, *(span.shape[1] for span in spans)])
     every = np.concatenate(spans, axis=1).T
     maxima = []
-    for _ in range(4):
-        if whitening.coloured:
-            z = np.ascontiguousarray(whitening(whitening.draw(draws // 4, rng)).T)
-        else:
-            z = rng.standard_normal((whitening.size, draws // 4))
-        for axis, count in enumerate(noise_samples):
-            if not count:  # the residual itself gave the scale
-                continue
-            factor = 1.0 / np.sqrt(rng.chisquare(count, z.shape[1]) / count)
-            for part in whitening.parts:
-                if part.axis == axis:
-                    z[part.rows] *= factor
+    for first in range(0, draws, _BATCH):
+        z = whitening.chance(min(_BATCH, draws - first), rng)
         left = project(z)
         inner = (every @ left.astype(np.float32)).astype(float)
         known = Scale(scale.quiet, scale.freedom, np.einsum("nd,nd->d", left, left))
@@ -221,12 +213,12 @@ def _chance(
         evidence = [
             one.evidence(inner[a:b], known) for one, a, b in zip(listed, edges[:-1], edges[1:], strict=True)
         ]
-        first, by_effect = 0, []
+        start, by_effect = 0, []
         for traced in found:
             count = len(traced.signatures)
             if count:
-                by_effect.append(logsumexp(evidence[first : first + count], axis=0) - np.log(count))
-            first += count
+                by_effect.append(logsumexp(evidence[start : start + count], axis=0) - np.log(count))
+            start += count
         if scatter is not None:
             by_effect.append(np.array(scatter))
         maxima.append(np.max(by_effect, axis=0))

@@ -9,9 +9,13 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Array, Matrix, Vector
+from lcopa_bayes.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.inference.data import Samples
 from lcopa_bayes.loop.autoregression import Autoregression, unbroken
+from lcopa_bayes.loop.noiseposterior import NoisePosterior
+
+_PER_PROCESS = 4
+"""Draws of noise from each plausible process [-]."""
 
 
 @final
@@ -56,8 +60,8 @@ class Whitening:
     """One per response axis."""
     dependence: tuple[float, ...] = ()
     """Samples that count as one independent sample, per response axis; 1 by default [-]."""
-    coloured: tuple[Autoregression, ...] = ()
-    """Noise that chance residuals are drawn from, per response axis; by default `noise`."""
+    posterior: tuple[NoisePosterior, ...] = ()
+    """What is known of the noise of each response axis; by default it is `noise`."""
 
     @cached_property
     def parts(self) -> tuple[Part, ...]:
@@ -75,15 +79,15 @@ class Whitening:
         return np.concatenate([one.values for record in self.samples for one in record.axes])
 
     @cached_property
-    def _stretches(self) -> list[tuple[int, slice]]:
-        """Axis and rows of every unbroken stretch."""
-        out = []
+    def _stretches(self) -> list[tuple[int, Index]]:
+        """Axis and rows of unbroken stretches, those of one axis and length together, (stretches, n)."""
+        found: dict[tuple[int, int], list[Index]] = {}
         for part in self.parts:
             gaps = self.samples[part.record].axes[part.axis].gaps
-            if gaps.size:
-                first = part.rows.start
-                out += [(part.axis, slice(first + s.start, first + s.stop)) for s in unbroken(gaps)]
-        return out
+            for piece in unbroken(gaps) if gaps.size else ():
+                rows = np.arange(piece.start, piece.stop) + part.rows.start
+                found.setdefault((part.axis, rows.size), []).append(rows)
+        return [(axis, np.array(rows)) for (axis, _), rows in found.items()]
 
     def __call__(self, columns: Array) -> Array:
         """Whitened columns (..., n), same shape [-]."""
@@ -103,9 +107,9 @@ class Whitening:
 
     @cached_property
     def log_scale(self) -> float:
-        """Sum of log sd of the prediction errors [nat]."""
+        """Sum over samples of log sd of the prediction errors [nat]."""
         return float(
-            sum(self.noise[axis].log_scale(rows.stop - rows.start) for axis, rows in self._stretches)
+            sum(len(rows) * self.noise[axis].log_scale(rows.shape[1]) for axis, rows in self._stretches)
         )
 
     def excess(self, residual: Vector) -> float:
@@ -113,9 +117,21 @@ class Whitening:
         power = sum(np.sum((residual[p.rows] / self.noise[p.axis].sd) ** 2) for p in self.parts)
         return float(np.sqrt(power / self.size))
 
-    def draw(self, count: int, rng: np.random.Generator) -> Matrix:
-        """Noise of all samples, (count, n) [response unit]."""
-        out, noise = np.empty((count, self.size)), self.coloured or self.noise
-        for axis, rows in self._stretches:
-            out[:, rows] = noise[axis].draw(count, rows.stop - rows.start, rng)
-        return out
+    def chance(self, count: int, rng: np.random.Generator) -> Matrix:
+        """Noise whitened by the estimate, (n, count) [-], drawn from all that its posterior leaves plausible.
+
+        Where the noise is known the draws are independent standard normal.
+        """
+        if not self.posterior:
+            return rng.standard_normal((self.size, count))
+        raw = np.empty((count, self.size))
+        several = -(-count // _PER_PROCESS)
+        for axis, posterior in enumerate(self.posterior):
+            own = [rows for number, rows in self._stretches if number == axis]
+            for k, process in enumerate(posterior.draw(several, rng)):
+                some = slice(k * _PER_PROCESS, min((k + 1) * _PER_PROCESS, count))
+                number = some.stop - some.start
+                for rows in own:
+                    drawn = process.draw(number * len(rows), rows.shape[1], rng)
+                    raw[some, rows.ravel()] = drawn.reshape(number, -1)
+        return np.ascontiguousarray(self(raw).T)
