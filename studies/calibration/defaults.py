@@ -1,6 +1,6 @@
 """Coverage of the default settings at stated truths: noise, orders, delays, terms and kinds of noise.
 
-    python studies/calibration/defaults.py [--replicas N] [--jobs N] [--seed N] [--cells NAME ...]
+    python studies/calibration/defaults.py [--replicas N] [--jobs N] [--seed N] [--cells PATTERN ...]
 
 Every cell is a step response of 240 samples, 0.2 ms apart, measured on the virtual bench at one truth; every
 replica is fitted with default settings, default priors derived from its own record. Cells differ in the level
@@ -16,6 +16,7 @@ import argparse
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -303,13 +304,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--replicas", type=int, default=200)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--seed", type=int, default=20)
-    parser.add_argument("--cells", nargs="+", metavar="NAME", help="cells whose name contains one of these")
+    parser.add_argument("--cells", nargs="+", metavar="PATTERN", help="cells whose name matches one of these")
     parser.add_argument("--out", type=Path, default=Path("reports/calibration/defaults"))
     parser.add_argument("--store", type=Path, default=Path(tempfile.gettempdir()) / "lcopa-defaults")
     options = parser.parse_args(arguments)
     rows = []
     for number, cell in enumerate(cells()):
-        if options.cells and not any(word in cell.name for word in options.cells):
+        if options.cells and not any(fnmatchcase(cell.name, pattern) for pattern in options.cells):
             continue
         made = calibrate(
             cell.study(1000 * options.seed + number),
