@@ -21,7 +21,7 @@ from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.draws import Draws
 from lcopa_bayes.inference.grade import Limitation
 from lcopa_bayes.inference.leastsquares import LeastSquares
-from lcopa_bayes.inference.optimum import find_optima
+from lcopa_bayes.inference.optimum import Optimum, find_optima
 from lcopa_bayes.inference.posterior import Posterior
 
 LARGEST = 0.1
@@ -97,17 +97,20 @@ class Discretisation:
         }
 
 
-def resolved(problem: Problem) -> Problem:
+def resolved(problem: Problem, optima: Sequence[Optimum] | None = None) -> Problem:
     """The problem on blocks so narrow that the optimum moves by at most `LARGEST` sd on narrower ones.
 
-    The same problem gives the same blocks; see `narrowed`.
+    The same problem gives the same blocks; see `narrowed`. `optima` are its own, best first, where they are
+    known already.
     """
     rng = np.random.default_rng([problem.study.seed, 6])
     with threadpool_limits(1):  # matrices are small: more threads only wait for each other
-        optima = find_optima(problem.posterior, rng, starts=_STARTS)
+        if optima is None:
+            optima = find_optima(problem.posterior, rng, starts=_STARTS)
         if not optima:
             return problem
-        return narrowed(problem, lambda each: optimum_shift(each, optima[0].values))
+        best = optima[0].values
+        return narrowed(problem, lambda each: optimum_shift(each, best))
 
 
 def narrowed(problem: Problem, shift: Callable[[Problem], float]) -> Problem:
