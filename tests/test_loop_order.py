@@ -104,7 +104,7 @@ def test_orders_of_unlike_terms_never_change_places(gap):
     optimum = regression.descend(start, most=60)
     assert optimum.x[FIRST] >= optimum.x[SECOND]
     assert np.isfinite(optimum.cost)
-    assert model.ordered(optimum.x[None], every=False)[0]
+    assert model.supported(optimum.x[None], every=False)[0]
 
 
 def density(pair: tuple[BaseModel, Regression], start: np.ndarray) -> LoopDensity:

@@ -128,19 +128,21 @@ class BaseModel:
         out[places] = x
         return out
 
-    def ordered(self, x: Matrix, *, every: bool = True) -> Flags:
-        """Whether the orders decrease, of coordinates (batch, k), (batch,); unless `every`, in elements whose
-        terms cannot be exchanged."""
+    def supported(self, x: Matrix, *, every: bool = True) -> Flags:
+        """Whether orders decrease and terms are resolved, of coordinates (batch, k), (batch,).
+
+        Unless `every`, terms that can be exchanged may stand in any sequence.
+        """
         table = self.posterior.table
         values = np.tile(self.template, (len(x), 1))
         for position, k in enumerate(self.least.columns):
             values[:, k] = np.exp(x[:, position]) if table.rows[k].log_scale else x[:, position]
-        return table.ordered(values if every else table.canonical(values))
+        return table.supported(values if every else table.canonical(values))
 
     @property
-    def log_ordering(self) -> float:
-        """What decreasing orders add to the log of a prior density of terms in any sequence [nat]."""
-        return self.posterior.table.log_ordering
+    def log_support(self) -> float:
+        """What the support of terms adds to the log of a prior density of terms in any sequence [nat]."""
+        return self.posterior.table.log_support
 
     def values(self, x: Vector) -> Vector:
         """Table values of coordinates, (rows,), terms in canonical order."""

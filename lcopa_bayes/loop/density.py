@@ -80,7 +80,7 @@ class LoopDensity:
         x = self.state.optimum.x.copy()
         x[self.sampled] = z
         model = self.state.model
-        if not model.base.ordered(x[None, : model.plant_size], every=False)[0]:
+        if not model.base.supported(x[None, : model.plant_size], every=False)[0]:
             return None
         try:
             predicted = model.predict(x)
@@ -132,7 +132,7 @@ class LoopDensity:
         x = np.tile(self.state.optimum.x[: model.plant_size], (len(z), 1))
         plant = self.sampled < model.plant_size
         x[:, self.sampled[plant]] = held[:, plant]
-        inside &= model.base.ordered(x, every=ordered)
+        inside &= model.base.supported(x, every=ordered)
         return np.where(inside, total, -np.inf)
 
     def completed(self, z: Matrix, conditional: Matrix, rng: np.random.Generator) -> Matrix:

@@ -117,7 +117,7 @@ def _gain(base: Base, wider: Base) -> float:
     """Log evidence of the wider model over the other under the wider one's noise [nat]."""
     quiet = float(sum(wider.fit.noise_samples))
     same = Regression(base.fit.model, wider.fit.regression.whitening).descend(base.fit.optimum.x)
-    ordering = wider.fit.model.log_ordering - base.fit.model.log_ordering
+    ordering = wider.fit.model.log_support - base.fit.model.log_support
     return log_bayes_factor(same, wider.fit.optimum, quiet) + ordering
 
 
