@@ -86,9 +86,9 @@ def _exposure(record: Record, exposure: float) -> list[str]:
     unit = record.time_unit
     return [
         f"record {record.name!r}: the exposure of {exposure:.6g} {unit} is longer than the {period:.6g} "
-        f"{unit} from one sample to the next, in which a sample cannot be taken; `exposure_ms` is in ms: give "
-        "the exposure of one sample, or leave it out where a filter averages over several, which the plant "
-        "then includes"
+        f"{unit} from one sample to the next, in which a sample cannot be taken; `exposure_ms` is in ms: "
+        "give the exposure of one sample, or leave it out where a filter averages over several, which the "
+        "plant then includes"
     ]
 
 

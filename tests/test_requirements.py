@@ -6,10 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small import record, study
+from small import U, Y, path, record, study
 
+from lcopa_bayes.bench.command import Command
+from lcopa_bayes.bench.device import Device
 from lcopa_bayes.cli import main
 from lcopa_bayes.fit import fit
+from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.inference.discretisation import resolved
+from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.loop.loop import loop
 from lcopa_bayes.problems import InputError
 from lcopa_bayes.record import Record, save_record
@@ -77,3 +82,51 @@ def test_the_command_line_tells_the_exposure_in_the_unit_of_the_records(tmp_path
         "error: record 'step': the exposure of 0.3 s is longer than the 0.2 s from one sample"
     )
     assert not (tmp_path / "run").exists()
+
+
+ORDINARY = {"gain": 2.0, "time_1": 1.5, "order_1": 0.9, "delay": 0.53, "offset": 0.3}
+EVERY = 0.2 * np.arange(60.0)
+SOUND = {
+    "exposure longer than the delay": ({"delay": 0.05}, EVERY, (1.0,), (1.0,), 0.19),
+    "delay below a sample": ({"delay": 0.03}, EVERY, (1.0,), (1.0,), 0.0),
+    "time constant below a sample": ({"time_1": 0.12}, EVERY, (1.0, 4.07), (1.0, 0.0), 0.0),
+    "changes between samples": ({}, EVERY, (1.07, 4.33), (1.0, 0.0), 0.0),
+    "a pulse between two samples": ({}, EVERY, (1.05, 1.1), (20.0, 0.0), 0.0),
+    "irregular samples": ({}, np.sort(np.random.default_rng(8).uniform(0, 12, 60)), (0.9,), (1.0,), 0.0),
+    "bursts": ({}, np.r_[np.arange(0, 1, 0.02), np.arange(1, 12, 0.5)], (0.31,), (1.0,), 0.0),
+    "samples over decades": ({}, np.geomspace(0.01, 100, 60), (0.05,), (1.0,), 0.0),
+    "clock of years": ({}, EVERY, (1.07,), (1.0,), 0.0),
+}
+
+
+@pytest.mark.parametrize("name", SOUND)
+def test_unusual_records_give_the_truth_of_the_bench(name):
+    """Least-squares optima at noise of 0.2 % of the response, within 4.5 of their own standard deviations."""
+    changed, times, changes, levels, exposure = SOUND[name]
+    truth = ORDINARY | changed
+    device = Device(
+        ((path(truth["gain"], truth["delay"], (truth["time_1"],), (truth["order_1"],)),),), (U,), (Y,), (0.3,)
+    )
+    command = Command(np.array(changes), np.array(levels)[:, None], np.zeros(1))
+    exact = device.response(command, times, exposure=exposure)
+    rows = np.union1d(np.r_[times[0] - 1.0, times], changes)
+    drive = np.r_[0.0, levels][np.searchsorted(changes, rows, side="right")]
+    response = np.full((rows.size, 1), np.nan)
+    noisy = exact + 0.002 * np.ptp(exact) * np.random.default_rng(1).standard_normal(exact.shape)
+    response[np.searchsorted(rows, times)] = noisy
+    rows = rows + (1.7e12 if name == "clock of years" else 0.0)  # to 0.001 of a sample in double precision
+    made = study(Record("r", rows, drive[:, None], response, (U,), (Y,), "ms"), exposure=exposure)
+    assert unmet(made) == []
+    posterior = resolved(problem_of(made)).posterior
+    best = find_optima(posterior, np.random.default_rng(0), starts=6)[0]
+    told = dict(zip(posterior.table.names, best.values, strict=True))
+    spread = dict(
+        zip(
+            [posterior.table.names[k] for k in posterior.sampled],
+            np.sqrt(np.diag(best.covariance)),
+            strict=True,
+        )
+    )
+    for key in ("time_1", "order_1", "delay"):
+        size = truth[key] if key == "time_1" else 1.0  # sampled by its logarithm
+        assert abs(told[key] - truth[key]) < 4.5 * spread[key] * size, (key, told[key], spread[key])
