@@ -67,9 +67,9 @@ def test_samples_per_independent_one_are_those_of_a_sum_of_squares(partial, n):
 def test_the_posterior_of_the_noise_is_that_of_a_grid():
     """24 samples admit orders 0 and 1: importance sampling against sums over a grid of the correlation."""
     pieces = NoisePieces.of(list(first_order(0.7).draw(2, 12, np.random.default_rng(2))))
-    grid = np.tanh(np.linspace(-4.5, 4.5, 1501))
+    grid = np.tanh(np.linspace(-8, 8, 3001))
     weights = np.exp(-np.array([pieces.cost(np.array([kappa]))[0] for kappa in grid]) + pieces.modes[0].cost)
-    weights *= np.gradient(grid) / 2
+    weights *= np.gradient(np.arcsin(grid)) / np.pi
     drawn = NoisePosterior(pieces).draw(4000, np.random.default_rng(0))
     kappa = np.array([one.partial[0] for one in drawn if one.order == 1])
     exact = weights.sum() / (1 + weights.sum())
