@@ -8,6 +8,7 @@ from typing import final
 
 import numpy as np
 
+from lcopa_bayes.adequacy import limitations
 from lcopa_bayes.arrays import Matrix
 from lcopa_bayes.checks import refuse_if
 from lcopa_bayes.estimate import Estimate
@@ -75,8 +76,9 @@ def fit(
     the same as without interruption. With `cross_check` the posterior is also sampled by nested sampling,
     always from the start, and where the two disagree every grade is lowered. Blocks are narrowed until their
     width does not move the optimum; how far it moves the posterior is measured and, where too far, lowers the
-    grade. InputError when the study does not fit its records, a record moves before its drive does or the
-    folder cannot be written to; then nothing is written.
+    grade. So does what speaks against the model itself (`adequacy`). InputError when the study does not fit
+    its records, a record moves before its drive does or the folder cannot be written to; then nothing is
+    written.
     """
     refuse_if(not_at_rest(study.fit, study.held_out))
     problem = problem_of(study)
@@ -112,9 +114,10 @@ def fit(
     if study.held_out:
         samples, model = problem.simulated(study.held_out)
         shown += bands(draws, model, samples, noise, held_out=True, rng=rng)
+    left = residuals(draws, shown, noise, problem.scales.period)
+    draws = draws.limited(limitations(problem, draws, shown, left, np.random.default_rng([plan.seed, 4])))
     curves = step_curves(draws, problem.scales.span)
     metrics = step_metrics(draws, curves, time_unit=study.time_unit)
-    left = residuals(draws, shown, noise, problem.scales.period)
     moved = sensitivity(draws, problem.posterior)
     return Fit(
         problem,

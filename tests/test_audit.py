@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,9 +22,11 @@ from lcopa_bayes.audit.profilewalk import _Walk, profile
 from lcopa_bayes.audit.radial import radial
 from lcopa_bayes.audit.sensitivities import sensitivities
 from lcopa_bayes.audit.structure import Structure, structure
+from lcopa_bayes.audit.tolerance import Tolerance
 from lcopa_bayes.audit.verdict import Finding, judged
 from lcopa_bayes.bench.command import step
 from lcopa_bayes.inference.optimum import find_optima
+from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.posterior import Posterior
 
 SHORT = record(camera=0.6)
@@ -295,7 +298,9 @@ def rough(landscape: Landscape, peak: Peak, rng: np.random.Generator) -> Matrix:
 
 
 def found_of(name: str, seed: int, **options: object) -> Finding:
-    posterior = problem(options.pop("record_of")(seed), **options).posterior  # type: ignore[operator]
+    fast = str(options.pop("fast", ""))
+    made = problem(options.pop("record_of")(seed), **options)  # type: ignore[operator]
+    posterior = made.posterior
     landscape, rng = Landscape(posterior), np.random.default_rng(seed)
     peak = maximum(landscape)
     prior = prior_draws(landscape, rng)
@@ -309,6 +314,8 @@ def found_of(name: str, seed: int, **options: object) -> Finding:
         structure_of(posterior),
         curvature(landscape, peak.values, spread),
         _flat(row),
+        Tolerance.of(row, made.scales),
+        fast,
     )
 
 
@@ -340,6 +347,57 @@ def test_each_verdict_is_recognised(verdict):
     name, options = CASES[verdict]
     recognised = [found_of(name, seed, **options).verdict for seed in range(3)]
     assert recognised == [verdict] * 3
+
+
+def test_an_interval_that_spans_more_than_a_factor_of_two_is_weakly_identified():
+    """The same gain from a quiet and from a loud record, everything else known."""
+    known = {"priors": KNOWN | {"offset": TRUTH["offset"], "gain": FLAT_GAIN}, "noise": "white"}
+    verdicts = []
+    for noise_sd in (0.02, 2.5):
+        found = found_of(
+            "gain", 1, record_of=lambda s, sd=noise_sd: record(s, camera=0.6, noise_sd=sd), **known
+        )
+        low, high = found.profile.intervals[0.9]
+        assert (found.verdict == "weakly identified") == (high > 2 * low)
+        verdicts.append(found.verdict)
+    assert verdicts == ["identified", "weakly identified"]
+    assert "a factor of" in found.reason
+
+
+def test_what_resonates_faster_than_the_samples_is_never_identified():
+    found = found_of("delay", 1, record_of=plain, priors={"gain": FLAT_GAIN}, fast="a periodic disturbance")
+    assert (found.verdict, found.reason) == ("unresolved", "a periodic disturbance")
+
+
+def row_of(kind: str) -> Parameter:
+    return Parameter(kind, "-", kind, Place(0, 0), None)
+
+
+@pytest.mark.parametrize(
+    ("kind", "lower", "upper", "wide"),
+    [
+        ("gain", 0.0177, 0.0397, True),
+        ("gain", 0.0177, 0.0350, False),
+        ("gain", -0.0350, -0.0177, False),
+        ("gain", -0.0397, -0.0177, True),
+        ("gain", -0.001, 0.001, True),
+        ("time", 1.0, 2.1, True),
+        ("time", 1.0, 1.9, False),
+        ("order", 0.6, 1.2, True),
+        ("order", 0.6, 1.0, False),
+        ("delay", 0.0, 0.9, False),  # a sampling period is 1
+        ("delay", 0.1, 1.3, True),
+        ("delay", 10.0, 15.0, False),
+        ("offset", -0.5, 0.4, False),  # the response ranges over 2
+        ("offset", -0.6, 0.5, True),
+        ("rho", 0.3, 0.7, False),
+        ("rho", 0.3, 0.9, True),
+        ("sigma", 0.01, 0.019, False),
+    ],
+)
+def test_the_tolerance_of_each_kind(kind, lower, upper, wide):
+    scales = SimpleNamespace(period=1.0, amplitude=np.array([2.0]))
+    assert bool(Tolerance.of(row_of(kind), scales).exceeded(lower, upper)) == wide
 
 
 @pytest.mark.slow

@@ -13,9 +13,11 @@ from small import TWO, problem, record
 from lcopa_bayes.audit.delays import delays
 from lcopa_bayes.bench.command import on_off, step
 from lcopa_bayes.cli import main
+from lcopa_bayes.inference.grade import Limitation
 from lcopa_bayes.paper.claims import judge
 from lcopa_bayes.paper.verdict import Evidence
 from lcopa_bayes.record import save_record
+from lcopa_bayes.report.sections import audited
 
 STUDY = """[records]
 fit = ["one.csv"]
@@ -33,7 +35,7 @@ steps = 200
 """
 VERDICTS = {
     *("identified", "one-sided", "practically unidentifiable", "structurally unidentifiable"),
-    "prior-dominated",
+    *("prior-dominated", "weakly identified", "unresolved"),
 }
 
 
@@ -65,6 +67,8 @@ def test_audit_tells_what_other_tools_rely_on(run):
     assert merged == ["structurally unidentifiable"] * 2  # the search sees that only T1^0.8 + T2^0.8 acts
     assert rows["time_1"]["partners"][0] == "time_2"
     assert [rows[name]["verdict"] for name in ("gain", "delay", "sigma")] == ["identified"] * 3
+    assert told["verdict"].startswith("Given this model, ")
+    assert told["limitations"] == json.loads((run / "results.json").read_text())["limitations"]
     assert told["spectrum"][-1]["prior_knows_more"]
     advised = {row["name"]: row for row in told["next_measurement"]["parameters"]}
     assert set(advised) == {name for name, row in rows.items() if row["verdict"] != "identified"}
@@ -205,3 +209,23 @@ def test_paths_driven_one_after_the_other_are_told_apart_and_an_idle_drive_is_no
     assert finite == {("x_x", "y_x")}
     assert single.as_json()["paths"][1]["sd"] is None
     assert "can never be told apart" in single.sentence
+
+
+# -- what is said when every parameter is identified ----------------------------------------------
+
+
+def advice(limitations: list[dict]) -> str:
+    section = audited._next({"next_measurement": None, "limitations": limitations})
+    return " ".join(section.text)
+
+
+def test_a_model_that_stands_needs_no_further_record():
+    assert advice([]).startswith("Given this model every parameter is identified")
+
+
+def test_a_model_that_does_not_stand_is_mended_first():
+    limit = Limitation("tentative", "intervals hold only if A", "add terms").as_json()
+    said = advice([limit])
+    assert "nothing more" not in said
+    assert "speak against it" in said
+    assert "Intervals hold only if A. To do: add terms." in said

@@ -22,11 +22,13 @@ from lcopa_bayes.audit.profilewalk import profile
 from lcopa_bayes.audit.radial import Radial, radial
 from lcopa_bayes.audit.sensitivities import sensitivities
 from lcopa_bayes.audit.structure import Structure, exchanges, structure
+from lcopa_bayes.audit.tolerance import Tolerance
 from lcopa_bayes.audit.verdict import Finding, judged
 from lcopa_bayes.estimate import plain
 from lcopa_bayes.fit import Fit
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.parameter import Parameter
+from lcopa_bayes.resonance import unresolved
 
 _POINTS = 24
 """Prior draws at which symmetries are looked for, besides likely ones."""
@@ -68,7 +70,12 @@ class Audit:
             counted.setdefault(found.verdict, []).append(found.profile.parameter)
         told = "; ".join(f"{verdict}: {', '.join(names)}" for verdict, names in counted.items())
         best = self.known[0].estimate.name if self.known else ""
-        return f"{told}." + (f" Known best: {best}." if best else "")
+        limits = "; ".join(one.reason for one in self.fit.draws.limitations)
+        return (
+            f"Given this model, {told}."
+            + (f" Known best: {best}." if best else "")
+            + (f" But {limits}." if limits else "")
+        )
 
     def as_json(self) -> dict[str, Any]:
         """Every number of the audit; what is open, infinite or undefined is None."""
@@ -79,6 +86,7 @@ class Audit:
                 "verdict": self.sentence,
                 "grade": draws.grade.level,
                 "grade_reason": draws.grade.reason,
+                "limitations": [one.as_json() for one in draws.limitations],
                 "time_unit": self.fit.study.time_unit,
                 "parameters": [found.as_json() for found in self.findings],
                 "symmetries": [found.as_json() for found in self.structure.symmetries],
@@ -132,8 +140,13 @@ def audit(fit: Fit, *, jobs: int = 1) -> Audit:
         moved = radial(landscape, peak, spread, curved.directions[-1], _RADIUS)
     believed = beliefs(landscape, fit.draws, spread, fit.sensitivity)
     rows = [posterior.table.rows[k] for k in landscape.free]
+    scales = fit.problem.scales
+    fast = unresolved(fit.draws, scales.period)
     findings = tuple(
-        judged(one, belief, symmetric, curved, _flat(row))
+        judged(
+            *(one, belief, symmetric, curved, _flat(row), Tolerance.of(row, scales)),
+            next((f.sentence(scales.period, fit.study.time_unit) for f in fast if f.concerns(row)), ""),
+        )
         for one, belief, row in zip(profiles, believed, rows, strict=True)
     )
     apart = delays(fit.study, posterior.table, peak.values)

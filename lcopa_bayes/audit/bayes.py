@@ -10,6 +10,7 @@ from scipy.stats import rankdata
 
 from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.audit.landscape import Landscape
+from lcopa_bayes.audit.tolerance import FACTOR, Tolerance
 from lcopa_bayes.estimate import Estimate, plain
 from lcopa_bayes.inference.draws import Draws
 from lcopa_bayes.sensitivity import Sensitivity
@@ -77,14 +78,16 @@ class Known:
 
     @property
     def verdict(self) -> str:
-        """Whether the draws bound the function, on both sides, one or none."""
+        """Whether the draws bound the function, on both sides, one or none, and how narrowly."""
         ends = [np.isfinite(self.estimate.lower), np.isfinite(self.estimate.upper)]
         if not any(ends):
             return "practically unidentifiable"
         if not all(ends):
             return "one-sided"
-        known = self.relative_width < 0.5 * self.prior_relative_width
-        return "identified" if known else "prior-dominated"
+        if not self.relative_width < 0.5 * self.prior_relative_width:
+            return "prior-dominated"
+        wide = Tolerance(0.0, FACTOR, self.estimate.unit).exceeded(self.estimate.lower, self.estimate.upper)
+        return "weakly identified" if wide else "identified"
 
 
 def prior_draws(landscape: Landscape, rng: np.random.Generator) -> Matrix:

@@ -11,10 +11,13 @@ from lcopa_bayes.audit.bayes import Belief
 from lcopa_bayes.audit.local import Curvature
 from lcopa_bayes.audit.profile import Profile
 from lcopa_bayes.audit.structure import Structure
+from lcopa_bayes.audit.tolerance import Tolerance
 from lcopa_bayes.estimate import LEVEL, plain
 
 Verdict = Literal[
     "identified",
+    "weakly identified",
+    "unresolved",
     "one-sided",
     "practically unidentifiable",
     "structurally unidentifiable",
@@ -64,14 +67,21 @@ class Finding:
 
 
 def judged(
-    profile: Profile, belief: Belief, structure: Structure, curvature: Curvature | None, flat_prior: bool
+    profile: Profile,
+    belief: Belief,
+    structure: Structure,
+    curvature: Curvature | None,
+    flat_prior: bool,
+    tolerance: Tolerance,
+    unresolved: str = "",
 ) -> Finding:
     """Verdict of one parameter.
 
+    Unresolved: of an element that resonates faster than the samples resolve, as `unresolved` says.
     Structurally unidentifiable: part of a symmetry. Otherwise by the profile at `LEVEL`: no side closed,
     practically unidentifiable, or prior-dominated where the prior is not flat on the sampled scale; one
-    side closed, one-sided; both closed, identified, or prior-dominated where the prior knows more than
-    the data (contraction below a half).
+    side closed, one-sided; both closed, identified, or weakly identified where the interval exceeds the
+    tolerance, or prior-dominated where the prior knows more than the data (contraction below a half).
     """
     name, open_sides = profile.parameter, profile.open_sides
     partners = dict.fromkeys(
@@ -84,12 +94,16 @@ def judged(
     )
     local = curvature.at(name) if curvature else None
     sd, relative = (None, np.nan) if local is None else local
-    verdict, reason = _decided(profile, belief, structure, flat_prior)
+    verdict, reason = _decided(profile, belief, structure, flat_prior, tolerance)
+    if unresolved:
+        verdict, reason = "unresolved", unresolved
     against = _against(verdict, profile, belief, sd)
     return Finding(profile, belief, verdict, reason, tuple(partners), relative, tuple(against))
 
 
-def _decided(profile: Profile, belief: Belief, structure: Structure, flat_prior: bool) -> tuple[Verdict, str]:
+def _decided(
+    profile: Profile, belief: Belief, structure: Structure, flat_prior: bool, tolerance: Tolerance
+) -> tuple[Verdict, str]:
     """The verdict and its reason."""
     name, unit = profile.parameter, "" if profile.unit == "-" else f" {profile.unit}"
     symmetry = next((s for s in structure.symmetries if s.kind != "exchange" and name in s.parameters), None)
@@ -119,6 +133,9 @@ def _decided(profile: Profile, belief: Belief, structure: Structure, flat_prior:
             "its prior"
         )
     parts = f", in {profile.parts} separate stretches" if profile.parts > 1 else ""
+    wide = tolerance.exceeded(low, high)
+    if wide:
+        return "weakly identified", f"the data alone bound it, but only within {within}, {wide}{parts}"
     return "identified", f"the data alone bound it within {within}{parts}"
 
 
@@ -144,12 +161,13 @@ def _against(verdict: Verdict, profile: Profile, belief: Belief, sd: float | Non
     if belief.hills > 1:
         out.append(f"draws: {belief.hills} separate hills")
     moved = belief.sensitivity
-    if verdict == "identified" and moved is not None and moved.diagnosis not in ("-", "not trusted"):
+    bounded = verdict in ("identified", "weakly identified")
+    if bounded and moved is not None and moved.diagnosis not in ("-", "not trusted"):
         out.append(f"power scaling: {moved.diagnosis}")
     ends_95 = profile.intervals[max(profile.intervals)]
     middle = belief.estimate.value
     if (ends_95[0] is not None and middle < ends_95[0]) or (ends_95[1] is not None and middle > ends_95[1]):
         out.append(f"draws: their median {middle:.3g} lies outside the profile's 95 % interval")
-    if profile.at_bound and verdict == "identified":
+    if profile.at_bound and bounded:
         out.append(f"profile: leans on the bounds of {', '.join(profile.at_bound)}")
     return out

@@ -235,4 +235,5 @@ def _alone(study: Study) -> tuple[str, ...]:
 
 def _side(problem: Problem, state: State) -> Side:
     unseen = held_out_scores(state, problem) if problem.study.held_out else left_out_scores(state)
-    return Side(state, tuple(fit_scores(state)), tuple(unseen), state.optimum.log_evidence)
+    log_evidence = state.optimum.log_evidence + state.model.base.log_support
+    return Side(state, tuple(fit_scores(state)), tuple(unseen), log_evidence)

@@ -21,6 +21,7 @@ _NEEDS = (
         "verdict",
         "grade",
         "grade_reason",
+        "limitations",
         "parameters",
         "symmetries",
         "structure",

@@ -32,7 +32,11 @@ def _verdicts(told: Mapping[str, Any]) -> Section:
     caption = (
         "The profile interval is that of the likelihood alone, within the support of the priors. Contraction "
         "is 1 - posterior over prior variance on the sampled scale; relative sd is the Cramer-Rao bound "
-        "at the maximum, a dash where the Fisher matrix is singular or the parameter belongs to the noise."
+        "at the maximum, a dash where the Fisher matrix is singular or the parameter belongs to the noise. "
+        "Verdicts hold given this model. Identified: the data bound both ends of the interval, within a "
+        "factor of 2 (6 dB, an octave), an order within 0.5 (45 degrees of phase), a delay within one "
+        "sampling period or a factor of 2, an offset within half the range of the response. Weakly "
+        "identified: bounded, but not as narrowly. Unresolved: a resonance faster than the samples resolve."
     )
     why = Table(
         (Column("name", "code"), Column("why", "prose"), Column("partners", "prose")),
@@ -58,10 +62,25 @@ def _verdicts(told: Mapping[str, Any]) -> Section:
 
 def _next(told: Mapping[str, Any]) -> Section:
     advice = told["next_measurement"]
+    limits = told["limitations"]
+    if advice is None and limits:
+        text = tuple(
+            f"{_sentence(one['reason'])} To do: {one['remedy'] or 'see the report'}." for one in limits
+        )
+        return Section(
+            "What to measure next",
+            (
+                "Given this model every parameter is identified, but the checks of the model speak against "
+                "it: first mend the model, then ask again.",
+                *text,
+            ),
+        )
     if advice is None:
-        return Section("What to measure next", ("Every parameter is identified: nothing more is needed.",))
-    sentence = str(advice["reason"])
-    text = (f"{sentence[0].upper()}{sentence[1:]}.",)
+        return Section(
+            "What to measure next",
+            ("Given this model every parameter is identified: its parameters need no further record.",),
+        )
+    text = (_sentence(advice["reason"]),)
     if not advice["parameters"]:
         return Section("What to measure next", text)
     columns = (
@@ -82,6 +101,11 @@ def _next(told: Mapping[str, Any]) -> Section:
         "other times and confirms by simulation."
     )
     return Section("What to measure next", text, (), (Table(columns, rows, caption),))
+
+
+def _sentence(clause: str) -> str:
+    """A clause as a sentence."""
+    return f"{clause[0].upper()}{clause[1:]}."
 
 
 def _promised(row: Mapping[str, Any], which: str) -> str:
