@@ -4,9 +4,9 @@ Posterior of order, partial autocorrelations and innovation: a flat prior of the
 innovation, and ``1 / (pi sqrt(1 - kappa^2))`` of every partial autocorrelation kappa, Jeffreys' prior of the
 only one of order 1 in a long record (Berger and Yang 1994, Econometric Theory 10): under a flat one, noise of
 correlation near 1 raises more alarms than told. Levels of the pieces are integrated out under a flat prior,
-the innovation in closed form, the correlations by importance sampling (Geweke 1989, Econometrica 57): half of
-them about the mode of every order, half with a first partial autocorrelation from its prior, since few samples
-leave long memories possible far from the mode.
+the innovation in closed form, the correlations by importance sampling (Geweke 1989, Econometrica 57): half
+of them about the mode of every order, half with a first partial autocorrelation from its prior, since few
+samples leave long memories possible far from the mode.
 """
 
 from __future__ import annotations
