@@ -246,7 +246,7 @@ def test_clean_campaigns_are_called_clean(rho, quiet):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("rho", "curvature"), [(0.0, 0.06), (0.6, 0.12), (0.9, 0.3)])
+@pytest.mark.parametrize(("rho", "curvature"), [(0.0, 0.012), (0.6, 0.03), (0.9, 0.1)])
 def test_bent_campaigns_are_not_called_clean(rho, curvature):
     """100 draws whose answer is known, from 400 quiet samples."""
     records = noiseless(400)
