@@ -269,7 +269,6 @@ def test_priors_stay_the_studys_own(monkeypatch):
     (first, plan), (second, other) = seen
     own = made.problem.posterior
     assert first.table is second.table is own.table
-    assert first.model is own.model
     values = [posterior.samples[0].axes[0].values for posterior in (own, first, second)]
     assert not np.isin(values[1], values[0]).any()
     assert not np.isin(values[1], values[2]).any()
