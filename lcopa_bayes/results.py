@@ -24,7 +24,8 @@ def verdict(fit: Fit) -> str:
         parts.append(f"{said[0].upper()}{said[1:]}.")
     parts.append(f"{fit.discretisation.sentence}.")
     worst = min((r for r in fit.residuals if not r.held_out), key=lambda r: r.p_white, default=None)
-    tried = sum(not one.held_out for one in (*fit.residuals, *fit.bands))
+    flags = [one.held_out for one in fit.residuals] + [one.held_out for one in fit.bands]
+    tried = flags.count(False)  # as many tests as `adequacy` corrects for
     if worst is not None and tried * worst.p_white >= WHITE_P:  # what is not white is part of the grade
         parts.append(f"What is left looks like the noise model (smallest p = {worst.p_white:.2g}).")
     parts.extend(_held_out_sentence(fit))
