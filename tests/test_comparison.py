@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from math import log
 
 import numpy as np
@@ -22,6 +23,7 @@ from lcopa_bayes.comparison.stacking import probabilities, stacking_weights
 from lcopa_bayes.estimate import Estimate
 from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.priors import Prior
+from lcopa_bayes.study import Study
 
 
 @pytest.fixture
@@ -284,8 +286,13 @@ def card(name: str, evidence: float | None, lpd: float, **told: object) -> dict:
     return base | told
 
 
+@cache
+def any_study() -> Study:
+    return problem().study
+
+
 def outcome(*cards: dict) -> dict:
-    return judged(cards, problem().study)
+    return judged(cards, any_study())
 
 
 def test_the_simpler_of_equals_suffices_and_the_gain_is_told():

@@ -205,7 +205,8 @@ def test_the_same_randomness_gives_the_same_draws():
     assert other is not None
     assert_array_equal(one.coordinates, other.coordinates)
     assert one.pareto_k == other.pareto_k
-    assert_array_equal(posterior.log_density(one.coordinates), one.log_density)
+    inside = np.isfinite(one.log_density)
+    assert_allclose(posterior.log_density(one.coordinates[inside]), one.log_density[inside], rtol=1e-9)
     assert one.good(400)
     assert not replace(one, ess=0.39 * one.log_weights.size).good(400)
     assert not replace(one, pareto_k=0.71).good(400)

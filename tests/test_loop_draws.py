@@ -123,25 +123,26 @@ class Linear:
     def pulled(self, white):
         return white @ self.columns
 
-    def log_priors(self, z):
+    def log_priors(self, z, *, ordered=True):
         return np.zeros(len(z))
 
     def log_likelihood(self, power):
         cost = 2 * self.state.optimum.cost
         return -0.5 * 300 * np.log1p((power - cost) / cost)
 
-    def told(self, z):
+    def with_conditional(self, z):
         white = self.residual(z)
         inner = self.pulled(white)
         shift = self.inverse @ inner
-        return float(self.log_likelihood(white @ white - inner @ shift)), shift
+        power = white @ white - inner @ shift
+        return float(self.log_likelihood(power)), np.append(shift, power)
 
     def __call__(self, z):
-        return self.told(z)[0]
+        return self.with_conditional(z)[0]
 
-    def completed(self, z, shifts, rng):
-        noise = rng.standard_normal(shifts.shape) * np.sqrt(self.inverse[0, 0])
-        return np.concatenate([z, shifts + noise], axis=1)
+    def completed(self, z, conditional, rng):
+        noise = rng.standard_normal((len(z), 1)) * np.sqrt(self.inverse[0, 0])
+        return np.concatenate([z, conditional[:, :1] + noise], axis=1)
 
 
 @pytest.mark.parametrize("curved", [0.0, 3.0])

@@ -166,3 +166,23 @@ def test_tanks_that_overflow_are_named():
     assert [effect.name for effect in found.effects] == ["overflow"]
     assert found.after.unseen[0].rmse < 0.6
     assert found.verdict.confidence == "tentative"
+
+
+def test_a_record_without_a_sampling_period_is_looped_to_a_verdict():
+    """Logarithmic times: every stretch of equal spacing is one sample long."""
+    rng = np.random.default_rng(8)
+    t = np.concatenate(
+        [np.linspace(0.0, 19.0, 60) + rng.uniform(0, 0.1, 60), 20.0 + np.geomspace(0.1, 60, 80)]
+    )
+    y = 2.0 * -np.expm1(-np.maximum(t - 20.0, 0) / TIME) + 0.02 * rng.standard_normal(t.size)
+    record = Record("uneven", t, np.where(t > 20.0, 1.0, 0.0)[:, None], y[:, None], AXIS, AXIS, "ms")
+    study = Study("uneven", None, "ms", 3, (record,), (), ModelSettings(offset="shared"))
+    library = [catalogue()[name] for name in ("odd_curvature", "unmodelled_smooth")]
+    found = loop(study, library=library, sample=False, quick=True, as_stated=True)
+    assert found.base.failed == ""
+    assert found.verdict.kind == "clean"
+    assert found.base.noise[0].source == "quiet"
+    assert found.base.noise[0].process.sd == pytest.approx(0.02, rel=4 / np.sqrt(2 * 60))
+    wrong = replace(record, response=rng.permutation(y)[:, None])
+    bad = loop(replace(study, fit=(wrong,)), library=library, sample=False, quick=True, as_stated=True)
+    assert "less than half" in bad.base.failed

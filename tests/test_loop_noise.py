@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from scipy.linalg import toeplitz
 from scipy.stats import multivariate_normal
 
-from lcopa_bayes.loop.autoregression import Autoregression, estimated, unbroken
+from lcopa_bayes.loop.autoregression import Autoregression, unbroken
+from lcopa_bayes.loop.noisepieces import estimated
 from lcopa_bayes.loop.scatter import scatter_evidence
 from lcopa_bayes.loop.scoreevidence import Projection, log_bayes_factors, survival
 from lcopa_bayes.loop.signature import Scale, Signature

@@ -20,7 +20,8 @@ from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.data import Samples
 from lcopa_bayes.inference.discretisation import discretisation, resolved
 from lcopa_bayes.inference.draws import Draws, gather
-from lcopa_bayes.inference.importance import Effort, ImportancePlan, first_look, weighted_draws
+from lcopa_bayes.inference.importance import Effort, ImportancePlan, importance, weighted_draws
+from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.sampler import SamplePlan, sample
 from lcopa_bayes.record import Record
@@ -152,9 +153,8 @@ class Replication:
         truth = self.truths.draw(drawing)
         exact = exact_responses(self.problem, truth)
         records = measured(self.problem, truth, exact, noise)
-        problem = resolved(self._measured_again(records))
+        problem, draws, engine, pareto_k = self._inferred(self._measured_again(records), seed, looking)
         posterior = problem.posterior
-        draws, engine, pareto_k = self._inferred(posterior, seed, looking)
         width = discretisation(problem, draws)
         draws = draws.limited(width.limitations)
         curves = step_curves(draws, self.problem.scales.span)
@@ -181,7 +181,7 @@ class Replication:
             engine,
             pareto_k,
             problem.refinement,
-            width.shift,
+            abs(width.shift),
             width.negligible,
         )
 
@@ -198,15 +198,23 @@ class Replication:
         return replace(self.problem, study=study, posterior=replace(self.problem.posterior, samples=samples))
 
     def _inferred(
-        self, posterior: Posterior, seed: int, rng: np.random.Generator
-    ) -> tuple[Draws, Engine, float | None]:
-        """Draws, what gave them, and the Pareto k of the importance weights that were tried."""
-        look = first_look(posterior, rng, _LOOK) if self.engine == "importance" else None
+        self, problem: Problem, seed: int, rng: np.random.Generator
+    ) -> tuple[Problem, Draws, Engine, float | None]:
+        """The problem on narrow enough blocks, draws, what gave them, and the Pareto k of weights."""
+        look = None
+        if self.engine == "importance":
+            optima = find_optima(problem.posterior, rng, starts=_LOOK.starts)
+            problem = resolved(problem, optima)
+            look = importance(problem.posterior, optima, rng, _LOOK) if optima else None
+        else:
+            problem = resolved(problem)
+        posterior = problem.posterior
         if look is not None and look.good(self.plan.target_ess):
             draws = weighted_draws(posterior, look, rng, target_ess=self.plan.target_ess)
-            return draws, "importance", look.pareto_k
+            return problem, draws, "importance", look.pareto_k
         draws = gather(posterior, sample(posterior, replace(self.plan, seed=seed)))
-        return draws, "sampling", look.pareto_k if look is not None and np.isfinite(look.pareto_k) else None
+        tried = look.pareto_k if look is not None and np.isfinite(look.pareto_k) else None
+        return problem, draws, "sampling", tried
 
     def _true(self, posterior: Posterior, truth: Vector, times: Vector) -> list[float]:
         """True value of each quantity; step responses by the bench."""

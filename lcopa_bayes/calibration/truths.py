@@ -45,7 +45,10 @@ class Truths:
             truth[[self.table.names.index(name) for name in self.stated]] = list(self.stated.values())
             if self.table.supported(truth[None]).all():
                 return np.asarray(truth)
-        raise InputError("orders drawn from the prior do not decrease beside those stated; state them all")
+        raise InputError(
+            "no draw of the prior has decreasing orders and resolved terms beside what is stated; "
+            "state the orders and times of all terms, orders decreasing"
+        )
 
     @property
     def fixed(self) -> bool:

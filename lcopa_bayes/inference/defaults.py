@@ -22,7 +22,7 @@ has 8 independent ones or more on 5 levels or more (`quietnoise`). N is span / p
 ===========  ======================================  ============================================
 sigma        log-normal(median by Q, s)              s^2 = (ln 2)^2 + variance of ln sigma by Q: noise
                                                      may well double with the level
-sigma_ar     uniform(0, 2 sigma_Q), at most 2 A      sigma_Q = 97.5 % limit by Q: what lies further from
+sigma_ar     uniform(0, 1.5 sigma_Q), at most 2 A    sigma_Q = 97.5 % limit by Q: what lies further from
                                                      the plant than noise does at rest is no noise
 sigma        log-uniform(1e-6 A, 2 A)                without Q
 sigma_ar     log-uniform(1e-6 A, 2 A)                without Q
@@ -60,8 +60,9 @@ _TIMES = 20.0
 _SHORTEST, _SHORT = 1.0, 2.0
 """Shortest correlation time of a noise, and what its longest may always be [sampling periods]."""
 _DOUBLE = 2.0
-"""By how much noise in motion may exceed noise at rest [-]: a standard deviation of its logarithm for the
-white part, the end of its prior for the correlated part."""
+"""Factor by which white noise in motion may well exceed that at rest [-], a standard deviation of its log."""
+_BEYOND = 1.5
+"""Factor by which correlated noise in motion exceeds the limit at rest at most [-]."""
 
 
 @final
@@ -175,7 +176,7 @@ class Scales:
         quiet = self.quiet(response)
         if quiet is None:
             return self.sigma(response)
-        most = min(_DOUBLE * quiet.correlated, 2 * float(self.amplitude[response]))
+        most = min(_BEYOND * quiet.correlated, 2 * float(self.amplitude[response]))
         return Prior("uniform", {"loc": 0.0, "scale": most})
 
     def rho_short(self) -> Prior:

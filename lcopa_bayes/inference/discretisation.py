@@ -9,6 +9,7 @@ narrow blocks would have had.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -20,14 +21,14 @@ from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.draws import Draws
 from lcopa_bayes.inference.grade import Limitation
 from lcopa_bayes.inference.leastsquares import LeastSquares
-from lcopa_bayes.inference.optimum import find_optima
+from lcopa_bayes.inference.optimum import Optimum, find_optima
 from lcopa_bayes.inference.posterior import Posterior
 
 LARGEST = 0.1
 """Largest shift of a parameter by the width of the blocks that leaves a grade as it is [posterior sd]."""
 UNUSABLE = 1.0
 """Shift at which numbers are not usable [posterior sd]."""
-_FACTORS = (2, 4)
+FACTORS = (2, 4)
 """How many times narrower the blocks are on which shifts are measured."""
 _REST = 16 / 15
 """What is left from blocks four times narrower to none, by the second order of the scheme."""
@@ -96,17 +97,29 @@ class Discretisation:
         }
 
 
-def resolved(problem: Problem) -> Problem:
+def resolved(problem: Problem, optima: Sequence[Optimum] | None = None) -> Problem:
     """The problem on blocks so narrow that the optimum moves by at most `LARGEST` sd on narrower ones.
 
-    Blocks are halved while it moves more; not beyond `_FINEST` or `_MOST_CELLS`, where the measurement after
-    sampling says what is left. The same problem gives the same blocks.
+    The same problem gives the same blocks; see `narrowed`. `optima` are its own, best first, where they are
+    known already.
     """
     rng = np.random.default_rng([problem.study.seed, 6])
     with threadpool_limits(1):  # matrices are small: more threads only wait for each other
-        optima = find_optima(problem.posterior, rng, starts=_STARTS)
-        while optima and optimum_shift(problem, optima[0].values) > LARGEST and _may_refine(problem):
-            problem = problem.refined(2)
+        if optima is None:
+            optima = find_optima(problem.posterior, rng, starts=_STARTS)
+        if not optima:
+            return problem
+        best = optima[0].values
+        return narrowed(problem, lambda each: optimum_shift(each, best))
+
+
+def narrowed(problem: Problem, shift: Callable[[Problem], float]) -> Problem:
+    """The problem on blocks halved while the `shift` measured on them is larger than `LARGEST` sd.
+
+    Not beyond `_FINEST` or `_MOST_CELLS`, where the measurement after sampling says what is left.
+    """
+    while shift(problem) > LARGEST and _may_refine(problem):
+        problem = problem.refined(2)
     return problem
 
 
@@ -127,15 +140,22 @@ def optimum_shift(problem: Problem, values: Vector) -> float:
     here = LeastSquares(problem.posterior)
     x = here.coordinates(values)
     residual, jacobian = here.residual(x, values)
-    covariance = np.linalg.pinv(jacobian.T @ jacobian + _prior_precision(here), hermitian=True)
+    precision = jacobian.T @ jacobian + _prior_precision(here)
+    covariance = np.asarray(np.linalg.pinv(precision, hermitian=True), dtype=float)
+    finer = [LeastSquares(problem.refined(factor).posterior) for factor in FACTORS]
+    changes = [each.residual(x, values)[0] - residual for each in finer]
+    return largest_shift(covariance, jacobian, changes)
+
+
+def largest_shift(covariance: Matrix, jacobian: Matrix, changes: Sequence[Vector]) -> float:
+    """Largest shift of a parameter by changes of the whitened response on narrower blocks [posterior sd].
+
+    Parameters: covariance (k, k) of the parameters at an optimum; jacobian (n, k) of the whitened response
+    there; changes (n,) on blocks `FACTORS` times narrower.
+    """
     sd = np.sqrt(np.diag(covariance))
-    largest = 0.0
-    for factor in _FACTORS:
-        finer = LeastSquares(problem.refined(factor).posterior)
-        change = finer.residual(x, values)[0] - residual
-        moved = np.abs(covariance @ (jacobian.T @ change)) / np.where(sd > 0, sd, np.inf)
-        largest = max(largest, float(moved.max(initial=0.0)))
-    return largest * _REST
+    shifts = [np.abs(covariance @ (jacobian.T @ change)) / np.where(sd > 0, sd, np.inf) for change in changes]
+    return float(np.max(shifts)) * _REST
 
 
 def _prior_precision(problem: LeastSquares) -> Matrix:
@@ -147,7 +167,7 @@ def _prior_precision(problem: LeastSquares) -> Matrix:
 
 def discretisation(problem: Problem, draws: Draws) -> Discretisation:
     """Shift of the posterior mean of every free parameter on blocks four times narrower."""
-    finer = problem.refined(_FACTORS[-1]).posterior
+    finer = problem.refined(FACTORS[-1]).posterior
     values = draws.thinned(_DRAWS)
     change = _log_likelihood(finer, values) - _log_likelihood(problem.posterior, values)
     weights = np.exp(change - change.max())

@@ -25,7 +25,7 @@ from lcopa_bayes.arrays import Index, Matrix, Vector
 from lcopa_bayes.inference.chart import Chart
 from lcopa_bayes.inference.draws import Draws
 from lcopa_bayes.inference.evidence import charted_density
-from lcopa_bayes.inference.grade import Quality
+from lcopa_bayes.inference.grade import Quality, between
 from lcopa_bayes.inference.optimum import Optimum, find_optima
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.proposal import Seen, around, fitted, split, weighty
@@ -151,7 +151,7 @@ def importance(
                 break
         y = proposal.draw(effort.draws, rng)
         density = charted_density(posterior, chart, y)
-        found = _weighed(posterior, chart, y, density - proposal.log_density(y))
+        found = _weighed(posterior, chart, y, density, density - proposal.log_density(y))
         if found.good(plan.wanted):
             break
         seen = seen.joined(proposal, y, density)
@@ -159,11 +159,11 @@ def importance(
     return replace(found, modes=len(chosen), evaluations=spent)
 
 
-def _weighed(posterior: Posterior, chart: Chart, y: Matrix, raw: Vector) -> Importance:
-    """Charted draws of one proposal with their log weights."""
+def _weighed(posterior: Posterior, chart: Chart, y: Matrix, charted: Vector, raw: Vector) -> Importance:
+    """Charted draws of one proposal with their densities in the chart and their log weights."""
     z, exists = chart.uncharted(y)
     density = np.full(len(y), -np.inf)
-    density[exists] = posterior.log_density(z[exists])
+    density[exists] = charted[exists] + chart.charted(z[exists])[1] - posterior.table.log_permutations
     log_weights, k = tail_smoothed(raw)
     if np.isneginf(raw).all():
         return Importance(z, density, log_weights, k, 0.0, -np.inf, np.inf, 0, 0)
@@ -188,8 +188,9 @@ def weighted_draws(
 ) -> Draws:
     """Draws of every parameter from weighted ones, linear parameters drawn exactly, with their grade.
 
-    Parts of the weighted draws stand for the ensembles of a sampler: they are independent, so R-hat between
-    them sees a mean that hangs on a few of them. The effective sample size is that of the weights.
+    Parts of the weighted draws stand for the ensembles of a sampler: being independent, they let R-hat and
+    scatter see a mean that hangs on a few draws. The effective sample size is that of the weights: it
+    is known here, and need not be judged by four means.
     """
     count = found.log_weights.size
     parts = [slice(k * count // _BATCHES, (k + 1) * count // _BATCHES) for k in range(_BATCHES)]
@@ -204,6 +205,7 @@ def weighted_draws(
             found.ess,
             found.ess,
             float(array_stats.rhat_nested(values[..., k], np.arange(_BATCHES))),  # type: ignore[no-untyped-call]
+            scatter=between(values[:, None, :, k])[1],
         )
         for k, row in enumerate(rows)
         if row.free

@@ -55,7 +55,7 @@ class LeastSquares:
             high.append(b - edge)
         return np.array(low), np.array(high)
 
-    def _bounds_around(self, values: Vector) -> tuple[Vector, Vector]:
+    def bounds_around(self, values: Vector) -> tuple[Vector, Vector]:
         """Bounds that also keep orders decreasing where terms cannot be exchanged.
 
         An order stays on its own side of the middle between its start and a free neighbour's, and of
@@ -161,7 +161,7 @@ class LeastSquares:
 
     def solve(self, values: Vector) -> tuple[Vector, Matrix]:
         """From a start to a local minimum: table values and the Jacobian there."""
-        low, high = self._bounds_around(values)
+        low, high = self.bounds_around(values)
         start = np.clip(self.coordinates(values), low, high)
         found = least_squares(
             *apart(lambda x: self.residual(x, values), start),

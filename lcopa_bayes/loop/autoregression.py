@@ -1,26 +1,21 @@
-"""Autoregressive Gaussian noise of any order: exact whitening, and its estimate from quiet samples."""
+"""Autoregressive Gaussian noise of any order: exact whitening, draws, autocovariance."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from typing import final
 
 import numpy as np
-from scipy.optimize import minimize
 from scipy.signal import lfilter, lfiltic
 
 from lcopa_bayes.arrays import Array, Matrix, Vector, frozen
 
-_LARGEST_ORDER = 8
-_PER_COEFFICIENT = 15
-"""Samples that one coefficient needs at least [-]."""
-_PATIENCE = 3
-"""Orders tried beyond the best so far [-]."""
 _UNIT_GAP = 1e-2
 """Gaps this close to one sampling period are one [sampling periods]."""
+_UNEVEN = 0.5
+"""Share of gaps away from their median beyond which a record has no sampling period [-]."""
 
 
 @final
@@ -80,6 +75,22 @@ class Autoregression:
             out[..., k] = (columns[..., k] - past) / self.scales[k]
         return out
 
+    def adjoint(self, columns: Array) -> Array:
+        """Adjoint of `whiten`: ``whiten(a) . b = a . adjoint(b)`` for columns (..., n), same shape
+        [1 / response unit]."""
+        n, p = columns.shape[-1], self.order
+        if n > p:
+            scale = np.concatenate([self.scales[:p], np.full(n - p, self.innovation_sd)])
+        else:
+            scale = self.scales[:n]
+        scaled = columns / scale
+        out = np.array(scaled)
+        for j, weight in enumerate(self.predictors[p] if n > p else (), start=1):
+            out[..., p - j : n - j] -= weight * scaled[..., p:]
+        for k in range(1, min(p, n)):
+            out[..., :k] -= scaled[..., k : k + 1] * self.predictors[k][::-1]
+        return out
+
     def log_scale(self, n: int) -> float:
         """Sum over n successive samples of log sd of the prediction error [nat]."""
         first = np.log(self.scales[: min(n, self.order)]).sum()
@@ -127,111 +138,14 @@ class Autoregression:
 
 
 def unbroken(gaps: Vector) -> list[slice]:
-    """Stretches of samples one sampling period apart; `gaps` (n,) in periods, the first not used."""
-    breaks = np.flatnonzero(np.abs(gaps[1:] - 1.0) > _UNIT_GAP) + 1
+    """Stretches of samples one sampling period apart; `gaps` (n,) in periods, the first not used.
+
+    Samples without a spacing of their own (logarithmic times, time stamps that jitter) are one stretch: their
+    noise correlates from sample to sample, since no time could be counted in periods.
+    """
+    inner = gaps[1:]
+    if inner.size and np.mean(np.abs(inner / np.median(inner) - 1.0) > _UNIT_GAP) > _UNEVEN:
+        return [slice(0, gaps.size)]
+    breaks = np.flatnonzero(np.abs(inner - 1.0) > _UNIT_GAP) + 1
     edges = [0, *breaks.tolist(), gaps.size]
     return [slice(a, b) for a, b in pairwise(edges) if b > a]
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Mode:
-    """Most likely autoregression of one order."""
-
-    partial: Vector
-    """Partial autocorrelations [-], (order,)."""
-    cost: float
-    """Negative restricted log likelihood at the best innovation sd [nat]."""
-    innovation_sd: float
-    """[response unit]."""
-    criterion: float
-    """Corrected Akaike criterion [-]."""
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class NoisePieces:
-    """Pieces of noise, each about a level of its own that is integrated out under a flat prior."""
-
-    pieces: tuple[Vector, ...]
-    """Each (n,), n > 1 [response unit]."""
-
-    @classmethod
-    def of(cls, pieces: Sequence[Vector]) -> NoisePieces:
-        """Pieces of two samples and more; ValueError with fewer than three samples beyond their number."""
-        kept = tuple(piece for piece in pieces if piece.size > 1)
-        total = sum(piece.size for piece in kept)
-        if total - len(kept) < 3:
-            raise ValueError(f"{total} samples in {len(kept)} pieces cannot give the scale of the noise")
-        return cls(kept)
-
-    @cached_property
-    def freedom(self) -> int:
-        """Samples beyond the levels [-]."""
-        return sum(piece.size - 1 for piece in self.pieces)
-
-    @cached_property
-    def _alike(self) -> list[Matrix]:
-        """Pieces by length."""
-        return [
-            np.array([p for p in self.pieces if p.size == n]) for n in sorted({p.size for p in self.pieces})
-        ]
-
-    def cost(self, partial: Vector) -> tuple[float, float]:
-        """Negative restricted log likelihood at the best innovation sd [nat], and that sd.
-
-        With the sd integrated out under ``1 / sd`` it is the same up to a constant.
-        """
-        unit = Autoregression(np.clip(partial, -1 + 1e-9, 1 - 1e-9), 1.0)
-        squares, levels, scales = 0.0, 0.0, 0.0
-        for pieces in self._alike:
-            number, n = pieces.shape
-            white, ones = unit.whiten(pieces), unit.whiten(np.ones(n))
-            power = float(ones @ ones)
-            squares += float((white**2).sum()) - float(((white @ ones) ** 2).sum()) / power
-            levels += 0.5 * number * np.log(power)
-            scales += number * unit.log_scale(n)
-        sd = float(np.sqrt(max(squares, 1e-300) / self.freedom))
-        return self.freedom * np.log(sd) + scales + levels, sd
-
-    def _stretched(self, x: Vector) -> float:
-        """Cost of the inverse hyperbolic tangents of partial autocorrelations."""
-        return self.cost(np.tanh(x))[0]
-
-    @cached_property
-    def modes(self) -> tuple[Mode, ...]:
-        """The mode of every order from 0 to three beyond that of the least criterion, at most 8."""
-        total, longest = sum(p.size for p in self.pieces), max(p.size for p in self.pieces)
-        start, out, best = np.empty(0), [], 0
-        for order in range(min(_LARGEST_ORDER, longest - 2, total // _PER_COEFFICIENT) + 1):
-            if order:
-                found = minimize(
-                    self._stretched,
-                    np.concatenate([start, [0.0]]),
-                    method="BFGS",
-                    options={"gtol": 1e-4, "maxiter": 60},
-                )
-                start = np.clip(
-                    found.x, -6.0, 6.0
-                )  # a start for the next order; 6 is a correlation of 0.99999
-            cost, sd = self.cost(np.tanh(start))
-            count = order + 1
-            criterion = 2 * cost + 2 * count * total / max(total - count - 1, 1)
-            out.append(Mode(np.tanh(start), cost, sd, criterion))
-            if criterion < out[best].criterion - 1e-9:
-                best = order
-            elif order >= best + _PATIENCE:
-                break
-        return tuple(out)
-
-    @property
-    def estimate(self) -> Autoregression:
-        """Restricted maximum likelihood, order by the corrected Akaike criterion: an order too small costs
-        false alarms, one too large next to nothing."""
-        best = min(self.modes, key=lambda one: one.criterion)
-        return Autoregression(best.partial, best.innovation_sd)
-
-
-def estimated(pieces: Sequence[Vector]) -> Autoregression:
-    """Order and scale from pieces of noise (`NoisePieces`)."""
-    return NoisePieces.of(pieces).estimate

@@ -16,7 +16,7 @@ from lcopa_bayes.loop.basemodel import BaseModel
 from lcopa_bayes.loop.quiet import AxisNoise, axis_noise, joint_noise, quiet_pieces
 from lcopa_bayes.loop.regression import Optimum, Regression
 from lcopa_bayes.loop.starts import screened
-from lcopa_bayes.loop.whitening import Whitening
+from lcopa_bayes.loop.whitening import Whitening, parts
 
 _STARTS = 8
 _DELAYS = (0.7, 0.85, 1.15, 1.3)
@@ -173,10 +173,10 @@ def _failure(model: BaseModel, optimum: Optimum) -> str:
         )
     responses = model.posterior.table.layout.responses
     for axis, response in enumerate(responses):
-        seen = axis_pieces(model.posterior, model.observed, axis)
-        left = axis_pieces(model.posterior, optimum.residual, axis)
-        spread = sum(float(((piece - piece.mean()) ** 2).sum()) for piece in seen)
-        missed = sum(float((piece**2).sum()) for piece in left)
+        own = [part.rows for part in parts(model.posterior.samples) if part.axis == axis]
+        seen = [model.observed[rows] for rows in own if rows.stop > rows.start]
+        spread = sum(float(((values - values.mean()) ** 2).sum()) for values in seen)
+        missed = sum(float((optimum.residual[rows] ** 2).sum()) for rows in own)
         if missed > (1 - _EXPLAINED) * spread > 0 and len(responses) == 1:
             return f"the base model explains less than half of the variance of {response.name}"
     return ""

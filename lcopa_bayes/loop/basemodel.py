@@ -8,10 +8,13 @@ from typing import Protocol, final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Matrix, Vector
+from lcopa_bayes.arrays import Flags, Matrix, Vector
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.noise import White
 from lcopa_bayes.inference.posterior import Posterior
+
+_MERGED = 1e-6
+"""Orders closer than this stand at the end of their support [-]."""
 
 
 class Curve(Protocol):
@@ -32,6 +35,12 @@ class Curve(Protocol):
     @property
     def bounds(self) -> tuple[Vector, Vector]:
         """Ends of the support of each coordinate."""
+
+    def bounds_about(self, x: Vector) -> tuple[Vector, Vector]:
+        """The same about coordinates: orders whose terms cannot be exchanged also stay in their sequence."""
+
+    def canonical(self, x: Vector) -> Vector:
+        """Coordinates of the same curve, terms in the sequence in which they are reported."""
 
     def predict(self, x: Vector) -> Vector:
         """Stacked responses at coordinates, (n,) [response unit]."""
@@ -99,6 +108,41 @@ class BaseModel:
     def bounds(self) -> tuple[Vector, Vector]:
         """Ends of the support of each coordinate."""
         return self.least.bounds
+
+    def bounds_about(self, x: Vector) -> tuple[Vector, Vector]:
+        """Bounds within which the orders of every element with unlike priors stay decreasing: a free
+        neighbour comes no closer than the middle, and merged orders stay apart."""
+        low, high = self.least.bounds_around(self.least.values(x, self.template))
+        plain = self.bounds
+        for ends, other in ((low, plain[0]), (high, plain[1])):
+            merged = (ends != other) & (np.abs(x - ends) < _MERGED)
+            ends[merged] = x[merged]
+        return low, high
+
+    def canonical(self, x: Vector) -> Vector:
+        """Coordinates of the same plant, terms that can be exchanged by decreasing order."""
+        raw = self.least.values(x, self.template)[None]
+        source = self.posterior.table.sorted_with_source(raw)[1][0]
+        places = np.searchsorted(self.least.columns, source[self.least.columns])
+        out = x.copy()
+        out[places] = x
+        return out
+
+    def supported(self, x: Matrix, *, every: bool = True) -> Flags:
+        """Whether orders decrease and terms are resolved, of coordinates (batch, k), (batch,).
+
+        Unless `every`, terms that can be exchanged may stand in any sequence.
+        """
+        table = self.posterior.table
+        values = np.tile(self.template, (len(x), 1))
+        for position, k in enumerate(self.least.columns):
+            values[:, k] = np.exp(x[:, position]) if table.rows[k].log_scale else x[:, position]
+        return table.supported(values if every else table.canonical(values))
+
+    @property
+    def log_support(self) -> float:
+        """What the support of terms adds to the log of a prior density of terms in any sequence [nat]."""
+        return self.posterior.table.log_support
 
     def values(self, x: Vector) -> Vector:
         """Table values of coordinates, (rows,), terms in canonical order."""

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import final
 
 import numpy as np
-from scipy.stats import chi2, f
+from scipy.stats import chi2
 
 from lcopa_bayes.arrays import Vector
 from lcopa_bayes.inference.effected import Placed
@@ -24,6 +24,8 @@ from lcopa_bayes.plant.effects.effect import Effect
 
 SIGNIFICANT = 2.7e-3
 """Two-sided p-value of three standard deviations [-]."""
+_PROCESSES = 400
+"""Plausible noise processes over which a p-value is averaged [-]."""
 _NEAR = 0.5
 """Expected gain of a step with which a descent by the plant's own tangents ends [nat]."""
 _DELAYS = (-0.25, -0.1)
@@ -105,17 +107,23 @@ class Refit:
         )
 
     def wald(self, name: str) -> float:
-        """p-value of an effect's coefficients being zero at the Laplace covariance [-].
+        """p-value of an effect's coefficients being zero, over all noise that is plausible [-].
 
-        Other coordinates held by an end of their support stay there: a delay that cannot shrink is no alias.
+        Their covariance is that of the estimate under the noise as it is, not as it was weighted: larger
+        where noise is as slow as the tangents (White 1982, Econometrica 50). Other coordinates held by an end
+        of their support stay there: a delay that cannot shrink is no alias.
         """
         where = self.places(name)
         psi = self.optimum.x[where]
         free = np.flatnonzero(~self.optimum.stuck | np.isin(np.arange(self.optimum.x.size), where))
         at = np.searchsorted(free, where)
-        covariance = np.linalg.pinv(self.optimum.information[np.ix_(free, free)], hermitian=True)
-        inner = covariance[np.ix_(at, at)]
-        return float(chi2.sf(psi @ np.linalg.solve(inner, psi), len(where)))
+        tangents = self.optimum.jacobian[:, free]
+        information = self.optimum.information[np.ix_(free, free)]
+        gain = np.linalg.pinv(information, hermitian=True)[:, at]
+        held = information - tangents.T @ tangents  # what priors say
+        noise = self.whitening.covariances(tangents @ gain, _PROCESSES)
+        power = [psi @ np.linalg.solve(one + gain.T @ held @ gain, psi) for one in noise]
+        return float(np.mean(chi2.sf(power, len(where))))
 
     def places(self, name: str) -> list[int]:
         """Coordinates of an effect's coefficients."""
@@ -132,16 +140,8 @@ class Refit:
 
     @cached_property
     def significant(self) -> bool:
-        """Whether all new effects are three standard deviations or more away from zero.
-
-        Where the noise is known from the residual alone its scale falls with them, and the ratio of both
-        residuals decides at the same level (F test).
-        """
-        if not self.whitening.dependence:
-            return all(self.wald(name) < SIGNIFICANT for name in self.added)
-        k, freedom = len(self.new), self.optimum.effective - self.optimum.x.size
-        ratio = self.taken / (1 - self.taken) * freedom / k
-        return bool(freedom > 0 and f.sf(ratio, k, freedom) < SIGNIFICANT)
+        """Whether all new effects are three standard deviations or more away from zero."""
+        return all(self.wald(name) < SIGNIFICANT for name in self.added)
 
 
 def refit(

@@ -40,7 +40,6 @@ def polished(
     plant's own tangents. Constants without a slope, as a number of grey levels, stay; so does one whose move
     off the grid the records do not ask for.
     """
-    low, high = model.bounds
     fit = Regression(replace(model, exact=False), whitening)
     for _ in range(_ROUNDS):
         here = fit.at(x)
@@ -59,7 +58,8 @@ def polished(
         step *= min(1.0, _FAR / max(float(np.abs(step[x.size :]).max()), 1e-12))
         for share in (1.0, 0.5, 0.25, 0.1):
             other = _moved(model, moves, share * step[x.size :])
-            new = np.clip(x + share * step[: x.size], low, high)  # a step ends where the support does
+            # a step ends where the support does
+            new = np.clip(x + share * step[: x.size], *model.bounds_about(x))
             cost = Regression(replace(other, exact=False), whitening).cost(new)
             if cost < here.cost:
                 break

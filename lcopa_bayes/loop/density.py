@@ -18,9 +18,9 @@ class LoopDensity:
     """Density of the coordinates that are sampled, at the noise of a state.
 
     Offsets, and coefficients that belong to one record, are integrated out about the optimum (exact for
-    offsets,
-    linearised for coefficients); so is the scale of the noise under ``1 / variance`` with `quiet` further
-    samples.
+    offsets, linearised for coefficients); so is the scale of the noise under ``1 / variance`` with `quiet`
+    further samples. Both together are exact where the priors of what is integrated out are wide, or narrow,
+    against what the samples say of it.
     """
 
     state: State
@@ -61,6 +61,16 @@ class LoopDensity:
         inverse: Matrix = np.linalg.inv(self.columns.T @ self.columns + precision).astype(float)
         return inverse
 
+    @cached_property
+    def determined(self) -> float:
+        """Coordinates integrated out that the samples determine, and not their priors [-]."""
+        return float(np.einsum("nk,kl,nl->", self.columns, self.inverse, self.columns, optimize=True))
+
+    @cached_property
+    def freedom(self) -> float:
+        """Degrees of freedom of the noise scale given the sampled coordinates [-]."""
+        return self.quiet + self.state.whitening.effective - self.determined
+
     def pulled(self, white: Vector) -> Vector:
         """Slope of the log density in the coordinates integrated out, from a whitened residual."""
         return np.asarray(white @ self.columns - self.pull)
@@ -69,37 +79,43 @@ class LoopDensity:
         """Whitened residual at sampled coordinates, the others at the optimum; None without a response."""
         x = self.state.optimum.x.copy()
         x[self.sampled] = z
+        model = self.state.model
+        if not model.base.supported(x[None, : model.plant_size], every=False)[0]:
+            return None
         try:
-            predicted = self.state.model.predict(x)
+            predicted = model.predict(x)
         except ArithmeticError:  # no bounded response: the likelihood is zero there
             return None
         return self.state.whitening(self.state.whitening.observed - predicted)
 
     def __call__(self, z: Vector) -> float:
         """Log density up to a constant, -inf outside the priors; FloatingPointError where NaN."""
-        return self.told(z)[0]
+        return self.with_conditional(z)[0]
 
-    def told(self, z: Vector) -> tuple[float, Vector]:
-        """Log density, and how far the coordinates integrated out lie from the optimum on average there."""
-        prior, nowhere = float(self.log_priors(z[None])[0]), np.zeros(self.linear.size)
+    def with_conditional(self, z: Vector) -> tuple[float, Vector]:
+        """Log density, and what `completed` needs there to draw what is integrated out, (linear + 1,): how
+        far those coordinates lie from the optimum at the nominal noise, and the squared whitened residual
+        that they leave [-]."""
+        prior = float(self.log_priors(z[None])[0])
         white = self.residual(z) if prior > -np.inf else None
         if white is None:
-            return -np.inf, nowhere
+            return -np.inf, np.zeros(self.linear.size + 1)
         inner = self.pulled(white)
         shift = self.inverse @ inner
-        value = prior + float(self.log_likelihood(white @ white - inner @ shift))
+        power = float(white @ white - inner @ shift)
+        value = prior + float(self.log_likelihood(np.array(power)))
         if np.isnan(value):
             raise FloatingPointError(f"the log density of the loop is NaN at {z.tolist()}")
-        return value, shift
+        return value, np.append(shift, power)
 
     def log_likelihood(self, power: Array) -> Array:
         """Of the squared whitened residual less what the coordinates integrated out take of it."""
         cost = self.state.optimum.cost
-        freedom = self.quiet + self.state.whitening.effective
-        return np.asarray(-0.5 * freedom * np.log1p((power - 2 * cost) / (self.quiet + 2 * cost)))
+        return np.asarray(-0.5 * self.freedom * np.log1p((power - 2 * cost) / (self.quiet + 2 * cost)))
 
-    def log_priors(self, z: Matrix) -> Vector:
-        """Of the sampled coordinates (batch, k), (batch,); -inf outside their support."""
+    def log_priors(self, z: Matrix, *, ordered: bool = True) -> Vector:
+        """Of the sampled coordinates (batch, k), (batch,); -inf outside their support and where orders do not
+        decrease. Unless `ordered`, terms that can be exchanged may be in any sequence."""
         model = self.state.model
         low, high = (ends[self.sampled] for ends in model.bounds)
         inside = np.logical_and(z >= low, z <= high).all(axis=1)
@@ -113,13 +129,29 @@ class LoopDensity:
                 continue
             row = rows[model.base.least.columns[position]]
             total += row.log_prior(np.exp(value)) + value if row.log_scale else row.log_prior(value)
+        x = np.tile(self.state.optimum.x[: model.plant_size], (len(z), 1))
+        plant = self.sampled < model.plant_size
+        x[:, self.sampled[plant]] = held[:, plant]
+        inside &= model.base.supported(x, every=ordered)
         return np.where(inside, total, -np.inf)
 
-    def completed(self, z: Matrix, shifts: Matrix, rng: np.random.Generator) -> Matrix:
-        """All coordinates (batch, all) of sampled ones (batch, k) and the shifts told there, (batch, linear):
-        those integrated out are drawn from their conditional."""
+    def completed(self, z: Matrix, conditional: Matrix, rng: np.random.Generator) -> Matrix:
+        """All coordinates (batch, all) of sampled ones (batch, k) and what `with_conditional` gave there,
+        (batch, linear + 1): the noise scale, then those integrated out given it, are drawn from their
+        conditionals."""
         x = np.tile(self.state.optimum.x, (len(z), 1))
         x[:, self.sampled] = z
-        noise = rng.standard_normal(shifts.shape)
-        x[:, self.linear] += shifts + noise @ np.linalg.cholesky(self.inverse).T
+        if not self.linear.size:
+            return x
+        shift, power = conditional[:, :-1], conditional[:, -1:]
+        variance = (self.quiet + power) / rng.chisquare(self.freedom, power.shape)
+        spread = self.state.model.spread[self.linear]
+        known, axes = np.linalg.eigh(np.outer(spread, spread) * (self.columns.T @ self.columns))
+        pull = self.pull * spread @ axes
+        # at the nominal noise the shift is (data - pull) / (known + 1): from it, that at another variance
+        data = (shift / spread) @ axes * (known + 1.0) + pull
+        precision = known / variance + 1.0
+        standard = (data / variance - pull) / precision
+        standard += rng.standard_normal(shift.shape) / np.sqrt(precision)
+        x[:, self.linear] += standard @ axes.T * spread
         return x

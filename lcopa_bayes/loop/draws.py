@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, final
@@ -14,6 +13,7 @@ from lcopa_bayes.arrays import Array, Matrix, Vector
 from lcopa_bayes.crew import crew
 from lcopa_bayes.estimate import Estimate
 from lcopa_bayes.inference.grade import Grade, Quality, overall, qualities
+from lcopa_bayes.loop.burnin import long_enough, settled
 from lcopa_bayes.loop.density import LoopDensity
 from lcopa_bayes.loop.extended import ExtendedModel
 from lcopa_bayes.loop.proposals import Counted, Jump, Walk, learnt
@@ -41,8 +41,6 @@ _STEPS_DEAR = 90
 _SAMPLES = 10_000
 _LONGER = 8.0
 """Samples from which these are the most; of fewer, which cost less, there may be so many times more [-]."""
-_LENGTH = 6.0
-"""Least length of a chain over the steps after which it forgets [-]."""
 _KEPT = 400
 """Draws kept of all coordinates, at least [-]."""
 TARGET_ESS = 400.0
@@ -63,6 +61,9 @@ class LoopDraws:
     """Of the sampled coordinates."""
     acceptance: float
     """Share of accepted proposals [-]."""
+    left_out: int
+    """Steps of every walker that were left out: those of the burn-in, and those after it from which the
+    starts were not yet forgotten."""
     sampled: tuple[int, ...]
     """Coordinates that were sampled; the others were drawn from their conditional."""
 
@@ -110,7 +111,8 @@ def sample_loop(density: LoopDensity, seed: int, *, jobs: int = 1, quick: bool =
     """Four independent ensembles from overdispersed starts about the optimum; deterministic given `seed`.
 
     They go on, 10 steps at a time, until the draws grade as reliable, or as long as an evaluation's price
-    allows (half as long with `quick`).
+    allows (half as long with `quick`). Draws from which the starts are not yet forgotten are left out
+    (`settled`).
     """
     dear = any(isinstance(effect, UPSTREAM) for effect in density.state.model.effects)
     longer = min(max(1.0, _SAMPLES / density.state.whitening.size), _LONGER)
@@ -122,30 +124,26 @@ def sample_loop(density: LoopDensity, seed: int, *, jobs: int = 1, quick: bool =
         runs = list(mapped(_begun, [(surrogate, law, seed, number) for number in range(ENSEMBLES)]))
         while True:
             runs = list(mapped(_continued, [(surrogate, law, run) for run in runs]))
-            chains = np.stack([run.chain for run in runs])
-            found, kept = qualities(names, chains), chains.shape[2]
-            enough = overall(found, _BEYOND * TARGET_ESS).level == "reliable" and _long(found, chains)
-            if enough or kept >= most:
+            whole = np.stack([run.chain for run in runs])
+            chains = settled(whole)
+            found, taken, kept = qualities(names, chains), whole.shape[2], chains.shape[2]
+            enough = overall(found, _BEYOND * TARGET_ESS).level == "reliable" and long_enough(found, chains)
+            if enough or taken >= most:
                 break
     stride = max(1, chains.shape[0] * chains.shape[1] * kept // _KEPT)
-    thin = np.stack([run.chain[:, ::-1][:, ::stride] for run in runs])
-    shifts = np.stack([run.shifts[:, ::-1][:, ::stride] for run in runs])
+    thin = chains[:, :, ::-1][:, :, ::stride]
+    given = np.stack([run.conditional for run in runs])[:, :, taken - kept :][:, :, ::-1][:, :, ::stride]
+    flat = thin.shape[0] * thin.shape[1] * thin.shape[2]
     rng = np.random.default_rng([seed, 21])
-    full = density.completed(thin.reshape(-1, thin.shape[-1]), shifts.reshape(-1, shifts.shape[-1]), rng)
+    full = density.completed(thin.reshape(flat, -1), given.reshape(flat, -1), rng)
     return LoopDraws(
         density.state.model,
         full.reshape(*thin.shape[:3], -1),
         found,
-        float(np.mean([run.accepted for run in runs]) / (kept * chains.shape[1])),
+        float(np.mean([run.accepted for run in runs]) / (taken * chains.shape[1])),
+        2 * _BURN + taken - kept,
         tuple(int(k) for k in density.sampled),
     )
-
-
-def _long(found: Sequence[Quality], chains: Array) -> bool:
-    """Whether every walker took many times the steps after which it forgets where it was: from shorter chains
-    that number of steps cannot be told."""
-    memory = chains[..., 0].size / min(quality.ess for quality in found)
-    return bool(chains.shape[2] > _LENGTH * memory)
 
 
 @final
@@ -159,8 +157,8 @@ class _Run:
     """Of the steps that walk on the surrogate, and of those that jump [-]."""
     chain: Array
     """(walkers, draws, dimension)."""
-    shifts: Array
-    """Of what is integrated out, (walkers, draws, linear)."""
+    conditional: Array
+    """What `LoopDensity.with_conditional` gives beside the density, (walkers, draws, linear + 1)."""
     accepted: int
     """Proposals accepted in the chain."""
 
@@ -172,7 +170,7 @@ def _begun(task: tuple[Surrogate, Jump, int, int]) -> _Run:
     walkers = max(k + 2, _WALKERS)
     random = np.random.RandomState(np.random.MT19937(np.random.SeedSequence([seed, 20, number])))
     start = emcee.State(_started(density, law, walkers, random), random_state=random.get_state())
-    empty = np.zeros((walkers, 0, k)), np.zeros((walkers, 0, density.linear.size))
+    empty = np.zeros((walkers, 0, k)), np.zeros((walkers, 0, density.linear.size + 1))
     run = _Run(start, law, _FIRST, *empty, 0)
     sampler, _, _ = _sampler(surrogate, law, run)
     state = sampler.run_mcmc(start, _BURN, skip_initial_state_check=True)
@@ -191,15 +189,13 @@ def _continued(task: tuple[Surrogate, Jump, _Run]) -> _Run:
     surrogate, law, run = task
     sampler, _, _ = _sampler(surrogate, law, run)
     reached = sampler.run_mcmc(run.state, _ROUND, skip_initial_state_check=True)
-    chain, shifts = sampler.get_chain().swapaxes(0, 1), sampler.get_blobs().swapaxes(0, 1)
+    chain, given = sampler.get_chain().swapaxes(0, 1), sampler.get_blobs().swapaxes(0, 1)
     return _Run(
         reached,
         run.jump,
         run.shares,
         np.concatenate([run.chain, chain], axis=1),
-        np.concatenate(
-            [run.shifts, shifts.reshape(*chain.shape[:2], -1)[..., : run.shifts.shape[2]]], axis=1
-        ),
+        np.concatenate([run.conditional, given.reshape(*chain.shape[:2], -1)], axis=1),
         run.accepted + int(sampler.backend.accepted.sum()),
     )
 
@@ -217,14 +213,8 @@ def _sampler(surrogate: Surrogate, law: Jump, run: _Run) -> tuple[Any, Counted, 
         (emcee.moves.StretchMove(live_dangerously=True), rest),
     ]
     walkers, dimension = run.chain.shape[0], run.chain.shape[2]
-    sampler = emcee.EnsembleSampler(walkers, dimension, _told, args=[surrogate.density], moves=moves)
+    sampler = emcee.EnsembleSampler(walkers, dimension, surrogate.density.with_conditional, moves=moves)
     return sampler, walk, jump
-
-
-def _told(z: Vector, density: LoopDensity) -> tuple[float, Vector]:
-    """Log density, and the shifts of what is integrated out; 0 stands for none."""
-    value, shift = density.told(z)
-    return value, shift if shift.size else np.zeros(1)
 
 
 def _started(density: LoopDensity, law: Jump, walkers: int, random: np.random.RandomState) -> Matrix:

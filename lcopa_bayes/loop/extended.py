@@ -84,6 +84,17 @@ class ExtendedModel:
         signed = [0.0 if one.coefficient.one_signed else -np.inf for one in self.effected.coefficients]
         return np.concatenate([low, signed]), np.concatenate([high, np.full(len(signed), np.inf)])
 
+    def bounds_about(self, x: Vector) -> tuple[Vector, Vector]:
+        """The same about coordinates: orders whose terms cannot be exchanged also stay in their sequence."""
+        low, high = (ends.copy() for ends in self.bounds)
+        n = self.plant_size
+        low[:n], high[:n] = self.base.bounds_about(x[:n])
+        return low, high
+
+    def canonical(self, x: Vector) -> Vector:
+        """Coordinates of the same curve, terms in the sequence in which they are reported."""
+        return np.concatenate([self.base.canonical(x[: self.plant_size]), x[self.plant_size :]])
+
     def split(self, x: Vector) -> tuple[Vector, Vector]:
         """Table values and coefficients of coordinates."""
         n = self.plant_size

@@ -141,7 +141,7 @@ def loop(
 def _looped(
     study: Study, kinds: Sequence[type[Effect]], *, jobs: int, sample: bool, quick: bool, as_stated: bool
 ) -> Loop:
-    draws = 1000 if quick else 4000
+    draws = 1000 if quick else 2000
     problem, base, start, enlarged = fitted_base(study, kinds, as_stated=as_stated, draws=draws)
     outliers = outlying(study, base)
     if outliers is not None:
@@ -235,4 +235,5 @@ def _alone(study: Study) -> tuple[str, ...]:
 
 def _side(problem: Problem, state: State) -> Side:
     unseen = held_out_scores(state, problem) if problem.study.held_out else left_out_scores(state)
-    return Side(state, tuple(fit_scores(state)), tuple(unseen), state.optimum.log_evidence)
+    log_evidence = state.optimum.log_evidence + state.model.base.log_support
+    return Side(state, tuple(fit_scores(state)), tuple(unseen), log_evidence)

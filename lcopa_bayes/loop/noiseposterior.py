@@ -16,9 +16,10 @@ import numpy as np
 from scipy.special import gammaln, logsumexp
 
 from lcopa_bayes.arrays import Matrix, Vector
-from lcopa_bayes.loop.autoregression import Autoregression, Mode, NoisePieces
+from lcopa_bayes.loop.autoregression import Autoregression
+from lcopa_bayes.loop.noisepieces import Mode, NoisePieces
 
-_PROPOSED = 600
+_PROPOSED = 400
 """Proposals per order [-]."""
 _TAIL = 4.0
 """Degrees of freedom of the proposals [-]: their tails are wider than those of any posterior here."""

@@ -13,7 +13,8 @@ from scipy.stats import chi2
 
 from lcopa_bayes.arrays import Vector
 from lcopa_bayes.inference.data import Samples
-from lcopa_bayes.loop.autoregression import Autoregression, NoisePieces, unbroken
+from lcopa_bayes.loop.autoregression import Autoregression, unbroken
+from lcopa_bayes.loop.noisepieces import NoisePieces
 from lcopa_bayes.loop.noiseposterior import NoisePosterior
 
 FEWEST = 50
@@ -209,8 +210,7 @@ def _dependence(pieces: Sequence[Vector], coloured: Autoregression) -> float:
 
 
 def _repeated(posterior: NoisePosterior, repeats: Sequence[Vector]) -> tuple[float, float]:
-    """Root mean square of repeats whitened by the noise, and the p-value of noise alone, averaged over all
-    noise that its posterior leaves plausible [-]."""
+    """Root mean square of whitened repeats, and the p-value of noise alone over all that is plausible [-]."""
     count = sum(piece.size - 1 for piece in repeats)
     drawn = posterior.draw(_REPEATED, np.random.default_rng(_SEED))
     powers = np.array([_power(process, repeats) for process in drawn])

@@ -98,20 +98,20 @@ class Regression:
         return float(0.5 * (white @ white) + 0.5 * (precision * (x - mean) ** 2).sum())
 
     def descend(self, start: Vector, *, most: int = 40, gain: float = _GAIN) -> Optimum:
-        """From a start to a local optimum within the support.
+        """From a start to a local optimum within the support, its terms in the sequence of the report.
 
         ArithmeticError when the response at the start is not finite or not bounded.
         """
-        low, high = self.curve.bounds
-        x = np.clip(start, low, high)  # a start only
+        x = np.clip(start, *self.curve.bounds_about(start))  # a start only
         damping, converged = 1e-4, False
         predicted, white, jacobian, tangents = self._rows(x)
         cost = self._cost(x, white)
         for _ in range(most):
+            low, high = self.curve.bounds_about(x)
             mean, precision = self._prior
             slope = jacobian.T @ white - precision * (x - mean)
             information = jacobian.T @ jacobian + np.diag(precision + 1e-9 / self.curve.spread**2)
-            free = np.flatnonzero(~self._stuck(x, slope))
+            free = np.flatnonzero(~_stuck(x, slope, low, high))
             if not free.size:
                 converged = True
                 break
@@ -139,16 +139,15 @@ class Regression:
             x = new
             predicted, white, jacobian, tangents = self._rows(x)
             cost = self._cost(x, white)
+        reported = self.curve.canonical(x)
+        if not np.array_equal(reported, x):
+            x = reported
+            predicted, white, jacobian, tangents = self._rows(x)
         return self._described(x, predicted, white, jacobian, tangents, converged)
 
     def at(self, x: Vector) -> Optimum:
         """The description of a point, without moving."""
         return self._described(x, *self._rows(x), converged=True)
-
-    def _stuck(self, x: Vector, slope: Vector) -> Flags:
-        """Coordinates at an end of their support beyond which the cost falls."""
-        low, high = self.curve.bounds
-        return np.asarray(((x <= low) & (slope < 0)) | ((x >= high) & (slope > 0)))
 
     def _rows(self, x: Vector) -> tuple[Vector, Vector, Matrix, Matrix]:
         predicted, tangents = self.curve.tangents(x)
@@ -176,7 +175,7 @@ class Regression:
         mean, precision = self._prior
         slope = jacobian.T @ white - precision * (x - mean)
         information = jacobian.T @ jacobian + np.diag(1 / spread**2)
-        stuck = self._stuck(x, slope)
+        stuck = _stuck(x, slope, *self.curve.bounds_about(x))
         level = cost + 0.5 * white.size * _LOG_2PI + self.whitening.log_scale
         scaled = np.linalg.slogdet(information * np.outer(spread, spread))[1]
         return Optimum(
@@ -189,7 +188,7 @@ class Regression:
             information,
             cost,
             float(-level - 0.5 * scaled),
-            tuple(name for name, close in zip(self.curve.names, near, strict=True) if close),
+            tuple(name for name, close in zip(self.curve.names, near | stuck, strict=True) if close),
             converged,
             self.whitening.effective,
             stuck,
@@ -212,6 +211,11 @@ class Regression:
         looked.sort(key=lambda one: one.cost)
         ended = [one if one.converged else self.descend(one.x, gain=gain) for one in looked[:2]]
         return min(ended, key=lambda one: one.cost)
+
+
+def _stuck(x: Vector, slope: Vector, low: Vector, high: Vector) -> Flags:
+    """Coordinates at an end of their support beyond which the cost falls."""
+    return np.asarray(((x <= low) & (slope < 0)) | ((x >= high) & (slope > 0)))
 
 
 def _solved_free(matrix: Matrix, right: Vector, free: Flags) -> Vector:

@@ -177,4 +177,4 @@ def _value(density: LoopDensity, z: Vector, white: Vector) -> float:
     """Log density where the residual is known."""
     inner = density.pulled(white)
     power = np.array(white @ white - inner @ density.inverse @ inner)
-    return float(density.log_priors(z[None])[0] + density.log_likelihood(power))
+    return float(density.log_priors(z[None], ordered=False)[0] + density.log_likelihood(power))

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from lcopa_bayes.checks import refuse_if
 from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.inference.discretisation import FACTORS, largest_shift, narrowed
 from lcopa_bayes.loop.basefit import BaseFit, base_fit
 from lcopa_bayes.loop.basemodel import BaseModel
 from lcopa_bayes.loop.confirm import log_bayes_factor
@@ -93,16 +95,30 @@ def _based(study: Study, *key: int) -> Base:
     """A study's base fit as it stands; `key` tells its random numbers from others'."""
     problem = problem_of(study)
     fit = base_fit(BaseModel(problem.posterior), np.random.default_rng([study.seed, 10, *key]))
+    narrow = narrowed(problem, partial(_shift, fit))
+    if narrow is not problem:
+        problem = narrow
+        fit = base_fit(BaseModel(problem.posterior), np.random.default_rng([study.seed, 10, *key]))
     model = ExtendedModel.of(fit.model, fit.optimum.x, taken=taken(study))
     state = State(model, fit.optimum, fit.regression.whitening, fit.optimum.covariance)
     return Base(problem, fit, state, "")
+
+
+def _shift(fit: BaseFit, problem: Problem) -> float:
+    """Largest shift of the base fit's parameters on narrower blocks than the problem's [posterior sd]."""
+    model, x, white = BaseModel(problem.posterior), fit.optimum.x, fit.regression.whitening
+    here, tangents = model.tangents(x)
+    finer = [BaseModel(problem.refined(factor).posterior) for factor in FACTORS]
+    changes = [white(each.predict(x) - here) for each in finer]
+    return largest_shift(fit.optimum.covariance, white(tangents.T).T, changes)
 
 
 def _gain(base: Base, wider: Base) -> float:
     """Log evidence of the wider model over the other under the wider one's noise [nat]."""
     quiet = float(sum(wider.fit.noise_samples))
     same = Regression(base.fit.model, wider.fit.regression.whitening).descend(base.fit.optimum.x)
-    return log_bayes_factor(same, wider.fit.optimum, quiet)
+    ordering = wider.fit.model.log_support - base.fit.model.log_support
+    return log_bayes_factor(same, wider.fit.optimum, quiet) + ordering
 
 
 def _named(base: Base, library: Sequence[type[Effect]], rng: np.random.Generator, draws: int) -> float:

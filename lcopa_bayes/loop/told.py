@@ -151,11 +151,14 @@ def _outliers(found: Loop) -> dict[str, Any] | None:
 def _evidence(found: Loop) -> dict[str, Any]:
     trace = found.trace
     if trace is None:
-        return {"threshold": None, "p_value": None, "draws": 0, "classes": []}
+        empty = dict.fromkeys(("threshold", "threshold_between", "p_value", "least_p_value"))
+        return {**empty, "draws": 0, "classes": []}
     chances = trace.probabilities
     return {
         "threshold": trace.threshold,
+        "threshold_between": trace.between,
         "p_value": trace.p_value,
+        "least_p_value": 1 / (trace.draws + 1),
         "draws": trace.draws,
         "none": chances["none"],
         "classes": [

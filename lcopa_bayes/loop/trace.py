@@ -9,6 +9,7 @@ from typing import final
 
 import numpy as np
 from scipy.special import logsumexp
+from scipy.stats import binom
 
 from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.loop.scatter import scatter_evidence
@@ -23,8 +24,10 @@ LEAST = 3.0
 QUANTILE = 0.99
 LEVEL = 0.5
 """Difference of log evidence up to which instances of an effect are level [nat]."""
-_DRAWS = 4000
-"""Chance residuals: the threshold is exceeded with a probability known to 0.002 [-]."""
+_DRAWS = 2000
+"""Chance residuals: the probability beyond the threshold is known to 0.002 [-]."""
+_TAIL = 0.05
+"""Probability outside the interval of a threshold [-]."""
 _BATCH = 200
 """Chance residuals drawn at once [-]."""
 _NONE = 0.5
@@ -75,6 +78,8 @@ class Trace:
     """By falling evidence."""
     threshold: float
     """Largest of 3 and the 99 % quantile of the largest log Bayes factor by chance [nat]."""
+    between: tuple[float, float]
+    """95 % interval of that quantile: so many draws do not give it better [nat]."""
     p_value: float
     """Share of chance maxima at or above `largest`, no less than 1 / (draws + 1) [-]."""
     draws: int
@@ -160,10 +165,23 @@ def trace(
         found.append(_traced(state, project, residual, scale, kind))
     maxima = _chance(project, whitening, found, rng, draws, scale)
     found.sort(key=lambda one: -one.log_bayes_factor)
-    threshold = max(LEAST, float(np.quantile(maxima, QUANTILE))) if maxima.size else LEAST
-    made = Trace(tuple(found), threshold, np.nan, draws, residual, scale)
+    threshold, low, high = threshold_of(maxima)
+    made = Trace(tuple(found), threshold, (low, high), np.nan, draws, residual, scale)
     beaten = int(np.count_nonzero(maxima >= made.largest))
     return replace(made, p_value=(beaten + 1) / (draws + 1))
+
+
+def threshold_of(maxima: Vector) -> tuple[float, float, float]:
+    """Threshold from chance maxima, and the ends of the 95 % interval of their quantile [nat].
+
+    The ends are order statistics: the number of draws below a quantile is binomial. None is below 3 nat.
+    """
+    if not maxima.size:
+        return LEAST, LEAST, LEAST
+    ordered = np.sort(maxima)
+    ranks = np.array([binom.ppf(p, maxima.size, QUANTILE) for p in (_TAIL / 2, 1 - _TAIL / 2)], dtype=int)
+    low, high = ordered[np.clip(ranks - [1, 0], 0, maxima.size - 1)]
+    return max(LEAST, float(np.quantile(ordered, QUANTILE))), max(LEAST, low), max(LEAST, high)
 
 
 def commands_of(drive: Matrix) -> int:

@@ -10,8 +10,9 @@ import numpy as np
 from scipy.stats import chi2, norm
 
 from lcopa_bayes.arrays import Index, Vector
-from lcopa_bayes.loop.autoregression import Autoregression, NoisePieces
+from lcopa_bayes.loop.autoregression import Autoregression
 from lcopa_bayes.loop.basefit import axis_pieces
+from lcopa_bayes.loop.noisepieces import NoisePieces
 from lcopa_bayes.loop.noiseposterior import NoisePosterior
 from lcopa_bayes.loop.scores import Score, State, pooled_rmse
 from lcopa_bayes.study import Study

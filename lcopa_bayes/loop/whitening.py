@@ -16,6 +16,7 @@ from lcopa_bayes.loop.noiseposterior import NoisePosterior
 
 _PER_PROCESS = 4
 """Draws of noise from each plausible process [-]."""
+_SEED = 7
 
 
 @final
@@ -96,6 +97,42 @@ class Whitening:
             out[..., rows] = self.noise[axis].whiten(columns[..., rows])
             if self.dependence:
                 out[..., rows] /= np.sqrt(self.dependence[axis])
+        return out
+
+    def adjoint(self, columns: Array) -> Array:
+        """Adjoint of whitening of columns (..., n), same shape [1 / response unit]."""
+        out = np.empty_like(columns, dtype=float)
+        for axis, rows in self._stretches:
+            out[..., rows] = self.noise[axis].adjoint(columns[..., rows])
+            if self.dependence:
+                out[..., rows] /= np.sqrt(self.dependence[axis])
+        return out
+
+    def covariances(self, columns: Matrix, count: int) -> Array:
+        """Covariance of products of whitened noise with columns (n, k), under `count` plausible processes,
+        (count, k, k) [-]; the estimate is right once where the noise is known, (1, k, k)."""
+        if not self.posterior:
+            return (columns.T @ columns)[None]
+        back, k = self.adjoint(columns.T), columns.shape[1]
+        rng, out = np.random.default_rng(_SEED), np.zeros((count, k, k))
+        for axis, posterior in enumerate(self.posterior):
+            lagged = self._lagged(back, axis)
+            for one, process in zip(out, posterior.draw(count, rng), strict=True):
+                one += np.einsum("l,lij->ij", process.autocovariance(len(lagged) - 1), lagged)
+        return out
+
+    def _lagged(self, columns: Matrix, axis: int) -> Array:
+        """Products of columns (k, n) a lag apart within stretches of an axis, either way, (lags, k, k)."""
+        own = [rows for number, rows in self._stretches if number == axis]
+        longest = max(rows.shape[1] for rows in own)
+        out = np.zeros((longest, len(columns), len(columns)))
+        for rows in own:
+            n = rows.shape[1]
+            spectra = np.fft.rfft(columns[:, rows], 2 * n)
+            power = np.einsum("igf,jgf->ijf", spectra.conj(), spectra)
+            lags = np.moveaxis(np.fft.irfft(power, 2 * n), -1, 0)[:n]
+            out[:n] += lags + lags.transpose(0, 2, 1)
+        out[0] /= 2
         return out
 
     @cached_property

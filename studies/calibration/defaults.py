@@ -1,12 +1,12 @@
 """Coverage of the default settings at stated truths: noise, orders, delays, terms and kinds of noise.
 
-    python studies/calibration/defaults.py [--replicas N] [--jobs N] [--seed N] [--cells NAME ...] [--out FOLDER]
+    python studies/calibration/defaults.py [--replicas N] [--jobs N] [--seed N] [--cells PATTERN ...]
 
 Every cell is a step response of 240 samples, 0.2 ms apart, measured on the virtual bench at one truth; every
 replica is fitted with default settings, default priors derived from its own record. Cells differ in the level
-of the noise relative to the step, in the order, in whether command plus delay falls on a sample, in the number
-of viscous terms and in the kind of noise. The band of a row is exact and simultaneous over all rows of the
-table (Clopper and Pearson 1934, Bonferroni). Priors are wide beside the posteriors, so that coverage at a
+of the noise relative to the step, in the order, in whether command plus delay falls on a sample, in the
+number of viscous terms and in the kind of noise. The band of a row is exact and simultaneous over all rows of
+the table (Clopper and Pearson 1934, Bonferroni). Priors are wide beside the posteriors, so that coverage at a
 fixed truth is close to nominal for what the record determines; the noise of the default kind is known in part
 by its prior alone, and stands apart. Finished replicas are kept in --store: the same command goes on where it
 stopped, and a larger --replicas adds to what is there.
@@ -16,6 +16,7 @@ import argparse
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -88,7 +89,7 @@ class Cell:
         rng = np.random.default_rng(seed)
         record = simulate(device, bench, step(1.0, at=COMMAND), duration=DURATION, name="step", rng=rng)
         # several terms are more often sampled by ensembles: few walkers do for 400 effective draws
-        sampler = SamplerSettings(ensembles=2, walkers=32) if len(self.times) > 1 else SamplerSettings()
+        sampler = SamplerSettings(walkers=32) if len(self.times) > 1 else SamplerSettings()
         return Study(
             self.name,
             None,
@@ -158,8 +159,8 @@ def covered(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def pooled(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Coverage of each kind of parameter over the one-term cells of the default noise together, by level of the
-    noise and for all of them: a small bias everywhere shows here first."""
+    """Coverage of each parameter over the one-term cells of the default noise together, by level of the noise
+    and for all of them: a small bias everywhere shows here first."""
     default = [row for row in rows if row["noise"] == "white+ar1" and len(row["orders"]) == 1]
     groups = {
         f"noise {100 * level:g} %": [r for r in default if r["level"] == level]
@@ -191,8 +192,8 @@ def sentence(coverage: Sequence[dict[str, Any]], kind: str, what: str) -> str:
     chosen = [row for row in coverage if row["kind"] == kind]
     outside = [row for row in chosen if not row["within"]]
     where = "; ".join(
-        f"{row.get('cell', row.get('cells'))} {row['parameter']} at {row['level']:.0%} ({row['observed']:.3f}, band "
-        f"{row['lower']:.3f} to {row['upper']:.3f})"
+        f"{row.get('cell', row.get('cells'))} {row['parameter']} at {row['level']:.0%} "
+        f"({row['observed']:.3f}, band {row['lower']:.3f} to {row['upper']:.3f})"
         for row in outside
     )
     return f"Of {len(chosen)} {what}, {len(chosen) - len(outside)} lie within their band" + (
@@ -241,9 +242,10 @@ def table_of(told: dict[str, Any]) -> str:
         lines.append(f"| {group} | {own[columns[0]]['replicas']} | " + " | ".join(values) + " |")
     lines += [
         "",
-        f"Replicas in all: {told['replicas']}, of them {told['sampled']} by ensembles, {told['not_reliable']} not "
-        f"graded reliable, {told['failed']} failed. `block shift`: largest shift of a posterior mean by the width "
-        "of the blocks over the replicas [posterior sd]; `s`: median processor time of a replica.",
+        f"Replicas in all: {told['replicas']}, of them {told['sampled']} by ensembles, "
+        f"{told['not_reliable']} not graded reliable, {told['failed']} failed. `block shift`: largest shift "
+        "of a posterior mean by the width of the blocks over the replicas [posterior sd]; `s`: median "
+        "processor time of a replica.",
         "",
     ]
     return "\n".join(lines)
@@ -276,9 +278,9 @@ def summary(rows: Sequence[dict[str, Any]], seed: int) -> dict[str, Any]:
     return plain(
         {
             "verdict": [
-                sentence(coverage, "plant", "coverages of plant parameters, cell by cell,"),
-                sentence(coverage, "noise", "coverages of noise parameters, cell by cell,"),
-                sentence(together, "plant", "coverages of plant parameters, pooled,"),
+                sentence(coverage, "plant", "coverages of plant parameters cell by cell"),
+                sentence(coverage, "noise", "coverages of noise parameters cell by cell"),
+                sentence(together, "plant", "pooled coverages of plant parameters"),
             ],
             "seed": seed,
             "simultaneous": SIMULTANEOUS,
@@ -302,13 +304,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--replicas", type=int, default=200)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--seed", type=int, default=20)
-    parser.add_argument("--cells", nargs="+", metavar="NAME", help="cells whose name contains one of these")
+    parser.add_argument("--cells", nargs="+", metavar="PATTERN", help="cells whose name matches one of these")
     parser.add_argument("--out", type=Path, default=Path("reports/calibration/defaults"))
     parser.add_argument("--store", type=Path, default=Path(tempfile.gettempdir()) / "lcopa-defaults")
     options = parser.parse_args(arguments)
     rows = []
     for number, cell in enumerate(cells()):
-        if options.cells and not any(word in cell.name for word in options.cells):
+        if options.cells and not any(fnmatchcase(cell.name, pattern) for pattern in options.cells):
             continue
         made = calibrate(
             cell.study(1000 * options.seed + number),

@@ -2,7 +2,7 @@
 
 import json
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +27,15 @@ class Task:
     """What one campaign hides."""
 
     kind: str
-    """clean, coloured, named, plain, outside or pair."""
+    """clean, coloured, named, plain, outside, pair or control."""
     effects: tuple[str, ...]
     drives: str
     correlation: float
     seed: int
     sampled: bool = False
     """Whether the final posterior is drawn too."""
+    quiet: int = 0
+    """Samples at rest of each axis, over all fit records, and no repeat; 0: as recorded."""
 
     @property
     def name(self) -> str:
@@ -68,10 +70,26 @@ def measured(task: Task) -> Campaign:
     for attempt in range(_ATTEMPTS):
         rng = np.random.default_rng([task.seed, 77, *([attempt] if attempt else [])])
         try:
-            return campaign(drawn(task.effects, rng), rng, drives=task.drives, correlation=task.correlation)
+            made = campaign(drawn(task.effects, rng), rng, drives=task.drives, correlation=task.correlation)
         except MarchError:
             continue
+        return shortened(made, task.quiet) if task.quiet else made
     raise RuntimeError(f"{task.name}: no device of {_ATTEMPTS} has a bounded response")
+
+
+def shortened(made: Campaign, quiet: int) -> Campaign:
+    """The campaign less its repeat, with so many samples at rest of each axis in the fit records together."""
+    repeated = made.fit[-1]
+    fit = [one for one in made.fit if one is not repeated]
+    rest = 0.8 * made.device.paths[0][0].delay  # what the loop takes for rest of a delay
+    share, out = -(-quiet // len(fit)), []
+    for one in fit:
+        moved = one.time[np.flatnonzero((one.drive != one.drive[0]).any(axis=1))[0]]
+        sampled = np.flatnonzero(~np.isnan(one.response).all(axis=1) & (one.time < moved + rest))
+        response = np.array(one.response)
+        response[sampled[: max(sampled.size - share, 0)]] = np.nan
+        out.append(replace(one, response=response))
+    return replace(made, fit=tuple(out))
 
 
 def judged(found: Loop, made: Campaign) -> dict[str, Any]:
@@ -99,6 +117,7 @@ def judged(found: Loop, made: Campaign) -> dict[str, Any]:
         "of_truth": {name: _evidence(found, name) for name in truth},
         "refits": refits,
         "orders": [one.process.order for one in found.base.noise],
+        "quiet_samples": [one.samples if one.known else 0 for one in found.base.noise],
         "base_failed": found.base.failed,
         "before": errors(found.before, made),
         "after": errors(found.after, made),

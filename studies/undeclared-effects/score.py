@@ -1,7 +1,7 @@
 """Score sheet of the loop: hidden effects on the virtual bench, judged by thresholds frozen beforehand.
 
     python studies/undeclared-effects/score.py [--seed 1000] [--each 4] [--controls 60] [--outsiders 10]
-        [--pairs 30] [--sampled 6] [--jobs N] [--out reports/undeclared-effects] [--limit N]
+        [--pairs 30] [--sampled 6] [--cells 12] [--jobs N] [--out reports/undeclared-effects] [--limit N]
 
 Every campaign is a task of its own, kept in OUT/rows: a killed run goes on where it stopped. Seeds below 1000
 were used in development and are refused unless --trial is given.
@@ -12,7 +12,7 @@ import json
 import sys
 import tomllib
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from itertools import combinations
+from itertools import combinations, product
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,8 @@ HERE = Path(__file__).parent
 FIRST_TEST_SEED = 1000
 COLOURED = 0.6
 """Correlation of successive samples of coloured noise [-]."""
+CELLS = tuple(product((0.0, 0.6, 0.9, 0.95), (40, 64, 176, 400)))
+"""Correlation of successive samples and samples at rest of the further controls [-]."""
 
 
 def tasks(options: argparse.Namespace) -> list[Task]:
@@ -51,9 +53,14 @@ def tasks(options: argparse.Namespace) -> list[Task]:
     made += [("pair", pairs[k], "rich", 0.0) for k in picked]
     sampled = set(rng.choice(len(made), size=min(options.sampled, len(made)), replace=False).tolist())
     first = options.seed * 100_000
-    return [
+    listed = [
         Task(kind, names, drives, rho, first + k, k in sampled)
         for k, (kind, names, drives, rho) in enumerate(made)
+    ]
+    further = [cell for cell in CELLS for _ in range(options.cells)]
+    return listed + [
+        Task("control", (), "rich", rho, first + len(made) + k, quiet=quiet)
+        for k, (rho, quiet) in enumerate(further)
     ]
 
 
@@ -161,7 +168,15 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    numbers = {"seed": FIRST_TEST_SEED, "each": 4, "controls": 60, "outsiders": 10, "pairs": 30, "sampled": 6}
+    numbers = {
+        "seed": FIRST_TEST_SEED,
+        "each": 4,
+        "controls": 60,
+        "outsiders": 10,
+        "pairs": 30,
+        "sampled": 6,
+        "cells": 12,
+    }
     for name, default in (numbers | {"jobs": 1, "limit": None, "every": 1}).items():
         parser.add_argument(f"--{name}", type=int, default=default)
     parser.add_argument("--out", type=Path, default=Path("reports/undeclared-effects"))

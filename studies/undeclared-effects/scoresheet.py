@@ -74,6 +74,8 @@ def sheet(rows: Sequence[Row], targets: Mapping[str, Any], seen: float) -> list[
     usable = [row for row in rows if not row["crashed"]]
     by = {kind: [row for row in usable if row["kind"] == kind] for kind in ("clean", "coloured", "named")}
     by |= {kind: [row for row in usable if row["kind"] == kind] for kind in ("plain", "outside", "pair")}
+    controls = [row for row in usable if row["kind"] == "control"]
+    cells = sorted({(row["correlation"], row["quiet"]) for row in controls})
     visible = [row for row in by["named"] if (_survival(row) or 0.0) > seen or _survival(row) is None]
     alarmed = [row for row in visible if row["alarmed"]]
     hidden = [row for row in [*by["named"], *by["plain"]] if (_survival(row) or 1.0) <= seen and row["named"]]
@@ -97,6 +99,30 @@ def sheet(rows: Sequence[Row], targets: Mapping[str, Any], seen: float) -> list[
             "false alarms, coloured noise",
             by["coloured"],
             lambda r: r["verdict"] != "clean",
+            targets["false_alarms"],
+            "most",
+        ),
+        *(
+            share(
+                f"false alarms, correlation {rho:g}, {quiet} samples at rest",
+                [row for row in controls if (row["correlation"], row["quiet"]) == (rho, quiet)],
+                lambda r: r["verdict"] != "clean",
+                targets["false_alarms"],
+                "most",
+            )
+            for rho, quiet in cells
+        ),
+        share(
+            "false alarms, all correlations and samples at rest",
+            controls,
+            lambda r: r["verdict"] != "clean",
+            targets["false_alarms"],
+            "most",
+        ),
+        share(
+            "the same, firm",
+            controls,
+            lambda r: r["verdict"] != "clean" and r["confidence"] == "firm",
             targets["false_alarms"],
             "most",
         ),

@@ -129,8 +129,8 @@ def _predicted(told: Mapping[str, Any]) -> Section:
     text = (
         "Whole records are predicted from the others, and the future of a record from its past where it is "
         "the only one; single points are never left out, since their neighbours tell them. The log density "
-        "is that of one forecast: each sample given those before it, the noise and, where a model gives "
-        "every record a level of its own, the level following the record, all else fixed by the other records. "
+        "is that of one forecast: each sample given those before it. The noise, and the level where a model "
+        "gives every record one of its own, follow the record; all else is known from the others. "
         "Samples at rest are known, the first one at least; all models predict the same samples. ± is the "
         "Monte Carlo error. 'if fitted' is the density of the same samples under draws that have seen them, "
         "which is larger; where it is not, the grade is lowered. Bands are pointwise: of every 100 samples "
