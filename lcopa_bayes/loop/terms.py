@@ -25,6 +25,7 @@ from lcopa_bayes.loop.scores import State
 from lcopa_bayes.loop.startlevel import Mended, started
 from lcopa_bayes.loop.trace import trace
 from lcopa_bayes.plant.effects.effect import Effect
+from lcopa_bayes.requirements import unmet_apart_from_rest
 from lcopa_bayes.rest import not_at_rest
 from lcopa_bayes.settings import PriorSettings
 from lcopa_bayes.study import Study
@@ -62,6 +63,7 @@ def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: boo
     than the best named effect, or more together with what it leaves to be named. InputError when a record
     moves before its drive does and no drive before the first row explains that.
     """
+    refuse_if(unmet_apart_from_rest(study))
     base = _based(study)
     for mended in (started, _later):
         better = mended(study, base.fit)
