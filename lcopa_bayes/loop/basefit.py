@@ -54,15 +54,18 @@ class BaseFit:
         return all(one.known for one in self.noise)
 
 
-def base_fit(model: BaseModel, rng: np.random.Generator, *, starts: int = _STARTS) -> BaseFit:
-    """Noise, then damped Gauss-Newton from several starts and delays.
+def base_fit(
+    model: BaseModel, rng: np.random.Generator, *, starts: int = _STARTS, near: Sequence[Vector] = ()
+) -> BaseFit:
+    """Noise, then damped Gauss-Newton from several starts and delays; `near` are further coordinates to start
+    from.
 
     Where an axis has too few quiet samples its noise is fitted to the residual in turn with the plant.
     """
     posterior = model.posterior
     seeds = [model.coordinates(values) for values in screened(posterior, rng, count=starts)]
     white = Whitening(posterior.samples, _guessed(posterior))
-    optimum = Regression(model, white).best(seeds)
+    optimum = Regression(model, white).best([*near, *seeds])
     optimum = Regression(model, white).best([optimum.x, *_other_delays(model, optimum.x)])
     noise: tuple[AxisNoise, ...] = ()
     for _ in range(_ROUNDS):
