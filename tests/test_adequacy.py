@@ -19,8 +19,8 @@ from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.predict import bands
 from lcopa_bayes.record import Record
 from lcopa_bayes.residuals import residuals
-from lcopa_bayes.results import results
 from lcopa_bayes.resonance import PEAK, peaks, unresolved
+from lcopa_bayes.results import results
 
 NOISE = TRUTH | {"sigma_ar": 0.003, "rho": 0.5, "nu": 200.0}
 
