@@ -173,7 +173,7 @@ def _calibrate_options(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="NAME=VALUE",
-        help="parameters with the same true value in every replica, in their units",
+        help="true values in every replica, or LOW:HIGH to draw them from, in the units of the study",
     )
     parser.add_argument(
         "--engine",

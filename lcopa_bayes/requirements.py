@@ -68,7 +68,7 @@ def _responses(study: Study) -> list[str]:
         problems += _scaled("response", axis, float(span))
         if span == 0.0:
             problems.append(
-                f"response {axis.name!r} is constant throughout the fit records ({np.nanmax(level):.6g} "
+                f"response {axis.name} is constant throughout the fit records ({np.nanmax(level):.6g} "
                 f"{axis.unit}): it shows neither noise nor anything to explain; leave its column out, or "
                 "give records in which it is read out finely enough to move"
             )

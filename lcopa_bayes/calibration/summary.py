@@ -186,8 +186,9 @@ def verdict(told: dict[str, Any], made: Calibration) -> str:
     truths = made.replication.truths
     if truths.stated:
         parts.append(
-            f"The truth was {'' if truths.fixed else 'in part '}the same in every replica: coverage is then "
-            "as stated as far as the priors are wide beside the posterior, and ranks need not be uniform."
+            f"The truth was {'' if truths.fixed else 'in part '}stated, not drawn from the prior: coverage "
+            "is then nominal as far as the priors are wide beside the posterior and the likelihood is smooth "
+            "at the truth, and ranks need not be uniform."
         )
         return " ".join([*parts, *_failed(made)])
     uneven = [row["parameter"] for row in told["ranks"] if len(told["ranks"]) * row["p_value"] < SMALL_P]

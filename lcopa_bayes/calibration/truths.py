@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import final
+from typing import TypeAlias, final
 
 import numpy as np
 import xarray as xr
@@ -16,6 +16,8 @@ from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.problems import InputError, nearest
 
+Stated: TypeAlias = float | tuple[float, float]
+"""A true value, or the ends between which it is drawn evenly."""
 _TRIES = 1_000
 """Draws from the prior within which the orders must once decrease beside stated ones."""
 
@@ -33,8 +35,9 @@ class Truths:
     grade: str = ""
     """Grade of the pool."""
 
-    stated: Mapping[str, float] = field(default_factory=dict)
-    """Values that are the same in every replica, by name, each in its parameter's unit."""
+    stated: Mapping[str, Stated] = field(default_factory=dict)
+    """By name, each in its parameter's unit: a value that is the same in every replica, or the two ends
+    between which it is drawn evenly."""
 
     def draw(self, rng: np.random.Generator) -> Vector:
         """One truth: canonical table values, (rows,)."""
@@ -42,7 +45,9 @@ class Truths:
             return np.asarray(self.pool[rng.integers(self.pool.shape[0])])
         for _ in range(_TRIES if self.stated else 1):
             truth = self.table.draw(1, rng)[0]
-            truth[[self.table.names.index(name) for name in self.stated]] = list(self.stated.values())
+            for name, value in self.stated.items():
+                drawn = rng.uniform(*value) if isinstance(value, tuple) else value
+                truth[self.table.names.index(name)] = drawn
             if self.table.supported(truth[None]).all():
                 return np.asarray(truth)
         raise InputError(
@@ -52,7 +57,7 @@ class Truths:
 
     @property
     def fixed(self) -> bool:
-        """Whether every free parameter is stated: one truth, and no randomness in it."""
+        """Whether every free parameter is stated, so that nothing comes from the prior."""
         return bool(self.stated) and all(row.name in self.stated for row in self.table.rows if row.free)
 
     @property
@@ -65,8 +70,8 @@ class Truths:
         )
 
 
-def truths_stated(stated: Mapping[str, float], table: ParameterTable) -> Truths:
-    """Truths with values that are stated, the other parameters drawn from the prior.
+def truths_stated(stated: Mapping[str, Stated], table: ParameterTable) -> Truths:
+    """Truths with values or ranges that are stated, the other parameters drawn from the prior.
 
     InputError for a name that is no free parameter, a value the prior excludes, or orders that do not
     decrease.
@@ -77,13 +82,13 @@ def truths_stated(stated: Mapping[str, float], table: ParameterTable) -> Truths:
         for name in stated.keys() - rows.keys()
     ]
     problems += [
-        f"the truth {name} = {stated[name]:g} is excluded by the prior of the study, {rows[name].prior}"
+        f"the truth {name} = {stated[name]} is excluded by the prior of the study, {rows[name].prior}"
         for name in stated.keys() & rows.keys()
-        if not np.isfinite(rows[name].log_prior(np.array([stated[name]]))).all()
+        if not np.isfinite(rows[name].log_prior(np.atleast_1d(np.array(stated[name], dtype=float)))).all()
     ]
     if problems:
         raise InputError(sorted(problems))
-    truths = Truths(table, stated={name: float(stated[name]) for name in rows if name in stated})
+    truths = Truths(table, stated={name: stated[name] for name in rows if name in stated})
     truths.draw(np.random.default_rng(0))
     return truths
 

@@ -33,6 +33,8 @@ _CONFIDENCE = 0.9
 """Of the upper bound on the scatter between ensembles [-]. Two ensembles with errors of 0.3 pass once in ten
 times, where R-hat lets every other pair pass; the price is that to pass nine times in ten two ensembles
 without an error need 3 800 effective draws, three 800 and four 500."""
+CERTAIN = 3.0
+"""Standard errors from which a drift is certain [-]."""
 RELIABLE_SHARES = 0.05
 """Difference of a hill's share between ensembles, beyond Monte Carlo error, that moves little [-]."""
 TENTATIVE_SHARES = 0.2
@@ -58,13 +60,17 @@ class Quality:
     ess_between: float = np.inf
     """Number of independent draws whose mean scatters as the means of the ensembles do [draws]; also of the
     shares of modes where there are several. It sees errors that all walkers of an ensemble share."""
+    ess_drift: float = np.inf
+    """Number of independent draws whose mean is as uncertain as the draws drift from their first to their
+    last third [draws]; infinite where no drift is certain. It sees what all ensembles have in common: a mode
+    that none of them had filled at the start."""
     scatter: float = 0.0
     """Upper bound at 90 % confidence on the error of one ensemble's mean [posterior standard deviations]."""
 
     @property
     def ess(self) -> float:
         """The smallest of the effective sample sizes, NaN when one is [draws]."""
-        return float(np.min([self.ess_bulk, self.ess_tail, self.ess_between]))
+        return float(np.min([self.ess_bulk, self.ess_tail, self.ess_between, self.ess_drift]))
 
     def grade(self, target_ess: float) -> Grade:
         """Grade of this parameter against a wanted effective sample size."""
@@ -109,6 +115,10 @@ class Quality:
                 f"{RELIABLE_SCATTER:g} when they agree closely enough)"
             )
             steps += ", or with more ensembles"
+        if self.ess_drift < target_ess:
+            wrong.append(
+                "its draws still drift: a mode that was hard to find is filling in all ensembles alike"
+            )
         if self.ess < target_ess:
             wrong.append(f"it has {self.ess:.0f} effective draws where {target_ess:.0f} are wanted")
             steps += f", about {max(2, ceil(target_ess / max(self.ess, 1.0)))} times as many"
@@ -196,10 +206,50 @@ def qualities(names: Sequence[str], values: Array) -> tuple[Quality, ...]:
                 float(array_stats.ess(chains, method="tail", prob=(0.05, 0.95))),  # type: ignore[no-untyped-call]
                 float(array_stats.rhat_nested(chains, owner)),  # type: ignore[no-untyped-call]
                 rank_correlation(chains[:, 0], chains[:, -1]),
-                *between(values[..., k]),
+                *_shared(values[..., k]),
             )
         )
     return tuple(out)
+
+
+def _shared(values: Array) -> tuple[float, float, float]:
+    """What errors that walkers share are worth: `between`, with `drift` second."""
+    worth, scatter = between(values)
+    return worth, drift(values), scatter
+
+
+def drift(values: Array) -> float:
+    """Effective sample size by the drifts of draws (ensembles, walkers, draws) that are certain [draws]:
+    with variance v, a mean that drifts by d is worth ``v / d^2`` draws; infinite where none is certain."""
+    worth = [variance / moved**2 for moved, error, variance in drifts(values) if abs(moved) > CERTAIN * error]
+    return min(worth, default=np.inf)
+
+
+def drifts(values: Array) -> tuple[tuple[float, float, float], ...]:
+    """Mean of the last third of draws (ensembles, walkers, draws) less that of the first, its standard error
+    and the variance of the draws: of their normal scores, of the shares beyond the 5 and the 95 % quantile.
+
+    All ensembles start from populations of one kind, so that they may agree while a mode that few walkers
+    found still fills (after Geweke 1992, Bayesian Statistics 4). The error is by how walkers and by how
+    ensembles differ, the larger one. None for fewer than three draws and for draws that do not vary.
+    """
+    third, out = values.shape[2] // 3, []
+    if third == 0 or np.ptp(values) == 0.0:
+        return ()
+    low, high = np.quantile(values, (0.05, 0.95))
+    for seen in (_scores(values), (values <= low).astype(float), (values >= high).astype(float)):
+        apart = seen[..., -third:].mean(axis=2) - seen[..., :third].mean(axis=2)
+        error = float(apart.std(ddof=1) / np.sqrt(apart.size))
+        if apart.shape[0] > 1:
+            error = max(error, float(apart.mean(axis=1).std(ddof=1) / np.sqrt(apart.shape[0])))
+        out.append((float(apart.mean()), error, float(seen.var())))
+    return tuple(out)
+
+
+def _scores(values: Array) -> Array:
+    """Normal scores of the ranks of values, of their shape."""
+    ranks = rankdata(values).reshape(values.shape)
+    return np.asarray(norm.ppf((ranks - 0.375) / (values.size + 0.25)))
 
 
 def between(values: Array) -> tuple[float, float]:
@@ -215,8 +265,7 @@ def between(values: Array) -> tuple[float, float]:
     ensembles = values.shape[0]
     if ensembles < 2 or np.ptp(values) == 0.0:
         return np.nan, np.nan
-    ranks = rankdata(values).reshape(values.shape)
-    scores = norm.ppf((ranks - 0.375) / (values.size + 0.25))
+    scores = _scores(values)
     variance = float(scores.var())
     apart = float(scores.mean(axis=(1, 2)).var(ddof=1))
     least = float(chi2.ppf(1 - _CONFIDENCE, ensembles - 1))

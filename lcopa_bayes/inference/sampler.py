@@ -18,7 +18,7 @@ from tqdm import tqdm
 from lcopa_bayes.arrays import Array, Matrix
 from lcopa_bayes.inference.chainfile import load_chain, save_chain
 from lcopa_bayes.inference.ensemble import Ensemble, advance
-from lcopa_bayes.inference.grade import Quality, qualities
+from lcopa_bayes.inference.grade import CERTAIN, Quality, drifts, qualities
 from lcopa_bayes.inference.knownmodes import around
 from lcopa_bayes.inference.lessons import LEARNING, taught
 from lcopa_bayes.inference.mixture import Mixture
@@ -36,6 +36,9 @@ _LEAST = 5
 _AS_LONG = 0.4
 """Sampling takes at least this share of the moves that the way from the prior took: a posterior that was
 hard to reach has hills that fill slowly [-]."""
+_TREND = 2.0
+"""Standard errors below which a drift of the kept draws is taken for chance where the run as a whole drifts
+[-]: there chance is the less likely reason, and to go on costs little."""
 _THIN = 5
 """Steps per kept draw unless the study says otherwise."""
 
@@ -164,7 +167,26 @@ def finished(posterior: Posterior, run: Run, bar: tqdm[Any] | None = None) -> bo
         )
     target = run.plan.target_ess
     good = all(q.grade(target).level == "reliable" and q.memory <= _MEMORY for q in found)
-    return good and all(one.ess >= target for one in _sampled_ridges(posterior, run))
+    return (
+        good
+        and all(one.ess >= target for one in _sampled_ridges(posterior, run))
+        and _settled(posterior, run)
+    )
+
+
+def _settled(posterior: Posterior, run: Run) -> bool:
+    """Whether what drifts over the whole run with certainty shows no trend any more in what is kept of it.
+
+    A mode that few walkers had found at the start fills slowly and in all ensembles alike, so that neither
+    their agreement nor the effective sample size of what is kept can tell how much is still to come.
+    """
+    whole, kept = (_sampled_values(posterior, run, kept=part) for part in (False, True))
+    for column in range(whole.shape[-1]):
+        pairs = zip(drifts(whole[..., column]), drifts(kept[..., column]), strict=False)
+        for (far, far_error, _), (near, near_error, _) in pairs:
+            if abs(far) > CERTAIN * far_error and abs(near) > _TREND * near_error:
+                return False
+    return True
 
 
 def sampled_qualities(posterior: Posterior, run: Run) -> tuple[Quality, ...]:
@@ -181,9 +203,10 @@ def _sampled_ridges(posterior: Posterior, run: Run) -> Iterator[Ridges]:
         yield ridges(row.name, row.unit, values[..., column], log_scale=row.log_scale)
 
 
-def _sampled_values(posterior: Posterior, run: Run) -> Array:
-    """Kept values of the sampled parameters, (ensembles, walkers, draws, parameters)."""
-    coordinates, _ = run.kept()
+def _sampled_values(posterior: Posterior, run: Run, *, kept: bool = True) -> Array:
+    """Values of the sampled parameters that are kept, or all, (ensembles, walkers, draws, parameters)."""
+    chains = [ensemble.chain for ensemble in run.ensembles]
+    coordinates = run.kept()[0] if kept else np.stack(chains).swapaxes(1, 2)
     values = posterior.values(coordinates.reshape(-1, coordinates.shape[-1]))[:, posterior.sampled]
     return values.reshape(*coordinates.shape[:3], -1)
 

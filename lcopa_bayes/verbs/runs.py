@@ -13,6 +13,7 @@ from lcopa_bayes.bench.plan import load_plan
 from lcopa_bayes.calibration.calibrate import calibrate
 from lcopa_bayes.calibration.summary import results as calibration_results
 from lcopa_bayes.calibration.summary import tables
+from lcopa_bayes.calibration.truths import Stated
 from lcopa_bayes.checks import refuse_if
 from lcopa_bayes.cores import cores
 from lcopa_bayes.files import writable_folder
@@ -97,19 +98,24 @@ def simulate(options: argparse.Namespace, command: list[str]) -> Told:
     return Told({"verdict": verdict, "files": [str(path) for path in paths]}, (verdict,))
 
 
-def stated_values(words: Sequence[str]) -> dict[str, float]:
-    """Values by name from words such as ``delay=1.0``; InputError where a word is none or a name twice."""
-    out: dict[str, float] = {}
+def stated_values(words: Sequence[str]) -> dict[str, Stated]:
+    """Values by name from words such as ``delay=1.0``, or ranges such as ``delay=0.9:1.1``; InputError where
+    a word is neither or a name occurs twice."""
+    out: dict[str, Stated] = {}
     problems = []
     for word in words:
-        name, mark, value = word.partition("=")
+        name, _, value = word.partition("=")
         try:
-            number = float(value)
+            ends = [float(end) for end in value.split(":")]
         except ValueError:
-            number = np.nan
-        if not (name and mark and np.isfinite(number)) or name in out:
-            problems.append(f"--truth {word}: give NAME=VALUE, a number, each name once")
-        out[name] = number
+            ends = []
+        sound = len(ends) in (1, 2) and bool(np.isfinite(ends).all()) and ends == sorted(ends)
+        if not (name and sound) or name in out:
+            problems.append(f"--truth {word}: give NAME=VALUE or NAME=LOW:HIGH in numbers, each name once")
+        elif len(ends) == 1:
+            out[name] = ends[0]
+        else:
+            out[name] = (ends[0], ends[1])
     refuse_if(problems)
     return out
 

@@ -232,12 +232,17 @@ def _replicas(told: Mapping[str, Any]) -> Section:
 
 def _origin(source: Mapping[str, Any]) -> str:
     """Where truths come from, in words."""
-    stated = ", ".join(f"{name} = {value:g}" for name, value in (source["stated"] or {}).items())
+    stated = ", ".join(
+        f"{name} = {value:g}"
+        if isinstance(value, float | int)
+        else f"{name} from {value[0]:g} to {value[1]:g}"
+        for name, value in (source["stated"] or {}).items()
+    )
     return {
         "prior": "drawn from the prior of the study",
         "posterior": f"drawn from the posterior in {source['folder']} (grade {source['grade']})",
-        "stated": f"the same in every replica: {stated}",
-        "stated and prior": f"the same in every replica: {stated}; the others drawn from the prior",
+        "stated": f"stated: {stated}",
+        "stated and prior": f"stated: {stated}; the others drawn from the prior",
     }[source["from"]]
 
 
