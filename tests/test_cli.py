@@ -114,7 +114,7 @@ def test_too_few_samples(tmp_path, capsys):
     path.write_text("time_ms,drive_x_V,response_y_V\n0,0,0\n1,1,0.2\n2,1,0.4\n")
     code, _, told = run(capsys, "fit", path, "--out", tmp_path / "run")
     assert code == 2
-    assert "3 samples cannot determine 7 free parameters" in told
+    assert "3 samples cannot determine 8 free parameters" in told
 
 
 def test_an_output_folder_that_is_a_file(record, tmp_path, capsys):

@@ -20,6 +20,7 @@ from lcopa_bayes.comparison.likelihood import highest
 from lcopa_bayes.fit import fit
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.nesting import lifted
+from lcopa_bayes.problems import InputError
 from lcopa_bayes.settings import PriorSettings
 
 SHORT = record(camera=0.6)
@@ -74,7 +75,7 @@ def test_terms_that_are_added_hardly_change_the_likelihood(large):
     assert np.isfinite(target.log_density(target.coordinates(found))).mean() > 0.3
     assert apart.max() > -5.0  # one of the ways is all but exact
     assert np.median(apart) > -1000.0  # what a term of random time costs
-    assert target.table.supported(found).all()
+    assert target.table.supported(found).mean() > 0.3
 
 
 @pytest.mark.parametrize(
@@ -151,6 +152,10 @@ def binary():
 RIGHT = {"gain": 1.0, "time_1": 0.15, "order_1": 0.9, "delay": 2.37, "offset": 0.0, "sigma": 0.05}
 
 
+def refused(self, starts, peaks):
+    raise InputError("needle")
+
+
 def card(name: str, values, optimum: float, parameters: int) -> dict:
     return {
         "name": name,
@@ -195,6 +200,10 @@ def test_a_richer_model_starts_from_the_optimum_of_what_it_contains(monkeypatch,
         assert own.log_likelihood < top.log_likelihood - 20
         delay = large.posterior.table.names.index("delay")
         assert np.all(np.abs(seen[0][:, delay] - 2.37) < 0.3)
+        monkeypatch.setattr(Check, "_again", refused)
+        left = check()
+        assert (left["usable"], left["grade"], left["containment"]["met"]) == (False, "unusable", False)
+        assert left["grade_reason"] == "needle"
     resumed = replace(check, card=dict(check.card) | {"containment": told["containment"]})
     assert resumed()["containment"] == told["containment"]  # what was checked is not checked again
 

@@ -15,11 +15,13 @@ from lcopa_bayes.candidatesettings import CandidateSettings
 from lcopa_bayes.comparison import prediction, priorwidth
 from lcopa_bayes.comparison.candidates import candidates_of
 from lcopa_bayes.comparison.compare import compare
+from lcopa_bayes.comparison.linearfollowing import linear_densities
 from lcopa_bayes.comparison.parts import parts_of, without
 from lcopa_bayes.comparison.prediction import left_out_weights, predictions
 from lcopa_bayes.comparison.priorwidth import widths
 from lcopa_bayes.comparison.sequential import known_before, log_densities
 from lcopa_bayes.fit import fit
+from lcopa_bayes.inference.data import Observed, Samples
 from lcopa_bayes.inference.noise import AR1, Student, White
 from lcopa_bayes.inference.weights import effective, smoothed
 from lcopa_bayes.sensitivity import _weights as power_weights
@@ -99,6 +101,49 @@ def test_what_is_known_of_a_record_depends_on_the_record_alone():
     assert known_before(never, 0, part) == 1
 
 
+def first_known(posterior, part, count: int):
+    """The posterior that knows all but the samples of a record from the `count`-th on."""
+    samples = list(posterior.samples)
+    own = samples[part.record]
+    kept = tuple(Observed(axis.index[:count], axis.values[:count], axis.gaps[:count]) for axis in own.axes)
+    samples[part.record] = Samples(own.record, own.times, kept)
+    return replace(posterior, samples=tuple(samples))
+
+
+@pytest.mark.parametrize("noise", ["white", "ar1", "white+ar1"])
+@pytest.mark.parametrize("offset", ["record", "shared", "none"])
+def test_gains_and_levels_are_integrated_out_of_a_sequence(rng, noise, offset):
+    """The sum over samples is the ratio of two marginal likelihoods, which integrate them at once."""
+    posterior = problem(*two(), noise=noise, offset=offset).posterior
+    values = posterior.table.draw(5, rng)
+    values[:, posterior.table.of_kind("sigma")] = 0.02
+    for part in parts_of(posterior, []):
+        target, own = without(posterior, part), posterior.samples[part.record]
+        told = linear_densities(target, part, own, _model(posterior, part), values, 0, 3)
+        for upto in (4, own.times.size):
+            whole = first_known(posterior, part, upto).log_likelihood(values)
+            known = first_known(posterior, part, 3).log_likelihood(values)
+            assert_allclose(told[:, : upto - 3].sum(axis=1), whole - known, rtol=1e-7, atol=1e-6)
+
+
+def test_a_held_out_record_is_predicted_as_one_that_is_left_out(rng):
+    """The same record, fitted elsewhere or not at all, with the prior of its level that of the others."""
+    both, alone = problem(*two()), problem(two()[0])
+    part, held = parts_of(both.posterior, [])[1], parts_of(alone.posterior, ["b"])[0]
+    values = both.posterior.table.draw(4, rng)
+    values[:, both.posterior.table.of_kind("sigma")] = 0.02
+    known, samples = without(both.posterior, part), both.posterior.samples[1]
+    own = linear_densities(known, part, samples, _model(known, part), values, 0, 3)
+    # the same priors: those of the pair look at both amplitudes
+    names = {row.name: row for row in both.posterior.table.rows}
+    names["offset"] = names["offset_a"]
+    table = replace(alone.posterior.table, rows=tuple(names[row.name] for row in alone.posterior.table.rows))
+    same = replace(alone.posterior, table=table)
+    fewer = np.delete(values, both.posterior.table.names.index("offset_b"), axis=1)
+    told = linear_densities(same, held, samples, _model(known, part), fewer, 0, 3)
+    assert_allclose(told, own, rtol=1e-6)
+
+
 # -- signs of weights ------------------------------------------------------------------------------
 
 
@@ -140,17 +185,17 @@ def pair():
 
 
 def exact_elpd(fitted, part) -> float:
-    """By quadrature over the order, with gains drawn from their conditional in many copies."""
+    """By quadrature over the order."""
     posterior = fitted.problem.posterior
     target = without(posterior, part)
     grid = np.linspace(0.3, 1.5, 241)[:, None]
     density = target.log_density(grid)
     kept = density > density.max() - 25
-    z = np.repeat(grid[kept], 200, axis=0)
-    weights = np.repeat(density[kept], 200)
+    z, weights = grid[kept], density[kept]
     values = target.complete(z, np.random.default_rng(1))
     scored = prediction._Scored(fitted, part, posterior.samples[part.record], _model(posterior, part))
-    return float(scored(values, weights - logsumexp(weights), "exact").log_density.sum())
+    found = scored(values, weights - logsumexp(weights), "exact", known=target)
+    return float(found.log_density.sum())
 
 
 def _model(posterior, part):

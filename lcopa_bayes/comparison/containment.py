@@ -30,6 +30,7 @@ from lcopa_bayes.inference.grade import Limitation
 from lcopa_bayes.inference.knownmodes import around
 from lcopa_bayes.inference.nesting import lifted
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.problems import InputError
 
 TOLERANCE = 0.5
 """Log likelihood by which a climb from a contained optimum may exceed the model's own [nat]: no more than a
@@ -100,7 +101,14 @@ class Check:
         if not peaks:
             return dict(self.card) | {"containment": told}
         began = time.perf_counter()
-        made, limitations = self._again(np.concatenate(starts), peaks)
+        try:
+            made, limitations = self._again(np.concatenate(starts), peaks)
+        except (
+            InputError
+        ) as error:  # the mode cannot be sampled: what was sampled without it stands for nothing
+            told["met"] = False
+            refused = {"usable": False, "grade": "unusable", "grade_reason": str(error)}
+            return dict(self.card) | refused | {"containment": told}
         told["met"] = not limitations
         scored = self.contender.scored(made, also=peaks)
         seconds = float(self.card["seconds"]) + time.perf_counter() - began
@@ -143,7 +151,12 @@ def reached(problem: Problem, candidate: Candidate, card: Card) -> tuple[Peak, M
     inside = [values[_inside(target, values)] for values in found if values is not None]
     if not len(inside[0]):
         return None
-    return highest(Landscape(target), inside[0]), inside[1]
+    landscape = Landscape(target)
+    peak = highest(landscape, inside[0])
+    if not _inside(target, peak.values[None]).all():  # a climb knows the ends of priors, not all they exclude
+        heights = landscape.log_likelihood(inside[0])
+        peak = Peak(inside[0][int(heights.argmax())], float(heights.max()))
+    return peak, inside[1]
 
 
 def _inside(posterior: Posterior, values: Matrix) -> Flags:

@@ -10,6 +10,7 @@ from scipy.special import logsumexp
 
 from lcopa_bayes.arrays import Array, Matrix, Vector
 from lcopa_bayes.comparison.carry import carried
+from lcopa_bayes.comparison.linearfollowing import applies, linear_densities
 from lcopa_bayes.comparison.parts import Part, parts_of, predicted, without
 from lcopa_bayes.comparison.sequential import LevelFrom, known_before, level_of, log_densities
 from lcopa_bayes.estimate import plain
@@ -114,7 +115,7 @@ def predictions(fit: Fit, *, held_out_only: bool = False) -> tuple[Predicted, ..
         if part.kind == "held-out record":
             samples, model = fit.problem.simulated(study.held_out)
             scored = _Scored(fit, part, samples[part.record], _one(model, part.record))
-            out.append(scored(fit.draws.thinned(_DRAWS), None, "exact"))
+            out.append(scored(fit.draws.thinned(_DRAWS), None, "exact", known=posterior))
             continue
         if held_out_only:
             continue
@@ -127,7 +128,7 @@ def predictions(fit: Fit, *, held_out_only: bool = False) -> tuple[Predicted, ..
         if k <= usable_k(len(values)) and effective(weights) >= FEWEST_EFFECTIVE:
             # gains and levels are drawn anew: those of the draws have seen what is to be predicted
             values = target.complete(posterior.coordinates(values), rng)
-            found = scored(values, weights, "importance weights", k=k)
+            found = scored(values, weights, "importance weights", k=k, known=target)
         else:
             seed = fit.run.plan.seed + 7_000 + len(out)
             moved = carried(source, target, positions, seed, jump=False)
@@ -136,7 +137,7 @@ def predictions(fit: Fit, *, held_out_only: bool = False) -> tuple[Predicted, ..
             flat = moved.coordinates.reshape(-1, posterior.dimension)
             chosen = np.linspace(0, len(flat) - 1, min(_DRAWS, len(flat))).astype(int)
             values = target.complete(flat[chosen], rng)
-            found = scored(values, None, "refit", k=k, ess=moved.ess, rhat=moved.rhat)
+            found = scored(values, None, "refit", k=k, ess=moved.ess, rhat=moved.rhat, known=target)
         total = float(seen.log_density.sum())
         out.append(replace(found, in_sample=total, in_sample_error=seen.error))
     return tuple(out)
@@ -181,6 +182,7 @@ class _Scored:
         k: float = np.nan,
         ess: float | None = None,
         rhat: float = np.nan,
+        known: Posterior | None = None,
     ) -> Predicted:
         table, pieces = self.fit.draws.table, np.array_split(values, max(1, len(values) // 64))
         plant = np.concatenate([responses(table, self.model, piece)[0] for piece in pieces], axis=1)
@@ -191,7 +193,7 @@ class _Scored:
         for axis, observed in enumerate(self.samples.axes):
             if not predicted(observed, self.part).size:
                 continue
-            each, source, index = self._axis(axis, observed, values, plant[axis])
+            each, source, index = self._axis(axis, observed, values, plant[axis], known)
             densities.append(each)
             sources.append(source)
             axes += [self.samples.record.response_axes[axis].name] * index.size
@@ -212,7 +214,7 @@ class _Scored:
         )
 
     def _axis(
-        self, axis: int, observed: Observed, values: Matrix, plant: Matrix
+        self, axis: int, observed: Observed, values: Matrix, plant: Matrix, known: Posterior | None
     ) -> tuple[Matrix, LevelFrom, np.ndarray[tuple[int], np.dtype[np.intp]]]:
         """Densities (draws, predicted), where the level comes from, and the predicted samples' places."""
         table, noise = self.fit.draws.table, self.fit.problem.posterior.noise
@@ -222,6 +224,13 @@ class _Scored:
         residual = observed.values[:last] - plant[:, index]
         parameters = values[:, [table.at(name, axis) for name in noise.names]]
         level = level_of(table, values, axis, self.part, self.samples)
+        if known is not None and applies(known):
+            pieces = np.array_split(values, max(1, len(values) // 64))
+            parts = [
+                linear_densities(known, self.part, self.samples, self.model, piece, axis, first)
+                for piece in pieces
+            ]
+            return np.concatenate(parts), level.source, index[first:]
         each = log_densities(noise, residual, parameters, observed.gaps[:last], level.value, first)
         return each, level.source, index[first:]
 

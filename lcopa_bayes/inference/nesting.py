@@ -25,6 +25,8 @@ _HARDLY = 0.1
 """White part over the correlated one that hardly shows [-]."""
 _BECOMES = frozenset({("white", "ar1"), ("white", "student"), ("white", "white+ar1"), ("ar1", "white+ar1")})
 """Noise models, of which the second can become the first."""
+_FAST_ORDERS = (0.5, 1.0)
+"""Orders of such a term where they are free [-]: above 1 a fast term is not resolved."""
 Slots = tuple[tuple[int, ...], ...]
 _FAST = (1e-3, 2e-2)
 """Quantiles of the prior between which the time of a term lies that is too fast to be seen [-]."""
@@ -186,7 +188,7 @@ class _Lift:
             new = np.where(split, (strength * (1 - share)) ** (1 / order), fast)
             times, orders = times.copy(), orders.copy()
             times[rows, term], orders[rows, term] = own, np.where(split, apart[0], order)
-            another = np.where(split, apart[1], self.rng.uniform(0.5, 1.5, n))
+            another = np.where(split, apart[1], self.rng.uniform(*_FAST_ORDERS, n))
             times, orders = np.column_stack([times, new]), np.column_stack([orders, another])
         return times, orders
 
@@ -194,4 +196,7 @@ class _Lift:
         row = self.large.rows[self.large.at("time", element, term)]
         if row.prior is None:
             return np.full(n, row.value)
+        order = self.large.rows[self.large.at("order", element, term)]
+        if not order.free and order.value > 1.0 and self.large.resolution > 0:
+            return np.asarray(self.large.resolution * np.exp(0.5 * self.rng.random(n)))
         return np.asarray(row.prior.frozen.ppf(self.rng.uniform(*_FAST, n)), dtype=float)

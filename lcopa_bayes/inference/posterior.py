@@ -127,7 +127,7 @@ class Posterior:
         total = np.zeros(values.shape[0])
         for axis in range(len(self.table.layout.responses)):
             if isinstance(self.noise, GaussianNoise):
-                equations, log_scale, count = self._equations(axis, values, units)
+                equations, log_scale, count = self.equations(axis, values, units)
                 total += equations.log_marginal() - log_scale - 0.5 * count * _LOG_2PI
             else:
                 for r, samples in enumerate(self.samples):
@@ -150,8 +150,8 @@ class Posterior:
             return values
         units = self.model.unit_responses(self.table.dynamics(values))
         for axis in range(len(self.table.layout.responses)):
-            equations, _, _ = self._equations(axis, values, units)
-            block = self._blocks[axis]
+            equations, _, _ = self.equations(axis, values, units)
+            block = self.blocks[axis]
             standard = equations.mean() if rng is None else equations.draw(rng)
             mean, sd = self._moments(block)
             values[:, block] = mean + sd * standard
@@ -173,7 +173,7 @@ class Posterior:
         ]
 
     @cached_property
-    def _blocks(self) -> list[list[int]]:
+    def blocks(self) -> list[list[int]]:
         """Linear parameters of each response axis."""
         axes = range(len(self.table.layout.responses))
         return [[k for k in self.linear if self.table.rows[k].place.first == axis] for axis in axes]
@@ -185,16 +185,15 @@ class Posterior:
         return np.array([p.mean() for p in frozen]), np.array([p.std() for p in frozen])
 
     @cached_property
-    def _scaled(self) -> list[tuple[Vector, Vector]]:
-        return [self._moments(block) for block in self._blocks]
+    def scaled(self) -> list[tuple[Vector, Vector]]:
+        """Prior means and standard deviations of the linear parameters of each response axis."""
+        return [self._moments(block) for block in self.blocks]
 
-    def _equations(
-        self, axis: int, values: Matrix, units: list[Array]
-    ) -> tuple[NormalEquations, Vector, int]:
+    def equations(self, axis: int, values: Matrix, units: list[Array]) -> tuple[NormalEquations, Vector, int]:
         """Normal equations of a response axis, sum of log innovation sd, and number of samples."""
         assert isinstance(self.noise, GaussianNoise)
-        batch, block = values.shape[0], self._blocks[axis]
-        mean, sd = self._scaled[axis]
+        batch, block = values.shape[0], self.blocks[axis]
+        mean, sd = self.scaled[axis]
         equations = NormalEquations.of_columns(batch, len(block))
         parameters = self.noise_parameters(values, axis)
         log_scale, count = np.zeros(batch), 0
