@@ -22,10 +22,10 @@ from lcopa_bayes.inference.nested import NestedPlan, nested
 from lcopa_bayes.inference.sampler import Run, SamplePlan, sample
 from lcopa_bayes.predict import Band, bands
 from lcopa_bayes.provenance import digest_of, fingerprint
+from lcopa_bayes.requirements import unmet
 from lcopa_bayes.residuals import Residual, residuals
-from lcopa_bayes.rest import not_at_rest
 from lcopa_bayes.sensitivity import Sensitivity, sensitivity
-from lcopa_bayes.stepmetrics import StepCurves, step_curves, step_metrics
+from lcopa_bayes.stepmetrics import StepCurves, step_curves, step_metrics, too_fast
 from lcopa_bayes.study import Study
 
 _QUICK = 4
@@ -77,10 +77,10 @@ def fit(
     always from the start, and where the two disagree every grade is lowered. Blocks are narrowed until their
     width does not move the optimum; how far it moves the posterior is measured and, where too far, lowers the
     grade. So does what speaks against the model itself (`adequacy`). InputError when the study does not fit
-    its records, a record moves before its drive does or the folder cannot be written to; then nothing is
-    written.
+    its records, these do not meet the requirements of a fit (`requirements`), or the folder cannot be written
+    to; then nothing is written.
     """
-    refuse_if(not_at_rest(study.fit, study.held_out))
+    refuse_if(unmet(study))
     problem = problem_of(study)
     if folder:
         writable_folder(folder)
@@ -108,7 +108,8 @@ def fit(
         )
         draws = draws.limited(check.limitations(draws.grade))
     width = discretisation(problem, draws)
-    draws = draws.limited(width.limitations)
+    curves = step_curves(draws, problem.scales.span)
+    draws = draws.limited([*width.limitations, *too_fast(draws, curves, problem.scales.period)])
     noise, rng = problem.posterior.noise, np.random.default_rng([plan.seed, 2])
     shown = bands(draws, problem.posterior.model, problem.posterior.samples, noise, held_out=False, rng=rng)
     if study.held_out:
@@ -116,7 +117,6 @@ def fit(
         shown += bands(draws, model, samples, noise, held_out=True, rng=rng)
     left = residuals(draws, shown, noise, problem.scales.period)
     draws = draws.limited(limitations(problem, draws, shown, left, np.random.default_rng([plan.seed, 4])))
-    curves = step_curves(draws, problem.scales.span)
     metrics = step_metrics(draws, curves, time_unit=study.time_unit)
     moved = sensitivity(draws, problem.posterior)
     return Fit(

@@ -24,7 +24,9 @@ def verdict(fit: Fit) -> str:
         parts.append(f"{said[0].upper()}{said[1:]}.")
     parts.append(f"{fit.discretisation.sentence}.")
     worst = min((r for r in fit.residuals if not r.held_out), key=lambda r: r.p_white, default=None)
-    if worst is not None and worst.p_white >= WHITE_P:  # what is not white is part of the grade
+    flags = [one.held_out for one in fit.residuals] + [one.held_out for one in fit.bands]
+    tried = flags.count(False)  # as many tests as `adequacy` corrects for
+    if worst is not None and tried * worst.p_white >= WHITE_P:  # what is not white is part of the grade
         parts.append(f"What is left looks like the noise model (smallest p = {worst.p_white:.2g}).")
     parts.extend(_held_out_sentence(fit))
     slow = max(share_unsettled(curve) for curve in fit.curves.normalised)
@@ -54,7 +56,9 @@ def results(fit: Fit) -> dict[str, Any]:
     grade = fit.draws.grade
     quality = {q.name: q for q in fit.draws.qualities}
     parameters = [
-        estimate.as_json() | {"rhat": quality[estimate.name].rhat} for estimate in fit.draws.estimates()
+        estimate.as_json()
+        | {"rhat": quality[estimate.name].rhat, "ess_between": quality[estimate.name].ess_between}
+        for estimate in fit.draws.estimates()
     ]
     told: dict[str, Any] = plain(
         {

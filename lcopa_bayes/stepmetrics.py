@@ -10,6 +10,7 @@ import numpy as np
 from lcopa_bayes.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.estimate import Estimate
 from lcopa_bayes.inference.draws import Draws
+from lcopa_bayes.inference.grade import Limitation
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.plant.drive import Drive
 from lcopa_bayes.plant.forward import Experiment, ForwardModel
@@ -27,6 +28,8 @@ _LATER_POINTS = 800
 """Samples of the response after the record."""
 _SETTLED = 0.02
 """A response within this share of its steady value counts as settled [-]."""
+_HALF = 0.5
+"""Share of the draws from which an element counts as too fast for the sampling [-]."""
 
 
 @final
@@ -60,6 +63,35 @@ def _unit_steps(table: ParameterTable, values: Matrix, time: Vector) -> Array:
     model = ForwardModel(table.layout, (Experiment("step", Mesh.of_samples(time, 0.0), drives, rest),))
     parts = np.array_split(values, max(1, values.shape[0] // 64))
     return np.concatenate([model.unit_responses(table.dynamics(part))[0] for part in parts], axis=1)
+
+
+def too_fast(draws: Draws, curves: StepCurves, period: float) -> list[Limitation]:
+    """A limitation for every element whose step response rises within a sampling `period` [time unit].
+
+    Rise is from 10 to 90 % of what the response reaches by the end of the record, in half of the draws or
+    more: of such a response no sample shows the course, and its times and orders are what the priors allow.
+    """
+    table = draws.table
+    out: list[Limitation] = []
+    for k, unit in enumerate(table.layout.units):
+        reached = curves.normalised[k] / curves.normalised[k][:, -1:]
+        rise = _difference(crossing(curves.time, reached, 0.9), crossing(curves.time, reached, 0.1))
+        names = tuple(
+            row.name
+            for row in table.rows
+            if row.free and row.kind in ("time", "order") and row.place.first == unit.element
+        )
+        if names and float(np.mean(rise < period)) >= _HALF and all(names != one.parameters for one in out):
+            out.append(
+                Limitation(
+                    "tentative",
+                    f"the step response rises within one sampling period: {', '.join(names)} say no more "
+                    "than that it is too fast for the sampling, within their priors",
+                    "sample faster, or fix them under [priors]",
+                    names,
+                )
+            )
+    return out
 
 
 def crossing(time: Vector, curves: Matrix, level: float) -> Vector:

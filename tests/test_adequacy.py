@@ -6,10 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small import TRUTH, U, Y, draws_of, problem, record
+from small import TRUTH, U, Y, draws_of, problem, record, study
 
 from lcopa_bayes.adequacy import _coverage, limitations
+from lcopa_bayes.audit.audit import audit
 from lcopa_bayes.bench.command import step
+from lcopa_bayes.fit import fit
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.draws import Draws
 from lcopa_bayes.inference.grade import Limitation
@@ -18,6 +20,7 @@ from lcopa_bayes.predict import bands
 from lcopa_bayes.record import Record
 from lcopa_bayes.residuals import residuals
 from lcopa_bayes.resonance import PEAK, peaks, unresolved
+from lcopa_bayes.results import results
 
 NOISE = TRUTH | {"sigma_ar": 0.003, "rho": 0.5, "nu": 200.0}
 
@@ -162,6 +165,21 @@ def test_three_lags_fitted_by_one_term_are_never_reliable(noise):
     assert "reliable" not in {one.grade for one in limited.estimates()}
     assert "intervals hold only if" in limited.grade.reason
     assert "add terms" in limited.grade.reason
+
+
+@pytest.mark.slow
+def test_three_lags_fitted_by_one_term_from_record_to_audit():
+    """The grade of the whole fit, of each of its numbers, and the headline of its audit."""
+    few = {"ensembles": 2, "walkers": 32, "steps": 600, "thin": 2}
+    made = fit(study(thermal(), noise="ar1", sampler=few))
+    assert made.draws.grade.level != "reliable"
+    told = results(made)
+    assert "intervals hold only if" in told["verdict"]
+    assert "reliable" not in {row["grade"] for row in told["parameters"] + told["step_metrics"]}
+    assert told["limitations"]
+    said = audit(made).sentence
+    assert said.startswith("Given this model, ")
+    assert "But intervals hold only if" in said
 
 
 # -- resonances ------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ ORDER = (
     ("settings",),
     ("candidatesettings",),
     ("study", "rest"),
+    ("requirements",),
     ("studyfile",),
     ("operational",),
     ("plant",),

@@ -8,8 +8,10 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from importlib.util import module_from_spec, spec_from_file_location
 from itertools import product
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -34,9 +36,24 @@ from lcopa_bayes.cli import main
 from lcopa_bayes.fit import fit, plan_of
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.data import Samples
+from lcopa_bayes.inference.discretisation import resolved
 from lcopa_bayes.problems import InputError
 from lcopa_bayes.record import Record, save_record
 from lcopa_bayes.runfolder import save_fit
+
+
+@pytest.fixture(scope="module")
+def defaults() -> ModuleType:
+    """The study of the default settings."""
+    path = Path(__file__).parents[1] / "studies" / "calibration" / "defaults.py"
+    spec = spec_from_file_location("calibration_defaults", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
 
 PRIORS = {
     "gain": ("norm", {"loc": 2.0, "scale": 0.5}),
@@ -385,6 +402,48 @@ def test_a_stated_truth_is_the_same_in_every_replica():
     json.dumps(told, allow_nan=False)
 
 
+def test_default_priors_of_a_stated_truth_are_those_of_its_own_records():
+    """As a fit derives them; where truths are drawn from the prior, the prior stays."""
+    told = study(record(camera=0.6), noise="white")
+    made = replication(told)
+    records = (record(7, camera=0.6, noise_sd=0.2),)
+    assert made._measured_again(records).posterior.table is made.problem.posterior.table
+    stated = replace(made, truths=truths_stated(TRUTH, made.problem.posterior.table))
+    again = stated._measured_again(records).posterior.table
+    assert str(again.rows[0].prior) != str(made.problem.posterior.table.rows[0].prior)
+    assert again.rows == problem_of(study(*records, noise="white")).posterior.table.rows
+
+
+def test_what_the_width_of_the_blocks_does_is_counted(monkeypatch):
+    """Wide blocks that may not be narrowed: the shift is measured, lowers the grade, and both are counted."""
+    monkeypatch.setattr("lcopa_bayes.inference.discretisation._FINEST", 1)
+    priors = PRIORS | {"order_1": ("uniform", {"loc": 0.2, "scale": 1.0})}
+    clean = record(camera=0.6, noise_sd=1e-4)
+    coarse = study(clean, noise="white", priors=priors | {"sigma": 1e-4}, blocks=4)
+    truth = {name: TRUTH[name] for name in ("gain", "time_1", "order_1", "offset")}
+    made = calibrate(coarse, replicas=1, truth=truth)
+    (outcome,) = made.outcomes
+    told = results(made)
+    assert outcome.shift > 0.2
+    assert not outcome.resolved
+    assert outcome.grade != "reliable"
+    assert told["discretisation"]["negligible"] == 0
+    assert told["discretisation"]["largest"] == outcome.shift
+
+
+@pytest.mark.parametrize("delay", [1.0, 1.07])
+@pytest.mark.parametrize("order", [0.6, 0.9, 1.8])
+def test_the_model_is_as_exact_as_the_noise_allows(defaults, order, delay):
+    """On blocks as a fit chooses them, at a noise of 0.2 % of the step, also with an onset on a sample.
+
+    A parabola through the three blocks around the onset was 9.7 noise standard deviations off at order 0.9.
+    """
+    cell = defaults.Cell(0.002, delay, (3.4,), (order,), "white")
+    made = resolved(problem_of(cell.study(1)))
+    truth = truths_stated(cell.truth, made.posterior.table).draw(np.random.default_rng(0))
+    assert model_gap(made, truth, exact_responses(made, truth)) < 0.5
+
+
 def test_what_is_not_stated_is_drawn_from_the_prior():
     made = calibrate(STUDY, replicas=2, truth={"time_1": 1.4})
     at = [quantity.name for quantity in made.replication.quantities].index("time_1")
@@ -614,6 +673,75 @@ def test_few_or_unreliable_replicas_are_graded_so(rng):
     assert told["reliable"] is None
     assert told["replicas"] == 3
     json.dumps(told, allow_nan=False)
+
+
+# -- the study of the default settings -------------------------------------------------------------
+
+
+def test_the_study_of_the_defaults_counts_and_resumes(defaults, tmp_path, capsys):
+    words = ("--cells", "white_0.5pc*", "--jobs", "1", "--out", str(tmp_path / "out"))
+    words += ("--store", str(tmp_path / "store"), "--replicas")
+    assert defaults.main([*words, "1"]) == 0
+    first = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert defaults.main([*words, "2"]) == 0
+    told = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert (first["replicas"], told["replicas"]) == (1, 2)
+    (cell,) = told["cells"]
+    assert cell["cell"] == "white_0.5pc_order0.9_delay1"
+    assert all(
+        first["cells"][0]["hits"][name]["0.9"] <= hits["0.9"] <= 2 for name, hits in cell["hits"].items()
+    )
+    assert cell["discretisation"]["negligible"] == 2
+    assert "| white_0.5pc_order0.9_delay1 | 2 |" in (tmp_path / "out" / "table.md").read_text()
+    assert (tmp_path / "out" / "coverage.svg").read_text().rstrip().endswith("</svg>")
+
+
+def counted(defaults: ModuleType, rng, *, narrow: str = "") -> dict:
+    """A summary over cells whose intervals cover as stated, but for one parameter of every cell."""
+    rows = []
+    for cell in defaults.cells()[:8]:
+        names = cell.truth
+        hits = {
+            name: {
+                str(level): int(rng.binomial(200, level - (0.06 if name == narrow else 0.0)))
+                for level in (0.5, 0.9)
+            }
+            for name in names
+        }
+        shown = {
+            "noise": cell.noise,
+            "level": cell.level,
+            "orders": cell.orders,
+            "hits": hits,
+            "replicas": 200,
+        }
+        rows.append(
+            {"cell": cell.name, "on_a_sample": cell.delay == 1.0, "engine": {"sampling": 0}, **shown}
+            | {"grades": {"reliable": 200, "failed": 0}, "discretisation": {"largest": 0.0}}
+            | {"seconds": {"median": 1.0}}
+        )
+    return defaults.summary(rows, 1)
+
+
+def test_a_small_bias_in_every_cell_shows_when_cells_are_pooled(defaults, rng):
+    """Six points of coverage, too few for one cell of 200 replicas."""
+    told = counted(defaults, rng)
+    assert all(row["within"] for row in told["coverage"] + told["pooled"])
+    told = counted(defaults, rng, narrow="delay")
+    outside = {row["parameter"] for row in told["pooled"] if not row["within"]}
+    assert outside == {"delay"}
+    assert "outside: " in told["verdict"][2]
+    assert "delay at 90%" in told["verdict"][2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("delay", [1.0, 1.07])
+def test_default_settings_cover_at_a_stated_truth(defaults, delay):
+    """On wide blocks read through a parabola 90 % intervals covered 0.3 to 0.7 (100 replicas)."""
+    cell = defaults.Cell(0.002, delay, (3.4,), (0.9,), "white")
+    made = calibrate(cell.study(1), replicas=60, truth=cell.truth, jobs=2)
+    told = results(made)
+    assert all(row["within"] for row in told["coverage"] if row["kind"] == "parameter")
 
 
 # -- the command line ------------------------------------------------------------------------------

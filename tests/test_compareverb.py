@@ -14,10 +14,14 @@ from small import record, study
 from lcopa_bayes.cli import main
 from lcopa_bayes.comparison.candidates import candidates_of
 from lcopa_bayes.comparison.compare import compare
+from lcopa_bayes.comparison.contender import contender
+from lcopa_bayes.fit import plan_of
+from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.paper.claims import judge
 from lcopa_bayes.paper.verdict import Evidence
 from lcopa_bayes.problems import InputError
 from lcopa_bayes.record import save_record
+from lcopa_bayes.report.comparisonpage import write_comparison
 
 FEW = {"ensembles": 2, "walkers": 16, "steps": 600, "thin": 2, "target_ess": 100}
 PICK = ("fractional-1", "first-order")
@@ -67,6 +71,8 @@ def test_every_score_has_its_error_and_grade(told):
         kinds = [one["kind"] for one in row["predictions"]]
         assert kinds == ["held-out record", *["future of the record"] * 4]
         for one in row["predictions"]:
+            assert one["plausible"]
+            assert (one["in_sample"] is None) == (one["kind"] == "held-out record")
             assert one["road"] in ("exact", "importance weights", "refit")
             assert one["monte_carlo_sd"] >= 0
 
@@ -121,6 +127,7 @@ def model(name: str, evidence: float, rmse: float, steady: float, **more: object
     metric = {"name": "steady_state[x]", "value": steady, "unit": "rad/rad", "level": 0.9}
     metric |= {"lower": 0.99999 * steady, "upper": 1.00001 * steady}
     base = {"name": name, "about": name, "usable": True, "integer": False, "terms": 3, "elpd": None}
+    base |= {"elpd_difference": None, "elpd_difference_sd": None}
     base |= {"log_evidence": evidence, "log_evidence_sd": 0.1, "fit_scores": [score], "held_out": []}
     return base | {"step_metrics": [metric]} | more
 
@@ -178,6 +185,31 @@ def test_m2_reads_the_distance_of_the_steady_states():
 def test_a_gain_within_its_error_leaves_m4_open():
     near = compared(two={"log_evidence": 20 - 3.0, "log_evidence_sd": 0.3})
     assert verdict_of("M4", near) == "undecided"
+
+
+def test_m4_tells_what_prediction_gains_with_its_error():
+    three = {"elpd": 110.0, "elpd_difference": 0.0, "elpd_difference_sd": 0.0}
+    two = {"elpd": 100.0, "elpd_difference": -10.0, "elpd_difference_sd": 4.0}
+    evidence = Evidence(compare=compared(three=three, two=two))
+    how = next(each.verdict.how for each in judge(evidence=evidence) if each.claim.id == "M4")
+    assert "by +10.00 ± 4.00 nats" in how
+
+
+def test_a_comparison_of_an_earlier_version_is_refused_by_the_page(folder, told, tmp_path):
+    old = told | {"models": [{k: v for k, v in row.items() if k != "containment"} for row in told["models"]]}
+    (tmp_path / "compare.json").write_text(json.dumps(old))
+    with pytest.raises(InputError, match="run `compare` again"):
+        write_comparison(tmp_path)
+
+
+def test_a_comparison_samples_as_a_fit_does():
+    """Its grades are those of a fit only with the ensembles and effective draws of one."""
+    for sampler in ({}, {"ensembles": 3, "target_ess": 250}):
+        (one, *_) = candidates_of(study(record(), sampler=sampler), pick=PICK)
+        made = contender(one, None, quick=False, resume=False).candidate
+        own, compared = (plan_of(problem_of(each.study), quick=False) for each in (one, made))
+        assert (compared.ensembles, compared.target_ess) == (own.ensembles, own.target_ess)
+        assert compared.steps == own.steps
 
 
 # -- measured records ------------------------------------------------------------------------------

@@ -17,9 +17,9 @@ from lcopa_bayes.comparison.compare import compare
 from lcopa_bayes.comparison.containment import Check, reached
 from lcopa_bayes.comparison.contender import Contender
 from lcopa_bayes.comparison.likelihood import highest
-from lcopa_bayes.comparison.nesting import lifted
 from lcopa_bayes.fit import fit
 from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.inference.nesting import lifted
 from lcopa_bayes.settings import PriorSettings
 
 SHORT = record(camera=0.6)

@@ -12,6 +12,8 @@ from scipy.special import logsumexp
 from small import TRUTH, Toy, problem, record
 
 from lcopa_bayes.arrays import Array, Matrix
+from lcopa_bayes.comparison.parts import Part
+from lcopa_bayes.comparison.prediction import Predicted
 from lcopa_bayes.inference.draws import gather
 from lcopa_bayes.inference.evidence import Evidence, bridge, evidence
 from lcopa_bayes.inference.posterior import Posterior
@@ -192,3 +194,16 @@ def test_the_grade_of_an_evidence_is_that_of_its_error(sd, level):
     told = replace(Evidence(-3.0, 0.1, (-3.0,)), sd=sd)
     assert told.grade.level == level
     assert f"{sd:.2f} nat" in told.grade.reason
+
+
+@pytest.mark.parametrize(
+    ("error", "level"), [(0.4, "reliable"), (1.0, "tentative"), (1444.0, "unusable"), (np.nan, "unusable")]
+)
+def test_a_log_density_is_no_better_than_its_error(error, level):
+    """1016 nat with an error of 1444 says nothing, however good the draws."""
+    part = Part("future", "future of the record", 0, 1, 2)
+    found = Predicted(
+        part, ("y",), np.zeros(1), np.array([1016.0]), error, "exact", np.nan, 400.0, np.nan, ()
+    )
+    assert found.grade("reliable") == level
+    assert found.grade("unusable") == "unusable"

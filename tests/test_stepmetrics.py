@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 from small import TRUTH, TWO, draws_of, problem, record, row_values
 
 from lcopa_bayes.estimate import Estimate
-from lcopa_bayes.stepmetrics import crossing, settling, share_unsettled, step_curves, step_metrics
+from lcopa_bayes.stepmetrics import crossing, settling, share_unsettled, step_curves, step_metrics, too_fast
 
 TIME = 20.0 * np.arange(1, 1001) / 1000
 STEP = TIME[1] - TIME[0]
@@ -188,3 +188,15 @@ def test_crosstalk_is_the_ratio_of_gains():
     assert told["crosstalk[y/x by x]"].value == pytest.approx(np.median(gains[:, 1, 0] / gains[:, 0, 0]))
     assert told["crosstalk[x/y by y]"].value == pytest.approx(np.median(gains[:, 0, 1] / gains[:, 1, 1]))
     assert {"rise_10_90[x_y]", "steady_state[y_x]"} < told.keys()
+
+
+@pytest.mark.parametrize(("time", "order", "fast"), [(0.01, 1.0, True), (0.01, 0.7, True), (1.5, 0.8, False)])
+def test_what_rises_between_two_samples_is_named_with_its_parameters(time, order, fast):
+    made, curves = curves_of(TRUTH | {"time_1": time, "order_1": order}, 20.0)
+    found = too_fast(made, curves, 0.6)
+    assert [one.parameters for one in found] == ([("time_1", "order_1")] if fast else [])
+    limited = made.limited(found)
+    assert [e.grade for e in limited.estimates() if e.name == "time_1"] == [
+        "tentative" if fast else "reliable"
+    ]
+    assert [e.grade for e in limited.estimates() if e.name == "gain"] == ["reliable"]

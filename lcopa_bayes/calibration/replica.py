@@ -37,7 +37,7 @@ Engine = Literal["importance", "sampling"]
 """Importance sampling around the optima, with the ensembles where its weights are not good; or always the
 ensembles."""
 ENGINES: tuple[Engine, ...] = get_args(Engine)
-_LOOK = ImportancePlan((Effort(3_000, 1_000, 6), Effort(8_000, 3_000, 6)), starts=3)
+_LOOK = ImportancePlan((Effort(3_000, 1_000, 6), Effort(8_000, 3_000, 6), Effort(8_000, 4_000, 6)), starts=3)
 """Work for importance sampling of a replica."""
 _STREAM = 4
 """Marks the randomness of truth, noise and ranks apart from that of sampling."""

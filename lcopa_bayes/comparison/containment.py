@@ -22,13 +22,13 @@ from lcopa_bayes.audit.landscape import Landscape, Peak
 from lcopa_bayes.comparison.candidates import Candidate
 from lcopa_bayes.comparison.contender import Contender
 from lcopa_bayes.comparison.likelihood import criteria, highest
-from lcopa_bayes.comparison.nesting import lifted
 from lcopa_bayes.fit import Fit
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.chart import Chart
 from lcopa_bayes.inference.evidence import charted_density
 from lcopa_bayes.inference.grade import Limitation
 from lcopa_bayes.inference.knownmodes import around
+from lcopa_bayes.inference.nesting import lifted
 from lcopa_bayes.inference.posterior import Posterior
 
 TOLERANCE = 0.5

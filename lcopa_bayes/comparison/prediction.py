@@ -15,7 +15,8 @@ from lcopa_bayes.comparison.sequential import LevelFrom, known_before, level_of,
 from lcopa_bayes.estimate import plain
 from lcopa_bayes.fit import Fit
 from lcopa_bayes.inference.data import Observed, Samples
-from lcopa_bayes.inference.grade import TENTATIVE_RHAT, Level
+from lcopa_bayes.inference.evidence import known_to
+from lcopa_bayes.inference.grade import TENTATIVE_RHAT, Grade, Level
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.weights import FEWEST_EFFECTIVE, effective, smoothed, usable_k
 from lcopa_bayes.plant.forward import ForwardModel
@@ -68,10 +69,13 @@ class Predicted:
         return bool(excess <= _BEYOND * np.hypot(self.error, self.in_sample_error))
 
     def grade(self, fitted: Level) -> Level:
-        """That of the draws, lowered where a refit's populations disagree or are small, and where what was
-        left out is predicted better than it was fitted."""
+        """That of the draws, lowered where a refit's populations disagree or are small, where what was left
+        out is predicted better than it was fitted, and where the Monte Carlo error is larger than an evidence
+        may have."""
+        known = known_to(self.error)
         agree = self.road != "refit" or (self.rhat <= TENTATIVE_RHAT and self.ess >= FEWEST_EFFECTIVE)
-        return fitted if (agree and self.plausible) or fitted == "unusable" else "tentative"
+        own: Level = "reliable" if agree and self.plausible else "tentative"
+        return Grade.worst([Grade(level, "") for level in (fitted, own, known)]).level
 
     def as_json(self) -> dict[str, Any]:
         """Plain values, without the samples."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import ceil
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -14,14 +14,24 @@ from lcopa_bayes.arrays import Array, Matrix, Vector
 from lcopa_bayes.bench.command import Command
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.noise import GaussianNoise, Student
-from lcopa_bayes.operational.series import Circle, Spectrum
-from lcopa_bayes.operational.transfer import TransferSlopes, transfer_slopes
+from lcopa_bayes.operational.series import Circle
+from lcopa_bayes.operational.stepresponse import StepResponse, step_response
 from lcopa_bayes.plant.drive import Drive
 from lcopa_bayes.plant.grid import Mesh
+from lcopa_bayes.plant.superposition import Superposition, blocks_of, phases
 
 _NOTHING = 1e-11
 """Share of a slope that is not constant below which a resting response makes up for all of it [-]."""
 _PLANT = ("gain", "time", "order", "delay")
+
+
+class Prepared(NamedTuple):
+    """An element at one set of values."""
+
+    response: StepResponse
+    """With its derivatives."""
+    superposition: Superposition
+    """Its readings, shared by all drives."""
 
 
 @final
@@ -31,8 +41,8 @@ class Bench:
 
     Slopes are in the logarithm of time constants and in the plain value of every other parameter, made
     white by the study's noise; the record's resting response is unknown where the study's is, and is
-    projected out. Costs, per set of values, a transfer function and its slopes, and per drive one transform
-    for every one of them: all in O(samples log samples). Accuracy: as `operational.transfer`.
+    projected out. Costs, per set of values, a step response and its slopes, and per drive their
+    superposition: all in O(samples log samples). Accuracy: as `operational.stepresponse`.
     """
 
     problem: Problem
@@ -55,7 +65,7 @@ class Bench:
     @cached_property
     def step(self) -> float:
         """Width of a block [time unit]: that of the fit."""
-        return min(one.mesh.grid.step for one in self.problem.posterior.model.experiments)
+        return min(one.mesh.lattice.step for one in self.problem.posterior.model.experiments)
 
     @cached_property
     def blocks(self) -> int:
@@ -76,33 +86,30 @@ class Bench:
     @cached_property
     def circle(self) -> Circle:
         """Where series are evaluated."""
-        return Circle(self.mesh.grid.n)
+        return Circle(blocks_of(self.mesh.lattice, 0.0))
 
     def sizes(self, values: Vector) -> Vector:
         """What a slope is multiplied by to be relative to the parameter's size, (parameters,)."""
         rows = self.problem.posterior.table.rows
         return np.array([1.0 if rows[k].kind == "time" else abs(values[k]) for k in self.columns])
 
-    def elements(self, values: Vector) -> list[tuple[Spectrum, TransferSlopes]]:
-        """Transfer functions of the elements at table values, with their slopes; shared by all drives."""
+    def elements(self, values: Vector) -> list[Prepared]:
+        """Step responses of the elements at table values, with their slopes; shared by all drives."""
         dynamics = self.problem.posterior.table.dynamics(values[None])
+        step = self.mesh.lattice.step
         return [
-            transfer_slopes(times, orders, self.circle, self.mesh.grid.step)
+            Prepared(step_response(times, orders, self.circle, step, slopes=True), Superposition(self.circle))
             for times, orders in zip(dynamics.times, dynamics.orders, strict=True)
         ]
 
-    def gram(
-        self, values: Vector, elements: Sequence[tuple[Spectrum, TransferSlopes]], command: Command
-    ) -> Matrix:
+    def gram(self, values: Vector, elements: Sequence[Prepared], command: Command) -> Matrix:
         """Fisher information of one record under `command`, (parameters, parameters)."""
         out = np.zeros((len(self.columns), len(self.columns)))
         for slopes in self.slopes(values, elements, command):
             out += slopes @ slopes.T
         return out
 
-    def slopes(
-        self, values: Vector, elements: Sequence[tuple[Spectrum, TransferSlopes]], command: Command
-    ) -> list[Matrix]:
+    def slopes(self, values: Vector, elements: Sequence[Prepared], command: Command) -> list[Matrix]:
         """White derivatives of every response axis, each (parameters, samples)."""
         table = self.problem.posterior.table
         units = [
@@ -124,19 +131,19 @@ class Bench:
             out.append(self._whitened(rows[list(self.columns)], values, axis))
         return out
 
-    def _unit(
-        self, values: Vector, element: tuple[Spectrum, TransferSlopes], slot: int, drive: Drive
-    ) -> Matrix:
+    def _unit(self, values: Vector, element: Prepared, slot: int, drive: Drive) -> Matrix:
         """A unit response and its slopes in log times, orders and delay, (2 terms + 2, samples)."""
-        value, parts = element
+        response, superposition = element
+        out = np.zeros((response.coarse.shape[0] + 1, self.sample_times.size))
         if not drive.moves:
-            return np.zeros((2 + 2 * len(parts.orders), self.sample_times.size))
-        delay = values[self.problem.posterior.table.at("delay", slot)]
-        means, by_delay = drive.block_means(self.mesh.grid.edges, np.array([delay]))
-        moving, late = self.circle.spectrum(np.concatenate([means, by_delay]))
-        shaped = [part[0] * moving for part in (value, *parts.log_times, *parts.orders)]
-        found = self.circle.coefficients(np.stack([*shaped, value[0] * late]))
-        return np.asarray(self.mesh.reading(found))
+            return out
+        lattice, later = self.mesh.lattice, slice(self.mesh.reading.first, None)
+        delays = values[None, self.problem.posterior.table.at("delay", slot)]
+        changes = phases(drive, lattice.step)
+        out[:-1, later] = superposition(response, changes, lattice, delays, (0, slot))[:, 0]
+        by_block = superposition(response, changes, lattice, delays, (0, slot), "slope")
+        out[-1, later] = -by_block[0, 0] / lattice.step
+        return out
 
     def _whitened(self, rows: Matrix, values: Vector, axis: int) -> Matrix:
         """Rows in noise standard deviations, without what a resting response can make up for."""

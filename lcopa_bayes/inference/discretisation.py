@@ -61,8 +61,9 @@ class Discretisation:
 
     @property
     def negligible(self) -> bool:
-        """Whether no parameter moves by more than `LARGEST`, the error of the measurement aside."""
-        return abs(self.shift) - 2 * self.error <= LARGEST
+        """Whether no parameter moves by more than `LARGEST`, a small error of measurement aside: a large one,
+        as of draws of which few have weight on narrow blocks, excuses nothing."""
+        return abs(self.shift) - min(2 * self.error, LARGEST) <= LARGEST
 
     @property
     def sentence(self) -> str:

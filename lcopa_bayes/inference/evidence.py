@@ -21,7 +21,8 @@ from lcopa_bayes.inference.mixture import Mixture, spread_evenly
 from lcopa_bayes.inference.posterior import Posterior
 
 _RELIABLE = 0.5
-"""Largest standard error of a reliable log evidence: a model comparison turns on a few nats [nat]."""
+"""Largest standard error of a reliable log evidence or log predictive density: a model comparison turns on a
+few nats [nat]."""
 _TENTATIVE = 2.0
 """Above it the ensembles tell different stories [nat]."""
 _BRIDGED = 3_000
@@ -45,10 +46,12 @@ class Evidence:
     @property
     def grade(self) -> Grade:
         """Reliable when known to half a nat, unusable when not to two."""
-        level: Level = (
-            "reliable" if self.sd <= _RELIABLE else "tentative" if self.sd <= _TENTATIVE else "unusable"
-        )
-        return Grade(level, f"log evidence {self.value:.2f}, standard error {self.sd:.2f} nat")
+        return Grade(known_to(self.sd), f"log evidence {self.value:.2f}, standard error {self.sd:.2f} nat")
+
+
+def known_to(error: float) -> Level:
+    """Level of a sum of log densities by its Monte Carlo standard error [nat]; unusable without one."""
+    return "reliable" if error <= _RELIABLE else "tentative" if error <= _TENTATIVE else "unusable"
 
 
 def evidence(posterior: Posterior, coordinates: Array, ess: float, seed: int) -> Evidence | None:

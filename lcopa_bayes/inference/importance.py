@@ -34,6 +34,8 @@ from lcopa_bayes.inference.weights import effective, smoothed, usable_k
 LEAST_EFFICIENCY = 0.4
 """Effective draws per draw of a good result [-]. A small k alone is not enough: a two-term posterior gave
 k = 0.4 at an efficiency of 0.2 while a third of its mass had not been met."""
+_MOST = 12
+"""Components beyond which a further attempt takes more draws alone [-]."""
 _LIGHT = 0.2
 """Pareto k at which the proposal is fitted no further, if it is efficient [-]."""
 _BATCHES = 4
@@ -137,7 +139,7 @@ def importance(
     proposal = core = around(posterior, chart, chosen, rng)
     seen = Seen((), (), ())
     for effort in plan.efforts:
-        if seen.proposals:
+        if seen.proposals and len(core.means) < _MOST:
             core = split(core, rng)
         for _ in range(effort.rounds):
             y = proposal.draw(effort.learning, rng)

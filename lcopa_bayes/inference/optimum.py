@@ -42,7 +42,10 @@ def find_optima(posterior: Posterior, rng: np.random.Generator, *, starts: int =
         for name, value in posterior.noise.nearly_white(0.05 * scale).items():
             if table.rows[table.at(name, axis)].free:
                 drawn[:, table.at(name, axis)] = value
-    chosen = drawn[np.argsort(-posterior.log_likelihood(drawn), kind="stable")]
+    likelihood = posterior.log_likelihood(drawn)
+    if np.isnan(likelihood).any():
+        posterior.log_density(posterior.coordinates(drawn[np.isnan(likelihood)]))  # raises and says where
+    chosen = drawn[np.argsort(-likelihood, kind="stable")]
     optima: list[Optimum] = []
     for values in _distinct(posterior, chosen, starts):
         values = posterior.complete(posterior.coordinates(values[None]), None)[0]

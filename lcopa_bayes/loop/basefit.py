@@ -9,7 +9,6 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.arrays import Vector
-from lcopa_bayes.checks import refuse_if
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.loop.autoregression import Autoregression, unbroken
 from lcopa_bayes.loop.basemodel import BaseModel
@@ -55,16 +54,18 @@ class BaseFit:
         return all(one.known for one in self.noise)
 
 
-def base_fit(model: BaseModel, rng: np.random.Generator, *, starts: int = _STARTS) -> BaseFit:
-    """Noise, then damped Gauss-Newton from several starts and delays.
+def base_fit(
+    model: BaseModel, rng: np.random.Generator, *, starts: int = _STARTS, near: Sequence[Vector] = ()
+) -> BaseFit:
+    """Noise, then damped Gauss-Newton from several starts and delays; `near` are further coordinates to start
+    from.
 
     Where an axis has too few quiet samples its noise is fitted to the residual in turn with the plant.
     """
     posterior = model.posterior
-    _moving(posterior)
     seeds = [model.coordinates(values) for values in screened(posterior, rng, count=starts)]
     white = Whitening(posterior.samples, _guessed(posterior))
-    optimum = Regression(model, white).best(seeds)
+    optimum = Regression(model, white).best([*near, *seeds])
     optimum = Regression(model, white).best([optimum.x, *_other_delays(model, optimum.x)])
     noise: tuple[AxisNoise, ...] = ()
     for _ in range(_ROUNDS):
@@ -82,20 +83,6 @@ def base_fit(model: BaseModel, rng: np.random.Generator, *, starts: int = _START
             break
         optimum = regression.descend(optimum.x)  # damped to a standstill: start again undamped
     return BaseFit(model, noise, regression, optimum, _failure(model, optimum), _cautions(noise, optimum))
-
-
-def _moving(posterior: Posterior) -> None:
-    """InputError when a response never changes: it has neither noise nor anything to explain."""
-    names = [response.name for response in posterior.table.layout.responses]
-    values = [np.concatenate([s.axes[k].values for s in posterior.samples]) for k in range(len(names))]
-    refuse_if(
-        [
-            f"response {name} is constant throughout the fit records: there is nothing a model of it could "
-            "lack; leave its column out or give records in which it is read out finely enough to move"
-            for name, seen in zip(names, values, strict=True)
-            if seen.size == 0 or np.ptp(seen) == 0
-        ]
-    )
 
 
 def _guessed(posterior: Posterior) -> tuple[Autoregression, ...]:

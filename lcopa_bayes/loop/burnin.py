@@ -18,8 +18,8 @@ the posterior less than 1 % of the excess variance is left then."""
 
 def memory(found: Sequence[Quality], chains: Array) -> float:
     """Steps after which the slowest coordinate of chains (ensembles, walkers, draws, k) forgets where it was:
-    draws over the smallest effective sample size `found`; infinite where nothing has moved."""
-    worst = min(quality.ess for quality in found)
+    draws over the smallest effective sample size within chains `found`; infinite where nothing has moved."""
+    worst = np.min([(quality.ess_bulk, quality.ess_tail) for quality in found])
     return float(chains[..., 0].size / worst) if worst > 0 else np.inf  # NaN is not above 0
 
 

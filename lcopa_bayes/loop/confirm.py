@@ -99,12 +99,10 @@ class Refit:
     def under(self, whitening: Whitening) -> Refit:
         """The same judged under another noise."""
         plain, _ = self.without(self.added)
-        return replace(
-            self,
-            optimum=Regression(self.model, whitening).descend(self.optimum.x, most=12, gain=_NEAR),
-            before=Regression(plain, whitening).descend(self.before.x, most=12, gain=_NEAR),
-            whitening=whitening,
-        )
+        before = Regression(plain, whitening).descend(self.before.x, most=12, gain=_NEAR)
+        optimum = Regression(self.model, whitening).descend(self.optimum.x, most=12, gain=_NEAR)
+        optimum = _no_worse(self.model, whitening, optimum, before)
+        return replace(self, optimum=optimum, before=before, whitening=whitening)
 
     def wald(self, name: str) -> float:
         """p-value of an effect's coefficients being zero, over all noise that is plausible [-].
@@ -171,12 +169,24 @@ def refit(
     quick = Regression(replace(extended, exact=False), whitening).best(starts, gain=_NEAR)
     extended, start = polished(extended, quick.x, whitening, tuple(effect.name for effect, _ in added))
     optimum = Regression(extended, whitening).descend(start, most=12, gain=0.02)
+    optimum = _no_worse(extended, whitening, optimum, before)
     sides = sum(one.coefficient.one_signed for one in extended.effected.coefficients[-linear.size :])
     tried = sum(np.log(len(effect.grid(extended.effected.ranges))) for effect, _ in added)
     names = tuple(effect.name for effect, _ in added)
     return Refit(
         extended, optimum, before, whitening, names, quiet, sides * float(np.log(2.0)) - float(tried)
     )
+
+
+def _no_worse(model: ExtendedModel, whitening: Whitening, found: Optimum, before: Optimum) -> Optimum:
+    """An optimum of `model`; where it is less likely than that `before` its last effects were added, which
+    the model contains at their vanishing, the one reached from there."""
+    if found.cost <= before.cost:
+        return found
+    vanishing = np.zeros(found.x.size - before.x.size)
+    start = np.concatenate([before.x, vanishing])
+    other = Regression(model, whitening).descend(start, most=12, gain=0.02)
+    return min(found, other, key=lambda one: one.cost)
 
 
 def under_one_noise(made: Sequence[Refit]) -> list[Refit]:

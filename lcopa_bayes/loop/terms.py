@@ -9,9 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lcopa_bayes.arrays import Vector
 from lcopa_bayes.checks import refuse_if
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.discretisation import FACTORS, largest_shift, narrowed
+from lcopa_bayes.inference.nesting import lifted
 from lcopa_bayes.loop.basefit import BaseFit, base_fit
 from lcopa_bayes.loop.basemodel import BaseModel
 from lcopa_bayes.loop.confirm import log_bayes_factor
@@ -23,6 +25,7 @@ from lcopa_bayes.loop.scores import State
 from lcopa_bayes.loop.startlevel import Mended, started
 from lcopa_bayes.loop.trace import trace
 from lcopa_bayes.plant.effects.effect import Effect
+from lcopa_bayes.requirements import unmet_apart_from_rest
 from lcopa_bayes.rest import not_at_rest
 from lcopa_bayes.settings import PriorSettings
 from lcopa_bayes.study import Study
@@ -31,6 +34,10 @@ _MOST = 3
 _GAIN = 10.0
 """Log evidence that one more viscous term must bring [nat]: it is an assumption of the user's that
 changes."""
+_COPIES = 6
+"""Starts in which the terms that a smaller model lacks are added to its optimum [-]."""
+_BELOW = 0.5
+"""Log likelihood by which a fit may stay below that of a model it contains [nat]."""
 _LONGER = 2.0
 """Factor on the default prior of a delay that ends at it: 0.4 becomes 0.8 of the records' span [-]."""
 _AT_END = 1e-2
@@ -56,6 +63,7 @@ def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: boo
     than the best named effect, or more together with what it leaves to be named. InputError when a record
     moves before its drive does and no drive before the first row explains that.
     """
+    refuse_if(unmet_apart_from_rest(study))
     base = _based(study)
     for mended in (started, _later):
         better = mended(study, base.fit)
@@ -68,7 +76,7 @@ def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: boo
         return base
     for terms in range(2, _MOST + 1):
         try:
-            wider = _based(replace(study, model=replace(study.model, terms=terms)), terms)
+            wider = _wider(study, base, terms)
         except ArithmeticError:
             break
         gain = _gain(base, wider)
@@ -91,17 +99,57 @@ def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: boo
     return base
 
 
-def _based(study: Study, *key: int) -> Base:
-    """A study's base fit as it stands; `key` tells its random numbers from others'."""
+def _wider(study: Study, base: Base, terms: int) -> Base:
+    """The base fit with more terms, also from the optimum with fewer, which it contains.
+
+    Where it stays less likely than that, it has failed.
+    """
+    wider = _based(replace(study, model=replace(study.model, terms=terms)), terms, contained=base)
+    regression = wider.fit.regression
+    inner = Regression(base.fit.model, regression.whitening).descend(base.fit.optimum.x)
+    if wider.fit.optimum.cost <= inner.cost + _BELOW:
+        return wider
+    starts = _lifted(wider.fit.model, base, np.random.default_rng([study.seed, 13, terms]))
+    optimum = regression.best([wider.fit.optimum.x, *starts])
+    short = optimum.cost - inner.cost
+    failed = wider.fit.failed
+    if short > _BELOW:
+        failed = failed or (
+            f"the fit of {terms} viscous terms is {short:.1f} nat less likely than that of fewer, which it "
+            "contains"
+        )
+    fit = replace(wider.fit, optimum=optimum, failed=failed)
+    return wider._replace(fit=fit, start=_state(study, fit))
+
+
+def _lifted(model: BaseModel, base: Base, rng: np.random.Generator) -> list[Vector]:
+    """Coordinates of a wider model at which it is close to the optimum of a base fit that it contains."""
+    values = np.repeat(base.fit.model.values(base.fit.optimum.x)[None], _COPIES, axis=0)
+    found = lifted(values, base.problem.posterior, model.posterior, rng)
+    return [] if found is None else [model.coordinates(each) for each in found]
+
+
+def _based(study: Study, *key: int, contained: Base | None = None) -> Base:
+    """A study's base fit as it stands; `key` tells its random numbers from others'. It starts from the
+    optimum of a `contained` model too."""
     problem = problem_of(study)
-    fit = base_fit(BaseModel(problem.posterior), np.random.default_rng([study.seed, 10, *key]))
+    fit = _fit(problem, key, contained)
     narrow = narrowed(problem, partial(_shift, fit))
     if narrow is not problem:
         problem = narrow
-        fit = base_fit(BaseModel(problem.posterior), np.random.default_rng([study.seed, 10, *key]))
+        fit = _fit(problem, key, contained)
+    return Base(problem, fit, _state(study, fit), "")
+
+
+def _fit(problem: Problem, key: Sequence[int], contained: Base | None) -> BaseFit:
+    model, seed = BaseModel(problem.posterior), [problem.study.seed, 10, *key]
+    near = _lifted(model, contained, np.random.default_rng([*seed, 1])) if contained else []
+    return base_fit(model, np.random.default_rng(seed), near=near)
+
+
+def _state(study: Study, fit: BaseFit) -> State:
     model = ExtendedModel.of(fit.model, fit.optimum.x, taken=taken(study))
-    state = State(model, fit.optimum, fit.regression.whitening, fit.optimum.covariance)
-    return Base(problem, fit, state, "")
+    return State(model, fit.optimum, fit.regression.whitening, fit.optimum.covariance)
 
 
 def _shift(fit: BaseFit, problem: Problem) -> float:

@@ -215,4 +215,8 @@ def _metric(model: Model, names: Sequence[str]) -> Mapping[str, Any] | None:
 def _predicted(best: Model, other: Model) -> str:
     if best["elpd"] is None or other["elpd"] is None:
         return ""
-    return f", and predicts what was left out better by {best['elpd'] - other['elpd']:+.2f} nats"
+    gain, told = best["elpd"] - other["elpd"], ""
+    against = next((one for one in (best, other) if one["elpd_difference_sd"]), None)
+    if against is not None and 0.0 in (best["elpd_difference"], other["elpd_difference"]):
+        told = f" ± {against['elpd_difference_sd']:.2f}"  # the other of the two predicts best of all
+    return f", and predicts what was left out by {gain:+.2f}{told} nats"

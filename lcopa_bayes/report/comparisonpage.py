@@ -33,6 +33,8 @@ def write_comparison(folder: Path) -> Path:
     absent = [key for key in _NEEDS if key not in told]
     if absent:
         raise InputError(f"{path}: lacks {', '.join(absent)}; run `compare` again with --resume")
+    if any("containment" not in row for row in told["models"]):
+        raise InputError(f"{path}: written by an earlier version; run `compare` again")
     with look():
         scores, *rest = compared.sections(told)
         sections = [scores, *comparedfigures.sections(told, _curves(folder, told)), *rest]
