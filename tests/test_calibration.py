@@ -767,8 +767,8 @@ def test_a_small_bias_in_every_cell_shows_when_cells_are_pooled(defaults, rng):
     told = counted(defaults, rng, narrow="delay")
     outside = {row["parameter"] for row in told["pooled"] if not row["within"]}
     assert outside == {"delay"}
-    assert "outside: " in told["verdict"][2]
-    assert "delay at 90%" in told["verdict"][2]
+    assert "outside: " in told["verdict"][3]
+    assert "delay at 90%" in told["verdict"][3]
 
 
 @pytest.mark.slow
@@ -776,7 +776,7 @@ def test_a_small_bias_in_every_cell_shows_when_cells_are_pooled(defaults, rng):
 def test_default_settings_cover_at_a_stated_truth(defaults, delay):
     """On wide blocks read through a parabola 90 % intervals covered 0.3 to 0.7 (100 replicas)."""
     cell = defaults.Cell(0.002, delay, (3.4,), (0.9,), "white")
-    made = calibrate(cell.study(1), replicas=60, truth=cell.truth, jobs=2)
+    made = calibrate(cell.study(2), replicas=60, truth=cell.truth, jobs=2)
     told = results(made)
     assert all(row["within"] for row in told["coverage"] if row["kind"] == "parameter")
 

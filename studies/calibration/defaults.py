@@ -45,6 +45,8 @@ ON, OFF = 1.0, 1.07
 """Delays [ms]; with the first, the response begins on a sample."""
 ANY = (0.9, 1.1)
 """Ends between which delays are drawn evenly: every phase of the samples [ms]."""
+EDGE = "on a sample at an order below 1"
+"""Where the likelihood has an edge at the truth."""
 SIMULTANEOUS = 0.95
 """Probability that all rows of a table whose intervals cover as stated lie within their bands [-]."""
 PLANT = ("gain", "time", "order", "delay", "offset")
@@ -89,6 +91,8 @@ class Cell:
 
     @property
     def onset(self) -> str:
+        if self.delay == ON and max(self.orders) < 1:
+            return EDGE
         return {ON: "on a sample", OFF: "between samples"}.get(self.delay, "anywhere")
 
     def study(self, seed: int) -> Study:
@@ -162,7 +166,12 @@ def covered(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     confidence = 1 - (1 - SIMULTANEOUS) / count
     return [
         Coverage(
-            name, "plant" if kind_of(name) in PLANT else "noise", level, hits, row["replicas"], confidence
+            name,
+            "noise" if kind_of(name) not in PLANT else "edge" if row["onset"] == EDGE else "plant",
+            level,
+            hits,
+            row["replicas"],
+            confidence,
         ).as_json()
         | {"cell": row["cell"]}
         for row in rows
@@ -175,20 +184,21 @@ def pooled(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Coverage of each parameter over the one-term cells of the default noise together, by level of the noise
     and for all of them: a small bias everywhere shows here first."""
     default = [row for row in rows if row["noise"] == "white+ar1" and len(row["orders"]) == 1]
+    smooth = [row for row in default if row["onset"] != EDGE]
     groups = {
-        f"noise {100 * level:g} %": [r for r in default if r["level"] == level]
+        f"noise {100 * level:g} %": [r for r in smooth if r["level"] == level]
         for level in (0.01, 0.005, 0.002)
     }
     for where in dict.fromkeys(r["onset"] for r in default):
         groups |= {f"onset {where}": [r for r in default if r["onset"] == where]}
-    groups |= {"all": default}
+    groups |= {"all but the edge": smooth}
     names = list(dict.fromkeys(name for row in default for name in row["hits"]))
     filled = {group: chosen for group, chosen in groups.items() if chosen}
     confidence = 1 - (1 - SIMULTANEOUS) / max(1, len(filled) * len(names) * len(LEVELS))
     return [
         Coverage(
             name,
-            "plant" if kind_of(name) in PLANT else "noise",
+            "noise" if kind_of(name) not in PLANT else "edge" if group.endswith(EDGE) else "plant",
             level,
             sum(row["hits"][name][str(level)] for row in chosen),
             sum(row["replicas"] for row in chosen),
@@ -292,6 +302,7 @@ def summary(rows: Sequence[dict[str, Any]], seed: int) -> dict[str, Any]:
         {
             "verdict": [
                 sentence(coverage, "plant", "coverages of plant parameters cell by cell"),
+                sentence(coverage, "edge", f"coverages of plant parameters with the onset {EDGE}"),
                 sentence(coverage, "noise", "coverages of noise parameters cell by cell"),
                 sentence(together, "plant", "pooled coverages of plant parameters"),
             ],
@@ -310,6 +321,12 @@ def summary(rows: Sequence[dict[str, Any]], seed: int) -> dict[str, Any]:
     )
 
 
+def stored(folder: Path) -> int:
+    """Number of replicas in a store from the first on, none left out."""
+    present = {int(path.stem) for path in (folder / "replicas").glob("[0-9]*.json")}
+    return next(number for number in range(len(present) + 1) if number not in present)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -320,17 +337,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--cells", nargs="+", metavar="PATTERN", help="cells whose name matches one of these")
     parser.add_argument("--out", type=Path, default=Path("reports/calibration/defaults"))
     parser.add_argument("--store", type=Path, default=Path(tempfile.gettempdir()) / "lcopa-defaults")
+    parser.add_argument("--stored", action="store_true", help="the table of what is stored, no new replicas")
     options = parser.parse_args(arguments)
     rows = []
     for number, cell in enumerate(cells()):
         if options.cells and not any(fnmatchcase(cell.name, pattern) for pattern in options.cells):
             continue
+        folder = options.store / cell.name
+        replicas = stored(folder) if options.stored else options.replicas
+        if replicas == 0:
+            continue
+        writable_folder(options.store)
         made = calibrate(
             cell.study(1000 * options.seed + number),
-            replicas=options.replicas,
+            replicas=replicas,
             truth=cell.truth,
             jobs=options.jobs,
-            folder=writable_folder(options.store) / cell.name,
+            folder=folder,
             resume=True,
         )
         rows.append(row_of(cell, made))
@@ -339,10 +362,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         }
         print(cell.name, rows[-1]["replicas"], {n: round(v, 3) for n, v in shown.items()}, flush=True)
         told = summary(rows, options.seed)
-        folder = writable_folder(options.out)
-        save_json(told, folder / "results.json")
-        write_text(folder / "table.md", table_of(told))
-        write_text(folder / "coverage.svg", figure_of(told))
+        out = writable_folder(options.out)
+        save_json(told, out / "results.json")
+        write_text(out / "table.md", table_of(told))
+        write_text(out / "coverage.svg", figure_of(told))
     return 0
 
 
