@@ -57,7 +57,9 @@ def save_posterior(fit: Fit, path: Path) -> None:
 
     One variable per free parameter; per record and axis one of `log_likelihood`,
     `posterior_predictive` (plant with noise) and `observed_data`, named `<record>_<axis>` with both in
-    its attributes. A slash in a name, which netCDF keeps for groups, is written as a vertical bar;
+    its attributes. The priors of single parameters add up to that of all but for a constant, the attribute
+    `joint_support` of `log_prior`: decreasing orders and resolved terms hold a part of the mass. A slash in a
+    name, which netCDF keeps for groups, is written as a vertical bar;
     names that would be the same are told apart by a number (`variable_names`).
     """
     draws, posterior = fit.draws, fit.problem.posterior
@@ -85,6 +87,7 @@ def save_posterior(fit: Fit, path: Path) -> None:
         for group in ("log_likelihood", "posterior_predictive", "observed_data"):
             tree[group][name].attrs |= {"record": record, "axis": axis}
         tree["constant_data"][f"{name}_time"].attrs |= {"record": record, "axis": axis}
+    tree["log_prior"].attrs["joint_support"] = table.log_support - table.log_permutations
     tree.attrs["grade"] = draws.grade.level
     tree.attrs["grade_reason"] = draws.grade.reason
     tree.attrs["noise"] = posterior.noise.kind

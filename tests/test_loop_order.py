@@ -107,6 +107,26 @@ def test_orders_of_unlike_terms_never_change_places(gap):
     assert model.supported(optimum.x[None], every=False)[0]
 
 
+@pytest.mark.parametrize("start", [[1.9, -6.0, 0.8, 1.0], [0.9, -6.0, 0.8, 1.0], [1.3, -1.0, 0.5, -5.0]])
+def test_terms_stay_resolved_wherever_a_descent_begins(start):
+    """Of default priors, a term of order above 1 is no faster than the samples show; slower ones may be."""
+    posterior = problem(TAKEN, terms=2, offset="none").posterior
+    model = BaseModel(posterior)
+    assert len(posterior.table.limited) == 2
+    noise = (Autoregression(np.empty(0), NOISE),)
+    regression = Regression(model, Whitening(posterior.samples, noise))
+    first, time_1, second, time_2 = start
+    optimum = regression.descend(np.array([2.0, time_1, first, time_2, second, 0.5]), most=60)
+    assert model.supported(optimum.x[None])[0]
+    assert np.isfinite(optimum.cost)
+    rng = np.random.default_rng(3)
+    for x in optimum.x + 2.0 * rng.standard_normal((200, 6)):  # nor does any step within the bounds leave it
+        inside = np.clip(x, *model.bounds)
+        if model.supported(inside[None], every=False)[0]:
+            step = np.clip(inside + rng.standard_normal(6), *model.bounds_about(inside))
+            assert model.supported(step[None], every=False)[0]
+
+
 def density(pair: tuple[BaseModel, Regression], start: np.ndarray) -> LoopDensity:
     model, regression = pair
     optimum = regression.descend(start)

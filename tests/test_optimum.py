@@ -97,17 +97,16 @@ def best(posterior: Posterior, **options) -> dict[str, float]:
 
 
 def test_recovers_a_noise_free_truth_with_an_error_that_falls_as_fast_as_the_model_converges():
-    """Nearly second order: the onset t^0.8 within one block takes a little off it."""
+    """Nearly second order: what follows the onset t^0.8 within one block takes a little off it."""
     clean = record(noise_sd=0.0, camera=0.1)
     names = ("gain", "time_1", "order_1", "delay", "offset")
     coarse, fine = (
         np.array([abs(found[name] - TRUTH[name]) for name in names])
         for found in (best(made(clean, blocks=blocks), starts=2) for blocks in (240, 3840))
     )
-    assert coarse.max() < 2e-3
-    assert fine.max() < 2e-5
-    slopes = np.log(coarse / fine) / np.log(16)
-    assert np.all((slopes > 1.3) & (slopes < 2.3))
+    assert coarse.max() < 1e-4
+    assert fine.max() < 2e-6
+    assert 1.3 < np.log(np.linalg.norm(coarse) / np.linalg.norm(fine)) / np.log(16) < 2.3
 
 
 def test_two_terms_are_recovered_from_a_clean_record():
@@ -200,7 +199,8 @@ def test_terms_that_cannot_be_exchanged_stay_in_order(priors):
         start = start.copy()
         start[posterior.table.of_kind("sigma")] = 0.05
         ends.append(least.solve(start)[0])
-    assert posterior.table.supported(np.array(ends)).all()
+    orders = posterior.table.of_kind("order")
+    assert np.all(np.diff(np.array(ends)[:, orders], axis=1) <= 0)
     assert find_optima(posterior, rng, starts=4)
 
 

@@ -106,6 +106,7 @@ def test_log_prior_and_log_likelihood_are_consistent_with_the_density(fitted, fo
     posterior, draws = fitted.problem.posterior, fitted.draws
     with xarray.open_datatree(folder / "posterior.nc", engine="h5netcdf") as read:
         prior = sum(read["log_prior"][name].to_numpy() for name in read["log_prior"].data_vars)
+        prior = prior + read["log_prior"].attrs["joint_support"]
         likelihood = sum(
             part.to_numpy().astype(float).sum(axis=2) for part in read["log_likelihood"].data_vars.values()
         )

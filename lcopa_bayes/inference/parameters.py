@@ -93,6 +93,12 @@ class ParameterTable:
         rows = self.rows[time], self.rows[order]
         return self.resolution > 0 and rows[0].free and all(row.default for row in rows)
 
+    @cached_property
+    def limited(self) -> tuple[tuple[int, int], ...]:
+        """Positions of time and order of every term that must be resolved."""
+        pairs = (pair for times, orders in self._columns for pair in zip(times, orders, strict=True))
+        return tuple((t, o) for t, o in pairs if self._limited(t, o))
+
     def _resolved_mass(self, time: int, order: int) -> float:
         """Prior mass of a term where it is resolved."""
         if not self._limited(time, order):
@@ -104,10 +110,8 @@ class ParameterTable:
     def _resolved(self, values: Matrix) -> Flags:
         """Whether every term that must be is resolved, (batch,)."""
         out = np.ones(values.shape[0], dtype=bool)
-        for times, orders in self._columns:
-            for t, o in zip(times, orders, strict=True):
-                if self._limited(t, o):
-                    out &= (values[:, o] <= 1.0) | (values[:, t] >= self.resolution)
+        for t, o in self.limited:
+            out &= (values[:, o] <= 1.0) | (values[:, t] >= self.resolution)
         return out
 
     @cached_property

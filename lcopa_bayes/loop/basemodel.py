@@ -110,13 +110,23 @@ class BaseModel:
         return self.least.bounds
 
     def bounds_about(self, x: Vector) -> tuple[Vector, Vector]:
-        """Bounds within which the orders of every element with unlike priors stay decreasing: a free
-        neighbour comes no closer than the middle, and merged orders stay apart."""
+        """Bounds within which the orders of every element with unlike priors stay decreasing and terms
+        resolved: a free neighbour comes no closer than the middle, and merged orders stay apart; a term
+        crosses 1 in its order, or the shortest resolved time, only where the other allows it."""
         low, high = self.least.bounds_around(self.least.values(x, self.template))
         plain = self.bounds
         for ends, other in ((low, plain[0]), (high, plain[1])):
             merged = (ends != other) & (np.abs(x - ends) < _MERGED)
             ends[merged] = x[merged]
+        table, shortest = self.posterior.table, np.log(self.posterior.table.resolution or 1.0)
+        for t, o in table.limited:
+            time = self.least.columns.index(t)
+            order = self.least.columns.index(o) if table.rows[o].free else None
+            steep = (table.rows[o].value if order is None else x[order]) > 1.0
+            if steep or x[time] > shortest + _MERGED:
+                low[time] = max(low[time], shortest)
+            elif order is not None:
+                high[order] = min(high[order], 1.0)
         return low, high
 
     def canonical(self, x: Vector) -> Vector:

@@ -16,10 +16,10 @@ _FORGET = 3.0
 the posterior less than 1 % of the excess variance is left then."""
 
 
-def memory(found: Sequence[Quality], chains: Array) -> float:
+def memory(measured: Sequence[Quality], chains: Array) -> float:
     """Steps after which the slowest coordinate of chains (ensembles, walkers, draws, k) forgets where it was:
-    draws over the smallest effective sample size within chains `found`; infinite where nothing has moved."""
-    worst = np.min([(quality.ess_bulk, quality.ess_tail) for quality in found])
+    draws over the smallest effective sample size within chains; infinite where nothing has moved."""
+    worst = np.min([(quality.ess_bulk, quality.ess_tail) for quality in measured])
     return float(chains[..., 0].size / worst) if worst > 0 else np.inf  # NaN is not above 0
 
 
@@ -36,7 +36,7 @@ def settled(chains: Array) -> Array:
     return chains[:, :, int(start) :]
 
 
-def long_enough(found: Sequence[Quality], chains: Array) -> bool:
+def long_enough(measured: Sequence[Quality], chains: Array) -> bool:
     """Whether every walker took many times the steps after which it forgets where it was: from shorter chains
     that number of steps cannot be told."""
-    return bool(chains.shape[2] > _LENGTH * memory(found, chains))
+    return bool(chains.shape[2] > _LENGTH * memory(measured, chains))

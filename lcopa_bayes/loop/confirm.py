@@ -178,15 +178,15 @@ def refit(
     )
 
 
-def _no_worse(model: ExtendedModel, whitening: Whitening, found: Optimum, before: Optimum) -> Optimum:
+def _no_worse(model: ExtendedModel, whitening: Whitening, reached: Optimum, before: Optimum) -> Optimum:
     """An optimum of `model`; where it is less likely than that `before` its last effects were added, which
     the model contains at their vanishing, the one reached from there."""
-    if found.cost <= before.cost:
-        return found
-    vanishing = np.zeros(found.x.size - before.x.size)
+    if reached.cost <= before.cost:
+        return reached
+    vanishing = np.zeros(reached.x.size - before.x.size)
     start = np.concatenate([before.x, vanishing])
     other = Regression(model, whitening).descend(start, most=12, gain=0.02)
-    return min(found, other, key=lambda one: one.cost)
+    return min(reached, other, key=lambda one: one.cost)
 
 
 def under_one_noise(made: Sequence[Refit]) -> list[Refit]:

@@ -125,8 +125,8 @@ def _wider(study: Study, base: Base, terms: int) -> Base:
 def _lifted(model: BaseModel, base: Base, rng: np.random.Generator) -> list[Vector]:
     """Coordinates of a wider model at which it is close to the optimum of a base fit that it contains."""
     values = np.repeat(base.fit.model.values(base.fit.optimum.x)[None], _COPIES, axis=0)
-    found = lifted(values, base.problem.posterior, model.posterior, rng)
-    return [] if found is None else [model.coordinates(each) for each in found]
+    starts = lifted(values, base.problem.posterior, model.posterior, rng)
+    return [] if starts is None else [model.coordinates(each) for each in starts]
 
 
 def _based(study: Study, *key: int, contained: Base | None = None) -> Base:
