@@ -504,7 +504,7 @@ def test_a_stated_order_keeps_the_terms_in_their_order():
     [
         ({"delay": 1.0}, "'delay' is stated, but this study does not infer it"),
         ({"gian": 1.0}, "gain"),
-        ({"time_1": 9.0}, "time_1 = 9 is excluded by the prior"),
+        ({"time_1": 9.0}, "time_1 = 9.0 is excluded by the prior"),
     ],
 )
 def test_a_truth_that_cannot_be_is_refused(truth, said):

@@ -181,7 +181,7 @@ def test_a_response_that_never_moves_is_refused_in_words():
     still = stepped(10.0)
     record = still.fit[0]
     flat = replace(still, fit=(replace(record, response=np.full_like(record.response, 0.3)),))
-    with pytest.raises(InputError, match="response 'x' is constant"):
+    with pytest.raises(InputError, match="response x is constant"):
         loop(flat, library=[], sample=False, quick=True)
 
 

@@ -30,7 +30,9 @@ KINDS = ("MixtureMove", "MixtureWalk", "DifferenceMove", "ShapeMove", "OrderSlid
 @cache
 def posterior() -> Posterior:
     """Two terms with equal priors, sampled in any order."""
-    return problem(record(camera=0.6), terms=2, priors={"gain": GAIN, "sigma": 0.1, "offset": 0.3}).posterior
+    times = {f"time_{k}": ("loguniform", {"a": 0.06, "b": 1165.0}) for k in (1, 2)}
+    priors = {"gain": GAIN, "sigma": 0.1, "offset": 0.3, **times}  # stated ones need not be resolved
+    return problem(record(camera=0.6), terms=2, priors=priors).posterior
 
 
 def column(kind: str, first: int, second: int = 0) -> int:
