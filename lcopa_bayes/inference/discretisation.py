@@ -28,6 +28,8 @@ LARGEST = 0.1
 """Largest shift of a parameter by the width of the blocks that leaves a grade as it is [posterior sd]."""
 UNUSABLE = 1.0
 """Shift at which numbers are not usable [posterior sd]."""
+_NOTHING = 0.02
+"""Shift that is not worth its digits [posterior sd]."""
 FACTORS = (2, 4)
 """How many times narrower the blocks are on which shifts are measured."""
 _REST = 16 / 15
@@ -68,8 +70,12 @@ class Discretisation:
     @property
     def sentence(self) -> str:
         """What was measured, a sentence without its full stop."""
+        if abs(self.shift) + 2 * self.error < _NOTHING:
+            return (
+                f"The width of the {self.blocks} blocks moves no posterior mean by more than {_NOTHING:g} sd"
+            )
         return (
-            f"The {self.blocks} blocks used move the posterior mean of {self.parameter} by "
+            f"The width of the {self.blocks} blocks moves the posterior mean of {self.parameter} by "
             f"{abs(self.shift):.2f} ± {self.error:.2f} sd, that of every other parameter by less"
         )
 

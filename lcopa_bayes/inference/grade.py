@@ -156,11 +156,6 @@ class Limitation:
     parameters: tuple[str, ...] = ()
     """The parameters it concerns; empty: every number."""
 
-    @property
-    def sentence(self) -> str:
-        """Reason and remedy, without a full stop."""
-        return f"{self.reason}; {self.remedy}" if self.remedy else self.reason
-
     def concerns(self, parameter: str) -> bool:
         """Whether the numbers of a parameter rest on it."""
         return not self.parameters or parameter in self.parameters
@@ -176,12 +171,16 @@ class Limitation:
 
 
 def limited(grade: Grade, limitations: Sequence[Limitation]) -> Grade:
-    """`grade`, or the lowest level of the limitations where that is lower, with the reason of each, the most
-    severe first; what was said of the sampling comes first where it is as low, else last."""
+    """`grade`, or the lowest level of the limitations where that is lower.
+
+    The reason names each limitation, the most severe first, then the remedies; what was said of the sampling
+    comes first where it is as low, else last.
+    """
     if not limitations:
         return grade
     ordered = sorted(limitations, key=lambda one: -_RANK[one.level])
-    said = "; ".join(one.sentence for one in ordered)
+    remedies = dict.fromkeys(one.remedy for one in ordered if one.remedy)  # what several ask for is said once
+    said = "; ".join([*(one.reason for one in ordered), *remedies])
     if _RANK[grade.level] >= _RANK[ordered[0].level]:
         joint = "but " if grade.level == "reliable" else "also, "
         return Grade(grade.level, f"{grade.reason}; {joint}{said}")
