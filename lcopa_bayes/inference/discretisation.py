@@ -36,8 +36,8 @@ _REST = 16 / 15
 """What is left from blocks four times narrower to none, by the second order of the scheme."""
 _FINEST = 16
 """Most by which blocks are narrowed [-]."""
-_MOST_CELLS = 1 << 18
-"""Blocks of all records together beyond which they are not narrowed."""
+_MOST_CELLS = 1 << 15
+"""Blocks of all records together beyond which they are not narrowed: a fit takes as many times longer."""
 _STARTS = 2
 """Starts of the search for the optimum."""
 _DRAWS = 400
