@@ -36,7 +36,7 @@ _BURN = 5
 """Steps of either half of the burn-in [-]."""
 _ROUND = 10
 _STEPS = 120
-_STEPS_DEAR = 90
+_STEPS_DEAR = 160
 """Most steps where an effect bends the dynamics: a density costs ten times as much."""
 _SAMPLES = 10_000
 _LONGER = 8.0
