@@ -18,7 +18,6 @@ from lcopa_bayes.loop.density import LoopDensity
 from lcopa_bayes.loop.extended import ExtendedModel
 from lcopa_bayes.loop.proposals import Counted, Jump, Walk, learnt
 from lcopa_bayes.loop.surrogate import Surrogate
-from lcopa_bayes.plant.effects.simulator import UPSTREAM
 
 ENSEMBLES = 4
 _NEAR = 0.2
@@ -35,9 +34,8 @@ _WALKERS = 12
 _BURN = 5
 """Steps of either half of the burn-in [-]."""
 _ROUND = 10
-_STEPS = 120
-_STEPS_DEAR = 160
-"""Most steps where an effect bends the dynamics: a density costs ten times as much."""
+_STEPS = 160
+"""Most steps of an ensemble [-]."""
 _SAMPLES = 10_000
 _LONGER = 8.0
 """Samples from which these are the most; of fewer, which cost less, there may be so many times more [-]."""
@@ -110,13 +108,12 @@ def unit_of(model: ExtendedModel, k: int) -> tuple[str, str, float]:
 def sample_loop(density: LoopDensity, seed: int, *, jobs: int = 1, quick: bool = False) -> LoopDraws:
     """Four independent ensembles from overdispersed starts about the optimum; deterministic given `seed`.
 
-    They go on, 10 steps at a time, until the draws grade as reliable, or as long as an evaluation's price
-    allows (half as long with `quick`). Draws from which the starts are not yet forgotten are left out
+    They go on, 10 steps at a time, until the draws grade as reliable, or to `_STEPS` for a record of 10 000
+    samples and longer for a shorter one (half as long with `quick`). Draws from which the starts are not yet forgotten are left out
     (`settled`).
     """
-    dear = any(isinstance(effect, UPSTREAM) for effect in density.state.model.effects)
     longer = min(max(1.0, _SAMPLES / density.state.whitening.size), _LONGER)
-    most = int(longer * (_STEPS_DEAR if dear else _STEPS)) // (2 if quick else 1)
+    most = int(longer * _STEPS) // (2 if quick else 1)
     names = [unit_of(density.state.model, int(k))[0] for k in density.sampled]
     surrogate = Surrogate.of(density)
     law = learnt(surrogate, surrogate.centre, surrogate.root, np.random.RandomState([seed, 22]))
