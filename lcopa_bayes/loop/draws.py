@@ -109,8 +109,8 @@ def sample_loop(density: LoopDensity, seed: int, *, jobs: int = 1, quick: bool =
     """Four independent ensembles from overdispersed starts about the optimum; deterministic given `seed`.
 
     They go on, 10 steps at a time, until the draws grade as reliable, or to `_STEPS` for a record of 10 000
-    samples and longer for a shorter one (half as long with `quick`). Draws from which the starts are not yet forgotten are left out
-    (`settled`).
+    samples and longer for a shorter one (half as long with `quick`). Draws from which the starts are not yet
+    forgotten are left out (`settled`).
     """
     longer = min(max(1.0, _SAMPLES / density.state.whitening.size), _LONGER)
     most = int(longer * _STEPS) // (2 if quick else 1)
