@@ -30,7 +30,6 @@ _EVALUATIONS = 60
 _ROUNDS = 12
 _GAINED = 1e-3
 """Rounds between plant and noise end when the log likelihood gains less [nat]."""
-_PORTION = 64
 
 
 @final
@@ -103,11 +102,7 @@ class Landscape:
 
     def log_likelihood(self, values: Matrix) -> Vector:
         """Of canonical table values (batch, rows), (batch,) [nat]."""
-        posterior, out = self.posterior, []
-        for first in range(0, values.shape[0], _PORTION):
-            records = posterior.pointwise(values[first : first + _PORTION])
-            out.append(np.sum([axis.sum(axis=1) for record in records for axis in record], axis=0))
-        return np.concatenate(out)
+        return self.posterior.joint_log_likelihood(values)
 
     def climb(self, start: Vector, *, held: int | None = None, most: int = _EVALUATIONS) -> Peak:
         """A local maximum from table values; the parameter `held` keeps the value it starts with.

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple, final, get_args
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.arrays import Matrix, Vector
+from lcopa_bayes.arrays import Vector
 from lcopa_bayes.calibration.coverage import LEVELS
 from lcopa_bayes.calibration.ranks import rank_of
 from lcopa_bayes.calibration.simulated import device_of, exact_responses, measured, model_gap
@@ -225,7 +225,7 @@ class Replication:
         return [
             *map(float, parameters),
             *map(float, np.concatenate(steps)),
-            float(_log_likelihood(posterior, truth[None])[0]),
+            float(posterior.joint_log_likelihood(truth[None])[0]),
         ]
 
     def _drawn(
@@ -246,7 +246,7 @@ class Replication:
             for k in at
         ]
         picked = draws.flat[rng.choice(draws.flat.shape[0], RANKED, replace=False)]
-        return [*parameters, *steps, _log_likelihood(posterior, picked)]
+        return [*parameters, *steps, posterior.joint_log_likelihood(picked)]
 
 
 def holds(draws: Vector, truth: float, level: float) -> bool:
@@ -254,9 +254,3 @@ def holds(draws: Vector, truth: float, level: float) -> bool:
     tail = (1 - level) / 2
     low, high = np.quantile(draws, [tail, 1 - tail])
     return bool(low <= truth <= high)
-
-
-def _log_likelihood(posterior: Posterior, values: Matrix) -> Vector:
-    """Joint log likelihood of table values, linear parameters included, (batch,) [nat]."""
-    each = [axis.sum(axis=1) for record in posterior.pointwise(values) for axis in record]
-    return np.asarray(np.sum(each, axis=0))

@@ -22,7 +22,6 @@ from lcopa_bayes.inference.draws import Draws
 from lcopa_bayes.inference.grade import Limitation
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.optimum import Optimum, find_optima
-from lcopa_bayes.inference.posterior import Posterior
 
 LARGEST = 0.1
 """Largest shift of a parameter by the width of the blocks that leaves a grade as it is [posterior sd]."""
@@ -176,7 +175,7 @@ def discretisation(problem: Problem, draws: Draws) -> Discretisation:
     """Shift of the posterior mean of every free parameter on blocks four times narrower."""
     finer = problem.refined(FACTORS[-1]).posterior
     values = draws.thinned(_DRAWS)
-    change = _log_likelihood(finer, values) - _log_likelihood(problem.posterior, values)
+    change = finer.joint_log_likelihood(values) - problem.posterior.joint_log_likelihood(values)
     weights = np.exp(change - change.max())
     weights /= weights.sum()
     rows = [k for k, row in enumerate(draws.table.rows) if row.free]
@@ -193,9 +192,3 @@ def discretisation(problem: Problem, draws: Draws) -> Discretisation:
         problem.refinement,
         _cells(problem),
     )
-
-
-def _log_likelihood(posterior: Posterior, values: Matrix) -> Vector:
-    """Joint log likelihood of table values, linear parameters included, (batch,) [nat]."""
-    each = [axis.sum(axis=1) for record in posterior.pointwise(values) for axis in record]
-    return np.asarray(np.sum(each, axis=0))

@@ -172,6 +172,14 @@ class Posterior:
             for r, samples in enumerate(self.samples)
         ]
 
+    def joint_log_likelihood(self, values: Matrix) -> Vector:
+        """Log likelihood of canonical values, linear parameters included, (batch,) [nat]."""
+        out = []
+        for first in range(0, values.shape[0], _PORTION):
+            records = self.pointwise(values[first : first + _PORTION])
+            out.append(np.sum([axis.sum(axis=1) for record in records for axis in record], axis=0))
+        return np.concatenate(out)
+
     @cached_property
     def blocks(self) -> list[list[int]]:
         """Linear parameters of each response axis."""

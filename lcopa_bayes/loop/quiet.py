@@ -78,16 +78,9 @@ class AxisNoise:
         return self.source != "joint"
 
 
-def first_change(samples: Samples) -> float:
-    """Time of the first drive change of a record, infinite when there is none [time unit]."""
-    drive = samples.record.drive
-    moved = np.flatnonzero((drive != drive[0]).any(axis=1))
-    return float(samples.record.time[moved[0]]) if moved.size else np.inf
-
-
 def quiet_samples(record: Samples, axis: int, delay: float) -> int:
     """Number of samples of an axis before anything can have arrived [-]; `delay` as in `quiet_pieces`."""
-    until = first_change(record) + _SAFE * delay
+    until = record.first_change + _SAFE * delay
     return int(np.searchsorted(record.times[record.axes[axis].index], until))
 
 
