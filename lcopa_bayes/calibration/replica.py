@@ -19,8 +19,8 @@ from lcopa_bayes.calibration.truths import Truths
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.data import Samples
 from lcopa_bayes.inference.discretisation import discretisation, resolved
-from lcopa_bayes.inference.draws import Draws, gather
-from lcopa_bayes.inference.importance import Effort, ImportancePlan, importance, weighted_draws
+from lcopa_bayes.inference.draws import Draws, gather, weighted_draws
+from lcopa_bayes.inference.importance import Effort, ImportancePlan, importance
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.sampler import SamplePlan, sample
@@ -210,10 +210,10 @@ class Replication:
             problem = resolved(problem)
         posterior = problem.posterior
         if look is not None and look.good(self.plan.target_ess):
-            draws = weighted_draws(posterior, look, rng, target_ess=self.plan.target_ess)
-            return problem, draws, "importance", look.pareto_k
+            draws = weighted_draws(posterior, look.weighted, rng, target_ess=self.plan.target_ess)
+            return problem, draws, "importance", look.weighted.pareto_k
         draws = gather(posterior, sample(posterior, replace(self.plan, seed=seed)))
-        tried = look.pareto_k if look is not None and np.isfinite(look.pareto_k) else None
+        tried = look.weighted.pareto_k if look is not None and np.isfinite(look.weighted.pareto_k) else None
         return problem, draws, "sampling", tried
 
     def _true(self, posterior: Posterior, truth: Vector, times: Vector) -> list[float]:

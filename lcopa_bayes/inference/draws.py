@@ -8,14 +8,16 @@ from functools import cached_property
 from typing import final
 
 import numpy as np
+from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 
-from lcopa_bayes.arrays import Array, Matrix, Vector
+from lcopa_bayes.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.estimate import Estimate
 from lcopa_bayes.inference.grade import (
     Grade,
     Level,
     Limitation,
     Quality,
+    between,
     limited,
     overall,
     qualities,
@@ -26,6 +28,7 @@ from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.ridges import Ridges, ridges
 from lcopa_bayes.inference.sampler import Run, sampled_qualities
+from lcopa_bayes.inference.weighted import Weighted
 
 _MEASURED = 12_000
 """Draws on which the convergence of the linear parameters is measured."""
@@ -110,16 +113,18 @@ class Draws:
 
 
 def gather(posterior: Posterior, run: Run) -> Draws:
-    """Draws of a run: the kept part, thinned evenly, with the linear parameters drawn exactly."""
+    """Draws of a run with the linear parameters drawn exactly: resampled importance draws, or the kept part
+    of the ensembles, thinned evenly."""
+    if run.weighted is not None and run.chosen is not None:
+        rng = np.random.default_rng(np.random.SeedSequence(run.plan.seed, spawn_key=(1_000,)))
+        return _resampled(posterior, run.weighted, run.chosen, rng, run.plan.target_ess)
     coordinates, log_density = run.kept()
     ensembles, walkers, count, _ = coordinates.shape
     stride = max(1, -(-ensembles * walkers * count // _MEASURED))
     coordinates, log_density = (kept[:, :, ::-1][:, :, ::stride] for kept in (coordinates, log_density))
     rng = np.random.default_rng(np.random.SeedSequence(run.plan.seed, spawn_key=(1_000,)))
     flat = coordinates.reshape(-1, coordinates.shape[-1])
-    chunks = np.array_split(flat, max(1, flat.shape[0] // _CHUNK))
-    values = np.concatenate([posterior.complete(chunk, rng) for chunk in chunks])
-    values = values.reshape(*coordinates.shape[:3], -1)
+    values = _completed(posterior, flat, rng).reshape(*coordinates.shape[:3], -1)
     found = {quality.name: quality for quality in sampled_qualities(posterior, run)}
     if posterior.linear:
         names = [posterior.table.names[k] for k in posterior.linear]
@@ -135,3 +140,55 @@ def gather(posterior: Posterior, run: Run) -> Draws:
     return Draws(
         posterior.table, by_draw[:, picked], densities[:, picked], ordered, run.plan.target_ess, several
     )
+
+
+def weighted_draws(
+    posterior: Posterior, weighted: Weighted, rng: np.random.Generator, *, target_ess: float
+) -> Draws:
+    """Draws of every parameter from weighted ones, linear parameters drawn exactly, with their grade."""
+    return _resampled(posterior, weighted, weighted.batches(_PER_ENSEMBLE, rng), rng, target_ess)
+
+
+def _resampled(
+    posterior: Posterior, weighted: Weighted, chosen: Index, rng: np.random.Generator, target_ess: float
+) -> Draws:
+    """Draws at positions of weighted ones.
+
+    Parts of the weighted draws stand for the ensembles of a sampler: being independent, they let R-hat and
+    scatter see a mean that hangs on a few draws. Effective sample sizes are those of the weights and of the
+    number of draws together.
+    """
+    values = _completed(posterior, weighted.coordinates[chosen.ravel()], rng)
+    values = values.reshape(*chosen.shape, -1)
+    several, rows = [], posterior.table.rows
+    centre, tail = (1 / (1 / own + 1 / chosen.size) for own in (weighted.centre_ess, weighted.tail_ess))
+    worth = {k: (float(centre[at]), float(tail[at])) for at, k in enumerate(posterior.sampled)}
+    linear = (float(min(centre, default=weighted.ess)), float(min(tail, default=weighted.ess)))
+    for at, k in enumerate(posterior.sampled):
+        # draws are in random order: a few of them stand for those of a walker
+        walkers = values[..., k].reshape(len(chosen), -1, 1)
+        found = ridges(rows[k].name, rows[k].unit, walkers, log_scale=rows[k].log_scale)
+        if found.boundaries:
+            by_weights = weighted.share_errors(weighted.sampled[:, at], found.boundaries)
+            several.append(replace(found, errors=np.hypot(found.errors, by_weights)))
+    measured = tuple(
+        with_shares(
+            Quality(
+                row.name,
+                *worth.get(k, linear),
+                float(array_stats.rhat_nested(values[..., k], np.arange(len(chosen)))),  # type: ignore[no-untyped-call]
+                scatter=between(values[:, None, :, k])[1],
+            ),
+            several,
+        )
+        for k, row in enumerate(rows)
+        if row.free
+    )
+    density = weighted.log_density[chosen]
+    return Draws(posterior.table, values, density, measured, target_ess, tuple(several))
+
+
+def _completed(posterior: Posterior, flat: Matrix, rng: np.random.Generator) -> Matrix:
+    """Table values of sampled coordinates, linear parameters drawn, (draws, rows)."""
+    chunks = np.array_split(flat, max(1, flat.shape[0] // _CHUNK))
+    return np.concatenate([posterior.complete(chunk, rng) for chunk in chunks])

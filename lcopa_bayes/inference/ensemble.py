@@ -9,6 +9,7 @@ import emcee
 import numpy as np
 
 from lcopa_bayes.arrays import Array, Matrix, Vector
+from lcopa_bayes.inference.cover import Cover
 from lcopa_bayes.inference.mixture import Mixture
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.ridgemoves import walking
@@ -65,15 +66,20 @@ class Ensemble:
 
 
 def advance(
-    posterior: Posterior, ensemble: Ensemble, draws: int, thin: int, mixture: Mixture | None = None
+    posterior: Posterior,
+    ensemble: Ensemble,
+    draws: int,
+    thin: int,
+    mixture: Mixture | None = None,
+    cover: Cover | None = None,
 ) -> Ensemble:
     """The ensemble after ``draws * thin`` more steps, every `thin`-th of them kept.
 
-    With `mixture` some moves follow it. Deterministic: the same ensemble advanced twice gives the same
+    With `mixture`, and `cover`, some moves follow them. Deterministic: the same ensemble advanced twice gives the same
     draws, in whatever process.
     """
     walkers = ensemble.position.shape[0]
-    sampler = walking(posterior, posterior.log_density, walkers, mixture, ensemble.random)
+    sampler = walking(posterior, posterior.log_density, walkers, mixture, ensemble.random, cover)
     state = emcee.State(ensemble.position, log_prob=ensemble.position_log_density)
     last = sampler.run_mcmc(state, draws, thin_by=thin, skip_initial_state_check=True)
     return Ensemble(

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
+from lcopa_bayes.arrays import Array
+from lcopa_bayes.inference.cover import Cover
 from lcopa_bayes.inference.ensemble import Ensemble
 from lcopa_bayes.inference.mixture import Mixture
 from lcopa_bayes.inference.mixturemove import learned
@@ -15,6 +19,9 @@ _WIDE = 0.5
 """Share of the mixture that is learned from the populations on their way from the prior [-]."""
 _KNOWN = 0.2
 """Share of modes that are known from elsewhere, where there are any [-]."""
+
+_COMPONENTS = 40
+"""Components of the cover that is learned."""
 
 
 def taught(
@@ -29,11 +36,26 @@ def taught(
     Rosenthal 2007, J. Appl. Probab. 44).
     """
     wide = learned(posterior, [ensemble.trail for ensemble in ensembles], seed).levelled()
+    lesson = _lesson(ensembles, per_round)
+    found = learned(posterior, lesson, seed).levelled().blended(wide, _WIDE) if lesson else wide
+    return found if known is None else found.blended(known, _KNOWN)
+
+
+def taught_cover(
+    posterior: Posterior, ensembles: Sequence[Ensemble], per_round: int, seed: int
+) -> Cover | None:
+    """A levelled cover of the same draws that `taught` learns from; None before there are any."""
+    lesson = _lesson(ensembles, per_round)
+    if not lesson:
+        return None
+    pooled = np.concatenate([chain.reshape(-1, posterior.dimension) for chain in lesson])
+    return Cover.fitted(posterior, pooled, seed, _COMPONENTS).levelled()
+
+
+def _lesson(ensembles: Sequence[Ensemble], per_round: int) -> list[Array]:
+    """The later half of the draws at the last power of two of rounds, by ensemble; none before `LEARNING`."""
     done = ensembles[0].chain.shape[0] // per_round
     if done < LEARNING:
-        found = wide
-    else:
-        lesson = per_round << (done.bit_length() - 1)
-        own = learned(posterior, [ensemble.chain[lesson // 2 : lesson] for ensemble in ensembles], seed)
-        found = own.levelled().blended(wide, _WIDE)
-    return found if known is None else found.blended(known, _KNOWN)
+        return []
+    last = per_round << (done.bit_length() - 1)
+    return [ensemble.chain[last // 2 : last] for ensemble in ensembles]

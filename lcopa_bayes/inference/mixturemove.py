@@ -9,8 +9,9 @@ import numpy as np
 
 from lcopa_bayes.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.chart import Chart
+from lcopa_bayes.inference.cover import Cover
 from lcopa_bayes.inference.mixture import Mixture
-from lcopa_bayes.inference.moves import PopulationMove, scales
+from lcopa_bayes.inference.moves import PopulationMove, Terrain, scales
 from lcopa_bayes.inference.posterior import Posterior
 
 
@@ -47,6 +48,25 @@ class MixtureMove(PopulationMove):
     def _log_density(self, z: Matrix) -> Vector:
         y, log_volume = self.chart.charted(z)
         return self.mixture.log_density(y) + log_volume
+
+
+@final
+class CoverMove(PopulationMove):
+    """Independence proposals from a cover, which is fixed while it is used."""
+
+    def __init__(self, terrain: Terrain, cover: Cover) -> None:
+        super().__init__(terrain)
+        self.cover = cover
+
+    def proposal(self, here: Matrix, others: Matrix, random: Any) -> tuple[Matrix, Vector]:
+        """See `PopulationMove.proposal`."""
+        drawn = self.cover.draw(len(here), random)
+        rows = random.permutation(len(here))[: len(drawn)]
+        proposed, factor = here.copy(), np.full(len(here), -np.inf)
+        proposed[rows] = drawn
+        with np.errstate(invalid="ignore"):
+            factor[rows] = self.cover.log_density(here[rows]) - self.cover.log_density(drawn)
+        return proposed, np.where(np.isfinite(factor), factor, -np.inf)
 
 
 @final
