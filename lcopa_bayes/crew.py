@@ -1,7 +1,8 @@
-"""Who does independent tasks: this process, or several of one thread each."""
+"""Processes: how many this one may run, and independent tasks done in several of one thread each."""
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -30,3 +31,10 @@ def _ready() -> None:
 
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # an interrupt ends a worker without a word
     threadpool_limits(1)
+
+
+def cores() -> int:
+    """Processors available to this process, at least 1."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

@@ -1,4 +1,4 @@
-"""Study files and bare record files, read into a `Study`."""
+"""Study files, files of candidates and bare record files, read into a `Study` and its candidates."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lcopa_bayes.candidatesettings import compare_settings
+from lcopa_bayes.candidatesettings import CandidateSettings, compare_settings
 from lcopa_bayes.cells import SUFFIXES
 from lcopa_bayes.problems import InputError, nearest
 from lcopa_bayes.record import Record, in_time_unit, load_record
@@ -25,6 +25,8 @@ from lcopa_bayes.settings import (
     settings_from,
 )
 from lcopa_bayes.study import DEFAULT_STAGES, Study, together
+
+_KNOWN = ("compare", "candidates")
 
 _TABLES = ("study", "records", "model", "priors", "noise", "sampler", "effects", "stages")
 _COMPARED = ("compare", "candidates")
@@ -191,3 +193,23 @@ def load_study(source: Path | Sequence[Path], *, held_out: Sequence[Path] = ()) 
     more = [f"and-{len(fit) - 3}-more"] if len(fit) > 3 else []  # the name becomes that of a folder
     name = "-".join([record.name for record in fit[:3]] + more)
     return Study(name, None, fit[0].time_unit, 0, fit, kept, inputs=_hashes([*sources, *apart]))
+
+
+def load_candidates(path: Path) -> tuple[tuple[str, ...] | None, tuple[CandidateSettings, ...]]:
+    """Names picked, None for all, and candidates described in a TOML file.
+
+    InputError with all that is wrong.
+    """
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as TOML ({error}); give a file of candidates") from None
+    problems = [
+        f"{path}: unknown table [{key}]{nearest(key, _KNOWN)}" for key in document if key not in _KNOWN
+    ]
+    chosen, made = compare_settings(document, str(path), problems)
+    if not document:
+        problems.append(f"{path}: names no candidate; write [[candidates]] or [compare] pick")
+    if problems:
+        raise InputError(problems)
+    return chosen.pick, made

@@ -14,12 +14,11 @@ from small import Toy, problem, record
 
 from lcopa_bayes.comparison.carry import carried
 from lcopa_bayes.comparison.decision import decided
-from lcopa_bayes.comparison.differences import stretches, total_sd
+from lcopa_bayes.comparison.gains import stretches, total_sd
 from lcopa_bayes.comparison.integerorder import savage_dickey
-from lcopa_bayes.comparison.judgement import judged
+from lcopa_bayes.comparison.judgement import judged, probabilities, stacking_weights
 from lcopa_bayes.comparison.parts import CUTS, parts_of, predicted, without
 from lcopa_bayes.comparison.priorwidth import _scaled
-from lcopa_bayes.comparison.stacking import probabilities, stacking_weights
 from lcopa_bayes.estimate import Estimate
 from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.priors import Prior

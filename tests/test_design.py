@@ -27,9 +27,9 @@ from lcopa_bayes.design.precision import cramer_rao, promises, reached, within
 from lcopa_bayes.design.refit import device_of, refit
 from lcopa_bayes.design.template import write_template
 from lcopa_bayes.design.told import as_json
-from lcopa_bayes.planning import plan_next
 from lcopa_bayes.problems import InputError
 from lcopa_bayes.record import load_record, save_record
+from lcopa_bayes.verbs.questions import plan_next
 
 PLANT = {key: value for key, value in TRUTH.items() if key not in ("offset", "sigma")}
 

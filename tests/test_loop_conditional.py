@@ -15,9 +15,8 @@ from lcopa_bayes.bench.command import on_off
 from lcopa_bayes.inference.grade import qualities
 from lcopa_bayes.loop.autoregression import Autoregression
 from lcopa_bayes.loop.basemodel import BaseModel
-from lcopa_bayes.loop.burnin import settled
 from lcopa_bayes.loop.density import LoopDensity
-from lcopa_bayes.loop.draws import LoopDraws, sample_loop
+from lcopa_bayes.loop.draws import LoopDraws, sample_loop, settled
 from lcopa_bayes.loop.extended import ExtendedModel
 from lcopa_bayes.loop.regression import Regression
 from lcopa_bayes.loop.scores import State

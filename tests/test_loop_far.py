@@ -17,8 +17,8 @@ from lcopa_bayes.loop.basemodel import BaseModel
 from lcopa_bayes.loop.leftout import PARTS, groups
 from lcopa_bayes.loop.loop import loop
 from lcopa_bayes.loop.quiet import joint_noise
-from lcopa_bayes.loop.regressedstarts import regressed
 from lcopa_bayes.loop.signature import Scale
+from lcopa_bayes.loop.starts import regressed
 from lcopa_bayes.loop.terms import fitted_base
 from lcopa_bayes.loop.whitening import Whitening
 from lcopa_bayes.plant.drive import Drive

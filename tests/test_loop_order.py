@@ -17,9 +17,9 @@ from lcopa_bayes.loop.autoregression import Autoregression
 from lcopa_bayes.loop.basemodel import BaseModel
 from lcopa_bayes.loop.density import LoopDensity
 from lcopa_bayes.loop.extended import ExtendedModel
-from lcopa_bayes.loop.moved import moved
 from lcopa_bayes.loop.regression import Regression
 from lcopa_bayes.loop.scores import State
+from lcopa_bayes.loop.told import moved
 from lcopa_bayes.loop.whitening import Whitening
 
 NOISE = 0.01

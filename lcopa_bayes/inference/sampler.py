@@ -20,10 +20,17 @@ from lcopa_bayes.inference.chainfile import load_chain, save_chain
 from lcopa_bayes.inference.ensemble import Ensemble, advance
 from lcopa_bayes.inference.grade import CERTAIN, Quality, drifts, qualities
 from lcopa_bayes.inference.knownmodes import around
-from lcopa_bayes.inference.lessons import LEARNING, taught
 from lcopa_bayes.inference.mixture import Mixture
+from lcopa_bayes.inference.mixturemove import learned
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.ridges import Ridges, ridges
+
+LEARNING = 2
+"""Rounds before the mixture is learned from the draws of all ensembles; and again at each doubling."""
+_WIDE = 0.5
+"""Share of the mixture that is learned from the populations on their way from the prior [-]."""
+_KNOWN = 0.2
+"""Share of modes that are known from elsewhere, where there are any [-]."""
 
 _ROUND = 20
 """Draws kept per round and walker."""
@@ -265,3 +272,25 @@ def _take_up(posterior: Posterior) -> None:
 def _perform(task: Callable[[Posterior, Any], Ensemble], given: Any) -> Ensemble:
     assert _posterior is not None
     return task(_posterior, given)
+
+
+def taught(
+    posterior: Posterior, ensembles: Sequence[Ensemble], per_round: int, seed: int, known: Mixture | None
+) -> Mixture:
+    """The mixture that moves follow: learned from the later half of the draws at the last power of two,
+    and in part from the populations on their way from the prior, which saw modes that few walkers stand
+    on; blended with the modes `known` from elsewhere.
+
+    `per_round` draws are kept of each walker in a round. A function of the chains alone, so that a resumed
+    run learns the same; learning thins out, as the ergodicity of adaptive sampling asks (Roberts and
+    Rosenthal 2007, J. Appl. Probab. 44).
+    """
+    wide = learned(posterior, [ensemble.trail for ensemble in ensembles], seed).levelled()
+    done = ensembles[0].chain.shape[0] // per_round
+    if done < LEARNING:
+        found = wide
+    else:
+        lesson = per_round << (done.bit_length() - 1)
+        own = learned(posterior, [ensemble.chain[lesson // 2 : lesson] for ensemble in ensembles], seed)
+        found = own.levelled().blended(wide, _WIDE)
+    return found if known is None else found.blended(known, _KNOWN)

@@ -10,12 +10,14 @@ import numpy as np
 from lcopa_bayes.estimate import plain
 from lcopa_bayes.loop.leftout import in_turn
 from lcopa_bayes.loop.loop import Loop, Side
-from lcopa_bayes.loop.moved import moved
-from lcopa_bayes.loop.nextmeasurement import next_measurement
 from lcopa_bayes.loop.residualview import View, views
 from lcopa_bayes.loop.rounds import Round
 from lcopa_bayes.loop.scores import Score, pooled_coverage, pooled_rmse
 from lcopa_bayes.loop.trace import SEEN
+from lcopa_bayes.plant.effects.effect import Card
+
+FAR = 2.0
+"""Shifts beyond so many standard deviations are listed [-]."""
 
 _NEAREST = 4
 """Rivals that are listed for each named effect [-]."""
@@ -250,3 +252,60 @@ def words(told: dict[str, Any]) -> Sequence[str]:
         out.append(f"pointwise 90 % bands hold {first} of unseen samples before, {last} after")
     out += [f"next measurement: {told['next_measurement']}"] if told["next_measurement"] else []
     return out
+
+
+def moved(found: Loop) -> list[dict[str, Any]]:
+    """Plant parameters that the effects moved by more than two standard deviations of the fit with them."""
+    if not found.effects:
+        return []
+    before, after = found.before.state, found.after.state
+    base, n = found.base.model, after.model.plant_size
+    first, last = base.values(before.optimum.x), base.values(after.optimum.x[:n])
+    sds = np.sqrt(np.diag(after.covariance))[:n]
+    out = []
+    rows = base.posterior.table.rows
+    for position, k in enumerate(base.least.columns):
+        shift = (after.optimum.x[position] - before.optimum.x[position]) / sds[position]
+        if abs(shift) > FAR:
+            row = rows[k]
+            out.append(
+                {
+                    "name": row.name,
+                    "unit": row.unit,
+                    "before": first[k],
+                    "after": last[k],
+                    "shift_in_sd": shift,
+                }
+            )
+    return sorted(out, key=lambda row: -abs(row["shift_in_sd"]))
+
+
+def next_measurement(found: Loop) -> str:
+    """In words: what excitation splits a group, finds what is unexplained, or shows what stayed invisible."""
+    trace = found.trace
+    if trace is None:
+        return "Mend the base fit first: give it records in which it can follow the response."
+    if not found.base.noise_known:
+        quiet = (
+            "a stretch before the first command, or a repeat, so that the noise is known apart from the fit"
+        )
+        return f"Record {quiet}."
+    cards = {one.name: one.card for one in trace.traced}
+    for group in found.groups:
+        if len(group) > 1:
+            wanted = _wanted([cards[name] for name in group if name in cards])
+            return f"To tell {', '.join(group)} apart, record {wanted}."
+    if found.verdict.kind == "unexplained":
+        near = [one for one in trace.traced if one.card.place != "generic"][:2]
+        return f"To find what is missing, record {_wanted([one.card for one in near])}." if near else ""
+    hidden = [one for one in trace.traced if one.survival < SEEN and one.card.place != "generic"]
+    if hidden:
+        names = ", ".join(one.name for one in hidden[:3])
+        return f"These records could not show {names}; {_wanted([one.card for one in hidden[:3]])} would."
+    return ""
+
+
+def _wanted(cards: Sequence[Card]) -> str:
+    """What reveals these effects, each excitation once."""
+    told = (part.strip() for card in cards for part in card.reveals.split(";")[0].split(","))
+    return ", ".join(dict.fromkeys(told))

@@ -6,9 +6,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from lcopa_bayes.paper.earlier import earlier
 from lcopa_bayes.paper.posteriorclaims import needs_audit
-from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict
+from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict, earlier
 from lcopa_bayes.stated import Stated
 
 COLLINEAR = 10.0

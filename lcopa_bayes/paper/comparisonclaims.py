@@ -7,10 +7,9 @@ from math import hypot, log
 from pathlib import Path
 from typing import Any
 
-from lcopa_bayes.paper.earlier import earlier
 from lcopa_bayes.paper.posteriorclaims import needs_comparison
 from lcopa_bayes.paper.printedmodel import integer_rival
-from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict
+from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict, earlier
 from lcopa_bayes.stated import Stated
 
 STRONG = log(20)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
-from lcopa_bayes.cores import cores
+from lcopa_bayes.crew import cores
 from lcopa_bayes.study import Study
 from lcopa_bayes.studyfile import load_study
 

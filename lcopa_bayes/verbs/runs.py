@@ -15,7 +15,7 @@ from lcopa_bayes.calibration.summary import results as calibration_results
 from lcopa_bayes.calibration.summary import tables
 from lcopa_bayes.calibration.truths import Stated
 from lcopa_bayes.checks import refuse_if
-from lcopa_bayes.cores import cores
+from lcopa_bayes.crew import cores
 from lcopa_bayes.files import writable_folder
 from lcopa_bayes.fit import fit
 from lcopa_bayes.provenance import provenance

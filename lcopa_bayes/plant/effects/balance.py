@@ -13,6 +13,8 @@ from scipy.linalg.lapack import dtrtrs
 
 from lcopa_bayes.arrays import Index, Matrix, Vector
 
+_STEPS = 400
+
 Force: TypeAlias = Callable[[slice | Index, Matrix, Matrix, Matrix], Matrix]
 """(blocks, deviation of y, its values one and two blocks before) -> deviation of the force, each of
 (axes, blocks); blocks by their positions may come several times."""
@@ -247,3 +249,22 @@ def _relaxed(
                 return target, v
             y = y + share * (target - y)
     return None
+
+
+def resting(force: Callable[[Matrix], Matrix], start: Matrix, scale: Vector) -> Matrix:
+    """Level at which ``force(y) = y``, (axes, 1), by the secant method from `start`; raises RunawayError."""
+    y, small, size = start, TOLERANCE * scale[:, None], scale[:, None]
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        ahead = force(y) - y
+        step = np.full(y.shape, 1e-6) * size
+        for _ in range(_STEPS):
+            done = np.abs(ahead) <= small
+            if done.all():
+                return y
+            slope = (force(y + step) - (y + step) - ahead) / step
+            move = np.where(done, 0.0, -ahead / slope)
+            y, ahead = y + move, force(y + move) - (y + move)
+            if not np.all(np.abs(y) < RUNAWAY * size):  # NaN too
+                break
+            step = np.where(done, 1e-6 * size, 1e-3 * move)
+    raise RunawayError(0)

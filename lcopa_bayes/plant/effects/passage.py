@@ -12,7 +12,7 @@ import numpy as np
 from lcopa_bayes.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.operational.series import Spectrum
 from lcopa_bayes.operational.transfer import transfer
-from lcopa_bayes.plant.effects.balance import RunawayError, balanced
+from lcopa_bayes.plant.effects.balance import RunawayError, balanced, resting
 from lcopa_bayes.plant.effects.effect import (
     Effect,
     ElementEffect,
@@ -21,7 +21,6 @@ from lcopa_bayes.plant.effects.effect import (
     SensorEffect,
     UnstableError,
 )
-from lcopa_bayes.plant.effects.resting import resting
 from lcopa_bayes.plant.forward import Dynamics, Experiment, ForwardModel, StepResponses
 from lcopa_bayes.plant.layout import Layout
 
