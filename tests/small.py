@@ -7,19 +7,19 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import Command, on_off, step
 from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.data.settings import ModelSettings, NoiseSettings, PriorSettings, SamplerSettings
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
-from lcopa_bayes.inference.draws import Draws
-from lcopa_bayes.inference.grade import Quality
 from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.priors import Prior
-from lcopa_bayes.record import Axis, Record
-from lcopa_bayes.settings import ModelSettings, NoiseSettings, PriorSettings, SamplerSettings
-from lcopa_bayes.study import Study
+from lcopa_bayes.sampling.convergence import Quality
+from lcopa_bayes.sampling.draws import Draws
 
 U, Y = Axis("u", "V"), Axis("y", "rad")
 TRUTH = {"gain": 2.0, "time_1": 1.5, "order_1": 0.8, "delay": 0.73, "offset": 0.3, "sigma": 0.02}

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 from small import TRUTH, U, Y, draws_of, problem, record, study
 
-from lcopa_bayes.adequacy import _coverage, limitations
 from lcopa_bayes.audit.audit import audit
 from lcopa_bayes.bench.command import step
-from lcopa_bayes.fit import fit
+from lcopa_bayes.data.record import Record
 from lcopa_bayes.inference.assembly import Problem
-from lcopa_bayes.inference.draws import Draws
-from lcopa_bayes.inference.grade import Limitation
 from lcopa_bayes.inference.optimum import find_optima
-from lcopa_bayes.predict import bands
-from lcopa_bayes.record import Record
-from lcopa_bayes.residuals import residuals
-from lcopa_bayes.resonance import PEAK, peaks, unresolved
-from lcopa_bayes.results import results
+from lcopa_bayes.results.adequacy import _coverage, limitations
+from lcopa_bayes.results.fit import fit
+from lcopa_bayes.results.prediction import bands
+from lcopa_bayes.results.residuals import residuals
+from lcopa_bayes.results.resonance import PEAK, peaks, unresolved
+from lcopa_bayes.results.summary import results
+from lcopa_bayes.sampling.convergence import Limitation
+from lcopa_bayes.sampling.draws import Draws
 
 NOISE = TRUTH | {"sigma_ar": 0.003, "rho": 0.5, "nu": 200.0}
 

@@ -11,20 +11,20 @@ from numpy.testing import assert_allclose
 from scipy.stats import chi2
 from small import TRUTH, TWO, draws_of, problem, record
 
-from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.audit.audit import _flat
-from lcopa_bayes.audit.bayes import beliefs, prior_draws, prior_spread
-from lcopa_bayes.audit.landscape import Landscape, Peak
-from lcopa_bayes.audit.local import curvature
+from lcopa_bayes.audit.contraction import beliefs, prior_draws, prior_spread
+from lcopa_bayes.audit.curvature import curvature
 from lcopa_bayes.audit.printedform import printed_form, printed_structure
 from lcopa_bayes.audit.profile import Freedom, Profile
-from lcopa_bayes.audit.profilewalk import _Walk, profile
+from lcopa_bayes.audit.profilepath import _Walk, profile
 from lcopa_bayes.audit.radial import radial
 from lcopa_bayes.audit.sensitivities import sensitivities
-from lcopa_bayes.audit.structure import Structure, structure
+from lcopa_bayes.audit.symmetries import Structure, structure
 from lcopa_bayes.audit.tolerance import Tolerance
 from lcopa_bayes.audit.verdict import Finding, judged
 from lcopa_bayes.bench.command import step
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.inference.likelihood import Landscape, Peak
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.posterior import Posterior

@@ -13,11 +13,11 @@ from small import TWO, problem, record
 from lcopa_bayes.audit.delays import delays
 from lcopa_bayes.bench.command import on_off, step
 from lcopa_bayes.cli import main
-from lcopa_bayes.inference.grade import Limitation
+from lcopa_bayes.data.record import save_record
 from lcopa_bayes.paper.claims import judge
 from lcopa_bayes.paper.verdict import Evidence
-from lcopa_bayes.record import save_record
-from lcopa_bayes.report.sections import audited
+from lcopa_bayes.report.sections import audittables
+from lcopa_bayes.sampling.convergence import Limitation
 
 STUDY = """[records]
 fit = ["one.csv"]
@@ -215,7 +215,7 @@ def test_paths_driven_one_after_the_other_are_told_apart_and_an_idle_drive_is_no
 
 
 def advice(limitations: list[dict]) -> str:
-    section = audited._next({"next_measurement": None, "limitations": limitations})
+    section = audittables._next({"next_measurement": None, "limitations": limitations})
     return " ".join(section.text)
 
 

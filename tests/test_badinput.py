@@ -10,12 +10,12 @@ import pytest
 from small import problem, record, study
 
 from lcopa_bayes.cli import main
-from lcopa_bayes.fit import Fit, fit
+from lcopa_bayes.data.record import save_record
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.inference.sampler import SamplePlan, sample
-from lcopa_bayes.plant.forward import Dynamics, ForwardModel
-from lcopa_bayes.record import save_record
-from lcopa_bayes.results import results
+from lcopa_bayes.model.forward import Dynamics, ForwardModel
+from lcopa_bayes.results.fit import Fit, fit
+from lcopa_bayes.results.summary import results
+from lcopa_bayes.sampling.sampler import SamplePlan, sample
 
 PLAN = SamplePlan(2, 12, 200, 1, 100.0, 1)
 SLOW = 3.0

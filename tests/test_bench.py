@@ -24,8 +24,8 @@ from lcopa_bayes.bench.command import Command, on_off, prbs, quiet, staircase, s
 from lcopa_bayes.bench.device import PAPER_DEVICE, Device, TransferPath
 from lcopa_bayes.bench.inversion import Compliance, InversionError, PoleSearchError
 from lcopa_bayes.bench.superposition import TableError, superposed, tabulated
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.record import Axis, load_record
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.record import Axis, load_record
 
 XX = PAPER_DEVICE.paths[0][0]
 SLOW_ONSET = TransferPath(gain=2.0, delay=0.7, etas=(3.0, 0.4), orders=(0.3, 0.1), stiffness=1.5)

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from lcopa_bayes.operational.blockpulse import (
+from lcopa_bayes.model.blockpulses import (
     integration_matrix,
     integration_weights,
     integration_weights_slope,

@@ -24,22 +24,22 @@ from test_importance import same_quantiles
 from test_verbs import check_page
 
 from lcopa_bayes.bench.command import on_off
-from lcopa_bayes.calibration.calibrate import Calibration, calibrate
-from lcopa_bayes.calibration.coverage import Coverage
-from lcopa_bayes.calibration.ranks import bin_limits, corridor, p_uniform, rank_of
-from lcopa_bayes.calibration.replica import ENGINES, RANKED, Failure, Outcome, Replication, holds
-from lcopa_bayes.calibration.simulated import command_of, device_of, exact_responses, measured, model_gap
-from lcopa_bayes.calibration.store import Store
-from lcopa_bayes.calibration.summary import results
-from lcopa_bayes.calibration.truths import Truths, truths_around, truths_stated
+from lcopa_bayes.calibrate.calibrate import Calibration, calibrate
+from lcopa_bayes.calibrate.coverage import Coverage
+from lcopa_bayes.calibrate.ranks import bin_limits, corridor, p_uniform, rank_of
+from lcopa_bayes.calibrate.replica import ENGINES, RANKED, Failure, Outcome, Replication, holds
+from lcopa_bayes.calibrate.simulation import command_of, device_of, exact_responses, measured, model_gap
+from lcopa_bayes.calibrate.store import Store
+from lcopa_bayes.calibrate.summary import results
+from lcopa_bayes.calibrate.truths import Truths, truths_around, truths_stated
 from lcopa_bayes.cli import main
-from lcopa_bayes.fit import fit, plan_of
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.record import Record, save_record
 from lcopa_bayes.inference.assembly import problem_of
-from lcopa_bayes.inference.data import Samples
-from lcopa_bayes.inference.discretisation import resolved
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.record import Record, save_record
-from lcopa_bayes.runfolder import save_fit
+from lcopa_bayes.inference.observations import Samples
+from lcopa_bayes.results.discretisation import resolved
+from lcopa_bayes.results.fit import fit, plan_of
+from lcopa_bayes.results.runfolder import save_fit
 
 
 @pytest.fixture(scope="module")
@@ -276,7 +276,7 @@ def test_terms_of_one_order_become_one():
 
 def test_priors_stay_the_studys_own(monkeypatch):
     """Defaults derived from the records must not be derived anew from the simulated ones."""
-    from lcopa_bayes.calibration import replica
+    from lcopa_bayes.calibrate import replica
 
     seen = []
     monkeypatch.setattr(replica, "sample", lambda posterior, plan: seen.append((posterior, plan)) or 1 / 0)
@@ -371,7 +371,7 @@ def test_both_engines_give_a_replica_the_same_posterior():
 
 def test_weights_that_are_not_good_lead_to_the_ensembles(alone, monkeypatch):
     assert results(alone)["engine"]["importance"] == 3
-    monkeypatch.setattr("lcopa_bayes.inference.importance.LEAST_EFFICIENCY", 9.0)
+    monkeypatch.setattr("lcopa_bayes.sampling.importance.LEAST_EFFICIENCY", 9.0)
     made = calibrate(STUDY, replicas=2)
     counted = results(made)["engine"]
     assert (counted["wanted"], counted["importance"], counted["sampling"]) == ("importance", 0, 2)
@@ -416,7 +416,7 @@ def test_default_priors_of_a_stated_truth_are_those_of_its_own_records():
 
 def test_what_the_width_of_the_blocks_does_is_counted(monkeypatch):
     """Wide blocks that may not be narrowed: the shift is measured, lowers the grade, and both are counted."""
-    monkeypatch.setattr("lcopa_bayes.inference.discretisation._FINEST", 1)
+    monkeypatch.setattr("lcopa_bayes.results.discretisation._FINEST", 1)
     priors = PRIORS | {"order_1": ("uniform", {"loc": 0.2, "scale": 1.0})}
     clean = record(camera=0.6, noise_sd=1e-4)
     coarse = study(clean, noise="white", priors=priors | {"sigma": 1e-4}, blocks=4)
@@ -868,7 +868,7 @@ def test_a_killed_calibration_resumes_to_the_same_result(written, tmp_path):
     ],
 )
 def test_bad_input_is_told_and_nothing_is_written(written, tmp_path, capsys, monkeypatch, words, said):
-    monkeypatch.setattr("lcopa_bayes.calibration.crew.CONNECT", 0.5)
+    monkeypatch.setattr("lcopa_bayes.calibrate.workers.CONNECT", 0.5)
     out = tmp_path / "run"
     code, printed, told = run(capsys, "calibrate", written, *words, "--out", out, "--quiet")
     assert code == 2
@@ -887,7 +887,7 @@ def test_dask_without_distributed_says_what_to_install(monkeypatch):
 @pytest.mark.parametrize("name", ["one-term", "two-terms", "three-terms"])
 def test_the_bundled_studies_can_be_calibrated(name):
     """Their shortest time constant is long against a block, and the bench can simulate their truths."""
-    from lcopa_bayes.studyfile import load_study
+    from lcopa_bayes.data.studyfile import load_study
 
     made = problem_of(load_study(Path(__file__).parents[1] / "studies" / "calibration" / name))
     table, rng = made.posterior.table, np.random.default_rng(0)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 from small import TWO, record, study
 
-from lcopa_bayes.candidatesettings import CandidateSettings
-from lcopa_bayes.comparison.candidates import Candidate, candidates_of, derived, known_settings
-from lcopa_bayes.comparison.compare import compare
+from lcopa_bayes.compare.candidates import Candidate, candidates_of, derived, known_settings
+from lcopa_bayes.compare.compare import compare
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.candidatesettings import CandidateSettings
+from lcopa_bayes.data.studyfile import load_candidates
 from lcopa_bayes.inference.assembly import problem_of
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.studyfile import load_candidates
 
 
 def named(one: Candidate) -> tuple[str, ...]:

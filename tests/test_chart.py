@@ -12,9 +12,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.special import logit
 from small import TWO, Toy, problem, record
 
-from lcopa_bayes.arrays import Matrix
-from lcopa_bayes.inference.chart import Chart
+from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.sampling.coordinates import Chart
 
 GAINS = {
     "uniform": ("uniform", {"loc": -5.0, "scale": 10.0}),

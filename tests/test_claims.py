@@ -9,13 +9,13 @@ from math import asin, pi
 import numpy as np
 import pytest
 
+from lcopa_bayes.data.literature import PAPER, Stated, StatedPath
 from lcopa_bayes.paper.claims import CLAIMS, judge
 from lcopa_bayes.paper.crosstalkclaims import crosstalk_rules
 from lcopa_bayes.paper.numericsclaims import delay_costs, wavelet_cost
 from lcopa_bayes.paper.opticsclaims import tilt_checks
 from lcopa_bayes.paper.printedmodel import RECORD_LENGTH, PrintedModel, integer_rival
 from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict
-from lcopa_bayes.stated import PAPER, Stated, StatedPath
 
 BY_ID = {claim.id: claim for claim in CLAIMS}
 SUPPORTED, CONTRADICTED, UNDECIDED = Kind.SUPPORTED, Kind.CONTRADICTED, Kind.UNDECIDED

@@ -12,16 +12,16 @@ import pytest
 from small import record, study
 
 from lcopa_bayes.cli import main
-from lcopa_bayes.comparison.candidates import candidates_of
-from lcopa_bayes.comparison.compare import compare
-from lcopa_bayes.comparison.contender import contender
-from lcopa_bayes.fit import plan_of
+from lcopa_bayes.compare.candidatefit import contender
+from lcopa_bayes.compare.candidates import candidates_of
+from lcopa_bayes.compare.compare import compare
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.record import save_record
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.paper.claims import judge
 from lcopa_bayes.paper.verdict import Evidence
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.record import save_record
 from lcopa_bayes.report.comparisonpage import write_comparison
+from lcopa_bayes.results.fit import plan_of
 
 FEW = {"ensembles": 2, "walkers": 16, "steps": 600, "thin": 2, "target_ess": 100}
 PICK = ("fractional-1", "first-order")
@@ -167,8 +167,8 @@ def test_another_comparison_gives_another_verdict(claim, change):
 
 
 def test_m2_reads_the_distance_of_the_steady_states():
+    from lcopa_bayes.data.literature import PAPER
     from lcopa_bayes.paper.comparisonclaims import same_steady_state
-    from lcopa_bayes.stated import PAPER
 
     def kind(told: dict) -> str:
         return same_steady_state(PAPER, told).kind.value

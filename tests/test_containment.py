@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 from small import TWO, path, problem, record, row_values, study
 
-from lcopa_bayes.audit.landscape import Landscape
 from lcopa_bayes.bench.command import prbs
 from lcopa_bayes.bench.device import Device
-from lcopa_bayes.comparison import contender
-from lcopa_bayes.comparison.candidates import candidates_of, derived, known_settings
-from lcopa_bayes.comparison.compare import compare
-from lcopa_bayes.comparison.containment import Check, reached
-from lcopa_bayes.comparison.contender import Contender
-from lcopa_bayes.comparison.likelihood import highest
-from lcopa_bayes.fit import fit
+from lcopa_bayes.compare import candidatefit
+from lcopa_bayes.compare.candidatefit import Contender
+from lcopa_bayes.compare.candidates import candidates_of, derived, known_settings
+from lcopa_bayes.compare.compare import compare
+from lcopa_bayes.compare.containment import Check, reached
+from lcopa_bayes.compare.criteria import highest
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.inference.assembly import problem_of
-from lcopa_bayes.inference.nesting import lifted
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.settings import PriorSettings
+from lcopa_bayes.inference.likelihood import Landscape
+from lcopa_bayes.inference.nestedmodels import lifted
+from lcopa_bayes.results.fit import fit
 
 SHORT = record(camera=0.6)
 COUPLED = record(device=TWO, camera=0.5)
@@ -229,7 +229,7 @@ def misled():
 @pytest.mark.slow
 def test_a_missed_mode_is_found_and_the_richer_model_sampled_again(misled, monkeypatch):
     two, astray = misled
-    monkeypatch.setattr(contender, "fit", astray)
+    monkeypatch.setattr(candidatefit, "fit", astray)
     told = compare(two, quick=True)
     one, richer = told["models"]
     held = richer["containment"]
@@ -251,7 +251,7 @@ def test_a_missed_mode_is_found_and_the_richer_model_sampled_again(misled, monke
 @pytest.mark.slow
 def test_a_model_that_does_not_meet_the_mode_is_ranked_nowhere(misled, monkeypatch):
     two, astray = misled
-    monkeypatch.setattr(contender, "fit", lambda one, *, starts=None, **options: astray(one, **options))
+    monkeypatch.setattr(candidatefit, "fit", lambda one, *, starts=None, **options: astray(one, **options))
     told = compare(two, quick=True)
     row = told["models"][1]
     assert not row["containment"]["met"]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from lcopa_bayes.crew import crew
+from lcopa_bayes.core.parallel import crew
 
 
 def threads(seed):

@@ -12,17 +12,17 @@ from scipy.stats import kstwobign, norm
 from small import draws_of, problem, record, study
 
 from lcopa_bayes.cli import main
-from lcopa_bayes.fit import Fit, fit
-from lcopa_bayes.inference.crosscheck import ALARM, CrossCheck, holm
-from lcopa_bayes.inference.draws import Draws
-from lcopa_bayes.inference.grade import Grade, Quality, limited
-from lcopa_bayes.inference.nested import Nested, NestedPlan
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.record import save_record
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.record import save_record
 from lcopa_bayes.report import write_report
-from lcopa_bayes.report.saved import load_run
-from lcopa_bayes.results import results, verdict
-from lcopa_bayes.runfolder import save_fit
+from lcopa_bayes.report.savedrun import load_run
+from lcopa_bayes.results.fit import Fit, fit
+from lcopa_bayes.results.runfolder import save_fit
+from lcopa_bayes.results.summary import results, verdict
+from lcopa_bayes.sampling.convergence import Grade, Quality, limited
+from lcopa_bayes.sampling.crosscheck import ALARM, CrossCheck, holm
+from lcopa_bayes.sampling.draws import Draws
+from lcopa_bayes.sampling.nested import Nested, NestedPlan
 
 TABLE = problem(record(camera=0.6), terms=2, priors={"offset": 0.3}).posterior.table
 FREE = [k for k, row in enumerate(TABLE.rows) if row.free]
@@ -182,7 +182,7 @@ def doubted(checked) -> Fit:
     k = checked.draws.table.names.index("delay")
     values[:, k] += 2 * values[:, k].std()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lcopa_bayes.fit.nested", lambda *_, **__: replace(honest, values=values))
+        patch.setattr("lcopa_bayes.results.fit.nested", lambda *_, **__: replace(honest, values=values))
         return fit(checked.study, cross_check=True)
 
 

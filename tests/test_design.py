@@ -11,12 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small import TRUTH, TWO, draws_of, problem, record, row_values
 
-from lcopa_bayes.audit.landscape import Landscape
 from lcopa_bayes.audit.sensitivities import sensitivities
 from lcopa_bayes.bench.acquisition import Bench as VirtualBench
 from lcopa_bayes.bench.acquisition import truth
 from lcopa_bayes.bench.command import quiet, step
 from lcopa_bayes.cli import main
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.record import load_record, save_record
 from lcopa_bayes.design.candidates import PLAIN, Candidate, candidates
 from lcopa_bayes.design.confirmation import confirm, confirmed
 from lcopa_bayes.design.design import checked, design
@@ -25,10 +26,9 @@ from lcopa_bayes.design.limits import Limits, bench_times, limits_of
 from lcopa_bayes.design.nextmeasurement import next_measurement
 from lcopa_bayes.design.precision import cramer_rao, promises, reached, within
 from lcopa_bayes.design.refit import device_of, refit
+from lcopa_bayes.design.summary import as_json
 from lcopa_bayes.design.template import write_template
-from lcopa_bayes.design.told import as_json
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.record import load_record, save_record
+from lcopa_bayes.inference.likelihood import Landscape
 from lcopa_bayes.verbs.questions import plan_next
 
 PLANT = {key: value for key, value in TRUTH.items() if key not in ("offset", "sigma")}

@@ -9,6 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import ellipk
 
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.literature import PAPER
 from lcopa_bayes.optics.cell import Cell, Field, paper_cell
 from lcopa_bayes.optics.director import NotConverged, equilibrium, grid_threshold
 from lcopa_bayes.optics.firstintegral import quadrature
@@ -23,8 +25,6 @@ from lcopa_bayes.optics.tiltlaw import (
     printed_law,
     tilt_law_check,
 )
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.stated import PAPER
 
 CELL = paper_cell()
 ONE = Cell(1e-11, 1e-11, 4e-11, 1e-10)

@@ -11,14 +11,14 @@ from small import U, Y, draws_of, path, record, study
 from lcopa_bayes.bench.command import step
 from lcopa_bayes.bench.device import Device
 from lcopa_bayes.inference.assembly import Problem, problem_of
-from lcopa_bayes.inference.discretisation import (
+from lcopa_bayes.inference.leastsquares import LeastSquares
+from lcopa_bayes.results.discretisation import (
     LARGEST,
     Discretisation,
     discretisation,
     optimum_shift,
     resolved,
 )
-from lcopa_bayes.inference.leastsquares import LeastSquares
 
 TIME, GAIN = 3.4, 1.0
 

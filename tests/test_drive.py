@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from lcopa_bayes.plant.drive import Drive
+from lcopa_bayes.data.drive import Drive
 
 EDGES = 0.5 * np.arange(21)
 drives = st.builds(

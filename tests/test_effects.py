@@ -14,25 +14,25 @@ from small import ONE, problem, record
 
 from lcopa_bayes.bench.command import on_off, prbs, staircase, two_axis
 from lcopa_bayes.bench.device import Device, TransferPath
-from lcopa_bayes.inference.effected import Effected, carried, effected, epochs_of
-from lcopa_bayes.plant.drive import Drive, sorted_jumps
-from lcopa_bayes.plant.effects import balance, sensor
-from lcopa_bayes.plant.effects.catalogue import bundled, catalogue
-from lcopa_bayes.plant.effects.commands import Hysteresis, RefreshHold
-from lcopa_bayes.plant.effects.dynamics import (
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.drive import Drive, sorted_jumps
+from lcopa_bayes.data.record import Axis
+from lcopa_bayes.inference.effects import Effected, carried, effected, epochs_of
+from lcopa_bayes.model.effects import balance, sensor
+from lcopa_bayes.model.effects.catalogue import bundled, catalogue
+from lcopa_bayes.model.effects.commands import Hysteresis, RefreshHold
+from lcopa_bayes.model.effects.dynamics import (
     CubicStiffness,
     LevelDependentSpeed,
     Overflow,
     RiseFallAsymmetry,
 )
-from lcopa_bayes.plant.effects.effect import UnstableError
-from lcopa_bayes.plant.effects.parallel import Backflow
-from lcopa_bayes.plant.effects.response import OddCurvature
-from lcopa_bayes.plant.effects.ripples import Vibration
-from lcopa_bayes.plant.effects.sensor import SensorLag
-from lcopa_bayes.predict import responses
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.record import Axis
+from lcopa_bayes.model.effects.effect import UnstableError
+from lcopa_bayes.model.effects.parallel import Backflow
+from lcopa_bayes.model.effects.response import OddCurvature
+from lcopa_bayes.model.effects.ripples import Vibration
+from lcopa_bayes.model.effects.sensor import SensorLag
+from lcopa_bayes.results.prediction import responses
 
 NAMES = [
     "rise_fall_asymmetry", "level_dependent_speed", "field_dependent_delay", "backflow", "cross_fade",
@@ -377,7 +377,7 @@ def test_campaign_speed_is_told_by_the_grid():
 OWN = """
 from dataclasses import dataclass
 from typing import ClassVar
-from lcopa_bayes.plant.effects.effect import Card, ReadoutEffect, single
+from lcopa_bayes.model.effects.effect import Card, ReadoutEffect, single
 
 @dataclass(frozen=True)
 class Doubled(ReadoutEffect):

@@ -10,15 +10,15 @@ import pytest
 from numpy.testing import assert_allclose
 from small import problem
 
-from lcopa_bayes.inference.data import Samples
-from lcopa_bayes.inference.effected import Effected, carried, effected
-from lcopa_bayes.plant.drive import Drive
-from lcopa_bayes.plant.effects.catalogue import bundled
-from lcopa_bayes.plant.effects.crossfade import CrossFade
-from lcopa_bayes.plant.effects.parallel import relaxing
-from lcopa_bayes.plant.effects.superposition import jumps_of, summed
-from lcopa_bayes.plant.forward import forward_model
-from lcopa_bayes.record import Axis, Record
+from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.inference.effects import Effected, carried, effected
+from lcopa_bayes.inference.observations import Samples
+from lcopa_bayes.model.effects.catalogue import bundled
+from lcopa_bayes.model.effects.crossfade import CrossFade
+from lcopa_bayes.model.effects.parallel import relaxing
+from lcopa_bayes.model.effects.superposition import jumps_of, summed
+from lcopa_bayes.model.forward import forward_model
 
 ALL = bundled()
 LAYOUTS = [(1, 1), (1, 2), (2, 1), (3, 2)]

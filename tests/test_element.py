@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lcopa_bayes.plant.element import Element, PaperForm, from_paper, to_paper
-from lcopa_bayes.stated import PAPER
+from lcopa_bayes.data.literature import PAPER
+from lcopa_bayes.model.element import Element, PaperForm, from_paper, to_paper
 
 PATHS = {name: getattr(PAPER.plant, name) for name in ("xx", "xy", "yx", "yy")}
 elements = st.lists(st.tuples(st.floats(0.05, 2.0), st.floats(-3.0, 3.0)), min_size=1, max_size=5).map(

@@ -11,13 +11,13 @@ from scipy.integrate import dblquad
 from scipy.special import logsumexp
 from small import TRUTH, Toy, problem, record
 
-from lcopa_bayes.arrays import Array, Matrix
-from lcopa_bayes.comparison.parts import Part
-from lcopa_bayes.comparison.prediction import Predicted
-from lcopa_bayes.inference.draws import gather
-from lcopa_bayes.inference.evidence import Evidence, bridge, evidence
+from lcopa_bayes.compare.folds import Part
+from lcopa_bayes.compare.predictivedensity import Predicted
+from lcopa_bayes.core.arrays import Array, Matrix
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.inference.sampler import SamplePlan, sample
+from lcopa_bayes.sampling.draws import gather
+from lcopa_bayes.sampling.evidence import Evidence, bridge, evidence
+from lcopa_bayes.sampling.sampler import SamplePlan, sample
 
 GAIN = ("gennorm", {"beta": 2.0, "loc": 1.0, "scale": 2.0 * np.sqrt(2)})
 """A normal density under another name, so that the gain is sampled and not integrated out."""

@@ -7,9 +7,9 @@ import os
 
 import pytest
 
-from lcopa_bayes import files
-from lcopa_bayes.files import enduring, writable_folder, write_text, write_whole
-from lcopa_bayes.problems import InputError
+from lcopa_bayes.core import files
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.files import enduring, writable_folder, write_text, write_whole
 
 
 def test_a_file_is_written_and_replaced(tmp_path):

@@ -11,11 +11,11 @@ from numpy.testing import assert_array_equal
 from small import TRUTH, record, study
 
 from lcopa_bayes.bench.command import on_off
-from lcopa_bayes.fit import Fit, fit, plan_of
+from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.inference.assembly import problem_of
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.provenance import fingerprint, provenance
-from lcopa_bayes.results import residual_rms, results, verdict
+from lcopa_bayes.results.fit import Fit, fit, plan_of
+from lcopa_bayes.results.provenance import fingerprint, provenance
+from lcopa_bayes.results.summary import residual_rms, results, verdict
 
 TINY = {"ensembles": 2, "walkers": 32, "steps": 600, "thin": 3, "target_ess": 200}
 HELD = record(2, command=on_off(-0.7, hold=4.0, at=1.3), name="held")

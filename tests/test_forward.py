@@ -13,14 +13,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from lcopa_bayes.bench.command import Command, prbs, staircase, step
 from lcopa_bayes.bench.device import Device, TransferPath
-from lcopa_bayes.plant.drive import Drive
-from lcopa_bayes.plant.element import PaperForm, from_paper
-from lcopa_bayes.plant.forward import Dynamics, Experiment, ForwardModel, forward_model
-from lcopa_bayes.plant.grid import Mesh
-from lcopa_bayes.plant.layout import Layout
-from lcopa_bayes.record import Axis, Record
-from lcopa_bayes.settings import ModelSettings
-from lcopa_bayes.stated import PAPER
+from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.literature import PAPER
+from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.data.settings import ModelSettings
+from lcopa_bayes.model.element import PaperForm, from_paper
+from lcopa_bayes.model.forward import Dynamics, Experiment, ForwardModel, forward_model
+from lcopa_bayes.model.grid import Mesh
+from lcopa_bayes.model.layout import Layout
 
 X, Y = Axis("x", "rad"), Axis("y", "rad")
 UNIT_STEP = Drive(np.zeros(1), np.ones(1))

@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 from small import record
 
-from lcopa_bayes import files
 from lcopa_bayes.bench.campaign import write_campaign
 from lcopa_bayes.cli import main
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.record import save_record
+from lcopa_bayes.core import files
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.record import save_record
 
 resource = pytest.importorskip("resource", reason="needs limits on the size of files")
 
@@ -30,10 +30,10 @@ import json, resource, sys
 from pathlib import Path
 import numpy as np
 from small import record, study
-from lcopa_bayes.files import write_whole
-from lcopa_bayes.fit import fit
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.runfolder import save_posterior
+from lcopa_bayes.core.files import write_whole
+from lcopa_bayes.results.fit import fit
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.results.runfolder import save_posterior
 
 def limit(size):
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))

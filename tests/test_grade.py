@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small import draws_of, problem
 
-from lcopa_bayes.inference.grade import (
+from lcopa_bayes.sampling.convergence import (
     Grade,
     Limitation,
     Quality,
@@ -17,7 +17,7 @@ from lcopa_bayes.inference.grade import (
     qualities,
     with_shares,
 )
-from lcopa_bayes.inference.ridges import Ridges
+from lcopa_bayes.sampling.modes import Ridges
 
 SHAPE = (4, 16, 60)
 """Ensembles, walkers, draws."""

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from lcopa_bayes.plant.grid import FEWEST_BLOCKS, MOST_BLOCKS, Grid, Mesh
+from lcopa_bayes.model.grid import FEWEST_BLOCKS, MOST_BLOCKS, Grid, Mesh
 
 RATE = 0.9
 

@@ -9,15 +9,15 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 
+from lcopa_bayes.bench.campaignfile import load_plan
 from lcopa_bayes.bench.command import on_off
-from lcopa_bayes.bench.drivekinds import by_axis, joined
+from lcopa_bayes.bench.driveeffects import by_axis, joined
 from lcopa_bayes.bench.inversion import Compliance
 from lcopa_bayes.bench.marching import MarchError, marched, step_means
-from lcopa_bayes.bench.plan import load_plan
 from lcopa_bayes.bench.schedules import LARGEST, plain_schedules, rich_schedules
 from lcopa_bayes.bench.undeclared import NAMED, NOISE, OUTSIDE, UndeclaredPlan, campaign, drawn, steerer
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.studyfile import load_study
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.studyfile import load_study
 
 STUDY = Path(__file__).parents[1] / "studies" / "undeclared"
 DEVICE = steerer(np.random.default_rng(1))

@@ -10,12 +10,12 @@ import pytest
 from small import study
 
 from lcopa_bayes.bench.acquisition import Bench, truth
-from lcopa_bayes.bench.hidden import HiddenDevice
+from lcopa_bayes.bench.hiddeneffects import HiddenDevice
 from lcopa_bayes.bench.schedules import rich_schedules
 from lcopa_bayes.bench.undeclared import NAMED, NOISE, drawn, shot_of, steerer
 from lcopa_bayes.inference.assembly import problem_of
-from lcopa_bayes.inference.effected import Effected, effected
-from lcopa_bayes.plant.effects.catalogue import bundled
+from lcopa_bayes.inference.effects import Effected, effected
+from lcopa_bayes.model.effects.catalogue import bundled
 
 DEVICE = steerer(np.random.default_rng(1))
 CHOSEN = ((0, 50.0), (5, 60.0), (8, 50.0))

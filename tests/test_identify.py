@@ -20,7 +20,12 @@ from small import ONE, TWO, path, record, study
 from lcopa_bayes.bench.acquisition import Bench, truth
 from lcopa_bayes.bench.command import Command, prbs, step
 from lcopa_bayes.bench.device import Device
-from lcopa_bayes.operational.blockpulse import integration_matrix
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.data.studyfile import load_study
+from lcopa_bayes.model.blockpulses import integration_matrix
+from lcopa_bayes.model.element import PaperForm
 from lcopa_bayes.paper.equation import (
     Convention,
     PathModel,
@@ -36,11 +41,6 @@ from lcopa_bayes.paper.intervals import Candidates, Interval, Scan, decreasing
 from lcopa_bayes.paper.outputerror import output_error_fit
 from lcopa_bayes.paper.paths import MOST_BLOCKS, PathData, path_data
 from lcopa_bayes.paper.scan import scan
-from lcopa_bayes.plant.element import PaperForm
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.record import Axis, Record
-from lcopa_bayes.study import Study
-from lcopa_bayes.studyfile import load_study
 
 PAPER_STEP = Path(__file__).parents[1] / "studies" / "paper-step"
 U, Y = Axis("u", "V"), Axis("y", "rad")

@@ -11,10 +11,11 @@ from scipy import stats
 from scipy.special import logsumexp
 from small import Toy, problem, record
 
-from lcopa_bayes.fit import plan_of
-from lcopa_bayes.inference.draws import Draws, gather
-from lcopa_bayes.inference.evidence import evidence
-from lcopa_bayes.inference.importance import (
+from lcopa_bayes.inference.optimum import Optimum
+from lcopa_bayes.results.fit import plan_of
+from lcopa_bayes.sampling.draws import Draws, gather
+from lcopa_bayes.sampling.evidence import evidence
+from lcopa_bayes.sampling.importance import (
     Effort,
     Importance,
     ImportancePlan,
@@ -23,8 +24,7 @@ from lcopa_bayes.inference.importance import (
     tail_smoothed,
     weighted_draws,
 )
-from lcopa_bayes.inference.optimum import Optimum
-from lcopa_bayes.inference.sampler import sample
+from lcopa_bayes.sampling.sampler import sample
 
 WIDE = ("norm", {"loc": 0.0, "scale": 10.0})
 

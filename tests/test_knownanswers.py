@@ -9,13 +9,13 @@ import pytest
 from scipy import signal, stats
 from small import TRUTH, Toy, U, Y, problem, record
 
-from lcopa_bayes.arrays import Matrix, Vector
-from lcopa_bayes.inference.draws import Draws, gather
-from lcopa_bayes.inference.evidence import evidence
-from lcopa_bayes.inference.grade import qualities
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.data.record import Record
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.inference.sampler import SamplePlan, sample
-from lcopa_bayes.record import Record
+from lcopa_bayes.sampling.convergence import qualities
+from lcopa_bayes.sampling.draws import Draws, gather
+from lcopa_bayes.sampling.evidence import evidence
+from lcopa_bayes.sampling.sampler import SamplePlan, sample
 
 FAR = 1.95
 """Distance of Kolmogorov, times the root of the number of draws, exceeded once in a thousand [-]."""

@@ -8,9 +8,9 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 from small import Toy
 
-from lcopa_bayes.inference.knownmodes import around
-from lcopa_bayes.inference.sampler import SamplePlan, sample
-from lcopa_bayes.problems import InputError
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.sampling.knownmodes import around
+from lcopa_bayes.sampling.sampler import SamplePlan, sample
 
 WIDE, NARROW = (0.3, 0.08), (0.8, 2e-5)
 """Mean and standard deviation, in each of three coordinates, of a mode and of a needle."""

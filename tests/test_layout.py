@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from lcopa_bayes.plant.layout import ElementSlot, Layout, Unit
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.record import Axis
-from lcopa_bayes.settings import ModelSettings
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.record import Axis
+from lcopa_bayes.data.settings import ModelSettings
+from lcopa_bayes.model.layout import ElementSlot, Layout, Unit
 
 X, Y = Axis("x", "rad"), Axis("y", "rad")
 HEATERS, SENSORS = (Axis("q1", "pct"), Axis("q2", "pct")), (Axis("t1", "degC"), Axis("t2", "degC"))

@@ -10,24 +10,24 @@ import pytest
 from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import on_off, staircase, step
 from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.data.settings import ModelSettings
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.loop.bandwidening import Widening
 from lcopa_bayes.loop.basefit import base_fit
 from lcopa_bayes.loop.basemodel import BaseModel
-from lcopa_bayes.loop.extended import ExtendedModel
-from lcopa_bayes.loop.leftout import Group, log_scores
+from lcopa_bayes.loop.crossvalidation import Group, log_scores
+from lcopa_bayes.loop.extendedmodel import ExtendedModel
+from lcopa_bayes.loop.gaussnewton import Regression
+from lcopa_bayes.loop.heldouteffects import unseen_share
 from lcopa_bayes.loop.loop import loop
-from lcopa_bayes.loop.quiet import axis_noise, repeat_pieces
-from lcopa_bayes.loop.regression import Regression
-from lcopa_bayes.loop.told import drawn, results, words
-from lcopa_bayes.loop.unseen import unseen_share
+from lcopa_bayes.loop.noisesamples import axis_noise, repeat_pieces
+from lcopa_bayes.loop.summary import drawn, results, words
 from lcopa_bayes.loop.verdict import Found, decide
 from lcopa_bayes.loop.whitening import Whitening
-from lcopa_bayes.loop.widening import Widening
-from lcopa_bayes.plant.effects.catalogue import catalogue
-from lcopa_bayes.plant.effects.effect import UnstableError
-from lcopa_bayes.record import Axis, Record
-from lcopa_bayes.settings import ModelSettings
-from lcopa_bayes.study import Study
+from lcopa_bayes.model.effects.catalogue import catalogue
+from lcopa_bayes.model.effects.effect import UnstableError
 
 NOISE = 5e-3
 NAMES = ("odd_curvature", "even_curvature", "gain_drift", "unmodelled_smooth")

@@ -14,20 +14,20 @@ from scipy.stats import t as student
 from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import on_off, staircase, step
 from lcopa_bayes.bench.device import Device, TransferPath
-from lcopa_bayes.inference.data import Samples
+from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.data.settings import ModelSettings
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.loop.autoregression import Autoregression, unbroken
-from lcopa_bayes.loop.confirm import SIGNIFICANT, Refit
+from lcopa_bayes.loop.heldouteffects import Errors
 from lcopa_bayes.loop.loop import loop
 from lcopa_bayes.loop.noisepieces import NoisePieces
 from lcopa_bayes.loop.noiseposterior import NoisePosterior
-from lcopa_bayes.loop.quiet import FEWEST
+from lcopa_bayes.loop.noisesamples import FEWEST
+from lcopa_bayes.loop.refits import SIGNIFICANT, Refit
 from lcopa_bayes.loop.trace import threshold_of
-from lcopa_bayes.loop.unseen import Errors
 from lcopa_bayes.loop.whitening import Whitening
-from lcopa_bayes.plant.effects.catalogue import catalogue
-from lcopa_bayes.record import Axis, Record
-from lcopa_bayes.settings import ModelSettings
-from lcopa_bayes.study import Study
+from lcopa_bayes.model.effects.catalogue import catalogue
 
 PARTIAL = st.lists(st.floats(-0.95, 0.95), max_size=5).map(np.array)
 AXIS = (Axis("x", "rad"),)

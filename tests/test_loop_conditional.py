@@ -12,15 +12,15 @@ from scipy import stats
 from small import TRUTH, problem, record
 
 from lcopa_bayes.bench.command import on_off
-from lcopa_bayes.inference.grade import qualities
 from lcopa_bayes.loop.autoregression import Autoregression
 from lcopa_bayes.loop.basemodel import BaseModel
 from lcopa_bayes.loop.density import LoopDensity
 from lcopa_bayes.loop.draws import LoopDraws, sample_loop, settled
-from lcopa_bayes.loop.extended import ExtendedModel
-from lcopa_bayes.loop.regression import Regression
+from lcopa_bayes.loop.extendedmodel import ExtendedModel
+from lcopa_bayes.loop.gaussnewton import Regression
 from lcopa_bayes.loop.scores import State
 from lcopa_bayes.loop.whitening import Whitening
+from lcopa_bayes.sampling.convergence import qualities
 
 SCALE = 3.0
 """Scatter of the samples over the nominal noise [-]."""

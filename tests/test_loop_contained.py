@@ -9,10 +9,10 @@ import pytest
 from small import record, study
 
 from lcopa_bayes.bench.command import on_off, staircase
-from lcopa_bayes.loop import basefit, confirm, terms
-from lcopa_bayes.loop.confirm import refit
-from lcopa_bayes.loop.regression import Regression
-from lcopa_bayes.plant.effects.catalogue import bundled
+from lcopa_bayes.loop import basefit, refits, terms
+from lcopa_bayes.loop.gaussnewton import Regression
+from lcopa_bayes.loop.refits import refit
+from lcopa_bayes.model.effects.catalogue import bundled
 
 NOISE = 0.01
 STUDY = study(
@@ -91,7 +91,7 @@ def test_a_refit_is_at_least_as_likely_as_without_its_effect(base, effect, monke
         away[: model.plant_size] = 0.5 * (away[: model.plant_size] + model.bounds[0][: model.plant_size])
         return model, np.where(np.isfinite(away), away, x)
 
-    monkeypatch.setattr(confirm, "polished", spoilt)
+    monkeypatch.setattr(refits, "polished", spoilt)
     made = refit(state.model, state.optimum, state.whitening, [(effect, np.ones(1))], 50.0)
     assert made.optimum.cost <= state.optimum.cost + 1e-9
     assert made.taken >= 0.0

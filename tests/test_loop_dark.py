@@ -7,11 +7,11 @@ import json
 import numpy as np
 import pytest
 
+from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.data.settings import ModelSettings
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.loop.loop import Loop, loop
-from lcopa_bayes.loop.told import results
-from lcopa_bayes.record import Axis, Record
-from lcopa_bayes.settings import ModelSettings
-from lcopa_bayes.study import Study
+from lcopa_bayes.loop.summary import results
 
 NOISE = 0.05
 """[degC]."""

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 from lcopa_bayes.loop.draws import sample_loop
 from lcopa_bayes.loop.proposals import Counted, Jump, Walk, learnt
 from lcopa_bayes.loop.surrogate import Surrogate
-from lcopa_bayes.plant.effects import balance
+from lcopa_bayes.model.effects import balance
 
 SLOPE, SCALE = 0.7, 1.6
 

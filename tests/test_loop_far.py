@@ -10,25 +10,25 @@ import pytest
 from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import step
 from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.data.settings import ModelSettings, PriorSettings
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.loop.autoregression import Autoregression
 from lcopa_bayes.loop.basefit import base_fit
 from lcopa_bayes.loop.basemodel import BaseModel
-from lcopa_bayes.loop.leftout import PARTS, groups
+from lcopa_bayes.loop.crossvalidation import PARTS, groups
 from lcopa_bayes.loop.loop import loop
-from lcopa_bayes.loop.quiet import joint_noise
+from lcopa_bayes.loop.noisesamples import joint_noise
 from lcopa_bayes.loop.signature import Scale
 from lcopa_bayes.loop.starts import regressed
 from lcopa_bayes.loop.terms import fitted_base
 from lcopa_bayes.loop.whitening import Whitening
-from lcopa_bayes.plant.drive import Drive
-from lcopa_bayes.plant.effects import superposition
-from lcopa_bayes.plant.effects.catalogue import catalogue
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.record import Axis, Record
-from lcopa_bayes.settings import ModelSettings, PriorSettings
-from lcopa_bayes.study import Study
-from lcopa_bayes.studyfile import load_study
+from lcopa_bayes.model.effects import superposition
+from lcopa_bayes.model.effects.catalogue import catalogue
 
 RECORDS = Path(os.environ.get("LCOPA_BAYES_DATA", Path(__file__).parents[1] / ".." / "shared")) / "records"
 AXIS = (Axis("x", "rad"),)

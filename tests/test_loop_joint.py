@@ -7,22 +7,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.data.settings import ModelSettings
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.loop.basefit import base_fit
 from lcopa_bayes.loop.basemodel import BaseModel
+from lcopa_bayes.loop.heldouteffects import missed
 from lcopa_bayes.loop.loop import loop
 from lcopa_bayes.loop.rounds import SINGLE
 from lcopa_bayes.loop.scoreevidence import Projection
 from lcopa_bayes.loop.signature import Scale, Signature
 from lcopa_bayes.loop.startlevel import started
 from lcopa_bayes.loop.trace import Traced, _chance
-from lcopa_bayes.loop.unseen import missed
 from lcopa_bayes.loop.whitening import Whitening
-from lcopa_bayes.plant.effects.catalogue import catalogue
-from lcopa_bayes.record import Axis, Record
-from lcopa_bayes.settings import ModelSettings
-from lcopa_bayes.study import Study
-from lcopa_bayes.studyfile import load_study
+from lcopa_bayes.model.effects.catalogue import catalogue
 
 RECORDS = Path(os.environ.get("LCOPA_BAYES_DATA", Path(__file__).parents[1] / ".." / "shared")) / "records"
 AXIS = (Axis("x", "V"),)

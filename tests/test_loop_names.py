@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 
 from lcopa_bayes.bench.undeclared import campaign, drawn
+from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.data.settings import ModelSettings
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
-from lcopa_bayes.inference.effected import effected
+from lcopa_bayes.inference.effects import effected
 from lcopa_bayes.loop.loop import loop
 from lcopa_bayes.loop.trace import SEEN
-from lcopa_bayes.plant.effects.catalogue import catalogue
-from lcopa_bayes.plant.effects.response import Clipping
-from lcopa_bayes.record import Axis, Record
-from lcopa_bayes.settings import ModelSettings
-from lcopa_bayes.study import Study
+from lcopa_bayes.model.effects.catalogue import catalogue
+from lcopa_bayes.model.effects.response import Clipping
 
 AXIS = (Axis("x", "rad"),)
 PERIOD, TIME, DELAY, NOISE = 0.1, 2.0, 1.5, 2e-3

@@ -12,7 +12,7 @@ from lcopa_bayes.loop.noisepieces import estimated
 from lcopa_bayes.loop.scatter import scatter_evidence
 from lcopa_bayes.loop.scoreevidence import Projection, log_bayes_factors, survival
 from lcopa_bayes.loop.signature import Scale, Signature
-from lcopa_bayes.plant.effects.catalogue import catalogue
+from lcopa_bayes.model.effects.catalogue import catalogue
 
 PARTIAL = st.lists(st.floats(-0.95, 0.95), max_size=5).map(np.array)
 

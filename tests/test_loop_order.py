@@ -16,10 +16,10 @@ from lcopa_bayes.loop import draws
 from lcopa_bayes.loop.autoregression import Autoregression
 from lcopa_bayes.loop.basemodel import BaseModel
 from lcopa_bayes.loop.density import LoopDensity
-from lcopa_bayes.loop.extended import ExtendedModel
-from lcopa_bayes.loop.regression import Regression
+from lcopa_bayes.loop.extendedmodel import ExtendedModel
+from lcopa_bayes.loop.gaussnewton import Regression
 from lcopa_bayes.loop.scores import State
-from lcopa_bayes.loop.told import moved
+from lcopa_bayes.loop.summary import moved
 from lcopa_bayes.loop.whitening import Whitening
 
 NOISE = 0.01

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from test_loop import LIBRARY, NOISE, study
 
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.loop.basefit import base_fit
 from lcopa_bayes.loop.basemodel import BaseModel
 from lcopa_bayes.loop.loop import loop
-from lcopa_bayes.loop.outlying import outlying
-from lcopa_bayes.loop.told import results
+from lcopa_bayes.loop.outliers import outlying
+from lcopa_bayes.loop.summary import results
 from lcopa_bayes.loop.verdict import Verdict, beside
-from lcopa_bayes.plant.effects.catalogue import catalogue
-from lcopa_bayes.study import Study
+from lcopa_bayes.model.effects.catalogue import catalogue
 
 SHARE = 0.03
 

@@ -9,7 +9,7 @@ from scipy import stats
 from scipy.integrate import quad
 from scipy.special import logsumexp
 
-from lcopa_bayes.inference.mixture import Mixture, spread_evenly
+from lcopa_bayes.sampling.mixture import Mixture, spread_evenly
 
 FREEDOM = 5.0
 SEEDS = (0, 7, 2**32 - 1, 2**32, 2**63, 2**80 + 1)

@@ -11,12 +11,12 @@ import pytest
 from scipy import stats
 from small import problem, record
 
-from lcopa_bayes.arrays import Matrix
-from lcopa_bayes.inference.mixture import Mixture
-from lcopa_bayes.inference.mixturemove import learned
-from lcopa_bayes.inference.moves import DifferenceMove, PopulationMove
+from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.inference.ridgemoves import moves
+from lcopa_bayes.sampling.mixture import Mixture
+from lcopa_bayes.sampling.mixturemoves import learned
+from lcopa_bayes.sampling.moves import DifferenceMove, PopulationMove
+from lcopa_bayes.sampling.ridgemoves import moves
 
 WALKERS, COSTLY, ROUNDS = 20_000, 6_000, 60
 """Of most moves, of those that follow a mixture, and moves of each [-]."""

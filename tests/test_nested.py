@@ -12,12 +12,12 @@ from scipy import stats
 from scipy.special import logsumexp
 from small import TRUTH, problem, record
 
-from lcopa_bayes.inference.homography import Element, elements
-from lcopa_bayes.inference.nested import Nested, NestedPlan, nested
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.inference.strands import Strands
-from lcopa_bayes.inference.unitcube import UnitCube
-from lcopa_bayes.inference.walk import Walk
+from lcopa_bayes.sampling.constrainedwalk import Walk
+from lcopa_bayes.sampling.deadpoints import Strands
+from lcopa_bayes.sampling.homography import Element, elements
+from lcopa_bayes.sampling.nested import Nested, NestedPlan, nested
+from lcopa_bayes.sampling.unitcube import UnitCube
 
 SHORT = record(camera=0.6)
 KINDS = ("difference", "follow", "slide", "roam", "swap")
@@ -151,7 +151,7 @@ def band_of(cube: UnitCube, monkeypatch) -> None:
 def walked(kinds, cube: UnitCube, monkeypatch, *, level: float = -0.5, steps: int = 30, count: int = 4000):
     """Prior draws above a level, and other such draws after a walk."""
     rng = np.random.default_rng(8)
-    monkeypatch.setattr("lcopa_bayes.inference.walk._KINDS", dict.fromkeys(kinds, 1 / len(kinds)))
+    monkeypatch.setattr("lcopa_bayes.sampling.constrainedwalk._KINDS", dict.fromkeys(kinds, 1 / len(kinds)))
     band_of(cube, monkeypatch)
     above = []
     while sum(map(len, above)) < 2 * count + 500:

@@ -10,6 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.literature import PAPER
 from lcopa_bayes.optics.array import LinearArray, PlanarArray, paper_array
 from lcopa_bayes.optics.chain import (
     geometry_check,
@@ -38,8 +40,6 @@ from lcopa_bayes.optics.lobes import (
     side_lobe_level,
     strongest_grating_lobe,
 )
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.stated import PAPER
 
 ARRAY = paper_array()
 SLIT = paper_array(fill_factor=1.0)

@@ -9,10 +9,10 @@ from small import TRUTH, TWO, path, problem, record
 
 from lcopa_bayes.bench.command import prbs
 from lcopa_bayes.bench.device import Device
+from lcopa_bayes.data.record import Record
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.record import Record
 
 SHORT = record(camera=0.6)
 COUPLED = record(device=TWO, camera=0.5)

@@ -12,16 +12,16 @@ import pytest
 from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import on_off, step
 from lcopa_bayes.bench.device import PAPER_DEVICE
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.literature import PAPER
+from lcopa_bayes.data.settings import ModelSettings
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.model.element import PaperForm
 from lcopa_bayes.paper.equation import PathModel
 from lcopa_bayes.paper.figures import KINDS, panels, paper_figure
 from lcopa_bayes.paper.identify import identify
 from lcopa_bayes.paper.intervals import Interval, Scan
 from lcopa_bayes.paper.steptable import METRICS, load_posterior, step_of, step_table
-from lcopa_bayes.plant.element import PaperForm
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.settings import ModelSettings
-from lcopa_bayes.stated import PAPER
-from lcopa_bayes.study import Study
 
 NOISE = 1e-4
 FEW = Scan(

@@ -14,11 +14,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy import integrate, stats
 from small import TWO, problem, record, study
 
+from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.priors import Prior
-from lcopa_bayes.problems import InputError
 
 TWO_TERMS = {"terms": 2}
 

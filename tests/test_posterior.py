@@ -14,8 +14,8 @@ from small import ONE, TRUTH, TWO, problem, record, row_values
 
 from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import step
+from lcopa_bayes.data.record import Record
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.record import Record
 
 SHORT = record(camera=0.6)
 

@@ -11,9 +11,9 @@ from scipy import stats
 from small import ONE, TRUTH, TWO, draws_of, problem, record, row_values
 
 from lcopa_bayes.bench.command import Command, on_off, quiet, step
-from lcopa_bayes.inference.data import Samples
-from lcopa_bayes.predict import Band, bands, responses
-from lcopa_bayes.record import Record
+from lcopa_bayes.data.record import Record
+from lcopa_bayes.inference.observations import Samples
+from lcopa_bayes.results.prediction import Band, bands, responses
 
 KNOWN = TRUTH | {"rho": 0.6, "nu": 4.0}
 

@@ -11,20 +11,20 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, norm
 from small import TRUTH, problem, record, study
 
-from lcopa_bayes.candidatesettings import CandidateSettings
-from lcopa_bayes.comparison import prediction, priorwidth
-from lcopa_bayes.comparison.candidates import candidates_of
-from lcopa_bayes.comparison.compare import compare
-from lcopa_bayes.comparison.linearfollowing import linear_densities
-from lcopa_bayes.comparison.parts import parts_of, without
-from lcopa_bayes.comparison.prediction import left_out_weights, predictions
-from lcopa_bayes.comparison.priorwidth import widths
-from lcopa_bayes.comparison.sequential import known_before, log_densities
-from lcopa_bayes.fit import fit
-from lcopa_bayes.inference.data import Observed, Samples
+from lcopa_bayes.compare import predictivedensity, priorwidth
+from lcopa_bayes.compare.candidates import candidates_of
+from lcopa_bayes.compare.compare import compare
+from lcopa_bayes.compare.folds import parts_of, without
+from lcopa_bayes.compare.lineardensity import linear_densities
+from lcopa_bayes.compare.predictivedensity import left_out_weights, predictions
+from lcopa_bayes.compare.priorwidth import widths
+from lcopa_bayes.compare.sequentialdensity import known_before, log_densities
+from lcopa_bayes.data.candidatesettings import CandidateSettings
 from lcopa_bayes.inference.noise import AR1, Student, White
-from lcopa_bayes.inference.weights import effective, smoothed
-from lcopa_bayes.sensitivity import _weights as power_weights
+from lcopa_bayes.inference.observations import Observed, Samples
+from lcopa_bayes.results.fit import fit
+from lcopa_bayes.results.sensitivity import _weights as power_weights
+from lcopa_bayes.sampling.importanceweights import effective, smoothed
 
 GAPS = np.array([1.0, 1.0, 2.0, 1.0, 0.5, 1.0, 1.0])
 
@@ -193,21 +193,21 @@ def exact_elpd(fitted, part) -> float:
     kept = density > density.max() - 25
     z, weights = grid[kept], density[kept]
     values = target.complete(z, np.random.default_rng(1))
-    scored = prediction._Scored(fitted, part, posterior.samples[part.record], _model(posterior, part))
+    scored = predictivedensity._Scored(fitted, part, posterior.samples[part.record], _model(posterior, part))
     found = scored(values, weights - logsumexp(weights), "exact", known=target)
     return float(found.log_density.sum())
 
 
 def _model(posterior, part):
-    return prediction._one(posterior.model, part.record)
+    return predictivedensity._one(posterior.model, part.record)
 
 
 @pytest.mark.parametrize("way", ["importance weights", "refit"])
 def test_left_out_records_by_weights_and_by_refit_are_the_exact_integral(pair, monkeypatch, way):
     """Both ways against quadrature; never above in-sample. With the sign of the weights flipped the left-out
     record counts twice."""
-    monkeypatch.setattr(prediction, "usable_k", lambda draws: np.inf if way != "refit" else -np.inf)
-    monkeypatch.setattr(prediction, "FEWEST_EFFECTIVE", 10.0)
+    monkeypatch.setattr(predictivedensity, "usable_k", lambda draws: np.inf if way != "refit" else -np.inf)
+    monkeypatch.setattr(predictivedensity, "FEWEST_EFFECTIVE", 10.0)
     for found in predictions(pair):
         assert found.road == way
         exact = exact_elpd(pair, found.part)

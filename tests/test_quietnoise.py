@@ -9,17 +9,17 @@ from scipy import linalg, signal, stats
 from small import problem, record
 
 from lcopa_bayes.bench.command import step
-from lcopa_bayes.inference.data import Observed
+from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.mixednoise import WhiteAR1
 from lcopa_bayes.inference.noise import NOISES
 from lcopa_bayes.inference.noisefit import NoiseFit
+from lcopa_bayes.inference.observations import Observed
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.priors import Prior
-from lcopa_bayes.inference.quietnoise import FEWEST, _about_own_level, quiet_noise
-from lcopa_bayes.record import Axis, Record
+from lcopa_bayes.inference.restnoise import FEWEST, _about_own_level, quiet_noise
 
 CORRELATIONS = (np.exp(-1.0), 0.95)
 LATE = step(1.0, at=4.0)

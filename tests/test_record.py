@@ -11,8 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.record import Axis, Record, in_time_unit, load_record, save_record
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.record import Axis, Record, in_time_unit, load_record, save_record
 
 HEADER = "time_ms,drive_x_rad,response_x_rad\n"
 GOOD = HEADER + "0,0,\n0.5,1,0.1\n1.5,1,0.2\n"

@@ -16,16 +16,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from lcopa_bayes.inference import defaults
-from lcopa_bayes.inference.ridges import Ridges
-from lcopa_bayes.problems import InputError
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.inference import defaultpriors
 from lcopa_bayes.report import write_page, write_report
-from lcopa_bayes.report.canvas import inlined
 from lcopa_bayes.report.decimation import extremes
-from lcopa_bayes.report.saved import load_run
+from lcopa_bayes.report.formatting import NOT_REACHED, figures, interval, to_spread
+from lcopa_bayes.report.savedrun import load_run
 from lcopa_bayes.report.section import Column, Drawing, Section, Table
-from lcopa_bayes.report.sections import data, pairs, parameters, residuals, sensitivity, steps
-from lcopa_bayes.report.wording import NOT_REACHED, figures, interval, to_spread
+from lcopa_bayes.report.sections import pairs, parameters, records, residuals, sensitivity, steps
+from lcopa_bayes.report.theme import inlined
+from lcopa_bayes.sampling.modes import Ridges
 
 PARAMETERS = {
     "gain": ("rad/V", "reliable", False),
@@ -239,7 +239,7 @@ def test_captions_carry_scores_and_mark_held_out_records(html):
 
 
 def test_default_priors_are_explained_in_the_words_of_their_module(html):
-    assert inspect.cleandoc(defaults.__doc__) in unescape(html)
+    assert inspect.cleandoc(defaultpriors.__doc__) in unescape(html)
 
 
 def test_page_needs_nothing_else(html):
@@ -345,7 +345,7 @@ def test_names_that_look_like_numbers_or_nothing_stay_names(tmp_path):
 
 def test_long_records_make_small_figures_and_say_so(tmp_path):
     run = load_run(run_folder(tmp_path / "run", size=40_000))
-    drawings = (*data.section(run).drawings, *residuals.section(run).drawings)
+    drawings = (*records.section(run).drawings, *residuals.section(run).drawings)
     assert max(len(drawing.svg) for drawing in drawings) < 300_000
     assert all("the record has 40000 samples" in drawing.caption for drawing in drawings)
 

@@ -11,14 +11,14 @@ from small import U, Y, path, record, study
 from lcopa_bayes.bench.command import Command
 from lcopa_bayes.bench.device import Device
 from lcopa_bayes.cli import main
-from lcopa_bayes.fit import fit
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.record import Record, save_record
+from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.inference.assembly import problem_of
-from lcopa_bayes.inference.discretisation import resolved
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.loop.loop import loop
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.record import Record, save_record
-from lcopa_bayes.requirements import unmet
+from lcopa_bayes.results.discretisation import resolved
+from lcopa_bayes.results.fit import fit
 
 PLAIN = record()
 

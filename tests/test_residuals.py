@@ -8,8 +8,8 @@ from numpy.testing import assert_allclose
 from scipy import signal, stats
 from small import TRUTH, draws_of, problem, record, row_values
 
-from lcopa_bayes.predict import Band
-from lcopa_bayes.residuals import Residual, ljung_box, residuals
+from lcopa_bayes.results.prediction import Band
+from lcopa_bayes.results.residuals import Residual, ljung_box, residuals
 
 KNOWN = TRUTH | {"rho": 0.6, "nu": 4.0, "sigma": 0.1}
 

@@ -14,12 +14,12 @@ from small import U, Y, path, study
 from lcopa_bayes.bench.command import Command
 from lcopa_bayes.bench.device import Device
 from lcopa_bayes.cli import main
-from lcopa_bayes.fit import fit
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.record import Record, save_record
+from lcopa_bayes.data.rest import not_at_rest, unrest
+from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.loop.loop import loop
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.record import Record, save_record
-from lcopa_bayes.rest import not_at_rest, unrest
-from lcopa_bayes.studyfile import load_study
+from lcopa_bayes.results.fit import fit
 
 RECORDS = Path(os.environ.get("LCOPA_BAYES_DATA", Path(__file__).parents[1] / ".." / "shared")) / "records"
 ALWAYS = 1e-9

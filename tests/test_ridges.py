@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lcopa_bayes.inference.grade import Quality, overall, shares_grade
-from lcopa_bayes.inference.ridges import Ridges, ridges
+from lcopa_bayes.sampling.convergence import Quality, overall, shares_grade
+from lcopa_bayes.sampling.modes import Ridges, ridges
 
 SHAPE = (4, 25, 10)
 """Ensembles, walkers, draws: a thousand independent draws."""

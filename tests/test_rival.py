@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from small import record
 
-from lcopa_bayes.fit import Fit, fit
+from lcopa_bayes.data.settings import ModelSettings, SamplerSettings
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.report import write_report
-from lcopa_bayes.rival import Rival, integer_rival, integer_study
-from lcopa_bayes.runfolder import save_fit
-from lcopa_bayes.settings import ModelSettings, SamplerSettings
-from lcopa_bayes.study import Study
+from lcopa_bayes.results.fit import Fit, fit
+from lcopa_bayes.results.integerrival import Rival, integer_rival, integer_study
+from lcopa_bayes.results.runfolder import save_fit
 
 FEW = SamplerSettings(ensembles=2, walkers=8, steps=100, thin=1, target_ess=10)
 

@@ -16,13 +16,13 @@ from scipy import stats
 from small import record, study
 
 from lcopa_bayes.bench.command import on_off
-from lcopa_bayes.fit import Fit, fit
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.record import Axis, Record
-from lcopa_bayes.report.saved import load_run
-from lcopa_bayes.results import results
-from lcopa_bayes.runfolder import save_fit, save_json, save_posterior, save_table, variable_names
-from lcopa_bayes.tables import tables
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.report.savedrun import load_run
+from lcopa_bayes.results.fit import Fit, fit
+from lcopa_bayes.results.runfolder import save_fit, save_json, save_posterior, save_table, variable_names
+from lcopa_bayes.results.summary import results
+from lcopa_bayes.results.tables import tables
 
 TINY = {"ensembles": 2, "walkers": 16, "steps": 60, "thin": 1, "target_ess": 100}
 PAIR = (record(1, camera=0.4, name="a"), record(2, camera=0.5, name="b"))
@@ -145,7 +145,7 @@ def test_a_failed_save_leaves_no_file(fitted, tmp_path, monkeypatch):
     def fail(*_):
         raise OSError("disk full")
 
-    monkeypatch.setattr("lcopa_bayes.runfolder.save_posterior", fail)
+    monkeypatch.setattr("lcopa_bayes.results.runfolder.save_posterior", fail)
     with pytest.raises(InputError, match=r"posterior\.nc: cannot be written \(disk full\)"):
         save_fit(fitted, tmp_path, [])
     assert sorted(p.name for p in tmp_path.iterdir()) == ["tables"]

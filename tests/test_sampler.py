@@ -11,15 +11,15 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 from small import ONE, TRUTH, TWO, Toy, problem, record
 
-from lcopa_bayes.inference import sampler
-from lcopa_bayes.inference.chainfile import load_chain, save_chain
-from lcopa_bayes.inference.draws import gather
-from lcopa_bayes.inference.ensemble import Ensemble, advance
-from lcopa_bayes.inference.grade import qualities
-from lcopa_bayes.inference.mixturemove import learned
+from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.inference.sampler import Run, SamplePlan, finished, sample
-from lcopa_bayes.problems import InputError
+from lcopa_bayes.sampling import sampler
+from lcopa_bayes.sampling.chainfile import load_chain, save_chain
+from lcopa_bayes.sampling.convergence import qualities
+from lcopa_bayes.sampling.draws import gather
+from lcopa_bayes.sampling.ensemble import Ensemble, advance
+from lcopa_bayes.sampling.mixturemoves import learned
+from lcopa_bayes.sampling.sampler import Run, SamplePlan, finished, sample
 
 ROUND = sampler._ROUND
 POSTERIOR = problem(record(camera=0.6)).posterior

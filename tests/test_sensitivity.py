@@ -11,9 +11,9 @@ import pytest
 from scipy import stats
 from small import problem, record
 
-from lcopa_bayes.inference.draws import Draws
-from lcopa_bayes.inference.grade import Quality
-from lcopa_bayes.sensitivity import ALPHAS, THRESHOLD, power_scaled, sensitivity
+from lcopa_bayes.results.sensitivity import ALPHAS, THRESHOLD, power_scaled, sensitivity
+from lcopa_bayes.sampling.convergence import Quality
+from lcopa_bayes.sampling.draws import Draws
 
 PRIOR_SD, NOISE_SD = 1.0, 0.5
 

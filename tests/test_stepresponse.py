@@ -9,15 +9,15 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from lcopa_bayes.bench.device import TransferPath
-from lcopa_bayes.operational.series import Circle
-from lcopa_bayes.operational.stepresponse import StepResponse, step_response, taps
-from lcopa_bayes.plant.drive import Drive
-from lcopa_bayes.plant.forward import Dynamics, Experiment, ForwardModel
-from lcopa_bayes.plant.grid import Mesh
-from lcopa_bayes.plant.layout import Layout
-from lcopa_bayes.plant.superposition import phases
-from lcopa_bayes.record import Axis
-from lcopa_bayes.settings import ModelSettings
+from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.record import Axis
+from lcopa_bayes.data.settings import ModelSettings
+from lcopa_bayes.model.forward import Dynamics, Experiment, ForwardModel
+from lcopa_bayes.model.grid import Mesh
+from lcopa_bayes.model.layout import Layout
+from lcopa_bayes.model.powerseries import Circle
+from lcopa_bayes.model.stepresponse import StepResponse, step_response, taps
+from lcopa_bayes.model.superposition import phases
 
 STEP, BLOCKS = 0.1, 160
 ELEMENTS = [

@@ -11,12 +11,12 @@ from scipy import stats
 from scipy.integrate import cumulative_trapezoid
 from small import TRUTH, TWO, problem, record, row_values
 
-from lcopa_bayes.audit.landscape import Landscape
 from lcopa_bayes.audit.sensitivities import sensitivities
 from lcopa_bayes.bench.command import quiet, step
-from lcopa_bayes.inference.data import Samples
+from lcopa_bayes.inference.likelihood import Landscape
 from lcopa_bayes.inference.noise import Student
-from lcopa_bayes.predict import _student_levels, offset_draws, responses
+from lcopa_bayes.inference.observations import Samples
+from lcopa_bayes.results.prediction import _student_levels, offset_draws, responses
 
 DRAWS = 3000
 

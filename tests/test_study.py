@@ -10,18 +10,18 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from lcopa_bayes.inference.assembly import problem_of
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.record import Axis
-from lcopa_bayes.settings import (
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.record import Axis
+from lcopa_bayes.data.settings import (
     ModelSettings,
     NoiseSettings,
     PriorSettings,
     RecordsSettings,
     SamplerSettings,
 )
-from lcopa_bayes.study import Study
-from lcopa_bayes.studyfile import load_study
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.data.studyfile import load_study
+from lcopa_bayes.inference.assembly import problem_of
 
 HEADER = "time_ms,drive_x_rad,response_x_rad\n"
 STEP = HEADER + "0,0,\n0.5,1,0.1\n1.5,1,0.2\n"

@@ -14,7 +14,7 @@ from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import step
 from lcopa_bayes.bench.device import Device, TransferPath
 from lcopa_bayes.cli import main
-from lcopa_bayes.record import Axis, save_record
+from lcopa_bayes.data.record import Axis, save_record
 
 PATH = TransferPath(0.2, 1.0, (3.0, 2.0), (1.6, 0.7), 1.0)
 DEVICE = Device(((PATH,),), (Axis("in", "V"),), (Axis("out", "mm"),), (0.1,))

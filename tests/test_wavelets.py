@@ -12,10 +12,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import quad
 from scipy.special import eval_legendre
 
-from lcopa_bayes.operational.blockpulse import integration_matrix, shift_matrix
-from lcopa_bayes.operational.series import Circle
-from lcopa_bayes.operational.transfer import transfer
-from lcopa_bayes.operational.wavelets import (
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.literature import PAPER
+from lcopa_bayes.model.blockpulses import integration_matrix, shift_matrix
+from lcopa_bayes.model.powerseries import Circle
+from lcopa_bayes.model.transfer import transfer
+from lcopa_bayes.model.wavelets import (
     PrintedEquation,
     WaveletBasis,
     form_costs,
@@ -23,8 +25,6 @@ from lcopa_bayes.operational.wavelets import (
     printed_integration,
     printed_shift,
 )
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.stated import PAPER
 
 XX = PAPER.plant.xx
 

@@ -8,9 +8,9 @@ from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
 
 from lcopa_bayes.bench.device import PAPER_DEVICE, TransferPath
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.literature import PAPER, StatedPath
 from lcopa_bayes.paper.wholeblocks import delay_rounding, delay_roundings
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.stated import PAPER, StatedPath
 
 SMALL = StatedPath(0.2, (1.5,), (0.8,), 1.0, delay=1.02)
 WORK = {"drive": 1.0, "span": 12.0, "period": 0.1, "noise_sd": 0.01}

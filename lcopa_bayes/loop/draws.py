@@ -10,14 +10,14 @@ from typing import Any, final
 import emcee
 import numpy as np
 
-from lcopa_bayes.arrays import Array, Matrix, Vector
-from lcopa_bayes.crew import crew
-from lcopa_bayes.estimate import Estimate
-from lcopa_bayes.inference.grade import Grade, Quality, overall, qualities
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.estimate import Estimate
+from lcopa_bayes.core.parallel import crew
 from lcopa_bayes.loop.density import LoopDensity
-from lcopa_bayes.loop.extended import ExtendedModel
+from lcopa_bayes.loop.extendedmodel import ExtendedModel
 from lcopa_bayes.loop.proposals import Counted, Jump, Walk, learnt
 from lcopa_bayes.loop.surrogate import Surrogate
+from lcopa_bayes.sampling.convergence import Grade, Quality, overall, qualities
 
 _LENGTH = 6.0
 """Least length of a chain over the steps after which it forgets [-]."""

@@ -10,13 +10,13 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.loop.candidates import refitted
-from lcopa_bayes.loop.confirm import SIGNIFICANT, Refit, log_bayes_factor, refit, under_one_noise
-from lcopa_bayes.loop.regression import Regression
+from lcopa_bayes.loop.gaussnewton import Regression
+from lcopa_bayes.loop.refits import SIGNIFICANT, Refit, log_bayes_factor, refit, under_one_noise
 from lcopa_bayes.loop.scores import State
 from lcopa_bayes.loop.signature import Signature, expected_margin, pair_evidence
 from lcopa_bayes.loop.trace import Trace, Traced, trace
 from lcopa_bayes.loop.verdict import MARGIN
-from lcopa_bayes.plant.effects.effect import Effect
+from lcopa_bayes.model.effects.effect import Effect
 
 MOST = 3
 """Effects that are added at most [-]."""

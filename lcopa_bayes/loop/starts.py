@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from lcopa_bayes.arrays import Matrix, Vector
-from lcopa_bayes.inference.data import Samples
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.posterior import Posterior
 
 _LAGS = 4

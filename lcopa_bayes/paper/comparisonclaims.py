@@ -7,10 +7,10 @@ from math import hypot, log
 from pathlib import Path
 from typing import Any
 
+from lcopa_bayes.data.literature import Stated
 from lcopa_bayes.paper.posteriorclaims import needs_comparison
 from lcopa_bayes.paper.printedmodel import integer_rival
 from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict, earlier
-from lcopa_bayes.stated import Stated
 
 STRONG = log(20)
 """Difference of log evidence from which a term is needed [nat] (Kass and Raftery 1995)."""

@@ -9,9 +9,9 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, final
 
-from lcopa_bayes.estimate import plain
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.stated import Stated
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.data.literature import Stated
 
 
 class Kind(Enum):

@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.report.canvas import look
+from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.report.page import Verdict, write_page
-from lcopa_bayes.report.saved import load_run
-from lcopa_bayes.report.sections import audited, auditfigures
+from lcopa_bayes.report.savedrun import load_run
+from lcopa_bayes.report.sections import auditfigures, audittables
+from lcopa_bayes.report.theme import look
 
 NAME = "audit.html"
 """Name of the page inside the run folder."""
@@ -47,6 +47,6 @@ def write_audit(folder: Path) -> Path:
         raise InputError(f"{path}: lacks {', '.join(absent)}; run `audit` again with --resume")
     run = load_run(folder)
     with look():
-        sections = [*audited.sections(told), *auditfigures.sections(told, run)]
+        sections = [*audittables.sections(told), *auditfigures.sections(told, run)]
     verdict = Verdict(str(told["grade"]), str(told["verdict"]), str(told["grade_reason"]))
     return write_page(folder, f"{told['study']}: identifiability", sections, verdict, NAME)

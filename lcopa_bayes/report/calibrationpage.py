@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.report.canvas import look
+from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.report.page import Verdict, write_page
 from lcopa_bayes.report.sections import calibration
+from lcopa_bayes.report.theme import look
 
 _NEEDS = (
     *("study", "verdict", "grade", "grade_reason", "seed", "asked", "replicas", "coverage", "simultaneous"),

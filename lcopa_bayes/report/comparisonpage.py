@@ -9,11 +9,11 @@ from typing import Any
 
 import pandas as pd
 
-from lcopa_bayes.comparison.compare import folder_name
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.report.canvas import look
+from lcopa_bayes.compare.compare import folder_name
+from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.report.page import Verdict, write_page
-from lcopa_bayes.report.sections import compared, comparedfigures
+from lcopa_bayes.report.sections import comparisonfigures, comparisontables
+from lcopa_bayes.report.theme import look
 
 NAME = "compare.html"
 """Name of the page inside the run folder."""
@@ -36,8 +36,8 @@ def write_comparison(folder: Path) -> Path:
     if any("containment" not in row for row in told["models"]):
         raise InputError(f"{path}: written by an earlier version; run `compare` again")
     with look():
-        scores, *rest = compared.sections(told)
-        sections = [scores, *comparedfigures.sections(told, _curves(folder, told)), *rest]
+        scores, *rest = comparisontables.sections(told)
+        sections = [scores, *comparisonfigures.sections(told, _curves(folder, told)), *rest]
     graded = {row["name"]: row for row in told["models"]}
     own = graded.get(told["preferred"])
     grade, reason = (own["grade"], own["grade_reason"]) if own else ("unusable", told["why"])

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.report.canvas import look
+from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.report.page import Verdict, write_page
-from lcopa_bayes.report.sections import designed
+from lcopa_bayes.report.sections import designtables
+from lcopa_bayes.report.theme import look
 
 NAME = "design.html"
 """Name of the page inside the run folder."""
@@ -34,6 +34,6 @@ def write_design(folder: Path) -> Path:
     if absent:
         raise InputError(f"{path}: lacks {', '.join(absent)}; run `design` again with --resume")
     with look():
-        sections = designed.sections(told)
+        sections = designtables.sections(told)
     verdict = Verdict(str(told["grade"]), str(told["verdict"]), str(told["grade_reason"]))
     return write_page(folder, f"{told['study']}: what to measure next", sections, verdict, NAME)

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.report.canvas import look
+from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.report.page import Verdict, write_page
-from lcopa_bayes.report.sections import looped, loopfigures
+from lcopa_bayes.report.sections import loopfigures, looptables
+from lcopa_bayes.report.theme import look
 
 NAME = "loop.html"
 """Name of the page inside the run folder."""
@@ -41,7 +41,7 @@ def write_loop(folder: Path) -> Path:
     """
     told, shown = (_loaded(folder / name, keys) for name, keys in _NEEDS.items())
     with look():
-        sections = [*looped.sections(told), *loopfigures.sections(told, shown)]
+        sections = [*looptables.sections(told), *loopfigures.sections(told, shown)]
     verdict = Verdict(
         str(told["grade"]),
         f"{told['verdict']} ({told['confidence']}): {told['sentence']}",

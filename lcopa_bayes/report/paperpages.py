@@ -6,17 +6,17 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.paper.figures import panels
 from lcopa_bayes.paper.identify import Identification
 from lcopa_bayes.paper.staticoptics import StaticOptics
 from lcopa_bayes.paper.steptable import Row
 from lcopa_bayes.paper.verdict import Judged, Kind
-from lcopa_bayes.report.canvas import look
+from lcopa_bayes.report.formatting import figures
 from lcopa_bayes.report.page import write_page
 from lcopa_bayes.report.section import Column, Section, Table
-from lcopa_bayes.report.sections import claimfigures, director, farfields, identified
-from lcopa_bayes.report.wording import figures
-from lcopa_bayes.study import Study
+from lcopa_bayes.report.sections import claimfigures, director, farfields, identification
+from lcopa_bayes.report.theme import look
 
 
 def write_optics(folder: Path, made: StaticOptics) -> Path:
@@ -31,7 +31,7 @@ def write_identification(
 ) -> Path:
     """`identify.html` with models, Table 1 and records; returns its path."""
     with look():
-        sections = identified.sections(study.time_unit, found, rows, panels(study, found))
+        sections = identification.sections(study.time_unit, found, rows, panels(study, found))
     return write_page(folder, f"{study.name}: identification", sections, name="identify.html")
 
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from lcopa_bayes.report.canvas import BAND, CYCLE, HELD_OUT, INK, blank, grid, label, log_ticks, plain, svg_of
-from lcopa_bayes.report.saved import SavedRun
+from lcopa_bayes.report.savedrun import SavedRun
 from lcopa_bayes.report.section import Drawing, Section
+from lcopa_bayes.report.theme import BAND, CYCLE, HELD_OUT, INK, blank, grid, label, log_ticks, plain, svg_of
 
 _PER_FIGURE = 12
 _TOP = 6.0

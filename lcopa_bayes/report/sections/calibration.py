@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from lcopa_bayes.report.canvas import BAND, HELD_OUT, INK, NOISE, blank, grid, plain, svg_of
+from lcopa_bayes.report.formatting import figures, percent, probability
 from lcopa_bayes.report.section import Column, Drawing, Section, Table
-from lcopa_bayes.report.wording import figures, percent, probability
+from lcopa_bayes.report.theme import BAND, HELD_OUT, INK, NOISE, blank, grid, plain, svg_of
 
 _PER_FIGURE = 18
 """Most quantities on one figure of ranks."""

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from lcopa_bayes.report.canvas import BAND, HELD_OUT, NOISE, SEEN, blank, label, plain, svg_of
 from lcopa_bayes.report.section import Drawing, Section
+from lcopa_bayes.report.theme import BAND, HELD_OUT, NOISE, SEEN, blank, label, plain, svg_of
 
 _MOST_CURVES = 12
 _LONGEST = 20
