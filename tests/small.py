@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -164,3 +166,22 @@ class Toy:
         inside = total > -np.inf
         total[inside] += heat * self.log_likelihood(coordinates[inside])
         return total
+
+
+def same_quantiles(a: Draws, b: Draws) -> bool:
+    """Whether the shares of `a` below quantiles of `b` are as they should be, within Monte Carlo error."""
+    p = np.array([0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98])
+    error = np.sqrt(p * (1 - p) * (1 / min(a.ess, len(a.flat)) + 1 / min(b.ess, len(b.flat))))
+    free = [k for k, row in enumerate(a.table.rows) if row.free]
+    shares = [np.mean(a.flat[:, k, None] < np.quantile(b.flat[:, k], p), axis=0) for k in free]
+    return bool((np.abs(np.array(shares) - p) < 4.5 * error).all())
+
+
+def check_page(path: Path) -> str:
+    """The page stands alone: no script, nothing fetched, no duplicate ids."""
+    page = path.read_text(encoding="utf-8")
+    assert "<script" not in page
+    assert not re.search(r'(?:src|href)="(?!#|data:)', page)
+    ids = re.findall(r'\bid="([^"]+)"', page)
+    assert len(ids) == len(set(ids))
+    return page

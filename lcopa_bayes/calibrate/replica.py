@@ -67,7 +67,7 @@ class Outcome:
     seconds: float
     """Processor time [s]."""
     gap: float
-    """See `simulated.model_gap` [-]."""
+    """See `simulation.model_gap` [-]."""
     truths: tuple[float, ...]
     """True values, each in its quantity's unit."""
     ranks: tuple[int, ...]

@@ -100,12 +100,12 @@ class Predicted:
 
 
 def predictions(fit: Fit, *, held_out_only: bool = False) -> tuple[Predicted, ...]:
-    """Every part of a fitted study (`parts_of`), each sample given the known ones (`sequential`).
+    """Every part of a fitted study (`parts_of`), each sample given the known ones (`sequentialdensity`).
 
     ``sum_i log E[p(y_i | y_1 .. y_i-1, theta) | known]``, i over the samples of a part: the log density of
     one forecast of the record by the posterior of its shared parameters given what is known. Held-out
     records come from the draws as they are. What was fitted is taken away again by importance weights when
-    their Pareto k is at most 0.7 and 100 draws or more stay effective, else by a refit (`carry`).
+    their Pareto k is at most 0.7 and 100 draws or more stay effective, else by a refit (`bridge`).
     """
     posterior, study = fit.problem.posterior, fit.study
     positions = _walkers(fit)

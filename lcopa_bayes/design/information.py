@@ -42,7 +42,7 @@ class Bench:
     Slopes are in the logarithm of time constants and in the plain value of every other parameter, made
     white by the study's noise; the record's resting response is unknown where the study's is, and is
     projected out. Costs, per set of values, a step response and its slopes, and per drive their
-    superposition: all in O(samples log samples). Accuracy: as `operational.stepresponse`.
+    superposition: all in O(samples log samples). Accuracy: as `model.stepresponse`.
     """
 
     problem: Problem

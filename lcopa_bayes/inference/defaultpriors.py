@@ -17,7 +17,7 @@ nu           gamma(2, scale 10)                      Juarez and Steel 2010, J. A
 ===========  ======================================  ============================================
 
 Noise of the kind ``white+ar1`` learns from Q, the samples taken before any drive has changed, where an axis
-has 8 independent ones or more on 5 levels or more (`quietnoise`). N is span / period:
+has 8 independent ones or more on 5 levels or more (`restnoise`). N is span / period:
 
 ===========  ======================================  ============================================
 sigma        log-normal(median by Q, s)              s^2 = (ln 2)^2 + variance of ln sigma by Q: noise

@@ -121,7 +121,7 @@ class Effected:
     def jacobian(self, values: Vector, psi: Vector | None = None) -> list[Matrix]:
         """Derivative in the table's values, per record (samples, axes, rows); 0 for noise parameters.
 
-        Exact without effects; see `plant.effects.slopes.plant_slopes` for what is differenced.
+        Exact without effects; see `model.effects.jacobian.plant_slopes` for what is differenced.
         """
         at, table = self.vanishing if psi is None else psi, self.table
         slopes = plant_slopes(self.simulator, self.plant(values), at)

@@ -113,7 +113,7 @@ class ForwardModel:
         """Deviation from rest per unit gain, for each experiment (units, batch, samples) [drive unit].
 
         The response of axis i is ``offset_i + sum_j gain_ij (rest_j + unit_ij)``. Second order in the
-        block width; see `operational.stepresponse`. `known` are step responses of these very dynamics, a
+        block width; see `model.stepresponse`. `known` are step responses of these very dynamics, a
         batch of one, under other commands; those that lack are added.
         """
         shapes = [(len(self.layout.units), dynamics.batch, e.mesh.reading.samples) for e in self.experiments]

@@ -1,7 +1,7 @@
 r"""Legendre wavelets and their operational matrices, dense and as printed (Ta et al. 2026, Eqs. 32-61).
 
 Vectors of basis functions stand on the left in the paper, ``(I^a Phi)(t) = P^a Phi(t)``, so that the
-coefficients of a function are rows and its matrices the transposes of those in `blockpulse`:
+coefficients of a function are rows and its matrices the transposes of those in `blockpulses`:
 ``F^a = integration_matrix(a).T`` and ``E = shift_matrix(j).T``, both upper triangular.
 
 What is printed does not agree with itself in three places, and this module says what it does there:

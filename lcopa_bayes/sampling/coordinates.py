@@ -1,8 +1,8 @@
 """A chart of the posterior: coordinates without bounds in which its ridges are close to straight.
 
-Elements are given by their shape at fixed frequencies (`shape`) in place of their time constants, gains
-by their ratio to the element's level, and what lies between two finite ends by its logit. In the chart a
-few ellipsoids cover a posterior that is thin and curved in the sampled coordinates.
+Elements are given by their shape at fixed frequencies (`shapecoordinates`) in place of their time constants,
+gains by their ratio to the element's level, and what lies between two finite ends by its logit. In the chart
+a few ellipsoids cover a posterior that is thin and curved in the sampled coordinates.
 """
 
 from __future__ import annotations

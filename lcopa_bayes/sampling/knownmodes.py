@@ -1,7 +1,7 @@
 """Modes of a posterior that something other than its own ensembles has found, as proposals of a move.
 
 A population started on such modes is moved in the posterior; a mixture learned from where it went is blended
-into the mixture that independence proposals are drawn from (`lessons`, `mixturemove`). That mixture is fixed
+into the mixture that independence proposals are drawn from (`sampler`, `mixturemoves`). That mixture is fixed
 while it is used and every proposal is accepted by Metropolis and Hastings' rule, so the posterior stays
 invariant whatever the starts were: a mode of no mass is left again, one of all the mass is entered at the
 first proposals. No walker is put anywhere by hand.

@@ -1,7 +1,7 @@
 """Nested sampling of a posterior with dynesty: draws and evidence by another road than the ensembles.
 
 Independent runs of dynesty (Speagle 2020, MNRAS 493) compress the prior towards high likelihood. New
-points travel by `walk` instead of dynesty's own proposals, which on narrow curved ridges forget
+points travel by `constrainedwalk` instead of dynesty's own proposals, which on narrow curved ridges forget
 nothing in hundreds of evaluations, and a whole queue travels at once, because the likelihood of a batch
 costs a tenth per point.
 """

@@ -2,8 +2,8 @@
 
 No one coordinate system fits both a ridge and the wide region where a term is negligible, so a run
 mixes: differential evolution in the sampled coordinates (ter Braak 2006, Statistics and Computing 16) and
-in the coordinates of `shape`, a slide of orders along the ridge, one order drawn anew along the ridge,
-and one whole term drawn anew. Proposals that leave the support have factor -inf or fail the prior.
+in the coordinates of `shapecoordinates`, a slide of orders along the ridge, one order drawn anew along the
+ridge, and one whole term drawn anew. Proposals that leave the support have factor -inf or fail the prior.
 """
 
 from __future__ import annotations

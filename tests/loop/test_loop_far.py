@@ -30,7 +30,7 @@ from lcopa_bayes.loop.whitening import Whitening
 from lcopa_bayes.model.effects import superposition
 from lcopa_bayes.model.effects.catalogue import catalogue
 
-RECORDS = Path(os.environ.get("LCOPA_BAYES_DATA", Path(__file__).parents[1] / ".." / "shared")) / "records"
+RECORDS = Path(os.environ.get("LCOPA_BAYES_DATA", Path(__file__).parents[2] / ".." / "shared")) / "records"
 AXIS = (Axis("x", "rad"),)
 PERIOD = 0.2
 """[ms]."""

@@ -9,11 +9,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 from scipy.special import logsumexp
-from small import Toy, problem, record
+from small import Toy, problem, record, same_quantiles
 
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.results.fit import plan_of
-from lcopa_bayes.sampling.draws import Draws, gather
+from lcopa_bayes.sampling.draws import gather
 from lcopa_bayes.sampling.evidence import evidence
 from lcopa_bayes.sampling.importance import (
     Effort,
@@ -41,15 +41,6 @@ def moments(found: Importance) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     mean = weights @ z
     covariance = (weights[:, None] * (z - mean)).T @ (z - mean)
     return mean, np.sqrt(np.square(weights) @ np.square(z - mean)), covariance
-
-
-def same_quantiles(a: Draws, b: Draws) -> bool:
-    """Whether the shares of `a` below quantiles of `b` are as they should be, within Monte Carlo error."""
-    p = np.array([0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98])
-    error = np.sqrt(p * (1 - p) * (1 / min(a.ess, len(a.flat)) + 1 / min(b.ess, len(b.flat))))
-    free = [k for k, row in enumerate(a.table.rows) if row.free]
-    shares = [np.mean(a.flat[:, k, None] < np.quantile(b.flat[:, k], p), axis=0) for k in free]
-    return bool((np.abs(np.array(shares) - p) < 4.5 * error).all())
 
 
 # -- known answers ---------------------------------------------------------------------------------

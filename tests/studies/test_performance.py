@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 
 
 def loaded(name: str) -> ModuleType:
-    path = Path(__file__).parents[1] / "studies" / "performance" / f"{name}.py"
+    path = Path(__file__).parents[2] / "studies" / "performance" / f"{name}.py"
     spec = spec_from_file_location(f"performance_{name}", path)
     assert spec is not None
     assert spec.loader is not None

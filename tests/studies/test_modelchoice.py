@@ -13,7 +13,7 @@ from scipy.stats import binom
 
 
 def loaded() -> ModuleType:
-    path = Path(__file__).parents[1] / "studies" / "model-choice" / "choice.py"
+    path = Path(__file__).parents[2] / "studies" / "model-choice" / "choice.py"
     spec = spec_from_file_location("model_choice", path)
     assert spec is not None
     assert spec.loader is not None

@@ -19,9 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
-from small import ONE, TRUTH, TWO, problem, record, row_values, study
-from test_importance import same_quantiles
-from test_verbs import check_page
+from small import ONE, TRUTH, TWO, check_page, problem, record, row_values, same_quantiles, study
 
 from lcopa_bayes.bench.command import on_off
 from lcopa_bayes.calibrate.calibrate import Calibration, calibrate
@@ -45,7 +43,7 @@ from lcopa_bayes.results.runfolder import save_fit
 @pytest.fixture(scope="module")
 def defaults() -> ModuleType:
     """The study of the default settings."""
-    path = Path(__file__).parents[1] / "studies" / "calibration" / "defaults.py"
+    path = Path(__file__).parents[2] / "studies" / "calibration" / "defaults.py"
     spec = spec_from_file_location("calibration_defaults", path)
     assert spec is not None
     assert spec.loader is not None
@@ -889,7 +887,7 @@ def test_the_bundled_studies_can_be_calibrated(name):
     """Their shortest time constant is long against a block, and the bench can simulate their truths."""
     from lcopa_bayes.data.studyfile import load_study
 
-    made = problem_of(load_study(Path(__file__).parents[1] / "studies" / "calibration" / name))
+    made = problem_of(load_study(Path(__file__).parents[2] / "studies" / "calibration" / name))
     table, rng = made.posterior.table, np.random.default_rng(0)
     gaps = []
     for truth in table.draw(20, rng):

@@ -24,7 +24,7 @@ from lcopa_bayes.loop.trace import Traced, _chance
 from lcopa_bayes.loop.whitening import Whitening
 from lcopa_bayes.model.effects.catalogue import catalogue
 
-RECORDS = Path(os.environ.get("LCOPA_BAYES_DATA", Path(__file__).parents[1] / ".." / "shared")) / "records"
+RECORDS = Path(os.environ.get("LCOPA_BAYES_DATA", Path(__file__).parents[2] / ".." / "shared")) / "records"
 AXIS = (Axis("x", "V"),)
 PERIOD, TIME, GAIN = 0.5, 8.0, 2.0
 """Sampling period [ms], time constant [ms] and gain [-] of the plant."""

@@ -21,7 +21,7 @@ from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.loop.loop import loop
 from lcopa_bayes.results.fit import fit
 
-RECORDS = Path(os.environ.get("LCOPA_BAYES_DATA", Path(__file__).parents[1] / ".." / "shared")) / "records"
+RECORDS = Path(os.environ.get("LCOPA_BAYES_DATA", Path(__file__).parents[2] / ".." / "shared")) / "records"
 ALWAYS = 1e-9
 """A range of which every movement is a large part, so that significance alone decides."""
 

@@ -28,7 +28,7 @@ STEP = HEADER + "0,0,\n0.5,1,0.1\n1.5,1,0.2\n"
 QUIET = HEADER + "0,1,0\n1,1,0\n"
 PAIR = "time_ms,drive_x_rad,drive_y_V,response_x_rad\n0,0,1,0\n1,1,2,0\n2,1,2,0\n"
 FLIPPED = "time_ms,response_x_rad,drive_y_V,drive_x_rad\n0,7,1,5\n1,7,1,5\n2,7,1,5\n"
-RECORDS = Path(os.environ.get("LCOPA_BAYES_DATA", Path(__file__).parents[1] / ".." / "shared")) / "records"
+RECORDS = Path(os.environ.get("LCOPA_BAYES_DATA", Path(__file__).parents[2] / ".." / "shared")) / "records"
 
 
 def folder_of(tmp_path: Path, text: str, **files: str) -> Path:
@@ -110,7 +110,7 @@ def test_records_in_other_units_are_converted_to_that_of_the_first(tmp_path):
 
 @pytest.mark.parametrize(
     "path",
-    sorted((Path(__file__).parents[1] / "studies").rglob("study.toml")),
+    sorted((Path(__file__).parents[2] / "studies").rglob("study.toml")),
     ids=lambda path: path.parent.name,
 )
 def test_bundled_studies_are_in_milliseconds(path):

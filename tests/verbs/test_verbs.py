@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small import check_page
 
 from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import step
@@ -41,16 +42,6 @@ def study(tmp_path_factory) -> Path:
     save_record(measured, folder / "one.csv")
     (folder / "study.toml").write_text('[records]\nfit = ["one.csv"]\n[model]\nterms = 2\n')
     return folder
-
-
-def check_page(path: Path) -> str:
-    """The page stands alone: no script, nothing fetched, no duplicate ids."""
-    page = path.read_text(encoding="utf-8")
-    assert "<script" not in page
-    assert not re.search(r'(?:src|href)="(?!#|data:)', page)
-    ids = re.findall(r'\bid="([^"]+)"', page)
-    assert len(ids) == len(set(ids))
-    return page
 
 
 # -- optics ----------------------------------------------------------------------------------------

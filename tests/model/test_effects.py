@@ -47,7 +47,7 @@ ALL = bundled()
 
 
 def two_axes() -> tuple[Effected, np.ndarray, list[np.ndarray]]:
-    """Base model of two records, its values, and its responses by `predict`."""
+    """Base model of two records, its values, and its responses by `prediction`."""
 
     def path(gain: float, terms: tuple[tuple[float, float], ...]) -> TransferPath:
         return TransferPath(gain, 0.3873, tuple(t**a for t, a in terms), tuple(a for _, a in terms), 1.0)

@@ -19,7 +19,7 @@ from lcopa_bayes.bench.undeclared import NAMED, NOISE, OUTSIDE, UndeclaredPlan, 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.studyfile import load_study
 
-STUDY = Path(__file__).parents[1] / "studies" / "undeclared"
+STUDY = Path(__file__).parents[2] / "studies" / "undeclared"
 DEVICE = steerer(np.random.default_rng(1))
 
 

@@ -87,7 +87,7 @@ def told(tmp_path_factory) -> dict:
     folder = tmp_path_factory.mktemp("full")
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT, str(folder), str(LIMIT)],
-        cwd=Path(__file__).parent,
+        cwd=Path(__file__).parents[1],
         env=os.environ | {"OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,

@@ -42,7 +42,7 @@ from lcopa_bayes.paper.outputerror import output_error_fit
 from lcopa_bayes.paper.paths import MOST_BLOCKS, PathData, path_data
 from lcopa_bayes.paper.scan import scan
 
-PAPER_STEP = Path(__file__).parents[1] / "studies" / "paper-step"
+PAPER_STEP = Path(__file__).parents[2] / "studies" / "paper-step"
 U, Y = Axis("u", "V"), Axis("y", "rad")
 ORDERS, ETAS, GAIN, DELAY = (1.6, 0.7), (3.0, 2.0), 0.2, 1.0
 TRUE = PathModel(PaperForm(GAIN, ETAS, ORDERS, 1.0), DELAY)
