@@ -150,7 +150,7 @@ def linearisation_table(stated: Stated = PAPER) -> tuple[LinearisationRow, ...]:
     """Claim S3: the pitch of Section 2 and the pitch the experiment implies, each over the ranges in use.
 
     Ranges: the step pi/2 of Figs. 13-15, the largest phase pi of Section 3.2, and, for the pitch of
-    Section 2, the phases that steer to each printed target of Fig. 3 but the normal. Numbers from `literature`.
+    Section 2, the phases that steer to each printed target of Fig. 3 but the normal. Numbers from `stated`.
     """
     simulated = paper_array(stated.optics)
     pitch = geometry_check(stated).implied_pitch
@@ -196,7 +196,7 @@ class GeometryCheck:
 def geometry_check(stated: Stated = PAPER) -> GeometryCheck:
     """Claim S4: pitch implied by the measured step (Table 1), pitch of Section 2 and width of Eq. 21.
 
-    All numbers come from `literature`.
+    All numbers come from `stated`.
     """
     optics, step, angle = stated.optics, stated.records.step_drive, stated.records.measured.steady
     simulated = paper_array(optics)

@@ -164,6 +164,6 @@ CLAIMS: tuple[Claim, ...] = (
 
 
 def judge(stated: Stated = PAPER, evidence: Evidence | None = None) -> tuple[Judged, ...]:
-    """Every claim with its verdict, computed from `literature` and the evidence at hand."""
+    """Every claim with its verdict, computed from `stated` and the evidence at hand."""
     at_hand = evidence or Evidence()
     return tuple(Judged(claim, claim.test(stated, at_hand)) for claim in CLAIMS)

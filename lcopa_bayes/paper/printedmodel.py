@@ -36,7 +36,7 @@ _POINTS = 40001
 @final
 @dataclass(frozen=True)
 class PrintedModel:
-    """The 2 x 2 model of Eq. 65 with the numbers of `literature`."""
+    """The 2 x 2 model of Eq. 65 with the numbers of `stated`."""
 
     stated: Stated = PAPER
 

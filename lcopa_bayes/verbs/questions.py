@@ -22,11 +22,11 @@ from lcopa_bayes.loop.loop import loop
 from lcopa_bayes.loop.summary import drawn, words
 from lcopa_bayes.loop.summary import results as loop_results
 from lcopa_bayes.report import write_report
-from lcopa_bayes.report.auditpage import write_audit
-from lcopa_bayes.report.comparisonpage import write_comparison
-from lcopa_bayes.report.designpage import NAME as DESIGN_PAGE
-from lcopa_bayes.report.designpage import write_design
-from lcopa_bayes.report.looppage import write_loop
+from lcopa_bayes.report.audit import write_audit
+from lcopa_bayes.report.compare import write_comparison
+from lcopa_bayes.report.design import NAME as DESIGN_PAGE
+from lcopa_bayes.report.design import write_design
+from lcopa_bayes.report.loop import write_loop
 from lcopa_bayes.results.fit import Fit, fit
 from lcopa_bayes.results.provenance import provenance
 from lcopa_bayes.results.runfolder import save_fit, save_json

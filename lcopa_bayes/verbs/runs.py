@@ -19,11 +19,11 @@ from lcopa_bayes.core.files import writable_folder
 from lcopa_bayes.core.parallel import cores
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.report import write_report
-from lcopa_bayes.report.auditpage import write_audit
-from lcopa_bayes.report.calibrationpage import is_calibration, write_calibration
-from lcopa_bayes.report.comparisonpage import write_comparison
-from lcopa_bayes.report.designpage import write_design
-from lcopa_bayes.report.looppage import write_loop
+from lcopa_bayes.report.audit import write_audit
+from lcopa_bayes.report.calibrate import is_calibration, write_calibration
+from lcopa_bayes.report.compare import write_comparison
+from lcopa_bayes.report.design import write_design
+from lcopa_bayes.report.loop import write_loop
 from lcopa_bayes.results.fit import fit
 from lcopa_bayes.results.integerrival import integer_rival
 from lcopa_bayes.results.provenance import provenance

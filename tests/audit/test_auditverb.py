@@ -16,7 +16,7 @@ from lcopa_bayes.cli import main
 from lcopa_bayes.data.record import save_record
 from lcopa_bayes.paper.claims import judge
 from lcopa_bayes.paper.verdict import Evidence
-from lcopa_bayes.report.sections import audittables
+from lcopa_bayes.report.audit import _next
 from lcopa_bayes.sampling.convergence import Limitation
 
 STUDY = """[records]
@@ -215,7 +215,7 @@ def test_paths_driven_one_after_the_other_are_told_apart_and_an_idle_drive_is_no
 
 
 def advice(limitations: list[dict]) -> str:
-    section = audittables._next({"next_measurement": None, "limitations": limitations})
+    section = _next({"next_measurement": None, "limitations": limitations})
     return " ".join(section.text)
 
 

@@ -20,7 +20,7 @@ from lcopa_bayes.data.record import save_record
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.paper.claims import judge
 from lcopa_bayes.paper.verdict import Evidence
-from lcopa_bayes.report.comparisonpage import write_comparison
+from lcopa_bayes.report.compare import write_comparison
 from lcopa_bayes.results.fit import plan_of
 
 FEW = {"ensembles": 2, "walkers": 16, "steps": 600, "thin": 2, "target_ess": 100}

@@ -1,20 +1,50 @@
-"""What to measure next: the drives, what each parameter gains, bench time, and the confirmation."""
+"""The page of a design, drawn from `design.json` of its run folder alone."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.report.formatting import NONE, figures, interval
+from lcopa_bayes.report.page import Verdict, write_page
 from lcopa_bayes.report.section import Column, Drawing, Section, Table
-from lcopa_bayes.report.theme import BAND, HELD_OUT, INK, grid, label, plain, svg_of
+from lcopa_bayes.report.theme import BAND, HELD_OUT, INK, grid, label, look, plain, svg_of
 
 _SPREAD = "median over draws of the posterior, 90 % of them in brackets"
 
+NAME = "design.html"
+"""Name of the page inside the run folder."""
+_NEEDS = (
+    *("study", "verdict", "grade", "grade_reason", "time", "time_unit", "winner", "parameters", "table"),
+    *("curve", "confirmed", "range", "repeats", "refresh", "draws", "structure", "template"),
+)
 
-def sections(told: Mapping[str, Any]) -> list[Section]:
+
+def write_design(folder: Path) -> Path:
+    """`design.html` with the table of drives, precision against bench time and its confirmation.
+
+    InputError when the folder holds no design or it cannot be used.
+    """
+    path = folder / "design.json"
+    try:
+        told: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); run `design` to write it") from None
+    absent = [key for key in _NEEDS if key not in told]
+    if absent:
+        raise InputError(f"{path}: lacks {', '.join(absent)}; run `design` again with --resume")
+    with look():
+        sections = _tables(told)
+    verdict = Verdict(str(told["grade"]), str(told["verdict"]), str(told["grade_reason"]))
+    return write_page(folder, f"{told['study']}: what to measure next", sections, verdict, NAME)
+
+
+def _tables(told: Mapping[str, Any]) -> list[Section]:
     """Every part of the page."""
     return [_parameters(told), _curve(told), _drives(told), _confirmed(told)]
 

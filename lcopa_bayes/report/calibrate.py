@@ -1,24 +1,56 @@
-"""Calibration of a study: coverage, rank histograms, ECDF differences, and every replica's grade."""
+"""The page of a calibration, drawn from its `results.json` alone."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 
+from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.report.formatting import figures, percent, probability
+from lcopa_bayes.report.page import Verdict, write_page
 from lcopa_bayes.report.section import Column, Drawing, Section, Table
-from lcopa_bayes.report.theme import BAND, HELD_OUT, INK, NOISE, blank, grid, plain, svg_of
+from lcopa_bayes.report.theme import BAND, HELD_OUT, INK, NOISE, blank, grid, look, plain, svg_of
 
 _PER_FIGURE = 18
 """Most quantities on one figure of ranks."""
 _MOST_ROWS = 40
 """Replicas listed one by one."""
 
+_NEEDS = (
+    *("study", "verdict", "grade", "grade_reason", "seed", "asked", "replicas", "coverage", "simultaneous"),
+    *("p_value", "p_value_of", "ranks", "rank_bins", "rank_corridor", "reliable", "grades", "not_reliable"),
+    *("failures", "truths", "model_gap", "seconds", "sampler", "engine", "discretisation"),
+)
 
-def sections(told: Mapping[str, Any]) -> list[Section]:
+
+def is_calibration(folder: Path) -> bool:
+    """Whether a run folder is that of a calibration."""
+    try:
+        return "rank_corridor" in json.loads((folder / "results.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError, TypeError):
+        return False
+
+
+def write_calibration(folder: Path) -> Path:
+    """`report.html` with coverage, ranks and grades; returns its path. InputError when keys are missing."""
+    told: Mapping[str, Any] = json.loads((folder / "results.json").read_text(encoding="utf-8"))
+    absent = [key for key in _NEEDS if key not in told]
+    if absent:
+        raise InputError(
+            f"{folder / 'results.json'}: lacks {', '.join(absent)}; run `calibrate` again with --resume"
+        )
+    with look():
+        sections = _sections(told)
+    verdict = Verdict(told["grade"], told["verdict"], told["grade_reason"])
+    return write_page(folder, f"{told['study']}: calibration", sections, verdict)
+
+
+def _sections(told: Mapping[str, Any]) -> list[Section]:
     """Sections of a calibration's `results.json`."""
     return [_coverage(told), _ranks(told), _differences(told), _replicas(told)]
 

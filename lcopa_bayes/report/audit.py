@@ -1,15 +1,83 @@
-"""What an audit found, as tables: verdicts first, then symmetries, functions and delays."""
+"""The page of an audit, drawn from `audit.json` and the draws of its run folder alone."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+from matplotlib.axes import Axes
+
+from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.report.formatting import NONE, figures, interval, percent
-from lcopa_bayes.report.section import Column, Section, Table
+from lcopa_bayes.report.page import Verdict, write_page
+from lcopa_bayes.report.savedrun import SavedRun, load_run
+from lcopa_bayes.report.section import Column, Drawing, Section, Table
+from lcopa_bayes.report.theme import (
+    BAND,
+    CYCLE,
+    HELD_OUT,
+    INK,
+    blank,
+    grid,
+    label,
+    log_ticks,
+    look,
+    plain,
+    svg_of,
+)
+
+_PER_FIGURE = 12
+_TOP = 6.0
+"""Largest fall that is drawn [nat]."""
+_AT_90 = 2.706
+"""Fall at the ends of a 90 % interval [nat]."""
+_PAIRS = 6
+_DOTS = 1500
 
 
-def sections(told: Mapping[str, Any]) -> list[Section]:
+NAME = "audit.html"
+"""Name of the page inside the run folder."""
+_NEEDS = (
+    *(
+        "study",
+        "verdict",
+        "grade",
+        "grade_reason",
+        "limitations",
+        "parameters",
+        "symmetries",
+        "structure",
+        "printed_form",
+        "spectrum",
+    ),
+    *("local", "radial", "functions", "delays", "next_measurement"),
+)
+
+
+def write_audit(folder: Path) -> Path:
+    """`audit.html` with verdicts, profiles, spectrum and pairs; returns its path.
+
+    InputError when the folder holds no audit or it cannot be used.
+    """
+    path = folder / "audit.json"
+    try:
+        told: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); run `audit` to write it") from None
+    absent = [key for key in _NEEDS if key not in told]
+    if absent:
+        raise InputError(f"{path}: lacks {', '.join(absent)}; run `audit` again with --resume")
+    run = load_run(folder)
+    with look():
+        sections = [*_tables(told), *_figures(told, run)]
+    verdict = Verdict(str(told["grade"]), str(told["verdict"]), str(told["grade_reason"]))
+    return write_page(folder, f"{told['study']}: identifiability", sections, verdict, NAME)
+
+
+def _tables(told: Mapping[str, Any]) -> list[Section]:
     """Everything of an audit that is words and numbers."""
     return [_verdicts(told), _next(told), _symmetries(told), _functions(told), _delays(told)]
 
@@ -176,3 +244,111 @@ def _delays(told: Mapping[str, Any]) -> Section:
     cells = tuple((" / ".join(row["pair"]), figures(row["smallest_difference"], 2)) for row in rows)
     caption = "Smallest difference a 90 % interval keeps apart from 0, linearised; a dash: none."
     return Section("Delays of the paths", text, (), (Table(columns, cells, caption),))
+
+
+def _figures(told: Mapping[str, Any], run: SavedRun) -> list[Section]:
+    """Every figure of an audit."""
+    return [_profiles(told, run), _spectrum(told), _pairs(told, run)]
+
+
+def _profiles(told: Mapping[str, Any], run: SavedRun) -> Section:
+    rows = told["parameters"]
+    caption = (
+        "Line: fall of twice the log likelihood along the profile, its 90 % level dashed, an open side where "
+        "the line stays below to the end. Filled: marginal posterior on the scale of the axis."
+    )
+    pages = [rows[k : k + _PER_FIGURE] for k in range(0, len(rows), _PER_FIGURE)]
+    drawings = tuple(
+        Drawing(f"profiles_{number:02d}", _profile_page(page, run), caption)
+        for number, page in enumerate(pages, start=1)
+    )
+    return Section("Profiles and marginals", drawings=drawings)
+
+
+def _profile_page(rows: Sequence[Mapping[str, Any]], run: SavedRun) -> str:
+    figure, panels = grid(len(rows), columns=3, height=1.7)
+    for panel, row in zip(panels, rows, strict=True):
+        name, curve = row["name"], row["profile"]
+        x, fall = np.array(curve["values"], dtype=float), np.array(curve["fall"], dtype=float)
+        draws, log = run.draws[name].ravel(), run.is_log(name)
+        if log:
+            panel.set_xscale("log")
+        inside = x[fall <= _TOP]
+        low, high = min(inside.min(), draws.min()), max(inside.max(), draws.max())
+        panel.plot(x, np.minimum(fall, 2 * _TOP), color=INK, marker=".", markersize=2.5, linewidth=1.0)
+        panel.axhline(_AT_90, color=HELD_OUT, linewidth=0.8, linestyle="--")
+        edges = np.geomspace(low, high, 41) if log else np.linspace(low, high, 41)
+        counts, _ = np.histogram(draws, edges)
+        panel.stairs(counts / max(counts.max(), 1) * 0.8 * _TOP, edges, fill=True, color=BAND, alpha=0.35)
+        margin = 0.03
+        if log:
+            panel.set_xlim(low * (low / high) ** margin, high * (high / low) ** margin)
+            log_ticks(panel.xaxis, low, high)
+        else:
+            panel.set_xlim(low - margin * (high - low), high + margin * (high - low))
+            panel.locator_params(axis="x", nbins=4)
+        panel.set_ylim(0.0, _TOP)
+        panel.set_xlabel(label(name, run.units[name]))
+        panel.set_title(row["verdict"], fontsize=7.5, loc="left")
+    return svg_of(figure)
+
+
+def _spectrum(told: Mapping[str, Any]) -> Section:
+    rows = told["spectrum"]
+    if not rows:
+        return Section("Sloppy spectrum", ("Only noise parameters are free.",))
+    figure = blank(0.9 + 0.24 * len(rows))
+    panel = figure.subplots()
+    floor = max(row["eigenvalue"] for row in rows) * 1e-16
+    for place, row in enumerate(rows):
+        value = max(row["eigenvalue"], floor)  # what is drawn; the table of numbers is in audit.json
+        panel.plot([value], [place], "o", color=BAND if row["eigenvalue"] >= 1 else HELD_OUT, markersize=4)
+        told_parts = ", ".join(f"{weight:+.2f} {name}" for name, weight in list(row["direction"].items())[:4])
+        panel.annotate(
+            plain(told_parts), (1.01, place), xycoords=("axes fraction", "data"), va="center", fontsize=7
+        )
+    panel.axvline(1.0, color=INK, linewidth=0.8, linestyle=":")
+    panel.set_xscale("log")
+    panel.invert_yaxis()
+    panel.set_yticks(range(len(rows)), [str(place + 1) for place in range(len(rows))])
+    panel.set_xlabel("precision of the data over that of the prior [-]")
+    panel.set_ylabel("direction")
+    caption = (
+        "Eigenvalues of the Fisher information at the maximum, in prior standard deviations; left of 1 the "
+        "prior knows more than the data. Beside each, the parameters it moves."
+    )
+    return Section("Sloppy spectrum", drawings=(Drawing("sloppy_spectrum", svg_of(figure), caption),))
+
+
+def _pairs(told: Mapping[str, Any], run: SavedRun) -> Section:
+    pairs: dict[frozenset[str], tuple[str, str]] = {}
+    for row in told["parameters"]:
+        if row["verdict"] != "identified":
+            for partner in row["partners"][:2]:
+                pairs.setdefault(frozenset((row["name"], partner)), (row["name"], partner))
+    shown = list(pairs.values())[:_PAIRS]
+    if not shown:
+        return Section("Degenerate pairs", ("No parameter needs a partner to explain it.",))
+    figure, panels = grid(len(shown), columns=3, height=2.1)
+    for panel, (a, b) in zip(panels, shown, strict=True):
+        _pair(panel, run, a, b)
+    left = len(pairs) - len(shown)
+    caption = "Draws of parameters that are not identified against those that make up for them." + (
+        f" {left} more pairs are not drawn." if left else ""
+    )
+    return Section("Degenerate pairs", drawings=(Drawing("degenerate_pairs", svg_of(figure), caption),))
+
+
+def _pair(panel: Axes, run: SavedRun, a: str, b: str) -> None:
+    x, y = (run.draws[name].ravel() for name in (a, b))
+    step = max(1, x.size // _DOTS)
+    panel.plot(x[::step], y[::step], ".", color=CYCLE[0], markersize=1.5, alpha=0.5, rasterized=False)
+    for name, axis, values, scale in (
+        (a, panel.xaxis, x, panel.set_xscale),
+        (b, panel.yaxis, y, panel.set_yscale),
+    ):
+        if run.spans_decades(name):
+            scale("log")
+            log_ticks(axis, float(values.min()), float(values.max()))
+    panel.set_xlabel(label(a, run.units[a]))
+    panel.set_ylabel(label(b, run.units[b]))
