@@ -1,0 +1,194 @@
+"""Posterior draws with names, units, log densities and a grade."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import final
+
+import numpy as np
+from arviz_stats.base import array_stats  # type: ignore[attr-defined]
+
+from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
+from lcopa_bayes.core.estimate import Estimate
+from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.sampling.convergence import (
+    Grade,
+    Level,
+    Limitation,
+    Quality,
+    between,
+    limited,
+    overall,
+    qualities,
+    shares_grade,
+    with_shares,
+)
+from lcopa_bayes.sampling.modes import Ridges, ridges
+from lcopa_bayes.sampling.sampler import Run, sampled_qualities
+from lcopa_bayes.sampling.weighted import Weighted
+
+_MEASURED = 12_000
+"""Draws on which the convergence of the linear parameters is measured."""
+_PER_ENSEMBLE = 500
+"""Draws delivered per ensemble."""
+_CHUNK = 128
+"""Draws completed at a time."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """Draws of every row of the parameter table."""
+
+    table: ParameterTable
+    values: Array
+    """Canonical table values, (ensembles, draws, rows), each in its row's unit."""
+    log_density: Matrix
+    """Log posterior density of the sampled coordinates, (ensembles, draws) [nat]."""
+    qualities: tuple[Quality, ...]
+    """Of every free parameter, in table order."""
+    target_ess: float
+    """Effective sample size asked for [draws]."""
+    ridges: tuple[Ridges, ...] = ()
+    """Of the sampled parameters whose marginal has more than one hill."""
+    limitations: tuple[Limitation, ...] = ()
+    """Conditions under which the intervals hold: each caps the grades of the numbers it concerns."""
+
+    @cached_property
+    def grade(self) -> Grade:
+        """Grade of the whole run."""
+        return limited(self.sampling_grade, self.limitations)
+
+    @cached_property
+    def sampling_grade(self) -> Grade:
+        """Grade of the sampling alone, whatever limits the numbers beside it."""
+        return overall(self.qualities, self.target_ess, self.ridges)
+
+    def limited(self, limitations: Sequence[Limitation]) -> Draws:
+        """The same draws under further limitations."""
+        return replace(self, limitations=(*self.limitations, *limitations))
+
+    def level(self, parameter: str, grade: Grade) -> Level:
+        """Level of a number of a parameter graded `grade`, under the limitations that concern it."""
+        return limited(grade, [one for one in self.limitations if one.concerns(parameter)]).level
+
+    @property
+    def flat(self) -> Matrix:
+        """All draws, (ensembles * draws, rows)."""
+        return self.values.reshape(-1, self.values.shape[-1])
+
+    @property
+    def ess(self) -> float:
+        """Smallest effective sample size [draws]."""
+        return float(np.min([quality.ess for quality in self.qualities]))
+
+    def thinned(self, count: int) -> Matrix:
+        """About `count` draws spread evenly over all of them, (count, rows)."""
+        flat = self.flat
+        return np.asarray(flat[np.linspace(0, flat.shape[0] - 1, min(count, flat.shape[0])).astype(int)])
+
+    def column(self, name: str) -> Vector:
+        """All draws of one parameter."""
+        return self.flat[:, self.table.names.index(name)]
+
+    def estimates(self) -> tuple[Estimate, ...]:
+        """Median, interval and grade of every free parameter."""
+        shares = {found.parameter: [shares_grade(found)] for found in self.ridges}
+        return tuple(
+            Estimate.of(
+                quality.name,
+                self.table.rows[self.table.names.index(quality.name)].unit,
+                self.column(quality.name),
+                ess=quality.ess,
+                grade=self.level(
+                    quality.name,
+                    Grade.worst([quality.grade(self.target_ess), *shares.get(quality.name, [])]),
+                ),
+            )
+            for quality in self.qualities
+        )
+
+
+def gather(posterior: Posterior, run: Run) -> Draws:
+    """Draws of a run with the linear parameters drawn exactly: resampled importance draws, or the kept part
+    of the ensembles, thinned evenly."""
+    if run.weighted is not None and run.chosen is not None:
+        rng = np.random.default_rng(np.random.SeedSequence(run.plan.seed, spawn_key=(1_000,)))
+        return _resampled(posterior, run.weighted, run.chosen, rng, run.plan.target_ess)
+    coordinates, log_density = run.kept()
+    ensembles, walkers, count, _ = coordinates.shape
+    stride = max(1, -(-ensembles * walkers * count // _MEASURED))
+    coordinates, log_density = (kept[:, :, ::-1][:, :, ::stride] for kept in (coordinates, log_density))
+    rng = np.random.default_rng(np.random.SeedSequence(run.plan.seed, spawn_key=(1_000,)))
+    flat = coordinates.reshape(-1, coordinates.shape[-1])
+    values = _completed(posterior, flat, rng).reshape(*coordinates.shape[:3], -1)
+    found = {quality.name: quality for quality in sampled_qualities(posterior, run)}
+    if posterior.linear:
+        names = [posterior.table.names[k] for k in posterior.linear]
+        found |= {q.name: q for q in qualities(names, values[..., posterior.linear])}
+    rows = [(k, posterior.table.rows[k]) for k in posterior.sampled]
+    hills = [ridges(row.name, row.unit, values[..., k], log_scale=row.log_scale) for k, row in rows]
+    several = tuple(one for one in hills if one.boundaries)
+    free = [name for name in posterior.table.names if name in found]
+    ordered = tuple(with_shares(found[name], several) for name in free)
+    by_draw = values.swapaxes(1, 2).reshape(ensembles, -1, values.shape[-1])
+    densities = log_density.swapaxes(1, 2).reshape(ensembles, -1)
+    picked = np.linspace(0, by_draw.shape[1] - 1, min(_PER_ENSEMBLE, by_draw.shape[1])).astype(int)
+    return Draws(
+        posterior.table, by_draw[:, picked], densities[:, picked], ordered, run.plan.target_ess, several
+    )
+
+
+def weighted_draws(
+    posterior: Posterior, weighted: Weighted, rng: np.random.Generator, *, target_ess: float
+) -> Draws:
+    """Draws of every parameter from weighted ones, linear parameters drawn exactly, with their grade."""
+    return _resampled(posterior, weighted, weighted.batches(_PER_ENSEMBLE, rng), rng, target_ess)
+
+
+def _resampled(
+    posterior: Posterior, weighted: Weighted, chosen: Index, rng: np.random.Generator, target_ess: float
+) -> Draws:
+    """Draws at positions of weighted ones.
+
+    Parts of the weighted draws stand for the ensembles of a sampler: being independent, they let R-hat and
+    scatter see a mean that hangs on a few draws. Effective sample sizes are those of the weights and of the
+    number of draws together.
+    """
+    values = _completed(posterior, weighted.coordinates[chosen.ravel()], rng)
+    values = values.reshape(*chosen.shape, -1)
+    several, rows = [], posterior.table.rows
+    centre, tail = (1 / (1 / own + 1 / chosen.size) for own in (weighted.centre_ess, weighted.tail_ess))
+    worth = {k: (float(centre[at]), float(tail[at])) for at, k in enumerate(posterior.sampled)}
+    linear = (float(min(centre, default=weighted.ess)), float(min(tail, default=weighted.ess)))
+    for at, k in enumerate(posterior.sampled):
+        # draws are in random order: a few of them stand for those of a walker
+        walkers = values[..., k].reshape(len(chosen), -1, 1)
+        found = ridges(rows[k].name, rows[k].unit, walkers, log_scale=rows[k].log_scale)
+        if found.boundaries:
+            by_weights = weighted.share_errors(weighted.sampled[:, at], found.boundaries)
+            several.append(replace(found, errors=np.hypot(found.errors, by_weights)))
+    measured = tuple(
+        with_shares(
+            Quality(
+                row.name,
+                *worth.get(k, linear),
+                float(array_stats.rhat_nested(values[..., k], np.arange(len(chosen)))),  # type: ignore[no-untyped-call]
+                scatter=between(values[:, None, :, k])[1],
+            ),
+            several,
+        )
+        for k, row in enumerate(rows)
+        if row.free
+    )
+    density = weighted.log_density[chosen]
+    return Draws(posterior.table, values, density, measured, target_ess, tuple(several))
+
+
+def _completed(posterior: Posterior, flat: Matrix, rng: np.random.Generator) -> Matrix:
+    """Table values of sampled coordinates, linear parameters drawn, (draws, rows)."""
+    chunks = np.array_split(flat, max(1, flat.shape[0] // _CHUNK))
+    return np.concatenate([posterior.complete(chunk, rng) for chunk in chunks])

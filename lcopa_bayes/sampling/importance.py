@@ -1,0 +1,137 @@
+"""A posterior by importance sampling around its optima: much faster than ensembles, where it holds.
+
+The proposal is a mixture of Student components in the chart of the posterior, one group per local optimum,
+fitted to its own weighted draws in a few rounds (Cappé, Douc, Guillin, Marin and Robert 2008, Statistics and
+Computing 18) and widened in part, so that its tails are heavier than the posterior's. Draws of a last, fixed
+proposal carry the result. Their weights are smoothed by a generalised Pareto distribution, whose shape k
+tells whether averages over them converge (Vehtari, Simpson, Gelman, Yao and Gabry 2024, JMLR 25).
+
+What no draw of the proposal reaches, no weight can show: a mode that neither the starts of the optimisation
+nor the tails of the proposal meet is missed. Tempered ensembles (`sampler`) are the method for posteriors
+with several modes, and what a caller falls back to where `Importance.good` is false.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.inference.optimum import Optimum, find_optima
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.sampling.coordinates import Chart
+from lcopa_bayes.sampling.evidence import charted_density
+from lcopa_bayes.sampling.importanceweights import effective, usable_k
+from lcopa_bayes.sampling.proposal import Seen, around, fitted, split, weighty
+from lcopa_bayes.sampling.weighted import Weighted, tail_smoothed
+
+LEAST_EFFICIENCY = 0.4
+"""Effective draws per draw of a good result [-]. A small k alone is not enough: a two-term posterior gave
+k = 0.4 at an efficiency of 0.2 while a third of its mass had not been met."""
+_MOST = 12
+"""Components beyond which a further attempt takes more draws alone [-]."""
+_LIGHT = 0.2
+"""Pareto k at which the proposal is fitted no further, if it is efficient [-]."""
+
+
+@final
+@dataclass(frozen=True)
+class Effort:
+    """How much work one attempt may spend."""
+
+    draws: int
+    """Draws of the last proposal."""
+    learning: int
+    """Draws of each round that fits the proposal."""
+    rounds: int
+    """Most such rounds."""
+
+
+@final
+@dataclass(frozen=True)
+class ImportancePlan:
+    """How much work importance sampling may spend."""
+
+    efforts: tuple[Effort, ...] = (Effort(4_000, 1_000, 6), Effort(8_000, 3_000, 6))
+    """Attempts, each going on from the one before with more components, until one is good."""
+    starts: int = 6
+    """Starts of the least-squares search."""
+    wanted: float = 400.0
+    """Effective draws of a good one."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Importance:
+    """Weighted draws of a posterior around its optima."""
+
+    weighted: Weighted
+    modes: int
+    """Optima the proposal started from."""
+    evaluations: int
+    """Evaluations of the density, those of the optimisation not counted."""
+
+    def good(self, wanted: float) -> bool:
+        """Whether averages converge, the proposal is close to the posterior, and enough draws count."""
+        own = self.weighted
+        return own.pareto_k <= usable_k(own.count) and own.ess >= max(wanted, LEAST_EFFICIENCY * own.count)
+
+
+def first_look(
+    posterior: Posterior, rng: np.random.Generator, plan: ImportancePlan = ImportancePlan()
+) -> Importance | None:
+    """Optima of a posterior from several starts, and importance sampling around them.
+
+    None where no start led to an optimum of positive density.
+    """
+    optima = find_optima(posterior, rng, starts=plan.starts)
+    return importance(posterior, optima, rng, plan) if optima else None
+
+
+def importance(
+    posterior: Posterior,
+    optima: Sequence[Optimum],
+    rng: np.random.Generator,
+    plan: ImportancePlan = ImportancePlan(),
+) -> Importance:
+    """Importance sampling around given optima, one or more.
+
+    FloatingPointError where the density is NaN.
+    """
+    chart = Chart.of(posterior)
+    chosen = weighty(optima)
+    proposal = core = around(posterior, chart, chosen, rng)
+    seen = Seen((), (), ())
+    for effort in plan.efforts:
+        if seen.proposals and len(core.means) < _MOST:
+            core = split(core, rng)
+        for _ in range(effort.rounds):
+            y = proposal.draw(effort.learning, rng)
+            seen = seen.joined(proposal, y, charted_density(posterior, chart, y))
+            log_weights = seen.log_weights()
+            if np.isneginf(log_weights).all():
+                break
+            own, k = tail_smoothed(seen.last_weights())
+            core, proposal = fitted(core, np.concatenate(seen.points), log_weights)
+            if k <= _LIGHT and effective(own) > LEAST_EFFICIENCY * effort.learning:
+                break
+        y = proposal.draw(effort.draws, rng)
+        density = charted_density(posterior, chart, y)
+        found = _weighed(posterior, chart, y, density, density - proposal.log_density(y))
+        if found.good(plan.wanted):
+            break
+        seen = seen.joined(proposal, y, density)
+    spent = sum(map(len, seen.points)) + (len(y) if found.good(plan.wanted) else 0)
+    return replace(found, modes=len(chosen), evaluations=spent)
+
+
+def _weighed(posterior: Posterior, chart: Chart, y: Matrix, charted: Vector, raw: Vector) -> Importance:
+    """Charted draws of one proposal with their densities in the chart and their log weights."""
+    z, exists = chart.uncharted(y)
+    usable = exists & np.isfinite(charted)
+    z = z[usable]
+    density = charted[usable] + chart.charted(z)[1] - posterior.table.log_permutations
+    return Importance(Weighted.of(posterior, z, density, raw[usable], len(y)), 0, 0)

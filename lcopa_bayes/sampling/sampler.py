@@ -1,0 +1,330 @@
+"""Independent ensembles from the prior, advanced in rounds until they agree or the budget is spent."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from math import ceil
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+from tqdm import tqdm
+
+from lcopa_bayes.core.arrays import Array, Index, Matrix
+from lcopa_bayes.data.settings import Method
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.sampling.chainfile import Chain, load_chain, save_chain
+from lcopa_bayes.sampling.convergence import CERTAIN, Quality, drifts, qualities
+from lcopa_bayes.sampling.cover import Cover
+from lcopa_bayes.sampling.coverdraws import Crew, cover_draws
+from lcopa_bayes.sampling.ensemble import Ensemble, advance
+from lcopa_bayes.sampling.knownmodes import around
+from lcopa_bayes.sampling.learning import LEARNING, taught, taught_cover
+from lcopa_bayes.sampling.mixture import Mixture
+from lcopa_bayes.sampling.modes import Ridges, ridges
+from lcopa_bayes.sampling.weighted import BATCHES, CHAIN, Weighted
+
+_ROUND = 20
+"""Draws kept per round and walker."""
+_MEMORY = 0.4
+"""Largest memory of a walker at which sampling stops [-]."""
+_SWEEPS = 80
+"""Most moves of every walker at each temperature on the way from the prior."""
+_LEAST = 5
+"""Rounds before sampling may stop: what is kept of them comes after the first learning."""
+_AS_LONG = 0.4
+"""Sampling takes at least this share of the moves that the way from the prior took: a posterior that was
+hard to reach has hills that fill slowly [-]."""
+_TREND = 2.0
+"""Standard errors below which a drift of the kept draws is taken for chance where the run as a whole drifts
+[-]: there chance is the less likely reason, and to go on costs little."""
+_THIN = 5
+"""Steps per kept draw unless the study says otherwise."""
+_ATTEMPTS, _LONGER = 3, 1.5
+"""Most attempts at importance draws, and how many times as long ensembles have run at the next one [-]."""
+_DELIVERED = 500
+"""Fewest importance draws of a batch that are delivered."""
+_PER_WANTED = 4.0
+"""Delivered draws per effective one that is wanted [-] ..."""
+_SURPLUS = 1.4
+"""... and effective importance draws: 1.4 and 4 times as many are together worth 1.04 times as many."""
+
+
+@final
+@dataclass(frozen=True)
+class SamplePlan:
+    """How long and how wide to sample."""
+
+    ensembles: int
+    """Independent ensembles [-]."""
+    walkers: int
+    """Walkers per ensemble [-]."""
+    steps: int
+    """Most steps per ensemble [-]."""
+    thin: int
+    """Steps per kept draw [-]."""
+    target_ess: float
+    """Effective sample size that ends sampling [draws]."""
+    seed: int
+    """Root of all randomness of the run."""
+    method: Method = "ensembles"
+    """Importance draws where a cover of the posterior gives them, or ensembles in any case."""
+
+    @classmethod
+    def of(
+        cls,
+        dimension: int,
+        *,
+        seed: int,
+        ensembles: int = 4,
+        walkers: int | None = None,
+        steps: int | None = None,
+        thin: int | None = None,
+        target_ess: float = 400,
+        method: Method = "ensembles",
+    ) -> SamplePlan:
+        """A plan with what is left open chosen from the number of sampled parameters."""
+        least = 2 * dimension + 2
+        return cls(
+            ensembles,
+            max(least + least % 2, walkers or max(128, 16 * dimension)),
+            steps or 2000 + 400 * dimension,
+            thin or _THIN,
+            target_ess,
+            seed,
+            method,
+        )
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What sampling gave."""
+
+    ensembles: tuple[Ensemble, ...]
+    plan: SamplePlan
+    weighted: Weighted | None = None
+    """Importance draws, where a cover of the posterior gave enough of them."""
+
+    @cached_property
+    def chosen(self) -> Index | None:
+        """Positions of resampled importance draws with equal weights, (batches, draws); None without any."""
+        if self.weighted is None:
+            return None
+        rng = np.random.default_rng(np.random.SeedSequence(self.plan.seed, spawn_key=(1_001,)))
+        count = max(_DELIVERED, ceil(_PER_WANTED * self.plan.target_ess / BATCHES))
+        return self.weighted.batches(count + -count % CHAIN, rng)
+
+    @property
+    def visited(self) -> Matrix:
+        """Where the walkers of the ensembles have been in the last three fifths, (points, dimension)."""
+        coordinates = Run(self.ensembles, self.plan).kept()[0]
+        return coordinates.reshape(-1, coordinates.shape[-1])
+
+    def kept(self) -> tuple[Array, Array]:
+        """Draws of equal weight: coordinates (ensembles, walkers, draws, dimension), and log density.
+
+        Of importance draws resampled ones, whose batches stand for ensembles; of ensembles the last three
+        fifths.
+        """
+        if self.weighted is not None and self.chosen is not None:
+            order = self.chosen.reshape(BATCHES, -1, CHAIN)
+            return self.weighted.coordinates[order], self.weighted.log_density[order]
+        chain = np.stack([ensemble.chain for ensemble in self.ensembles])
+        log_density = np.stack([ensemble.log_density for ensemble in self.ensembles])
+        first = 2 * chain.shape[1] // 5
+        return chain[:, first:].swapaxes(1, 2), log_density[:, first:].swapaxes(1, 2)
+
+
+def sample(
+    posterior: Posterior,
+    plan: SamplePlan,
+    *,
+    jobs: int = 1,
+    chain_file: Path | None = None,
+    fingerprint: str = "",
+    resume: bool = False,
+    quiet: bool = True,
+    starts: Matrix | None = None,
+) -> Run:
+    """Sample a posterior: populations tempered from the prior, then rounds of emcee; and, as the plan allows,
+    importance draws of a cover of where these have been (`coverdraws`), which are the result where their
+    weights converge.
+
+    Where they do not in a posterior of several modes, the ensembles go on and it is tried again. The draws
+    depend on the arguments alone, not on `jobs` nor on interruptions: with `resume`, a run killed at any
+    moment continues from the last complete round in `chain_file`. `starts`, table values (starts, rows), are
+    modes known from elsewhere, which moves propose too (`knownmodes`); InputError when none lies inside the
+    prior.
+    """
+    known = None if starts is None else around(posterior, starts, plan.seed)
+    stored = load_chain(chain_file, fingerprint) if resume and chain_file else Chain()
+    if stored.weighted is not None:
+        return Run(stored.ensembles, plan, stored.weighted)
+    ensembles = stored.ensembles
+    rounds = max(2, -(-plan.steps // (_ROUND * plan.thin)))
+    done = ensembles[0].steps // (_ROUND * plan.thin) if ensembles else 0
+    with (
+        _crew(posterior, min(jobs, plan.ensembles)) as crew,
+        tqdm(total=rounds, initial=done, unit="round", disable=quiet, desc="from the prior") as bar,
+    ):
+        if not ensembles:
+            seeds = np.random.SeedSequence(plan.seed).spawn(plan.ensembles)
+            ensembles = tuple(crew(_Birth(plan.walkers), seeds))
+            _store(chain_file, Chain(ensembles), fingerprint)
+        bar.set_description("sampling")
+        mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
+        cover = taught_cover(posterior, ensembles, _ROUND, plan.seed)
+        hardest = max(ensemble.way for ensemble in ensembles)
+        least = max(_LEAST, round(_AS_LONG * hardest / (_ROUND * plan.thin)))
+        failed = stored.failed
+        while True:
+            run, again = Run(ensembles, plan), ceil(_LONGER * failed[-1]) if failed else least
+            if done >= rounds or (done >= again and finished(posterior, run, bar)):
+                weighted = None
+                if plan.method == "auto":
+                    wanted = _SURPLUS * plan.target_ess
+                    weighted = cover_draws(posterior, run.visited, wanted, plan.seed, crew)
+                failed = (*failed, done)
+                last = done >= rounds or len(failed) == _ATTEMPTS or not _has_modes(posterior, run)
+                if weighted is not None or plan.method == "ensembles" or last:
+                    _store(chain_file, Chain(ensembles, weighted), fingerprint)
+                    return Run(ensembles, plan, weighted)
+            if done >= LEARNING and done.bit_count() == 1:
+                mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
+                cover = taught_cover(posterior, ensembles, _ROUND, plan.seed)
+            ensembles = tuple(crew(_Round(plan.thin, mixture, cover), ensembles))
+            done += 1
+            _store(chain_file, Chain(ensembles, failed=failed), fingerprint)
+            bar.update()
+
+
+def _has_modes(posterior: Posterior, run: Run) -> bool:
+    """Whether the marginal of any sampled parameter has several modes."""
+    return any(found.boundaries for found in _sampled_ridges(posterior, run))
+
+
+def _store(chain_file: Path | None, chain: Chain, fingerprint: str) -> None:
+    if chain_file:
+        save_chain(chain_file, chain, fingerprint)
+
+
+def finished(posterior: Posterior, run: Run, bar: tqdm[Any] | None = None) -> bool:
+    """Whether every sampled parameter agrees between ensembles and has its effective sample size, and the
+    shares of its modes have.
+
+    Walkers travel a little further than a grade asks, so that the linear parameters, which are drawn
+    afterwards, have too.
+    """
+    found = sampled_qualities(posterior, run)
+    if bar is not None:
+        ess, rhat = float(np.min([q.ess for q in found])), float(np.max([q.rhat for q in found]))
+        memory = float(np.max([q.memory for q in found]))
+        acceptance = np.mean([ensemble.acceptance for ensemble in run.ensembles])
+        bar.set_postfix(
+            acceptance=f"{acceptance:.2f}", ess=f"{ess:.0f}", rhat=f"{rhat:.3f}", memory=f"{memory:.2f}"
+        )
+    target = run.plan.target_ess
+    good = all(q.grade(target).level == "reliable" and q.memory <= _MEMORY for q in found)
+    return (
+        good
+        and all(one.ess >= target for one in _sampled_ridges(posterior, run))
+        and _settled(posterior, run)
+    )
+
+
+def _settled(posterior: Posterior, run: Run) -> bool:
+    """Whether what drifts over the whole run with certainty shows no trend any more in what is kept of it.
+
+    A mode that few walkers had found at the start fills slowly and in all ensembles alike, so that neither
+    their agreement nor the effective sample size of what is kept can tell how much is still to come.
+    """
+    whole, kept = (_sampled_values(posterior, run, kept=part) for part in (False, True))
+    for column in range(whole.shape[-1]):
+        pairs = zip(drifts(whole[..., column]), drifts(kept[..., column]), strict=False)
+        for (far, far_error, _), (near, near_error, _) in pairs:
+            if abs(far) > CERTAIN * far_error and abs(near) > _TREND * near_error:
+                return False
+    return True
+
+
+def sampled_qualities(posterior: Posterior, run: Run) -> tuple[Quality, ...]:
+    """Quality of the sampled parameters over the kept part of a run."""
+    names = [posterior.table.names[k] for k in posterior.sampled]
+    return qualities(names, _sampled_values(posterior, run))
+
+
+def _sampled_ridges(posterior: Posterior, run: Run) -> Iterator[Ridges]:
+    """Modes of the sampled parameters over the kept part of a run."""
+    values = _sampled_values(posterior, run)
+    for column, k in enumerate(posterior.sampled):
+        row = posterior.table.rows[k]
+        yield ridges(row.name, row.unit, values[..., column], log_scale=row.log_scale)
+
+
+def _sampled_values(posterior: Posterior, run: Run, *, kept: bool = True) -> Array:
+    """Values of the sampled parameters that are kept, or all, (ensembles, walkers, draws, parameters)."""
+    chains = [ensemble.chain for ensemble in run.ensembles]
+    coordinates = run.kept()[0] if kept else np.stack(chains).swapaxes(1, 2)
+    values = posterior.values(coordinates.reshape(-1, coordinates.shape[-1]))[:, posterior.sampled]
+    return values.reshape(*coordinates.shape[:3], -1)
+
+
+@final
+@dataclass(frozen=True)
+class _Birth:
+    """Task: a new ensemble of a seed."""
+
+    walkers: int
+
+    def __call__(self, posterior: Posterior, seed: np.random.SeedSequence) -> Ensemble:
+        return Ensemble.born(posterior, self.walkers, _SWEEPS, seed)
+
+
+@final
+@dataclass(frozen=True)
+class _Round:
+    """Task: an ensemble one round further."""
+
+    thin: int
+    mixture: Mixture | None
+    cover: Cover | None
+
+    def __call__(self, posterior: Posterior, ensemble: Ensemble) -> Ensemble:
+        return advance(posterior, ensemble, _ROUND, self.thin, self.mixture, self.cover)
+
+
+@contextmanager
+def _crew(posterior: Posterior, jobs: int) -> Iterator[Crew]:
+    """A map of a task over its inputs, in this process or in `jobs` others."""
+    if jobs <= 1:
+        with threadpool_limits(1):
+            yield lambda task, inputs: (task(posterior, one) for one in inputs)
+        return
+    with ProcessPoolExecutor(
+        jobs, mp_context=get_context("spawn"), initializer=_take_up, initargs=(posterior,)
+    ) as pool:
+        yield lambda task, inputs: pool.map(_perform, [task] * len(inputs), inputs)
+
+
+_posterior: Posterior | None = None
+"""The posterior a worker process samples; set once when the process starts."""
+
+
+def _take_up(posterior: Posterior) -> None:
+    global _posterior
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # an interrupt ends a worker without a word
+    threadpool_limits(1)
+    _posterior = posterior
+
+
+def _perform(task: Callable[[Posterior, Any], Any], given: Any) -> Any:
+    assert _posterior is not None
+    return task(_posterior, given)
