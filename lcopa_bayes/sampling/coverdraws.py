@@ -18,17 +18,16 @@ import numpy as np
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.cover import Cover
-from lcopa_bayes.sampling.importanceweights import LARGEST_K
 from lcopa_bayes.sampling.weighted import Weighted
 
 _COMPONENTS = 60
 """Components of the cover."""
 _PILOT = 20_000
-"""Draws that tell how many are needed."""
+"""First draws, which tell how many are needed."""
 _MOST = 400_000
 """Most draws."""
 _SPARE = 1.15
-"""Factor on the number of draws that the pilot says are needed [-]."""
+"""Factor on the number of draws that those so far say are needed [-]."""
 _PART = 500
 """Fewest draws of a task."""
 _TASKS = 8
@@ -58,26 +57,29 @@ def cover_draws(
     """
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(6_000,)))
     cover = Cover.fitted(posterior, visited, seed, _COMPONENTS)
-    pilot = _weighted(posterior, cover, _PILOT, rng, crew)
-    if pilot.pareto_k > LARGEST_K:
-        return None
-    worth, _ = pilot.convergence(rng)
-    needed = ceil(_SPARE * _PILOT * wanted / worth) if worth > 0 else _MOST + 1
-    if needed > _MOST:
-        return None
-    found = _weighted(posterior, cover, max(needed, _PILOT), rng, crew)
-    worth, shape = found.convergence(rng)
-    return found if worth >= wanted and shape <= LARGEST_K else None
+    drawn: list[tuple[Matrix, Vector, Vector]] = []
+    count, wanted_count = 0, _PILOT
+    while wanted_count <= _MOST:
+        drawn.append(_drawn(posterior, cover, wanted_count - count, rng, crew))
+        count = wanted_count
+        z, density, raw = (np.concatenate(part) for part in zip(*drawn, strict=True))
+        found = Weighted.of(posterior, z, density, raw, count, smooth=False)
+        worth = found.smallest_ess(rng)
+        if worth >= wanted:
+            return found
+        needed = ceil(_SPARE * count * wanted / worth) if worth > 0 else 0
+        wanted_count = min(max(needed, 2 * count), 4 * count)
+    return None
 
 
-def _weighted(
+def _drawn(
     posterior: Posterior, cover: Cover, count: int, rng: np.random.Generator, crew: Crew
-) -> Weighted:
-    """`count` draws of a cover, those that no chart has included, with their weights."""
+) -> tuple[Matrix, Vector, Vector]:
+    """`count` draws of a cover, those that no chart or no prior has left out: coordinates, log density and
+    log weight."""
     z = rng.permutation(cover.draw(count, rng))
     parts = np.array_split(z, max(1, min(_TASKS, len(z) // _PART)))
     density = np.concatenate(list(crew(_Density(), parts)))
     inside = np.isfinite(density)
     z, density = z[inside], density[inside]
-    raw = density + posterior.table.log_permutations - cover.log_density(z)
-    return Weighted.of(posterior, z, density, raw, count)
+    return z, density, density + posterior.table.log_permutations - cover.log_density(z)

@@ -138,7 +138,28 @@ def gather(posterior: Posterior, run: Run) -> Draws:
     densities = log_density.swapaxes(1, 2).reshape(ensembles, -1)
     picked = np.linspace(0, by_draw.shape[1] - 1, min(_PER_ENSEMBLE, by_draw.shape[1])).astype(int)
     return Draws(
-        posterior.table, by_draw[:, picked], densities[:, picked], ordered, run.plan.target_ess, several
+        posterior.table,
+        by_draw[:, picked],
+        densities[:, picked],
+        ordered,
+        run.plan.target_ess,
+        several,
+        _unconfirmed(several) if run.unconfirmed else (),
+    )
+
+
+def _unconfirmed(several: Sequence[Ridges]) -> tuple[Limitation, ...]:
+    """That no independent draws confirm the shares of modes, for the parameters that have some."""
+    if not several:
+        return ()
+    return (
+        Limitation(
+            "tentative",
+            "the shares of the modes are those of ensembles alone, which independent draws of a cover could "
+            "not confirm",
+            "allow more steps, or fix or narrow what the record cannot tell",
+            tuple(one.parameter for one in several),
+        ),
     )
 
 
@@ -161,8 +182,12 @@ def _resampled(
     values = _completed(posterior, weighted.coordinates[chosen.ravel()], rng)
     values = values.reshape(*chosen.shape, -1)
     several, rows = [], posterior.table.rows
-    centre, tail = (1 / (1 / own + 1 / chosen.size) for own in (weighted.centre_ess, weighted.tail_ess))
-    worth = {k: (float(centre[at]), float(tail[at])) for at, k in enumerate(posterior.sampled)}
+    # an effective size of independent draws joined with the number of those delivered; infinite where fixed
+    centre, tail = (
+        own * chosen.size / (own + chosen.size)
+        for own in (np.minimum(worth, 1e12) for worth in (weighted.centre_ess, weighted.tail_ess))
+    )
+    sizes = {k: (float(centre[at]), float(tail[at])) for at, k in enumerate(posterior.sampled)}
     linear = (float(min(centre, default=weighted.ess)), float(min(tail, default=weighted.ess)))
     for at, k in enumerate(posterior.sampled):
         # draws are in random order: a few of them stand for those of a walker
@@ -175,7 +200,7 @@ def _resampled(
         with_shares(
             Quality(
                 row.name,
-                *worth.get(k, linear),
+                *sizes.get(k, linear),
                 float(array_stats.rhat_nested(values[..., k], np.arange(len(chosen)))),  # type: ignore[no-untyped-call]
                 scatter=between(values[:, None, :, k])[1],
             ),

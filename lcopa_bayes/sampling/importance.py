@@ -134,4 +134,4 @@ def _weighed(posterior: Posterior, chart: Chart, y: Matrix, charted: Vector, raw
     usable = exists & np.isfinite(charted)
     z = z[usable]
     density = charted[usable] + chart.charted(z)[1] - posterior.table.log_permutations
-    return Importance(Weighted.of(posterior, z, density, raw[usable], len(y)), 0, 0)
+    return Importance(Weighted.of(posterior, z, density, raw[usable], len(y), smooth=True), 0, 0)

@@ -47,7 +47,7 @@ _TREND = 2.0
 [-]: there chance is the less likely reason, and to go on costs little."""
 _THIN = 5
 """Steps per kept draw unless the study says otherwise."""
-_ATTEMPTS, _LONGER = 3, 1.5
+_ATTEMPTS, _LONGER = 2, 1.5
 """Most attempts at importance draws, and how many times as long ensembles have run at the next one [-]."""
 _DELIVERED = 500
 """Fewest importance draws of a batch that are delivered."""
@@ -112,6 +112,8 @@ class Run:
     plan: SamplePlan
     weighted: Weighted | None = None
     """Importance draws, where a cover of the posterior gave enough of them."""
+    unconfirmed: bool = False
+    """Whether there are several modes whose shares importance draws were to confirm and could not."""
 
     @cached_property
     def chosen(self) -> Index | None:
@@ -196,7 +198,8 @@ def sample(
                 last = done >= rounds or len(failed) == _ATTEMPTS or not _has_modes(posterior, run)
                 if weighted is not None or plan.method == "ensembles" or last:
                     _store(chain_file, Chain(ensembles, weighted), fingerprint)
-                    return Run(ensembles, plan, weighted)
+                    unconfirmed = plan.method == "auto" and weighted is None and _has_modes(posterior, run)
+                    return Run(ensembles, plan, weighted, unconfirmed)
             if done >= LEARNING and done.bit_count() == 1:
                 mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
                 cover = taught_cover(posterior, ensembles, _ROUND, plan.seed)

@@ -43,7 +43,7 @@ class Weighted:
     raw: Vector
     """Log of the posterior density over that of the proposal, (draws,) [nat]."""
     log_weights: Vector
-    """Normalised and Pareto-smoothed, (draws,) [nat]."""
+    """Normalised, and Pareto-smoothed where asked for, (draws,) [nat]."""
     pareto_k: float
     """Shape of the weights' tail [-]; infinite where too few draws have any weight."""
     count: int
@@ -59,11 +59,24 @@ class Weighted:
 
     @classmethod
     def of(
-        cls, posterior: Posterior, coordinates: Matrix, log_density: Vector, raw: Vector, count: int
+        cls,
+        posterior: Posterior,
+        coordinates: Matrix,
+        log_density: Vector,
+        raw: Vector,
+        count: int,
+        *,
+        smooth: bool,
     ) -> Weighted:
-        """Weights of the draws that have a density, out of `count`; `log_density` without permutations."""
+        """Weights of the draws that have a density, out of `count`; `log_density` without permutations.
+
+        Smoothing reduces the scatter of weights that have one tail, and biases those of a proposal that
+        covers one mode less well than another.
+        """
         padded = np.concatenate([raw, np.full(count - len(raw), -np.inf)])
         log_weights, k = tail_smoothed(padded)
+        if not smooth and raw.size:
+            log_weights = padded - logsumexp(raw)
         log_evidence, error = -np.inf, np.inf
         if raw.size:
             log_evidence = float(logsumexp(raw) - np.log(count))
@@ -109,25 +122,16 @@ class Weighted:
             out.append(min(_worth((column <= end).astype(float), weights) for end in ends))
         return np.array(out)
 
-    def convergence(self, rng: np.random.Generator) -> tuple[float, float]:
-        """Smallest effective sample size of a centre, a tail or a mode's share [draws], and the largest
-        Pareto k of the weights inside a tail or a mode: each converges by itself."""
+    def smallest_ess(self, rng: np.random.Generator) -> float:
+        """Smallest effective sample size of a centre, a tail or a mode's share [draws]."""
         if not self.log_weights.size:
-            return 0.0, np.inf
+            return 0.0
         chosen = self.resampled(_LOOKED_AT, rng).reshape(BATCHES, -1, CHAIN)
-        worth, shapes = [*self.centre_ess, *self.tail_ess], [self.pareto_k]
+        worth = [*self.centre_ess, *self.tail_ess]
         for column, logarithmic in zip(self.sampled.T, self.logarithmic, strict=True):
             found = ridges("", "", column[chosen], log_scale=logarithmic)
             worth += self.share_ess(column, found.boundaries)
-            mode = np.searchsorted(found.boundaries, column)
-            low, high = np.quantile(column[chosen], _TAILS)
-            for part in (
-                *(mode == k for k in range(len(found.boundaries) + 1)),
-                column <= low,
-                column >= high,
-            ):
-                shapes.append(tail_smoothed(self.raw[part])[1])
-        return float(np.min(worth)), float(np.max(shapes))
+        return float(np.min(worth))
 
     def share_ess(self, column: Vector, boundaries: Sequence[float]) -> list[float]:
         """Effective sample size for the shares of the modes of a parameter [draws]; none without
@@ -179,7 +183,15 @@ def tail_smoothed(log_weights: Vector) -> tuple[Vector, float]:
 
 def _worth(values: Vector, weights: Vector) -> float:
     """Number of independent draws that would know the mean as well as normalised weights do; infinite where
-    nothing varies."""
+    nothing varies.
+
+    The variance of the mean is itself an average, which few draws may dominate: n of them know it to
+    ``sqrt(2 / n)``, and by twice that it is taken larger.
+    """
     apart = (values - weights @ values) ** 2
-    variance, error = float(weights @ apart), float(weights**2 @ apart)
-    return variance / error if error > 0 else np.inf
+    terms = weights**2 * apart
+    variance, error = float(weights @ apart), float(terms.sum())
+    if error == 0.0:
+        return np.inf
+    dominating = error**2 / float(terms @ terms)
+    return variance / error / (1 + 2 * np.sqrt(2 / dominating))
