@@ -24,7 +24,7 @@ _COMPONENTS = 60
 """Components of the cover."""
 _PILOT = 20_000
 """First draws, which tell how many are needed."""
-_MOST = 400_000
+_MOST = 320_000
 """Most draws."""
 _SPARE = 1.15
 """Factor on the number of draws that those so far say are needed [-]."""
@@ -67,7 +67,9 @@ def cover_draws(
         worth = found.smallest_ess(rng)
         if worth >= wanted:
             return found
-        needed = ceil(_SPARE * count * wanted / worth) if worth > 0 else 0
+        needed = ceil(_SPARE * count * wanted / worth)
+        if count >= 2 * _PILOT and needed > 2 * _MOST:
+            return None
         wanted_count = min(max(needed, 2 * count), 4 * count)
     return None
 

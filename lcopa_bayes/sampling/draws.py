@@ -144,21 +144,21 @@ def gather(posterior: Posterior, run: Run) -> Draws:
         ordered,
         run.plan.target_ess,
         several,
-        _unconfirmed(several) if run.unconfirmed else (),
+        _unconfirmed(run.unconfirmed),
     )
 
 
-def _unconfirmed(several: Sequence[Ridges]) -> tuple[Limitation, ...]:
-    """That no independent draws confirm the shares of modes, for the parameters that have some."""
-    if not several:
+def _unconfirmed(parameters: tuple[str, ...]) -> tuple[Limitation, ...]:
+    """That no independent draws confirm the shares of modes of these parameters."""
+    if not parameters:
         return ()
     return (
         Limitation(
             "tentative",
-            "the shares of the modes are those of ensembles alone, which independent draws of a cover could "
-            "not confirm",
+            f"modes of {', '.join(parameters)} filled while the ensembles ran, and independent draws of a "
+            "cover could not confirm their shares",
             "allow more steps, or fix or narrow what the record cannot tell",
-            tuple(one.parameter for one in several),
+            parameters,
         ),
     )
 

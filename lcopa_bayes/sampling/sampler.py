@@ -112,8 +112,9 @@ class Run:
     plan: SamplePlan
     weighted: Weighted | None = None
     """Importance draws, where a cover of the posterior gave enough of them."""
-    unconfirmed: bool = False
-    """Whether there are several modes whose shares importance draws were to confirm and could not."""
+    unconfirmed: tuple[str, ...] = ()
+    """Parameters with modes that filled while the ensembles ran, whose shares importance draws could not
+    confirm."""
 
     @cached_property
     def chosen(self) -> Index | None:
@@ -195,11 +196,11 @@ def sample(
                     wanted = _SURPLUS * plan.target_ess
                     weighted = cover_draws(posterior, run.visited, wanted, plan.seed, crew)
                 failed = (*failed, done)
-                last = done >= rounds or len(failed) == _ATTEMPTS or not _has_modes(posterior, run)
+                last = done >= rounds or len(failed) == _ATTEMPTS or not _filling(posterior, run)
                 if weighted is not None or plan.method == "ensembles" or last:
                     _store(chain_file, Chain(ensembles, weighted), fingerprint)
-                    unconfirmed = plan.method == "auto" and weighted is None and _has_modes(posterior, run)
-                    return Run(ensembles, plan, weighted, unconfirmed)
+                    doubtful = plan.method == "auto" and weighted is None
+                    return Run(ensembles, plan, weighted, _filling(posterior, run) if doubtful else ())
             if done >= LEARNING and done.bit_count() == 1:
                 mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
                 cover = taught_cover(posterior, ensembles, _ROUND, plan.seed)
@@ -209,9 +210,15 @@ def sample(
             bar.update()
 
 
-def _has_modes(posterior: Posterior, run: Run) -> bool:
-    """Whether the marginal of any sampled parameter has several modes."""
-    return any(found.boundaries for found in _sampled_ridges(posterior, run))
+def _filling(posterior: Posterior, run: Run) -> tuple[str, ...]:
+    """Sampled parameters with several modes that drift over the whole run with certainty."""
+    whole = _sampled_values(posterior, run, kept=False)
+    return tuple(
+        found.parameter
+        for column, found in enumerate(_sampled_ridges(posterior, run))
+        if found.boundaries
+        and any(abs(apart) > CERTAIN * error for apart, error, _ in drifts(whole[..., column]))
+    )
 
 
 def _store(chain_file: Path | None, chain: Chain, fingerprint: str) -> None:

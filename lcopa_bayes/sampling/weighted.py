@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from math import sqrt
 from typing import final
 
 import numpy as np
@@ -194,4 +195,4 @@ def _worth(values: Vector, weights: Vector) -> float:
     if error == 0.0:
         return np.inf
     dominating = error**2 / float(terms @ terms)
-    return variance / error / (1 + 2 * np.sqrt(2 / dominating))
+    return variance / error / (1 + 2 * sqrt(2 / dominating))
