@@ -20,9 +20,10 @@ from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.crosscheck import holm
 from lcopa_bayes.inference.draws import Draws
 from lcopa_bayes.inference.grade import Limitation
-from lcopa_bayes.predict import LEVELS, Band
+from lcopa_bayes.predict import Band
 from lcopa_bayes.residuals import WHITE_P, Residual
 from lcopa_bayes.resonance import resonances
+from lcopa_bayes.simultaneous import LEVELS
 
 REST = 2.0
 """Residual over the largest scatter that samples at rest allow, from which a model lacks something [-]: the

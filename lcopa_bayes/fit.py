@@ -110,11 +110,11 @@ def fit(
     width = discretisation(problem, draws)
     curves = step_curves(draws, problem.scales.span)
     draws = draws.limited([*width.limitations, *too_fast(draws, curves, problem.scales.period)])
-    noise, rng = problem.posterior.noise, np.random.default_rng([plan.seed, 2])
-    shown = bands(draws, problem.posterior.model, problem.posterior.samples, noise, held_out=False, rng=rng)
+    noise, seed = problem.posterior.noise, plan.seed
+    shown = bands(draws, problem.posterior.model, problem.posterior.samples, noise, held_out=False, seed=seed)
     if study.held_out:
         samples, model = problem.simulated(study.held_out)
-        shown += bands(draws, model, samples, noise, held_out=True, rng=rng)
+        shown += bands(draws, model, samples, noise, held_out=True, seed=seed)
     left = residuals(draws, shown, noise, problem.scales.period)
     draws = draws.limited(limitations(problem, draws, shown, left, np.random.default_rng([plan.seed, 4])))
     metrics = step_metrics(draws, curves, time_unit=study.time_unit)
