@@ -7,12 +7,16 @@ from pathlib import Path
 from typing import final
 
 import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
 
 from lcopa_bayes.adequacy import limitations
 from lcopa_bayes.arrays import Matrix
 from lcopa_bayes.checks import refuse_if
+from lcopa_bayes.drive import Drive
 from lcopa_bayes.estimate import Estimate
 from lcopa_bayes.files import writable_folder
+from lcopa_bayes.frequency import FrequencyResponse, frequency_response
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.crosscheck import CrossCheck
 from lcopa_bayes.inference.discretisation import Discretisation, discretisation, resolved
@@ -21,11 +25,14 @@ from lcopa_bayes.inference.evidence import Evidence, evidence
 from lcopa_bayes.inference.nested import NestedPlan, nested
 from lcopa_bayes.inference.sampler import Run, SamplePlan, sample
 from lcopa_bayes.predict import Band, bands
+from lcopa_bayes.prediction import Level, Prediction, predict
+from lcopa_bayes.problems import InputError
 from lcopa_bayes.provenance import digest_of, fingerprint
+from lcopa_bayes.record import Record
 from lcopa_bayes.requirements import unmet
 from lcopa_bayes.residuals import Residual, residuals
 from lcopa_bayes.sensitivity import Sensitivity, sensitivity
-from lcopa_bayes.stepmetrics import StepCurves, step_curves, step_metrics, too_fast
+from lcopa_bayes.stepmetrics import StepCurves, path_metrics, step_curves, step_metrics, too_fast
 from lcopa_bayes.study import Study
 
 _QUICK = 4
@@ -55,6 +62,38 @@ class Fit:
     def study(self) -> Study:
         """The study that was fitted."""
         return self.problem.study
+
+    def predict(self, driven: Drive | Record | Path | str, *, offset: Level = "fitted") -> Prediction:
+        """Bands for a drive nobody has measured, or for a record; see `prediction.predict`."""
+        return predict(self.problem, self.draws, driven, offset=offset)
+
+    def score(self, record: Record | Path | str) -> pd.DataFrame:
+        """Error and coverage of a record this fit has not seen, one row per axis, without a new fit.
+
+        The numbers are those of a fit that held the record out from the start. InputError as `predict`, and
+        for a file without responses.
+        """
+        scored = self.predict(record)
+        if not scored.scores:
+            raise InputError(f"{record}: holds no response to score; `predict` takes drives alone")
+        return pd.DataFrame(scored.scores)
+
+    def frequency_response(self, frequencies: ArrayLike | None = None) -> FrequencyResponse:
+        """Gain and phase of every path at `frequencies` [cycles / time unit]; see `frequency`."""
+        scales, unit = self.problem.scales, self.study.time_unit
+        return frequency_response(
+            self.draws, frequencies, span=scales.span, period=scales.period, time_unit=unit
+        )
+
+    def step_metrics(self, path: str | None = None, *, span: float | None = None) -> pd.DataFrame:
+        """Rise, settling, overshoot and steady state of a path or of all, one row each.
+
+        `span` [time unit] is the time that is looked at, by default that of the longest fit record.
+        InputError for a path the plant does not have and a span that is not positive.
+        """
+        over = self.problem.scales.span if span is None else span
+        found = path_metrics(self.draws, span=over, time_unit=self.study.time_unit, path=path)
+        return pd.DataFrame([one.as_json() for one in found])
 
 
 def fit(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
@@ -72,6 +72,22 @@ class Band:
         """Share of the samples inside the band with noise [-]."""
         low, high = (self.noisy[0], self.noisy[4]) if level == LEVELS[1] else (self.noisy[1], self.noisy[3])
         return float(np.mean((self.observed >= low) & (self.observed <= high)))
+
+    def score(self) -> dict[str, Any]:
+        """Error and coverage as plain values."""
+        return {
+            "record": self.record,
+            "axis": self.axis,
+            "unit": self.unit,
+            "rmse": self.rmse,
+            "coverage_50": self.coverage(LEVELS[0]),
+            "coverage_90": self.coverage(LEVELS[1]),
+            "bands": KIND,
+            "samples": self.time.size,
+            "offset_from": self.offset_from,
+            "offset_samples": self.offset_samples,
+            "draws": self.draws,
+        }
 
 
 def responses(table: ParameterTable, model: ForwardModel, values: Matrix) -> list[Array]:

@@ -12,7 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
+from typing import Protocol, final
 
 import numpy as np
 import pandas as pd
@@ -48,6 +48,17 @@ class Axis:
                 raise InputError(f"axis {self.name!r} in {self.unit!r}: both must be printable words")
         if "_" in self.unit:
             raise InputError(f"axis {self.name!r}: the unit {self.unit!r} must not hold an underscore")
+
+
+class Driven(Protocol):
+    """What a plant was, or is to be, driven with: a record, or a drive nobody has measured."""
+
+    @property
+    def name(self) -> str: ...  # noqa: D102
+    @property
+    def time(self) -> Vector: ...  # noqa: D102
+    @property
+    def drive(self) -> Matrix: ...  # noqa: D102
 
 
 @final

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import final
 
+from lcopa_bayes.arrays import Vector
 from lcopa_bayes.inference.data import Samples
 from lcopa_bayes.inference.defaults import Scales
 from lcopa_bayes.inference.noise import NOISES
@@ -14,7 +15,7 @@ from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.plant.forward import ForwardModel, forward_model
 from lcopa_bayes.plant.layout import Layout
 from lcopa_bayes.problems import InputError
-from lcopa_bayes.record import Record
+from lcopa_bayes.record import Driven, Record
 from lcopa_bayes.study import Study
 
 
@@ -33,6 +34,18 @@ class Problem:
         """Samples of other records of the same axes, and the model that simulates them."""
         layout, period = self.posterior.table.layout, self.scales.period
         return prepared(self.study, layout, records, period, refinement=self.refinement)
+
+    def driven(self, drive: Driven, times: Vector) -> ForwardModel:
+        """The model that simulates a drive, read at `times` [time unit]."""
+        wanted, layout = self.study.model, self.posterior.table.layout
+        return forward_model(
+            layout,
+            [drive],
+            [times],
+            blocks=wanted.blocks,
+            exposure=wanted.exposure,
+            refinement=self.refinement,
+        )
 
     def refined(self, factor: int) -> Problem:
         """The same problem on blocks narrower by a further factor."""

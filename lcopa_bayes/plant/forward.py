@@ -16,7 +16,7 @@ from lcopa_bayes.plant.drive import Drive
 from lcopa_bayes.plant.grid import Mesh
 from lcopa_bayes.plant.layout import Layout
 from lcopa_bayes.plant.superposition import Phase, Superposition, blocks_of, phases
-from lcopa_bayes.record import Record
+from lcopa_bayes.record import Driven
 
 _CELLS = 3 << 13
 """Plants times blocks times viscous terms evaluated at once. Larger temporaries go back to the operating
@@ -66,7 +66,7 @@ class Experiment:
     @classmethod
     def of(
         cls,
-        record: Record,
+        record: Driven,
         times: Vector,
         *,
         blocks: int | None = None,
@@ -224,7 +224,7 @@ class ForwardModel:
 
 def forward_model(
     layout: Layout,
-    records: Sequence[Record],
+    records: Sequence[Driven],
     times: Sequence[Vector],
     *,
     blocks: int | None = None,
