@@ -11,7 +11,7 @@ from typing import final
 import numpy as np
 from scipy.optimize import least_squares
 
-from lcopa_bayes.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.inference.noise import GaussianNoise, White
 from lcopa_bayes.inference.noisefit import NoiseFit
 from lcopa_bayes.inference.posterior import Posterior

@@ -7,7 +7,7 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.posterior import Posterior
 

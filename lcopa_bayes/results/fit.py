@@ -1,0 +1,191 @@
+"""The verb `fit`: posterior, bands, held-out scores and step metrics of a study."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import final
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
+
+from lcopa_bayes.core.arrays import Matrix
+from lcopa_bayes.core.checks import refuse_if
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import Estimate
+from lcopa_bayes.core.files import writable_folder
+from lcopa_bayes.data.drives import Drive
+from lcopa_bayes.data.record import Record
+from lcopa_bayes.data.requirements import unmet
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.results.adequacy import limitations
+from lcopa_bayes.results.discretisation import Discretisation, discretisation, resolved
+from lcopa_bayes.results.frequency import FrequencyResponse, frequency_response
+from lcopa_bayes.results.newdrive import Level, Prediction, predict
+from lcopa_bayes.results.prediction import Band, bands
+from lcopa_bayes.results.provenance import digest_of, fingerprint
+from lcopa_bayes.results.residuals import Residual, residuals
+from lcopa_bayes.results.sensitivity import Sensitivity, sensitivity
+from lcopa_bayes.results.steps import StepCurves, path_metrics, step_curves, step_metrics, too_fast
+from lcopa_bayes.sampling.crosscheck import CrossCheck
+from lcopa_bayes.sampling.draws import Draws, gather
+from lcopa_bayes.sampling.evidence import Evidence, evidence
+from lcopa_bayes.sampling.nested import NestedPlan, nested
+from lcopa_bayes.sampling.sampler import Run, SamplePlan, sample
+
+_QUICK = 4
+"""How many times fewer steps a quick fit takes."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A fitted study."""
+
+    problem: Problem
+    run: Run
+    draws: Draws
+    bands: tuple[Band, ...]
+    residuals: tuple[Residual, ...]
+    curves: StepCurves
+    metrics: tuple[Estimate, ...]
+    sensitivity: tuple[Sensitivity, ...]
+    evidence: Evidence | None
+    """None for a single ensemble, which cannot tell its error."""
+    discretisation: Discretisation
+    """How far the width of the blocks moves the posterior."""
+    cross_check: CrossCheck | None = None
+
+    @property
+    def study(self) -> Study:
+        """The study that was fitted."""
+        return self.problem.study
+
+    def predict(self, driven: Drive | Record | Path | str, *, offset: Level = "fitted") -> Prediction:
+        """Bands for a drive nobody has measured, or for a record; see `prediction.predict`."""
+        return predict(self.problem, self.draws, driven, offset=offset)
+
+    def score(self, record: Record | Path | str) -> pd.DataFrame:
+        """Error and coverage of a record this fit has not seen, one row per axis, without a new fit.
+
+        The numbers are those of a fit that held the record out from the start. InputError as `predict`, and
+        for a file without responses.
+        """
+        scored = self.predict(record)
+        if not scored.scores:
+            raise InputError(f"{record}: holds no response to score; `predict` takes drives alone")
+        return pd.DataFrame(scored.scores)
+
+    def frequency_response(self, frequencies: ArrayLike | None = None) -> FrequencyResponse:
+        """Gain and phase of every path at `frequencies` [cycles / time unit]; see `frequency`."""
+        scales, unit = self.problem.scales, self.study.time_unit
+        return frequency_response(
+            self.draws, frequencies, span=scales.span, period=scales.period, time_unit=unit
+        )
+
+    def step_metrics(self, path: str | None = None, *, span: float | None = None) -> pd.DataFrame:
+        """Rise, settling, overshoot and steady state of a path or of all, one row each.
+
+        `span` [time unit] is the time that is looked at, by default that of the longest fit record.
+        InputError for a path the plant does not have and a span that is not positive.
+        """
+        over = self.problem.scales.span if span is None else span
+        found = path_metrics(self.draws, span=over, time_unit=self.study.time_unit, path=path)
+        return pd.DataFrame([one.as_json() for one in found])
+
+
+def fit(
+    study: Study,
+    *,
+    jobs: int = 1,
+    folder: Path | None = None,
+    resume: bool = False,
+    quick: bool = False,
+    cross_check: bool = False,
+    quiet: bool = True,
+    starts: Matrix | None = None,
+) -> Fit:
+    """Sample the posterior of a study and derive what it predicts.
+
+    `starts`, table values (starts, rows), are modes known from elsewhere that sampling proposes too.
+
+    With `folder`, sampling is stored there in `chain.h5` and `resume` goes on from it; the result is
+    the same as without interruption. With `cross_check` the posterior is also sampled by nested sampling,
+    always from the start, and where the two disagree every grade is lowered. Blocks are narrowed until their
+    width does not move the optimum; how far it moves the posterior is measured and, where too far, lowers the
+    grade. So does what speaks against the model itself (`adequacy`). InputError when the study does not fit
+    its records, these do not meet the requirements of a fit (`requirements`), or the folder cannot be written
+    to; then nothing is written.
+    """
+    refuse_if(unmet(study))
+    problem = problem_of(study)
+    if folder:
+        writable_folder(folder)
+    problem = resolved(problem)
+    plan = plan_of(problem, quick=quick)
+    run = sample(
+        problem.posterior,
+        plan,
+        jobs=jobs,
+        chain_file=folder / "chain.h5" if folder else None,
+        fingerprint=fingerprint(study, plan) + ("" if starts is None else digest_of(starts)),
+        resume=resume,
+        quiet=quiet,
+        starts=starts,
+    )
+    draws, check = gather(problem.posterior, run), None
+    weighed = evidence(problem.posterior, run.kept()[0], draws.ess, plan.seed)
+    if cross_check:
+        wanted = NestedPlan.of(problem.posterior.dimension, seed=plan.seed, quick=quick)
+        check = CrossCheck.of(
+            draws,
+            nested(problem.posterior, wanted, jobs=jobs, quiet=quiet),
+            log_evidence=weighed.value if weighed else None,
+            log_evidence_sd=weighed.sd if weighed else None,
+        )
+        draws = draws.limited(check.limitations(draws.grade))
+    width = discretisation(problem, draws)
+    curves = step_curves(draws, problem.scales.span)
+    draws = draws.limited([*width.limitations, *too_fast(draws, curves, problem.scales.period)])
+    noise, seed = problem.posterior.noise, plan.seed
+    shown = bands(draws, problem.posterior.model, problem.posterior.samples, noise, held_out=False, seed=seed)
+    if study.held_out:
+        samples, model = problem.simulated(study.held_out)
+        shown += bands(draws, model, samples, noise, held_out=True, seed=seed)
+    left = residuals(draws, shown, noise, problem.scales.period)
+    draws = draws.limited(limitations(problem, draws, shown, left, np.random.default_rng([plan.seed, 4])))
+    metrics = step_metrics(draws, curves, time_unit=study.time_unit)
+    moved = sensitivity(draws, problem.posterior)
+    return Fit(
+        problem,
+        run,
+        draws,
+        tuple(shown),
+        tuple(left),
+        curves,
+        tuple(metrics),
+        moved,
+        weighed,
+        width,
+        check,
+    )
+
+
+def plan_of(problem: Problem, *, quick: bool) -> SamplePlan:
+    """How a study asks to be sampled."""
+    wanted, study = problem.study.sampler, problem.study
+    plan = SamplePlan.of(
+        problem.posterior.dimension,
+        seed=study.seed,
+        ensembles=wanted.ensembles,
+        walkers=wanted.walkers,
+        steps=wanted.steps,
+        thin=wanted.thin,
+        target_ess=wanted.target_ess,
+    )
+    if not quick:
+        return plan
+    steps = max(plan.thin, plan.steps // _QUICK)
+    return SamplePlan(plan.ensembles, plan.walkers, steps, plan.thin, plan.target_ess, plan.seed)

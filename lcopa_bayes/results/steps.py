@@ -1,0 +1,212 @@
+"""Figures engineers read off a step response, each with its credible interval."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
+from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.core.estimate import Estimate
+from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.model.forward import Experiment, ForwardModel
+from lcopa_bayes.model.grid import Mesh
+from lcopa_bayes.model.layout import Layout
+from lcopa_bayes.sampling.convergence import Limitation
+from lcopa_bayes.sampling.draws import Draws
+
+_POINTS = 1000
+"""Samples of the step response."""
+_DRAWS = 1000
+"""Draws behind the metrics."""
+_LATER = 4.0
+"""Time after the record over which a response must stay where it settled, in spans of the record [-]: a fast
+mode that crosses the steady value at the record's end has left it again long before."""
+_LATER_POINTS = 800
+"""Samples of the response after the record."""
+_SETTLED = 0.02
+"""A response within this share of its steady value counts as settled [-]."""
+_HALF = 0.5
+"""Share of the draws from which an element counts as too fast for the sampling [-]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class StepCurves:
+    """Responses of every path to a unit step at time 0, over the longest record."""
+
+    time: Vector
+    """(n,) [time unit]."""
+    normalised: Array
+    """Response over its steady value, (units, draws, n) [-]; steady is 1 by construction."""
+    gains: Array
+    """Steady response per unit step, (draws, responses, drives) [response unit / drive unit]."""
+    delays: Matrix
+    """(draws, delay slots) [time unit]."""
+
+
+def step_curves(draws: Draws, span: float) -> StepCurves:
+    """Unit step responses of posterior draws over `span` [time unit]."""
+    values = draws.thinned(_DRAWS)
+    time = span * np.arange(1, _POINTS + 1) / _POINTS
+    units = _unit_steps(draws.table, values, time)
+    return StepCurves(time, units, draws.table.gains(values), draws.table.dynamics(values).delays)
+
+
+def _unit_steps(table: ParameterTable, values: Matrix, time: Vector) -> Array:
+    """Responses to a unit step at time 0 over their steady values, (units, draws, n) [-]."""
+    step = Drive(np.zeros(1), np.ones(1))
+    rest = np.zeros(len(table.layout.drives))
+    drives = tuple(step for _ in table.layout.drives)
+    model = ForwardModel(table.layout, (Experiment("step", Mesh.of_samples(time, 0.0), drives, rest),))
+    parts = np.array_split(values, max(1, values.shape[0] // 64))
+    return np.concatenate([model.unit_responses(table.dynamics(part))[0] for part in parts], axis=1)
+
+
+def too_fast(draws: Draws, curves: StepCurves, period: float) -> list[Limitation]:
+    """A limitation for every element whose step response rises within a sampling `period` [time unit].
+
+    Rise is from 10 to 90 % of what the response reaches by the end of the record, in half of the draws or
+    more: of such a response no sample shows the course, and its times and orders are what the priors allow.
+    """
+    table = draws.table
+    out: list[Limitation] = []
+    for k, unit in enumerate(table.layout.units):
+        reached = curves.normalised[k] / curves.normalised[k][:, -1:]
+        rise = _difference(crossing(curves.time, reached, 0.9), crossing(curves.time, reached, 0.1))
+        names = tuple(
+            row.name
+            for row in table.rows
+            if row.free and row.kind in ("time", "order") and row.place.first == unit.element
+        )
+        if names and float(np.mean(rise < period)) >= _HALF and all(names != one.parameters for one in out):
+            out.append(
+                Limitation(
+                    "tentative",
+                    f"the step response rises within one sampling period: {', '.join(names)} say no more "
+                    "than that it is too fast for the sampling, within their priors",
+                    "sample faster, or fix them under [priors]",
+                    names,
+                )
+            )
+    return out
+
+
+def crossing(time: Vector, curves: Matrix, level: float) -> Vector:
+    """First time at which each curve (draws, n) reaches `level`; infinite when it never does."""
+    above = curves >= level
+    first = above.argmax(axis=1)
+    reached = above.any(axis=1)
+    rows = np.arange(curves.shape[0])
+    before = np.where(first > 0, curves[rows, first - 1], 0.0)
+    start = np.where(first > 0, time[first - 1], 0.0)
+    after = curves[rows, first]
+    share = (level - before) / np.where(after > before, after - before, 1.0)
+    return np.where(reached, start + share * (time[first] - start), np.inf)
+
+
+def settling(time: Vector, curves: Matrix, band: float, *, until: float = np.inf) -> Vector:
+    """Last time at which each curve (draws, n) is `band` away from 1; infinite when that is after `until`.
+
+    Infinite too when it is farther at the end. Curves that go on beyond `until` tell a response that has
+    settled by then from one that only passes through the band at that time.
+    """
+    time = np.concatenate(([0.0], time))
+    away = np.pad(curves - 1.0, ((0, 0), (1, 0)), constant_values=-1.0)  # nothing has moved at time 0
+    last = time.size - 1 - (np.abs(away) > band)[:, ::-1].argmax(axis=1)
+    after = np.minimum(last + 1, time.size - 1)
+    rows = np.arange(curves.shape[0])
+    outside, inside = away[rows, last], away[rows, after]
+    travelled = np.where(last < after, outside - inside, 1.0)
+    share = (outside - np.sign(outside) * band) / travelled
+    settled = np.where(last < after, time[last] + share * (time[after] - time[last]), np.inf)
+    return np.where(settled <= until, settled, np.inf)
+
+
+def path_metrics(draws: Draws, *, span: float, time_unit: str, path: str | None = None) -> list[Estimate]:
+    """`step_metrics` over any `span` [time unit], of one path ``<response>_<drive>`` or of all.
+
+    The only path of a plant goes by the name of its response. InputError for a span that is not positive and
+    a path the plant does not have.
+    """
+    if not 0 < span < np.inf:
+        raise InputError(f"`span` must be a positive time [{time_unit}]; got {span!r}")
+    layout = draws.table.layout
+    places = np.ndindex(len(layout.responses), len(layout.drives))
+    paths = [layout.path_name(i, j) or layout.responses[i].name for i, j in places]
+    if path is not None and path not in paths:
+        raise InputError(f"the plant has no path {path!r}{nearest(path, paths)}")
+    found = step_metrics(draws, step_curves(draws, span), time_unit=time_unit)
+    return [one for one in found if path is None or one.name.endswith(f"[{path}]")]
+
+
+def step_metrics(draws: Draws, curves: StepCurves, *, time_unit: str) -> list[Estimate]:
+    """Metrics of every path: rise 10-90 %, delay, settling, overshoot, value at the end, steady state.
+
+    Times are counted from the step. What is not reached within the record is open above; a response has
+    settled when it stays within the band after the record too, to which the overshoot refers as well.
+    """
+    layout, grade, ess = draws.table.layout, draws.grade.level, draws.ess
+    out: list[Estimate] = []
+    end = float(curves.time[-1])
+    after = end * (1 + _LATER * np.arange(1, _LATER_POINTS + 1) / _LATER_POINTS)
+    later = _unit_steps(draws.table, draws.thinned(_DRAWS), after)
+    time = np.concatenate((curves.time, after))
+
+    def add(name: str, unit: str, values: Vector, note: str = "") -> None:
+        out.append(Estimate.of(name, unit, values, ess=ess, grade=grade, note=note))
+
+    for i, response in enumerate(layout.responses):
+        for j, drive in enumerate(layout.drives):
+            k = layout.unit_of[i][j]
+            curve, whole = curves.normalised[k], np.concatenate((curves.normalised[k], later[k]), axis=1)
+            gain, unit = curves.gains[:, i, j], f"{response.unit}/{drive.unit}"
+            path = layout.path_name(i, j) or response.name
+            low, high = crossing(curves.time, curve, 0.1), crossing(curves.time, curve, 0.9)
+            settled = settling(time, whole, _SETTLED, until=end)
+            unsettled = float(np.mean(np.isinf(settled)))
+            note = (
+                f"{100 * unsettled:.0f} % of draws have not settled to {100 * _SETTLED:.0f} % of steady "
+                "state by the end of the record"
+                if unsettled > 0.05
+                else ""
+            )
+            add(f"rise_10_90[{path}]", time_unit, _difference(high, low), note)
+            add(f"delay[{path}]", time_unit, curves.delays[:, layout.delay_of[i][j]])
+            add(f"settling_2[{path}]", time_unit, settled, note)
+            add(f"settling_5[{path}]", time_unit, settling(time, whole, 0.05, until=end), note)
+            add(f"overshoot[{path}]", "-", np.maximum(whole.max(axis=1) - 1.0, 0.0))
+            add(f"value_at_end[{path}]", unit, gain * curve[:, -1])
+            add(f"steady_state[{path}]", unit, gain, note)
+    out.extend(_crosstalk(layout, curves, ess=ess, grade=grade))
+    return out
+
+
+def share_unsettled(curve: Matrix) -> float:
+    """Share of draws that are not within 2 % of their steady state at the end."""
+    return float(np.mean(np.abs(curve[:, -1] - 1.0) > _SETTLED))
+
+
+def _difference(high: Vector, low: Vector) -> Vector:
+    """high - low, infinite where `high` is never reached."""
+    reached: Flags = np.isfinite(high)
+    return np.where(reached, np.where(reached, high, 0.0) - np.where(reached, low, 0.0), np.inf)
+
+
+def _crosstalk(layout: Layout, curves: StepCurves, *, ess: float, grade: str) -> list[Estimate]:
+    """Steady response of the other axes over that of the driven one, where two axes respond."""
+    out = []
+    for j, drive in enumerate(layout.drives):
+        own = layout.own_response(j)
+        for i, response in enumerate(layout.responses):
+            if own is not None and i != own:
+                direct = curves.gains[:, own, j]
+                other = curves.gains[:, i, j]
+                ratio = np.where(direct != 0, other / np.where(direct != 0, direct, 1), np.inf)
+                name = f"crosstalk[{response.name}/{layout.responses[own].name} by {drive.name}]"
+                unit = f"{response.unit}/{layout.responses[own].unit}"
+                out.append(Estimate.of(name, unit, ratio, ess=ess, grade=grade))
+    return out

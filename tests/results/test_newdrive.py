@@ -1,0 +1,242 @@
+"""Prediction for a new drive and scores of a new record, each number by a second way."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from small import ONE, TRUTH, TWO, draws_of, problem, record, row_values, study
+
+from lcopa_bayes.bench.acquisition import Bench, simulate
+from lcopa_bayes.bench.command import Command, on_off, step
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.drives import Drive
+from lcopa_bayes.data.record import save_record
+from lcopa_bayes.results.fit import Fit, fit
+from lcopa_bayes.results.fittedrange import energies
+from lcopa_bayes.results.newdrive import fitted_range, predict
+from lcopa_bayes.results.prediction import responses
+from lcopa_bayes.results.summary import results
+
+TINY = {"ensembles": 2, "walkers": 16, "steps": 60, "thin": 1, "target_ess": 100}
+HELD = record(2, command=on_off(-0.7, hold=4.0, at=1.3), name="held")
+STEPS = Drive.steps(u=[(0.35, 0.8), (5.0, 0.1)], until=11.0)
+
+
+def uncertain(made, count=2000, **spread):
+    """Draws about the truth with a given spread of some parameters."""
+    table, rng = made.posterior.table, np.random.default_rng(4)
+    values = np.tile(row_values(table, TRUTH), (count, 1))
+    for name, sd in spread.items():
+        values[:, table.names.index(name)] += sd * rng.standard_normal(count)
+    return draws_of(table, values)
+
+
+def test_equal_draws_follow_the_bench_under_a_drive_of_steps():
+    made = problem(record(camera=0.2))
+    (band,) = predict(made, uncertain(made), STEPS).bands
+    command = Command(np.array([0.35, 5.0]), np.array([[0.8], [0.1]]), np.zeros(1))
+    shown = simulate(
+        ONE, Bench(camera=0.01), command, duration=11.0, name="truth", rng=np.random.default_rng(0)
+    )
+    taken = np.isfinite(shown.response[:, 0])
+    exact = np.interp(band.time, shown.time[taken], shown.response[taken, 0])
+    assert np.abs(band.plant[2] - exact).max() < 6e-3
+    assert np.ptp(band.plant, axis=0).max() < 1e-10
+    assert_allclose(band.plant_simultaneous, band.plant[[0, 1, 3, 4]], atol=1e-9)
+    assert np.isnan(band.observed).all()
+    assert (band.time[0], band.time[-1]) == (pytest.approx(-0.65), pytest.approx(11.0, abs=0.2))
+    assert (np.abs(band.time - 0.35) < 1e-9).any()
+
+
+def test_bands_are_the_quantiles_of_offset_and_noise():
+    """Offset with a known spread, noise of a known scale: both bands by hand, before the drive acts."""
+    made = problem(record(camera=0.2))
+    (band,) = predict(made, uncertain(made, offset=0.1), STEPS).bands
+    assert band.offset_from == "that of the fit record"
+    early = band.time < 1.0
+    for rows, sd in ((band.plant, 0.1), (band.noisy, np.hypot(0.1, TRUTH["sigma"]))):
+        exact = TRUTH["offset"] + sd * np.array([-1.645, -0.6745, 0.0, 0.6745, 1.645])
+        assert_allclose(rows[:, early], np.tile(exact[:, None], early.sum()), atol=0.1 * sd)
+    # an offset moves the whole curve: there the simultaneous band of the plant is the pointwise one
+    assert_allclose(band.plant_simultaneous[[0, 3]], band.plant[[0, 4]], atol=0.03)
+    # noise does not: its largest deviation over all times is wider than that at one time
+    noise = (band.noisy_simultaneous[3] - band.noisy[2]).mean()
+    assert noise > 1.1 * (band.noisy[4] - band.noisy[2]).mean()
+    (alone,) = predict(made, uncertain(made, offset=0.1), STEPS, offset="zero").bands
+    assert alone.offset_from == "no offset"
+    assert_allclose(alone.plant[2], band.plant[2] - TRUTH["offset"], atol=0.01)
+
+
+def test_new_noise_lies_in_the_simultaneous_band_as_often_as_said():
+    """Curves drawn anew from the posterior, whole: 50 and 90 % of them lie within throughout."""
+    made = problem(record(camera=0.2))
+    values = uncertain(made, count=6000, offset=0.1, gain=0.2, delay=0.1)
+    (band,) = predict(made, values, STEPS).bands
+    fresh = replace(STEPS, name="another stream of random numbers")
+    inside = []
+    rng = np.random.default_rng(8)
+    offset = values.flat[:, values.table.names.index("offset")]
+    drive = predict(made, values, fresh).driven
+    curves = responses(values.table, made.driven(drive, band.time), values.flat[::3][:2000])[0][0]
+    curves = curves + offset[::3][:2000, None] + TRUTH["sigma"] * rng.standard_normal(curves.shape)
+    for low, high in ((1, 2), (0, 3)):
+        ends = band.noisy_simultaneous
+        inside.append(((curves >= ends[low]) & (curves <= ends[high])).all(axis=1).mean())
+    # 1000 draws size the band and 2000 test it
+    for got, level in zip(inside, (0.5, 0.9), strict=True):
+        assert abs(got - level) < 4 * np.sqrt(level * (1 - level) * (1 / 1000 + 1 / 2000))
+
+
+def test_offsets_of_several_records_are_drawn_from_all_of_them():
+    made = problem(record(1, camera=0.3, name="a"), record(2, camera=0.3, name="b"))
+    table = made.posterior.table
+    told = TRUTH | {"offset_a": -1.0, "offset_b": 2.0}
+    values = np.tile(row_values(table, told), (400, 1))
+    (band,) = predict(made, draws_of(table, values), STEPS).bands
+    assert "one of the 2 fit records" in band.offset_from
+    assert_allclose(band.plant[[0, 4], 0], [-1.0, 2.0], atol=1e-9)
+
+
+def test_a_drive_that_the_records_hold_is_inside_and_a_scaled_longer_faster_one_is_not():
+    made = problem(record(camera=0.2))
+    draws = uncertain(made)
+    same = predict(made, draws, Drive.steps(u=[(0.0, 1.0)], until=11.0))
+    assert same.outside == ()
+    assert "lies within the fitted range" in same.verdict
+    assert bool(same.table()["inside"].all())
+    larger = predict(made, draws, Drive.steps(u=[(0.0, 0.5), (3.0, -2.0)], until=11.0))
+    assert [(one.kind, one.axis, one.since) for one in larger.outside] == [("amplitude", "u", 3.0)]
+    assert "from -2 to 0.5 V, in the fit records from 0 to 1 V" in larger.verdict
+    table = larger.table()
+    assert (table["inside"] == (table["time"] < 3.0)).all()
+    longer = predict(made, draws, Drive.steps(u=[(0.0, 1.0)], until=40.0))
+    (late,) = longer.outside
+    assert (late.kind, late.since) == ("time", pytest.approx(made.scales.span))
+    time = np.arange(0.0, 11.0, 0.1)
+    rapid = Drive.of_arrays(time, u=0.5 - 0.5 * np.cos(2 * np.pi * 2.5 * time), time_unit="ms")
+    kinds = {one.kind: one for one in predict(made, draws, rapid).outside}
+    assert set(kinds) == {"frequency"}
+    assert "drive u brings" in kinds["frequency"].sentence
+
+
+def test_the_energy_of_a_drive_over_all_frequencies_is_that_over_all_times():
+    """Parseval: a pulse of height 2 over 3 ms holds 12 V^2 ms, and a hold of 1 from 1 to 5 ms holds 4."""
+    made = problem(record(camera=0.2))
+    fitted = fitted_range(made)
+    pulse = Drive.steps(u=[(1.0, 2.0), (4.0, 0.0)]).fitted_to(fitted.axes, "ms", [0.0], 1.0)
+    hold = Drive.steps(u=[(1.0, 1.0)]).fitted_to(fitted.axes, "ms", [0.0], 1.0)
+    edges = np.geomspace(1e-9, 200.0, 40)
+    assert energies(pulse, 6.0, edges).sum() == pytest.approx(12.0, rel=0.01)
+    assert energies(hold, 5.0, edges).sum() == pytest.approx(4.0, rel=0.01)
+    half = energies(pulse, 6.0, np.array([0.5, 0.6]))[0, 0]
+    f = np.linspace(0.5, 0.6, 400)
+    exact = 2 * np.trapezoid((2 * np.sin(3 * np.pi * f) / (np.pi * f)) ** 2, f)
+    assert half == pytest.approx(exact, rel=0.05)
+
+
+def test_a_drive_of_two_axes_needs_no_second_one_and_gives_both_responses():
+    made = problem(record(device=TWO, camera=0.6), terms={"direct": 2, "cross": 1})
+    table = made.posterior.table
+    draws = draws_of(table, table.draw(40, np.random.default_rng(2)))
+    found = predict(made, draws, Drive.steps(x=[(0, 0.5)], until=4.0))
+    assert [band.axis for band in found.bands] == ["x", "y"]
+    assert_array_equal(found.drives().query("axis == 'y'")["drive"].unique(), [0.2])  # as the records rest
+    assert list(found.summary()["axis"]) == ["x", "y"]
+    assert "half_width_simultaneous" in found._repr_html_()
+    json.dumps(found.to_json(), allow_nan=False)
+
+
+@pytest.mark.parametrize(
+    ("drive", "words"),
+    [
+        (Drive.steps(v=[(0, 1.0)]), "no drive axis 'v'"),
+        (Drive.steps(u=[(0, 1.0)], units="mV"), "is in mV, in the study it is in V"),
+        (Drive.steps(u=[(0, 1.0)], rest={"u": 0.5}), "is at 0.5 V before its first change, but the study's"),
+        (Drive.of_arrays([0, 1], u=[0.5, 1.0]), "rest at 0 V"),
+        (Drive.steps(u=[(0, 1.0)], until=1e6), "sampling periods"),
+    ],
+)
+def test_drives_of_another_plant_are_refused(drive, words):
+    made = problem(record(camera=0.2))
+    with pytest.raises(InputError, match=words) as raised:
+        predict(made, uncertain(made), drive)
+    assert len(raised.value.problems) == 1
+
+
+@pytest.fixture(scope="module")
+def fitted() -> Fit:
+    return fit(study(record(), held_out=(HELD,), sampler=TINY))
+
+
+@pytest.fixture(scope="module")
+def alone() -> Fit:
+    return fit(study(record(), sampler=TINY))
+
+
+def test_a_record_scored_later_has_the_numbers_of_one_held_out_from_the_start(fitted, alone, tmp_path):
+    assert_array_equal(alone.draws.values, fitted.draws.values)
+    declared = pd.DataFrame(results(fitted)["held_out"])
+    pd.testing.assert_frame_equal(alone.score(HELD), declared)
+    save_record(HELD, tmp_path / "held.csv")
+    pd.testing.assert_frame_equal(alone.score(tmp_path / "held.csv"), declared)
+    (band,) = (band for band in fitted.bands if band.held_out)
+    assert_array_equal(alone.predict(HELD).bands[0].noisy, band.noisy)
+    # nor does another record beside it move them
+    both = replace(alone.study, held_out=(record(9, command=step(0.4, at=2.0), name="other"), HELD))
+    again = fit(both)
+    assert results(again)["held_out"][1] == results(fitted)["held_out"][0]
+
+
+def test_a_score_is_the_error_of_the_median_and_the_share_inside(alone):
+    found = alone.predict(HELD)
+    (band,) = found.bands
+    observed = HELD.response[np.isfinite(HELD.response[:, 0]), 0]
+    (told,) = found.scores
+    assert told["rmse"] == pytest.approx(np.sqrt(np.mean((observed - band.plant[2]) ** 2)))
+    inside = (observed >= band.noisy[0]) & (observed <= band.noisy[4])
+    assert told["coverage_90"] == pytest.approx(inside.mean())
+    assert "RMSE" in found.verdict
+
+
+def test_a_record_that_a_fit_would_refuse_is_not_scored(alone):
+    wrong = replace(HELD, drive_axes=(replace(HELD.drive_axes[0], unit="mV"),))
+    with pytest.raises(InputError, match="in mV"):
+        alone.score(wrong)
+    with pytest.raises(InputError, match="2 records are named"):
+        alone.score(replace(HELD, name="step"))
+    with pytest.raises(InputError, match="s"):
+        alone.score(replace(HELD, time_unit="s"))
+
+
+def test_a_file_without_responses_cannot_be_scored(alone, tmp_path):
+    path = tmp_path / "plan.csv"
+    path.write_text("time_ms,drive_u_V\n0,0\n1,1\n9,1\n")
+    with pytest.raises(InputError, match="holds no response"):
+        alone.score(path)
+    assert alone.predict(path).bands[0].time[-1] == pytest.approx(9.0)
+
+
+def test_step_metrics_of_a_path_over_another_span(alone):
+    whole = alone.step_metrics().set_index("name")
+    told = {one.name: one for one in alone.metrics}
+    assert set(whole.index) == set(told)
+    assert whole.loc["rise_10_90[y]", "value"] == told["rise_10_90[y]"].value
+    longer = alone.step_metrics("y", span=200.0).set_index("name")
+    exact = np.median(alone.draws.column("gain"))
+    assert longer.loc["value_at_end[y]", "value"] == pytest.approx(exact, rel=0.05)
+    near, far = (abs(found.loc["value_at_end[y]", "value"] - exact) for found in (longer, whole))
+    assert near < far
+    with pytest.raises(InputError, match="no path 'z'"):
+        alone.step_metrics("z")
+    with pytest.raises(InputError, match="span"):
+        alone.step_metrics(span=-1.0)
+
+
+def test_frequency_response_of_a_fit_is_that_of_its_draws(alone):
+    (path,) = alone.frequency_response([1e-6]).paths
+    assert_allclose(path.gain.pointwise[2], np.median(np.abs(alone.draws.column("gain"))), rtol=1e-3)
