@@ -7,28 +7,23 @@ from pathlib import Path
 from typing import final
 
 import numpy as np
-import pandas as pd
-from numpy.typing import ArrayLike
 
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.core.checks import refuse_if
-from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.core.files import writable_folder
-from lcopa_bayes.data.drives import Drive
-from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.results.adequacy import limitations
 from lcopa_bayes.results.discretisation import Discretisation, discretisation, resolved
 from lcopa_bayes.results.frequency import FrequencyResponse, frequency_response
-from lcopa_bayes.results.newdrive import Level, Prediction, predict
 from lcopa_bayes.results.prediction import Band, bands
+from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.provenance import digest_of, fingerprint
 from lcopa_bayes.results.residuals import Residual, residuals
 from lcopa_bayes.results.sensitivity import Sensitivity, sensitivity
-from lcopa_bayes.results.steps import StepCurves, path_metrics, step_curves, step_metrics, too_fast
+from lcopa_bayes.results.steps import StepCurves, step_curves, step_metrics, too_fast
 from lcopa_bayes.sampling.crosscheck import CrossCheck
 from lcopa_bayes.sampling.draws import Draws, gather
 from lcopa_bayes.sampling.evidence import Evidence, evidence
@@ -41,7 +36,7 @@ _QUICK = 4
 
 @final
 @dataclass(frozen=True, eq=False)
-class Fit:
+class Fit(Predictive):
     """A fitted study."""
 
     problem: Problem
@@ -56,44 +51,9 @@ class Fit:
     """None for a single ensemble, which cannot tell its error."""
     discretisation: Discretisation
     """How far the width of the blocks moves the posterior."""
+    frequency: FrequencyResponse
+    """Over the frequencies that the fit records resolve."""
     cross_check: CrossCheck | None = None
-
-    @property
-    def study(self) -> Study:
-        """The study that was fitted."""
-        return self.problem.study
-
-    def predict(self, driven: Drive | Record | Path | str, *, offset: Level = "fitted") -> Prediction:
-        """Bands for a drive nobody has measured, or for a record; see `prediction.predict`."""
-        return predict(self.problem, self.draws, driven, offset=offset)
-
-    def score(self, record: Record | Path | str) -> pd.DataFrame:
-        """Error and coverage of a record this fit has not seen, one row per axis, without a new fit.
-
-        The numbers are those of a fit that held the record out from the start. InputError as `predict`, and
-        for a file without responses.
-        """
-        scored = self.predict(record)
-        if not scored.scores:
-            raise InputError(f"{record}: holds no response to score; `predict` takes drives alone")
-        return pd.DataFrame(scored.scores)
-
-    def frequency_response(self, frequencies: ArrayLike | None = None) -> FrequencyResponse:
-        """Gain and phase of every path at `frequencies` [cycles / time unit]; see `frequency`."""
-        scales, unit = self.problem.scales, self.study.time_unit
-        return frequency_response(
-            self.draws, frequencies, span=scales.span, period=scales.period, time_unit=unit
-        )
-
-    def step_metrics(self, path: str | None = None, *, span: float | None = None) -> pd.DataFrame:
-        """Rise, settling, overshoot and steady state of a path or of all, one row each.
-
-        `span` [time unit] is the time that is looked at, by default that of the longest fit record.
-        InputError for a path the plant does not have and a span that is not positive.
-        """
-        over = self.problem.scales.span if span is None else span
-        found = path_metrics(self.draws, span=over, time_unit=self.study.time_unit, path=path)
-        return pd.DataFrame([one.as_json() for one in found])
 
 
 def fit(
@@ -158,6 +118,9 @@ def fit(
     draws = draws.limited(limitations(problem, draws, shown, left, np.random.default_rng([plan.seed, 4])))
     metrics = step_metrics(draws, curves, time_unit=study.time_unit)
     moved = sensitivity(draws, problem.posterior)
+    response = frequency_response(
+        draws, span=problem.scales.span, period=problem.scales.period, time_unit=study.time_unit
+    )
     return Fit(
         problem,
         run,
@@ -169,6 +132,7 @@ def fit(
         moved,
         weighed,
         width,
+        response,
         check,
     )
 

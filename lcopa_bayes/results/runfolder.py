@@ -18,6 +18,7 @@ from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.integerrival import Rival
 from lcopa_bayes.results.prediction import responses
 from lcopa_bayes.results.provenance import provenance
+from lcopa_bayes.results.savedfit import NAME, fit_to_json
 from lcopa_bayes.results.summary import results
 from lcopa_bayes.results.tables import tables
 
@@ -37,6 +38,7 @@ def save_fit(fit: Fit, folder: Path, command: Sequence[str], *, rival: Rival | N
     for name, table in tables(fit).items():
         save_table(table, folder / "tables" / f"{name}.csv")
     write_whole(folder / "posterior.nc", lambda beside: save_posterior(fit, beside))
+    write_text(folder / NAME, json.dumps(fit_to_json(fit.problem, fit.draws), allow_nan=False) + "\n")
     save_json(provenance(fit.study, command), folder / "provenance.json")
     save_json(told, folder / "results.json")
     return told

@@ -31,6 +31,7 @@ def tables(fit: Fit) -> dict[str, pd.DataFrame]:
         "autocorrelation": _autocorrelation(fit),
         "spectrum": _spectrum(fit),
         "step_response": _step_response(fit),
+        "frequency_response": fit.frequency.table(),
         "priors": _priors(fit),
         "prior_density": _prior_density(fit),
     } | ({} if fit.cross_check is None else _cross_check(fit, fit.cross_check))

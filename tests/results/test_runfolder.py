@@ -43,6 +43,7 @@ def folder(fitted, tmp_path_factory):
 
 def test_the_folder_holds_what_was_promised(fitted, folder):
     assert sorted(p.name for p in folder.iterdir()) == [
+        "fit.json",
         "posterior.nc",
         "provenance.json",
         "results.json",
