@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, final
 
@@ -12,6 +13,7 @@ import pandas as pd
 from lcopa_bayes.core.arrays import Array, Vector
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.files import save_json, save_table, writable_folder
 from lcopa_bayes.data.drives import Drive, drive_of
 from lcopa_bayes.data.record import Record, load_columns, record_of
 from lcopa_bayes.data.requirements import unmet
@@ -24,6 +26,8 @@ from lcopa_bayes.sampling.draws import Draws
 
 Level = Literal["fitted", "zero"]
 """Offset of a response under a new drive: as in the fit records, or none."""
+NAME, BANDS, DRIVES = "predict.json", "predict_bands.csv", "predict_drives.csv"
+"""Files of a saved prediction; the tables stand in `tables/`."""
 _LEAD = 5
 """Sampling periods at rest before the first change of a drive that is given by its steps."""
 _MOST = 100_000
@@ -157,6 +161,25 @@ class Prediction:
         )
         return out
 
+    def save(self, folder: Path | str, **more: Any) -> dict[str, Any]:
+        """Write `predict.json`, with `more` values, and the tables of bands and drives; returns the values.
+
+        InputError when the folder cannot be written to.
+        """
+        values, folder = self.to_json() | more, Path(folder)
+        writable_folder(folder / "tables")
+        for name, table in ((BANDS, self.table()), (DRIVES, self.drives())):
+            save_table(table, folder / "tables" / name)
+        save_json(values, folder / NAME)
+        return values
+
+    def report(self, folder: Path | str) -> Path:
+        """`save`, then the page `predict.html` in the same folder; returns its path."""
+        self.save(folder)
+        # pages read results, never the other way round: the page is looked up when it is asked for
+        page = import_module("lcopa_bayes.report.predict").write_prediction(Path(folder))
+        return Path(page)
+
     def _repr_html_(self) -> str:
         return str(self.summary().to_html())
 
@@ -250,14 +273,14 @@ def _times(drive: Drive, span: float, period: float) -> Vector:
         return drive.time
     begin = beginning(drive)
     last = drive.time[-1] + span if drive.until is None else drive.until
-    count = int(np.ceil((last - drive.time[0]) / period - 1e-9)) + 1
+    # the first change falls on the lattice, which lies between the first row and the end
+    first = begin - np.floor((begin - drive.time[0]) / period + 1e-9) * period
+    count = int(np.floor((last - first) / period + 1e-9)) + 1
     if count > _MOST:
         raise InputError(
             f"drive {drive.name!r}: lasts {count} sampling periods of the study, more than {_MOST}; end it "
             f"earlier than {drive.time[0] + _MOST * period:.6g} {drive.time_unit}"
         )
-    # the first change falls on the lattice
-    first = begin - np.ceil((begin - drive.time[0]) / period - 1e-9) * period
     return np.asarray(first + period * np.arange(max(count, 2)))
 
 

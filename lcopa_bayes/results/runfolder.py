@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 import arviz_base
 import numpy as np
-import pandas as pd
 
 from lcopa_bayes.core.estimate import plain
-from lcopa_bayes.core.files import enduring, writable_folder, write_text, write_whole
+from lcopa_bayes.core.files import enduring, save_json, save_table, writable_folder, write_text, write_whole
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.integerrival import Rival
 from lcopa_bayes.results.prediction import responses
@@ -42,16 +41,6 @@ def save_fit(fit: Fit, folder: Path, command: Sequence[str], *, rival: Rival | N
     save_json(provenance(fit.study, command), folder / "provenance.json")
     save_json(told, folder / "results.json")
     return told
-
-
-def save_table(table: pd.DataFrame, path: Path) -> None:
-    """Write a table as CSV."""
-    write_whole(path, lambda beside: table.to_csv(beside, index=False))
-
-
-def save_json(values: Mapping[str, Any], path: Path) -> None:
-    """Write plain values as JSON."""
-    write_text(path, json.dumps(plain(values), indent=1, allow_nan=False) + "\n")
 
 
 def save_posterior(fit: Fit, path: Path) -> None:
