@@ -56,11 +56,11 @@ def study_from_json(values: Mapping[str, Any]) -> Study:
         values["seed"],
         tuple(_read(record) for record in values["fit"]),
         tuple(_read(record) for record in values["held_out"]),
-        priors={name: _made(PriorSettings, prior) for name, prior in values["priors"].items()},
+        priors={name: _settings(PriorSettings, prior) for name, prior in values["priors"].items()},
         stages=values["stages"],
         inputs=values["inputs"],
-        candidates=tuple(_made(CandidateSettings, one) for one in values["candidates"]),
-        **{key: _made(kind, values[key]) for key, kind in _SETTINGS.items()},
+        candidates=tuple(_settings(CandidateSettings, one) for one in values["candidates"]),
+        **{key: _settings(kind, values[key]) for key, kind in _SETTINGS.items()},
     )
 
 
@@ -99,11 +99,11 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
 
 
-def _made(kind: type[Any], values: Mapping[str, Any]) -> Any:
+def _settings(kind: type[Any], values: Mapping[str, Any]) -> Any:
     """Settings from their fields."""
     fields: dict[str, Any] = {
         key: tuple(item) if isinstance(item, list) else item for key, item in values.items()
     }
     if kind is CandidateSettings:
-        fields["priors"] = {name: _made(PriorSettings, prior) for name, prior in fields["priors"].items()}
+        fields["priors"] = {name: _settings(PriorSettings, prior) for name, prior in fields["priors"].items()}
     return kind(**fields)

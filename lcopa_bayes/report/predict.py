@@ -37,31 +37,31 @@ def write_prediction(folder: Path) -> Path:
     """
     path = folder / NAME
     try:
-        told: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        values: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         bands, drives = (
             pd.read_csv(folder / "tables" / name, dtype={"axis": str, "unit": str}, keep_default_na=True)
             for name in (BANDS, DRIVES)
         )
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read ({error}); run `predict` to write it") from None
-    absent = [key for key in _NEEDS if key not in told]
+    absent = [key for key in _NEEDS if key not in values]
     if absent:
         raise InputError(f"{path}: lacks {', '.join(absent)}; run `predict` again")
     with look():
-        sections = [_curves(told, bands, drives), _range(told), *_scores(told)]
-    verdict = Verdict(str(told["grade"]), str(told["verdict"]), str(told["grade_reason"]))
-    return write_page(folder, f"{told['study']}: response to {told['drive']}", sections, verdict, PAGE)
+        sections = [_curves(values, bands, drives), _range(values), *_scores(values)]
+    verdict = Verdict(str(values["grade"]), str(values["verdict"]), str(values["grade_reason"]))
+    return write_page(folder, f"{values['study']}: response to {values['drive']}", sections, verdict, PAGE)
 
 
-def _curves(told: Mapping[str, Any], bands: pd.DataFrame, drives: pd.DataFrame) -> Section:
+def _curves(values: Mapping[str, Any], bands: pd.DataFrame, drives: pd.DataFrame) -> Section:
     drawings, rows = [], []
-    for number, one in enumerate(told["axes"], start=1):
+    for number, one in enumerate(values["axes"], start=1):
         own = bands[bands["axis"] == str(one["axis"])]
         drawings.append(
             Drawing(
                 f"predict_{number:02d}_{one['axis']}",
-                _drawn(told, own, drives),
-                f"Response {one['axis']}, offset: {one['offset_from']}. {told['draws']} draws.",
+                _drawn(values, own, drives),
+                f"Response {one['axis']}, offset: {one['offset_from']}. {values['draws']} draws.",
             )
         )
         spread = (one["upper"] - one["lower"]) / 3.29
@@ -75,7 +75,7 @@ def _curves(told: Mapping[str, Any], bands: pd.DataFrame, drives: pd.DataFrame) 
             )
         )
     columns = (
-        *(Column("axis"), Column(f"end [{told['time_unit']}]", "number"), Column("median there", "number")),
+        *(Column("axis"), Column(f"end [{values['time_unit']}]", "number"), Column("median there", "number")),
         *(Column("90 % interval", "interval"), Column("unit"), Column(f"widest {POINTWISE}", "number")),
         Column(f"widest {SIMULTANEOUS}", "number"),
         Column("widest with noise", "number"),
@@ -88,13 +88,13 @@ def _curves(told: Mapping[str, Any], bands: pd.DataFrame, drives: pd.DataFrame) 
     return Section("Predicted response", text, tuple(drawings), (Table(columns, tuple(rows), caption),))
 
 
-def _drawn(told: Mapping[str, Any], rows: pd.DataFrame, drives: pd.DataFrame) -> str:
+def _drawn(values: Mapping[str, Any], rows: pd.DataFrame, drives: pd.DataFrame) -> str:
     units = list(dict.fromkeys(drives["unit"]))
     figure = blank(3.0 + 0.85 * len(units))
     top, *below = figure.subplots(
         1 + len(units), 1, sharex=True, squeeze=False, height_ratios=[3.4] + [1.0] * len(units)
     ).ravel()
-    _bands(top, rows, measured=bool(told["measured"]))
+    _bands(top, rows, measured=bool(values["measured"]))
     time = rows["time"].to_numpy()
     first, last = float(time[0]), float(time[-1])
     beyond = time[~rows["inside"].to_numpy(dtype=bool)]
@@ -117,7 +117,7 @@ def _drawn(told: Mapping[str, Any], rows: pd.DataFrame, drives: pd.DataFrame) ->
     top.set_ylabel(label(str(rows["axis"].iloc[0]), str(rows["unit"].iloc[0])))
     margin = 0.02 * (last - first)
     top.set_xlim(first - margin, last + margin)
-    (below[-1] if below else top).set_xlabel(label("time", str(told["time_unit"])))
+    (below[-1] if below else top).set_xlabel(label("time", str(values["time_unit"])))
     figure.align_ylabels()
     figure.legend(*top.get_legend_handles_labels(), loc="outside upper center", ncols=4, markerscale=2)
     return svg_of(figure)
@@ -148,14 +148,14 @@ def _bands(panel: Axes, rows: pd.DataFrame, *, measured: bool) -> None:
         panel.plot(time[at], seen[at], ".", ms=2.5, mew=0, color=HELD_OUT, label="observed", zorder=3)
 
 
-def _range(told: Mapping[str, Any]) -> Section:
-    outside = [str(one["sentence"]) for one in told["outside"]]
+def _range(values: Mapping[str, Any]) -> Section:
+    outside = [str(one["sentence"]) for one in values["outside"]]
     inside = "Amplitude, duration and frequencies of the drive lie within those of the fit records."
     return Section("Fitted range", tuple(outside) or (inside,))
 
 
-def _scores(told: Mapping[str, Any]) -> list[Section]:
-    if not told["scores"]:
+def _scores(values: Mapping[str, Any]) -> list[Section]:
+    if not values["scores"]:
         return []
     columns = (
         *(Column("axis"), Column("RMSE", "number"), Column("unit"), Column("in 50 % band", "number")),
@@ -166,7 +166,7 @@ def _scores(told: Mapping[str, Any]) -> list[Section]:
             *(str(row["axis"]), figures(row["rmse"]), str(row["unit"]), percent(row["coverage_50"])),
             *(percent(row["coverage_90"]), str(row["samples"]), str(row["offset_from"])),
         )
-        for row in told["scores"]
+        for row in values["scores"]
     )
     caption = (
         f"RMSE is against the median of the plant; coverage is by the {POINTWISE} bands with noise. "

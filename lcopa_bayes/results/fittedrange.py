@@ -1,7 +1,7 @@
 """What a drive asks of a plant beyond what the fit records showed: in size, in duration and in frequency.
 
-A model predicts there too, but by its form alone. Nothing is refused for it: each thing outside is said in a
-sentence, with the time from which it counts.
+A model predicts there too, but by its form alone. Nothing is refused for it: each thing outside becomes a
+sentence with the time from which it counts.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _WEAK = 0.01
 """Energy of the fit records' drive over that of the drive to predict, in a band of frequencies, below which
 the records say little there [-]: an error of the response that is below their noise may be ten times that
 noise under the drive."""
-_HEARD = 0.01
+_NOTABLE = 0.01
 """Share of the response's energy from which a band of frequencies counts [-]."""
 _BANDS = 6
 """Bands per decade of frequency."""
@@ -114,10 +114,10 @@ class FittedRange:
         `squared`: magnitude squared of every path at `centres`, (responses, drives, bands)
         [(response unit / drive unit)^2]; None leaves frequencies out.
         """
-        found = [*self._amplitudes(driven), *self._rests(driven), *self._times(driven, times)]
+        marks = [*self._amplitudes(driven), *self._rests(driven), *self._times(driven, times)]
         if squared is not None:
-            found += self._frequencies(driven, times, squared)
-        return tuple(found)
+            marks += self._frequencies(driven, times, squared)
+        return tuple(marks)
 
     def _amplitudes(self, driven: Driven) -> list[Outside]:
         slack, out = _SLIGHT * (self.high - self.low), []
@@ -140,8 +140,8 @@ class FittedRange:
 
     def _rests(self, driven: Driven) -> list[Outside]:
         return [
-            Outside("rest", "", None, f"{said[0].upper()}{said[1:]}.")
-            for said in self.other_rest(driven.drive[0])
+            Outside("rest", "", None, f"{problem[0].upper()}{problem[1:]}.")
+            for problem in self.other_rest(driven.drive[0])
         ]
 
     def _times(self, driven: Driven, times: Vector) -> list[Outside]:
@@ -176,21 +176,21 @@ class FittedRange:
 
     def _frequencies(self, driven: Driven, times: Vector, squared: Array) -> list[Outside]:
         edges, centres = self.edges(driven, times), self.centres(driven, times)
-        asked = energies(driven, float(times[-1]), edges)
-        shown = np.sum([energies(one, float(one.time[-1]), edges) for one in self.records], axis=0)
-        shown = np.where(centres <= 0.5 / self.period, shown, 0.0)
-        heard = squared * asked
-        total = heard.sum(axis=(1, 2), keepdims=True)
-        share = np.max(heard / np.where(total > 0, total, 1.0), axis=0)
+        wanted = energies(driven, float(times[-1]), edges)
+        fitted = np.sum([energies(one, float(one.time[-1]), edges) for one in self.records], axis=0)
+        fitted = np.where(centres <= 0.5 / self.period, fitted, 0.0)
+        energy = squared * wanted
+        total = energy.sum(axis=(1, 2), keepdims=True)
+        share = np.max(energy / np.where(total > 0, total, 1.0), axis=0)
         # of a drive that repeats what the records show, a stretch as long as the longest of them counts
         length = max(float(times[-1]) - beginning(driven), self.period)
         excursion = np.max([np.abs(one.drive - one.drive[0]).max(axis=0) for one in self.records], axis=0)
         size = np.abs(driven.drive - driven.drive[0]).max(axis=0)
-        larger = np.maximum(size / np.where(excursion > 0, excursion, 1.0), 1.0)  # said as amplitude
-        fair = asked * min(1.0, self.span / length) / larger[:, None] ** 2
+        larger = np.maximum(size / np.where(excursion > 0, excursion, 1.0), 1.0)  # marked as amplitude
+        scaled = wanted * min(1.0, self.span / length) / larger[:, None] ** 2
         out = []
         for k, axis in enumerate(self.axes):
-            weak = (shown[k] < _WEAK * fair[k]) & (share[k] > _HEARD) & (centres >= 1.0 / self.span)
+            weak = (fitted[k] < _WEAK * scaled[k]) & (share[k] > _NOTABLE) & (centres >= 1.0 / self.span)
             if weak.any():
                 low, high = edges[:-1][weak].min(), edges[1:][weak].max()
                 out.append(

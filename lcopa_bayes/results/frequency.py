@@ -220,18 +220,18 @@ def frequency_response(
                     else "",
                 )
             )
-    told = []
+    outside = []
     if frequency[0] < lowest * (1 - 1e-9):
-        told.append(
+        outside.append(
             f"Below {lowest:.3g} 1/{time_unit} the fit records are shorter than one cycle: the "
             "response there is an extrapolation."
         )
     if frequency[-1] > highest * (1 + 1e-9):
-        told.append(
+        outside.append(
             f"Above {highest:.3g} 1/{time_unit} the fit records have fewer than two samples a "
             "cycle: the response there is an extrapolation."
         )
-    return FrequencyResponse(frequency, time_unit, tuple(paths), tuple(told), values.shape[0])
+    return FrequencyResponse(frequency, time_unit, tuple(paths), tuple(outside), values.shape[0])
 
 
 def _bandwidth(frequency: Vector, magnitude: Matrix, at_rest: Vector) -> Vector:
@@ -245,5 +245,5 @@ def _bandwidth(frequency: Vector, magnitude: Matrix, at_rest: Vector) -> Vector:
     at = np.log(frequency[before]) + (high - np.log(_HALF_POWER)) / fallen * np.log(
         frequency[first] / frequency[before]
     )
-    found = np.where(first > 0, np.exp(at), frequency[0])
-    return np.where(below.any(axis=1), found, np.inf)
+    crossing = np.where(first > 0, np.exp(at), frequency[0])
+    return np.where(below.any(axis=1), crossing, np.inf)

@@ -176,7 +176,7 @@ class Prediction:
     def report(self, folder: Path | str) -> Path:
         """`save`, then the page `predict.html` in the same folder; returns its path."""
         self.save(folder)
-        # pages read results, never the other way round: the page is looked up when it is asked for
+        # pages read results, and results import no page: it is looked up when wanted
         page = import_module("lcopa_bayes.report.predict").write_prediction(Path(folder))
         return Path(page)
 
@@ -202,16 +202,16 @@ def predict(
             record_of(load_columns(Path(driven), study.time_unit)) if columns.measured else drive_of(columns)
         )
     if isinstance(driven, Record):
-        driven, shown = _recorded(problem, draws, driven)
+        driven, predicted = _recorded(problem, draws, driven)
     else:
-        driven, shown = _unmeasured(problem, draws, driven, offset)
-    fitted, times = fitted_range(problem), shown[0].time
+        driven, predicted = _unmeasured(problem, draws, driven, offset)
+    fitted, times = fitted_range(problem), predicted[0].time
     squared = _squared(draws, fitted.centres(driven, times))
     grade = draws.grade
     return Prediction(
         study.name,
         driven,
-        tuple(shown),
+        tuple(predicted),
         fitted.outside(driven, times, squared),
         grade.level,
         grade.reason,

@@ -23,7 +23,7 @@ class Predictive(ABC):
     """A study with the draws of its posterior."""
 
     problem: Problem
-    """The study made ready for inference."""
+    """The study prepared for inference."""
     draws: Draws
     """Posterior draws with their grade."""
 
@@ -61,5 +61,5 @@ class Predictive(ABC):
         InputError for a path the plant does not have and a span that is not positive.
         """
         over = self.problem.scales.span if span is None else span
-        found = path_metrics(self.draws, span=over, time_unit=self.study.time_unit, path=path)
-        return pd.DataFrame([one.as_json() for one in found])
+        metrics = path_metrics(self.draws, span=over, time_unit=self.study.time_unit, path=path)
+        return pd.DataFrame([one.as_json() for one in metrics])

@@ -1,7 +1,7 @@
 """A finished fit, kept in its run folder and read back without sampling.
 
 `posterior.nc` holds the draws and `fit.json` all else that they rest on: the study with its records, how far
-blocks were narrowed, and what the grade was made of. Other files of the folder are not needed.
+blocks were narrowed, and what its grade rests on. Other files of the folder are not needed.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _CUT = "the run was cut short, or files of two runs are mixed; run `fit` again"
 @final
 @dataclass(frozen=True, eq=False)
 class SavedFit(Predictive):
-    """A fit that was read from its run folder: it predicts as it did when it was made."""
+    """A fit that was read from its run folder: it predicts as it did after sampling."""
 
     problem: Problem
     draws: Draws
@@ -122,7 +122,7 @@ def _draws(path: Path, table: ParameterTable) -> tuple[Array, Array]:
         raise InputError(f"{path}: this file of the run folder is missing; {_CUT}")
     try:
         with xr.open_dataset(path, group="posterior", engine="h5netcdf") as group:
-            found = {
+            columns_read = {
                 str(one.attrs.get("parameter", name)): one.transpose("chain", "draw").to_numpy()
                 for name, one in group.data_vars.items()
             }
@@ -130,11 +130,11 @@ def _draws(path: Path, table: ParameterTable) -> tuple[Array, Array]:
             density = group["lp"].transpose("chain", "draw").to_numpy()
     except (OSError, ValueError, KeyError, RuntimeError) as error:
         raise InputError(f"{path}: cannot be read as draws ({error}); {_CUT}") from None
-    absent = [row.name for row in table.rows if row.free and row.name not in found]
+    absent = [row.name for row in table.rows if row.free and row.name not in columns_read]
     if absent:
         raise InputError(f"{path}: holds no draws of {', '.join(absent)}; {_CUT}")
     columns = [
-        found[row.name] if row.free else np.full(density.shape, float(row.value)) for row in table.rows
+        columns_read[row.name] if row.free else np.full(density.shape, float(row.value)) for row in table.rows
     ]
     return np.stack(columns, axis=-1), density
 

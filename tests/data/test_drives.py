@@ -39,11 +39,11 @@ def test_times_are_converted_and_axes_of_any_name_can_be_given():
 
 def test_arrays_and_files_rest_under_their_first_row(tmp_path):
     time, x = np.array([0.0, 1.0, 2.5]), np.array([0.2, 0.9, 0.4])
-    made = Drive.of_arrays(time, x=x, units={"x": "rad"}, time_unit="ms", name="plan")
+    prepared = Drive.of_arrays(time, x=x, units={"x": "rad"}, time_unit="ms", name="plan")
     frame = pd.DataFrame({"time_ms": time, "drive_x_rad": x})
     frame.to_csv(tmp_path / "plan.csv", index=False)
     frame.to_parquet(tmp_path / "plan.parquet", index=False)
-    for drive in (made, load_drive(tmp_path / "plan.csv"), load_drive(tmp_path / "plan.parquet")):
+    for drive in (prepared, load_drive(tmp_path / "plan.csv"), load_drive(tmp_path / "plan.parquet")):
         fitted = drive.fitted_to([X], "ms", [0.0], 0.5)
         assert_array_equal(fitted.time, time)
         assert_array_equal(fitted.drive[:, 0], x)
@@ -87,9 +87,9 @@ def test_axes_and_units_of_another_plant_are_refused_together():
     drive = Drive.of_arrays([0, 1], x=[0, 1], w=[0, 1], units={"x": "V"})
     with pytest.raises(InputError) as raised:
         drive.fitted_to([X, Y], "ms", [0.0, 0.0], 1.0)
-    told = " ".join(raised.value.problems)
+    known = " ".join(raised.value.problems)
     for words in ("no drive axis 'w'", "axis 'x' is in V, in the study it is in rad", "'y' [rad]"):
-        assert words in told
+        assert words in known
     assert len(raised.value.problems) == 3
 
 
@@ -98,9 +98,9 @@ def test_a_bad_file_is_told_with_its_place(tmp_path):
     path.write_text("time_ms,drive_x_rad\n0,0\n2,1\n1,high\n")
     with pytest.raises(InputError) as raised:
         load_drive(path)
-    told = " ".join(raised.value.problems)
-    assert "line 4, column 'time_ms': 1.0 does not come after" in told
-    assert "line 4, column 'drive_x_rad': 'high' is not a finite number" in told
+    known = " ".join(raised.value.problems)
+    assert "line 4, column 'time_ms': 1.0 does not come after" in known
+    assert "line 4, column 'drive_x_rad': 'high' is not a finite number" in known
     path.write_text("time_ms,response_x_rad\n0,0\n2,1\n")
     with pytest.raises(InputError, match="has no drive column"):
         load_drive(path)

@@ -19,8 +19,10 @@ FREQUENCY = np.geomspace(0.02, 2.0, 60)
 
 
 def known(values: dict[str, float], **model: object):
-    made = problem(record(camera=0.6), **model)
-    return made, draws_of(made.posterior.table, np.tile(row_values(made.posterior.table, values), (8, 1)))
+    prepared = problem(record(camera=0.6), **model)
+    return prepared, draws_of(
+        prepared.posterior.table, np.tile(row_values(prepared.posterior.table, values), (8, 1))
+    )
 
 
 def answered(draws, frequencies=FREQUENCY):
@@ -44,13 +46,13 @@ def test_every_path_of_a_coupled_plant_and_its_phase_stay_continuous():
     magnitude, phase = transfer_function(table, values, FREQUENCY)
     s = 2j * np.pi * FREQUENCY
     for b in range(8):
-        told = dict(zip(table.names, values[b], strict=True))
+        known = dict(zip(table.names, values[b], strict=True))
         for i, r in enumerate("xy"):
             for j, d in enumerate("xy"):
                 kind = "direct" if i == j else "cross"
                 terms = range(1, 3 if i == j else 2)
-                below = 1 + sum((told[f"time_{k}_{kind}"] * s) ** told[f"order_{k}_{kind}"] for k in terms)
-                exact = told[f"gain_{r}_{d}"] * np.exp(-s * told["delay"]) / below
+                below = 1 + sum((known[f"time_{k}_{kind}"] * s) ** known[f"order_{k}_{kind}"] for k in terms)
+                exact = known[f"gain_{r}_{d}"] * np.exp(-s * known["delay"]) / below
                 assert_allclose(magnitude[i, j, b] * np.exp(1j * phase[i, j, b]), exact, rtol=1e-9)
     late = 2 * np.pi * FREQUENCY * values[:, table.names.index("delay"), None]
     assert np.abs(np.diff(phase + late)).max() < np.pi
@@ -61,24 +63,24 @@ def test_every_path_of_a_coupled_plant_and_its_phase_stay_continuous():
 @pytest.mark.parametrize("frequency", [0.05, 0.17, 0.4])
 def test_the_forward_model_under_a_sinusoid_answers_with_this_gain_and_phase(frequency):
     """Steps of 1 / 200 of a cycle, held: half a step late and smaller by their sinc, both taken off."""
-    made, draws = known(TRUTH)
+    prepared, draws = known(TRUTH)
     cycles, held = 12 + round(80 * frequency), 1 / (200 * frequency)
     time = held * np.arange(200 * cycles + 1)
     drive = Drive.of_arrays(time, u=np.sin(2 * np.pi * frequency * time), units="V", time_unit="ms")
     table = draws.table
-    response = responses(table, made.driven(drive, time), draws.flat[:1])[0][0, 0]
+    response = responses(table, prepared.driven(drive, time), draws.flat[:1])[0][0, 0]
     last = slice(-1 - 600, -1)
     wave = np.exp(-2j * np.pi * frequency * time[last])
-    found = 2j * np.mean(response[last] * wave)
-    found /= np.sinc(frequency * held) * np.exp(-1j * np.pi * frequency * held)
+    result = 2j * np.mean(response[last] * wave)
+    result /= np.sinc(frequency * held) * np.exp(-1j * np.pi * frequency * held)
     magnitude, phase = transfer_function(table, draws.flat[:1], np.array([frequency]))
     exact = (magnitude * np.exp(1j * phase))[0, 0, 0, 0]
-    assert abs(found - exact) < 5e-3 * abs(exact)  # an algebraic tail of the onset is left
+    assert abs(result - exact) < 5e-3 * abs(exact)  # an algebraic tail of the onset is left
 
 
 def test_bands_are_the_quantiles_of_the_draws_and_simultaneous_ones_are_wider():
-    made = problem(record(camera=0.6))
-    table = made.posterior.table
+    prepared = problem(record(camera=0.6))
+    table = prepared.posterior.table
     values = np.tile(row_values(table, TRUTH), (2000, 1))
     gain = values[:, table.names.index("gain")] = np.random.default_rng(3).lognormal(0.5, 0.2, 2000)
     (path,) = answered(draws_of(table, values)).paths
@@ -90,8 +92,8 @@ def test_bands_are_the_quantiles_of_the_draws_and_simultaneous_ones_are_wider():
 
 
 def test_an_open_sign_is_said():
-    made = problem(record(camera=0.6))
-    table = made.posterior.table
+    prepared = problem(record(camera=0.6))
+    table = prepared.posterior.table
     values = np.tile(row_values(table, TRUTH), (100, 1))
     values[:30, table.names.index("gain")] *= -1
     (path,) = answered(draws_of(table, values)).paths
@@ -104,8 +106,8 @@ def test_what_the_records_do_not_resolve_is_said_and_the_default_stays_within():
     _, draws = known(TRUTH)
     assert answered(draws, None).outside == ()
     assert answered(draws, [0.1, 0.5]).outside == ()
-    told = answered(draws, [0.01, 5.0]).outside
-    assert [one.partition(" ")[0] for one in told] == ["Below", "Above"]
+    outside = answered(draws, [0.01, 5.0]).outside
+    assert [one.partition(" ")[0] for one in outside] == ["Below", "Above"]
     assert json.dumps(answered(draws).to_json(), allow_nan=False)
     assert len(answered(draws).table()) == FREQUENCY.size
     assert "bandwidth" in answered(draws)._repr_html_()

@@ -1,4 +1,4 @@
-"""Prediction for a new drive and scores of a new record, each number by a second way."""
+"""Prediction for a new drive and scores of a new record, each number by a second method."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ HELD = record(2, command=on_off(-0.7, hold=4.0, at=1.3), name="held")
 STEPS = Drive.steps(u=[(0.35, 0.8), (5.0, 0.1)], until=11.0)
 
 
-def uncertain(made, count=2000, **spread):
+def uncertain(prepared, count=2000, **spread):
     """Draws about the truth with a given spread of some parameters."""
-    table, rng = made.posterior.table, np.random.default_rng(4)
+    table, rng = prepared.posterior.table, np.random.default_rng(4)
     values = np.tile(row_values(table, TRUTH), (count, 1))
     for name, sd in spread.items():
         values[:, table.names.index(name)] += sd * rng.standard_normal(count)
@@ -37,8 +37,8 @@ def uncertain(made, count=2000, **spread):
 
 
 def test_equal_draws_follow_the_bench_under_a_drive_of_steps():
-    made = problem(record(camera=0.2))
-    (band,) = predict(made, uncertain(made), STEPS).bands
+    prepared = problem(record(camera=0.2))
+    (band,) = predict(prepared, uncertain(prepared), STEPS).bands
     command = Command(np.array([0.35, 5.0]), np.array([[0.8], [0.1]]), np.zeros(1))
     shown = simulate(
         ONE, Bench(camera=0.01), command, duration=11.0, name="truth", rng=np.random.default_rng(0)
@@ -55,8 +55,8 @@ def test_equal_draws_follow_the_bench_under_a_drive_of_steps():
 
 def test_bands_are_the_quantiles_of_offset_and_noise():
     """Offset with a known spread, noise of a known scale: both bands by hand, before the drive acts."""
-    made = problem(record(camera=0.2))
-    (band,) = predict(made, uncertain(made, offset=0.1), STEPS).bands
+    prepared = problem(record(camera=0.2))
+    (band,) = predict(prepared, uncertain(prepared, offset=0.1), STEPS).bands
     assert band.offset_from == "that of the fit record"
     early = band.time < 1.0
     for rows, sd in ((band.plant, 0.1), (band.noisy, np.hypot(0.1, TRUTH["sigma"]))):
@@ -67,22 +67,22 @@ def test_bands_are_the_quantiles_of_offset_and_noise():
     # noise does not: its largest deviation over all times is wider than that at one time
     noise = (band.noisy_simultaneous[3] - band.noisy[2]).mean()
     assert noise > 1.1 * (band.noisy[4] - band.noisy[2]).mean()
-    (alone,) = predict(made, uncertain(made, offset=0.1), STEPS, offset="zero").bands
+    (alone,) = predict(prepared, uncertain(prepared, offset=0.1), STEPS, offset="zero").bands
     assert alone.offset_from == "no offset"
     assert_allclose(alone.plant[2], band.plant[2] - TRUTH["offset"], atol=0.01)
 
 
 def test_new_noise_lies_in_the_simultaneous_band_as_often_as_said():
     """Curves drawn anew from the posterior, whole: 50 and 90 % of them lie within throughout."""
-    made = problem(record(camera=0.2))
-    values = uncertain(made, count=6000, offset=0.1, gain=0.2, delay=0.1)
-    (band,) = predict(made, values, STEPS).bands
+    prepared = problem(record(camera=0.2))
+    values = uncertain(prepared, count=6000, offset=0.1, gain=0.2, delay=0.1)
+    (band,) = predict(prepared, values, STEPS).bands
     fresh = replace(STEPS, name="another stream of random numbers")
     inside = []
     rng = np.random.default_rng(8)
     offset = values.flat[:, values.table.names.index("offset")]
-    drive = predict(made, values, fresh).driven
-    curves = responses(values.table, made.driven(drive, band.time), values.flat[::3][:2000])[0][0]
+    drive = predict(prepared, values, fresh).driven
+    curves = responses(values.table, prepared.driven(drive, band.time), values.flat[::3][:2000])[0][0]
     curves = curves + offset[::3][:2000, None] + TRUTH["sigma"] * rng.standard_normal(curves.shape)
     for low, high in ((1, 2), (0, 3)):
         ends = band.noisy_simultaneous
@@ -93,41 +93,41 @@ def test_new_noise_lies_in_the_simultaneous_band_as_often_as_said():
 
 
 def test_offsets_of_several_records_are_drawn_from_all_of_them():
-    made = problem(record(1, camera=0.3, name="a"), record(2, camera=0.3, name="b"))
-    table = made.posterior.table
-    told = TRUTH | {"offset_a": -1.0, "offset_b": 2.0}
-    values = np.tile(row_values(table, told), (400, 1))
-    (band,) = predict(made, draws_of(table, values), STEPS).bands
+    prepared = problem(record(1, camera=0.3, name="a"), record(2, camera=0.3, name="b"))
+    table = prepared.posterior.table
+    known = TRUTH | {"offset_a": -1.0, "offset_b": 2.0}
+    values = np.tile(row_values(table, known), (400, 1))
+    (band,) = predict(prepared, draws_of(table, values), STEPS).bands
     assert "one of the 2 fit records" in band.offset_from
     assert_allclose(band.plant[[0, 4], 0], [-1.0, 2.0], atol=1e-9)
 
 
 def test_a_drive_that_the_records_hold_is_inside_and_a_scaled_longer_faster_one_is_not():
-    made = problem(record(camera=0.2))
-    draws = uncertain(made)
-    same = predict(made, draws, Drive.steps(u=[(0.0, 1.0)], until=11.0))
+    prepared = problem(record(camera=0.2))
+    draws = uncertain(prepared)
+    same = predict(prepared, draws, Drive.steps(u=[(0.0, 1.0)], until=11.0))
     assert same.outside == ()
     assert "lies within the fitted range" in same.verdict
     assert bool(same.table()["inside"].all())
-    larger = predict(made, draws, Drive.steps(u=[(0.0, 0.5), (3.0, -2.0)], until=11.0))
+    larger = predict(prepared, draws, Drive.steps(u=[(0.0, 0.5), (3.0, -2.0)], until=11.0))
     assert [(one.kind, one.axis, one.since) for one in larger.outside] == [("amplitude", "u", 3.0)]
     assert "from -2 to 0.5 V, in the fit records from 0 to 1 V" in larger.verdict
     table = larger.table()
     assert (table["inside"] == (table["time"] < 3.0)).all()
-    longer = predict(made, draws, Drive.steps(u=[(0.0, 1.0)], until=40.0))
+    longer = predict(prepared, draws, Drive.steps(u=[(0.0, 1.0)], until=40.0))
     (late,) = longer.outside
-    assert (late.kind, late.since) == ("time", pytest.approx(made.scales.span))
+    assert (late.kind, late.since) == ("time", pytest.approx(prepared.scales.span))
     time = np.arange(0.0, 11.0, 0.1)
     rapid = Drive.of_arrays(time, u=0.5 - 0.5 * np.cos(2 * np.pi * 2.5 * time), time_unit="ms")
-    kinds = {one.kind: one for one in predict(made, draws, rapid).outside}
+    kinds = {one.kind: one for one in predict(prepared, draws, rapid).outside}
     assert set(kinds) == {"frequency"}
     assert "drive u brings" in kinds["frequency"].sentence
 
 
 def test_the_energy_of_a_drive_over_all_frequencies_is_that_over_all_times():
     """Parseval: a pulse of height 2 over 3 ms holds 12 V^2 ms, and a hold of 1 from 1 to 5 ms holds 4."""
-    made = problem(record(camera=0.2))
-    fitted = fitted_range(made)
+    prepared = problem(record(camera=0.2))
+    fitted = fitted_range(prepared)
     pulse = Drive.steps(u=[(1.0, 2.0), (4.0, 0.0)]).fitted_to(fitted.axes, "ms", [0.0], 1.0)
     hold = Drive.steps(u=[(1.0, 1.0)]).fitted_to(fitted.axes, "ms", [0.0], 1.0)
     edges = np.geomspace(1e-9, 200.0, 40)
@@ -140,15 +140,15 @@ def test_the_energy_of_a_drive_over_all_frequencies_is_that_over_all_times():
 
 
 def test_a_drive_of_two_axes_needs_no_second_one_and_gives_both_responses():
-    made = problem(record(device=TWO, camera=0.6), terms={"direct": 2, "cross": 1})
-    table = made.posterior.table
+    prepared = problem(record(device=TWO, camera=0.6), terms={"direct": 2, "cross": 1})
+    table = prepared.posterior.table
     draws = draws_of(table, table.draw(40, np.random.default_rng(2)))
-    found = predict(made, draws, Drive.steps(x=[(0, 0.5)], until=4.0))
-    assert [band.axis for band in found.bands] == ["x", "y"]
-    assert_array_equal(found.drives().query("axis == 'y'")["drive"].unique(), [0.2])  # as the records rest
-    assert list(found.summary()["axis"]) == ["x", "y"]
-    assert "half_width_simultaneous" in found._repr_html_()
-    json.dumps(found.to_json(), allow_nan=False)
+    result = predict(prepared, draws, Drive.steps(x=[(0, 0.5)], until=4.0))
+    assert [band.axis for band in result.bands] == ["x", "y"]
+    assert_array_equal(result.drives().query("axis == 'y'")["drive"].unique(), [0.2])  # as the records rest
+    assert list(result.summary()["axis"]) == ["x", "y"]
+    assert "half_width_simultaneous" in result._repr_html_()
+    json.dumps(result.to_json(), allow_nan=False)
 
 
 @pytest.mark.parametrize(
@@ -162,9 +162,9 @@ def test_a_drive_of_two_axes_needs_no_second_one_and_gives_both_responses():
     ],
 )
 def test_drives_of_another_plant_are_refused(drive, words):
-    made = problem(record(camera=0.2))
+    prepared = problem(record(camera=0.2))
     with pytest.raises(InputError, match=words) as raised:
-        predict(made, uncertain(made), drive)
+        predict(prepared, uncertain(prepared), drive)
     assert len(raised.value.problems) == 1
 
 
@@ -193,14 +193,14 @@ def test_a_record_scored_later_has_the_numbers_of_one_held_out_from_the_start(fi
 
 
 def test_a_score_is_the_error_of_the_median_and_the_share_inside(alone):
-    found = alone.predict(HELD)
-    (band,) = found.bands
+    result = alone.predict(HELD)
+    (band,) = result.bands
     observed = HELD.response[np.isfinite(HELD.response[:, 0]), 0]
-    (told,) = found.scores
-    assert told["rmse"] == pytest.approx(np.sqrt(np.mean((observed - band.plant[2]) ** 2)))
+    (known,) = result.scores
+    assert known["rmse"] == pytest.approx(np.sqrt(np.mean((observed - band.plant[2]) ** 2)))
     inside = (observed >= band.noisy[0]) & (observed <= band.noisy[4])
-    assert told["coverage_90"] == pytest.approx(inside.mean())
-    assert "RMSE" in found.verdict
+    assert known["coverage_90"] == pytest.approx(inside.mean())
+    assert "RMSE" in result.verdict
 
 
 def test_a_record_that_a_fit_would_refuse_is_not_scored(alone):
@@ -223,13 +223,13 @@ def test_a_file_without_responses_cannot_be_scored(alone, tmp_path):
 
 def test_step_metrics_of_a_path_over_another_span(alone):
     whole = alone.step_metrics().set_index("name")
-    told = {one.name: one for one in alone.metrics}
-    assert set(whole.index) == set(told)
-    assert whole.loc["rise_10_90[y]", "value"] == told["rise_10_90[y]"].value
+    known = {one.name: one for one in alone.metrics}
+    assert set(whole.index) == set(known)
+    assert whole.loc["rise_10_90[y]", "value"] == known["rise_10_90[y]"].value
     longer = alone.step_metrics("y", span=200.0).set_index("name")
     exact = np.median(alone.draws.column("gain"))
     assert longer.loc["value_at_end[y]", "value"] == pytest.approx(exact, rel=0.05)
-    near, far = (abs(found.loc["value_at_end[y]", "value"] - exact) for found in (longer, whole))
+    near, far = (abs(result.loc["value_at_end[y]", "value"] - exact) for result in (longer, whole))
     assert near < far
     with pytest.raises(InputError, match="no path 'z'"):
         alone.step_metrics("z")

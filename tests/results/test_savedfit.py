@@ -63,7 +63,7 @@ def test_a_saved_fit_predicts_scores_and_grades_as_it_did(fitted, folder):
 
 def test_a_study_survives_its_copy_exactly():
     first = record(1, device=TWO, camera=0.37, name="x y")
-    told = study(
+    known = study(
         first,
         held_out=(record(2, device=TWO, camera=0.41, name="other"),),
         priors={"delay": 0.1, "sigma_x": ("loguniform", {"a": 0.001, "b": 1.0})},
@@ -73,14 +73,14 @@ def test_a_study_survives_its_copy_exactly():
     )
     prior = PriorSettings("delay", dist="norm", parameters={"loc": 0.1, "scale": 0.2})
     candidate = CandidateSettings("rival", orders=(2.0, 1.0), priors={"delay": prior}, improper=("gain",))
-    told = type(told)(
-        **{key: getattr(told, key) for key in told.__dataclass_fields__}
+    known = type(known)(
+        **{key: getattr(known, key) for key in known.__dataclass_fields__}
         | {"candidates": (candidate,), "compare": CompareSettings(("rival",)), "stages": {"fit": {}}}
     )
-    again = study_from_json(json.loads(json.dumps(study_to_json(told), allow_nan=False)))
-    assert settings_of(again) == settings_of(told)
-    assert (again.candidates, again.compare, again.stages) == (told.candidates, told.compare, told.stages)
-    for one, other in zip((*told.fit, *told.held_out), (*again.fit, *again.held_out), strict=True):
+    again = study_from_json(json.loads(json.dumps(study_to_json(known), allow_nan=False)))
+    assert settings_of(again) == settings_of(known)
+    assert (again.candidates, again.compare, again.stages) == (known.candidates, known.compare, known.stages)
+    for one, other in zip((*known.fit, *known.held_out), (*again.fit, *again.held_out), strict=True):
         for name in ("time", "drive", "response"):
             assert_array_equal(getattr(one, name), getattr(other, name))
         assert (one.name, one.drive_axes, one.response_axes) == (
@@ -124,8 +124,8 @@ def test_a_folder_that_was_cut_short_is_refused_in_one_sentence(folder, tmp_path
     spoil(copy)
     with pytest.raises(InputError) as raised:
         load_fit(copy)
-    (told,) = raised.value.problems
-    assert words in told
+    (known,) = raised.value.problems
+    assert words in known
 
 
 def test_another_version_another_fit_and_other_contents_are_refused(folder, fitted, tmp_path):

@@ -43,17 +43,17 @@ def test_bands_of_a_drive_are_written_with_a_page_and_are_those_of_python(fitted
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     path = plan(folder, GOOD)
     assert main(["predict", str(folder), str(path), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
+    known = json.loads(capsys.readouterr().out)
     place = folder / "predict" / "plan"
-    assert told["report"] == str(place / "predict.html")
+    assert known["report"] == str(place / "predict.html")
     page = (place / "predict.html").read_text()
     assert "response to plan" in page
     assert page.count("<svg") == 1
     values = json.loads((place / "predict.json").read_text())
     assert values["provenance"]["command"][1] == "predict"
-    found = fitted.predict(path)
+    result = fitted.predict(path)
     table = pd.read_csv(place / "tables" / "predict_bands.csv")
-    pd.testing.assert_frame_equal(table, found.table(), check_dtype=False)
+    pd.testing.assert_frame_equal(table, result.table(), check_dtype=False)
     kinds = {name.rpartition("_")[0] for name in table.columns if name[-2:].isdigit()}
     assert kinds == {
         f"{what}_{kind}" for what in ("plant", "noisy") for kind in ("pointwise", "simultaneous")
@@ -92,9 +92,9 @@ def test_a_drive_that_does_not_suit_is_refused_and_nothing_written(folder, capsy
     path = plan(folder, text)
     before = sorted(folder.rglob("*"))
     assert main(["predict", str(folder), str(path)]) == 2
-    told = capsys.readouterr()
-    assert told.out == ""
-    lines = told.err.splitlines()
+    known = capsys.readouterr()
+    assert known.out == ""
+    lines = known.err.splitlines()
     assert len(lines) == len(words)
     assert all(word in line for word, line in zip(words, lines, strict=True))
     assert sorted(folder.rglob("*")) == before
