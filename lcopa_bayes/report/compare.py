@@ -11,7 +11,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from lcopa_bayes.compare.compare import folder_name
+from lcopa_bayes.comparison.compare import folder_name
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.report.decimation import extremes
 from lcopa_bayes.report.formatting import NONE, figures, interval, percent, to_spread

@@ -6,21 +6,21 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from lcopa_bayes.audit.audit import audit
-from lcopa_bayes.compare.candidates import candidates_of
-from lcopa_bayes.compare.compare import compare
+from lcopa_bayes.comparison.candidates import candidates_of
+from lcopa_bayes.comparison.compare import compare
 from lcopa_bayes.core.files import save_json, writable_folder
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_candidates
-from lcopa_bayes.design.confirmation import REPLICAS, confirmed
-from lcopa_bayes.design.design import DRAWS, checked, design
-from lcopa_bayes.design.nextmeasurement import next_measurement
-from lcopa_bayes.design.summary import as_json
-from lcopa_bayes.design.template import write_template
+from lcopa_bayes.effectsearch.loop import loop
+from lcopa_bayes.effectsearch.summary import drawn, words
+from lcopa_bayes.effectsearch.summary import results as loop_results
+from lcopa_bayes.experiments.confirmation import REPLICAS, confirmed
+from lcopa_bayes.experiments.design import DRAWS, checked, design
+from lcopa_bayes.experiments.nextmeasurement import next_measurement
+from lcopa_bayes.experiments.summary import as_json
+from lcopa_bayes.experiments.template import write_template
+from lcopa_bayes.identifiability.audit import audit
 from lcopa_bayes.inference.assembly import problem_of
-from lcopa_bayes.loop.loop import loop
-from lcopa_bayes.loop.summary import drawn, words
-from lcopa_bayes.loop.summary import results as loop_results
 from lcopa_bayes.report import write_report
 from lcopa_bayes.report.audit import write_audit
 from lcopa_bayes.report.compare import write_comparison

@@ -10,10 +10,10 @@ import numpy as np
 
 from lcopa_bayes.bench.campaign import write_campaign
 from lcopa_bayes.bench.campaignfile import load_plan
-from lcopa_bayes.calibrate.calibrate import calibrate
-from lcopa_bayes.calibrate.summary import results as calibration_results
-from lcopa_bayes.calibrate.summary import tables
-from lcopa_bayes.calibrate.truths import Stated
+from lcopa_bayes.calibration.calibrate import calibrate
+from lcopa_bayes.calibration.summary import results as calibration_results
+from lcopa_bayes.calibration.summary import tables
+from lcopa_bayes.calibration.truths import Stated
 from lcopa_bayes.core.checks import refuse_if
 from lcopa_bayes.core.files import save_json, save_table, writable_folder
 from lcopa_bayes.core.parallel import cores

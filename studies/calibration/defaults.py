@@ -28,9 +28,9 @@ import numpy as np
 from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import step
 from lcopa_bayes.bench.device import Device, TransferPath
-from lcopa_bayes.calibrate.calibrate import Calibration, calibrate
-from lcopa_bayes.calibrate.coverage import LEVELS, Coverage
-from lcopa_bayes.calibrate.summary import results
+from lcopa_bayes.calibration.calibrate import Calibration, calibrate
+from lcopa_bayes.calibration.coverage import LEVELS, Coverage
+from lcopa_bayes.calibration.summary import results
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import save_json, writable_folder, write_text
 from lcopa_bayes.data.record import Axis

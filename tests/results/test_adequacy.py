@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from small import TRUTH, U, Y, draws_of, problem, record, study
 
-from lcopa_bayes.audit.audit import audit
 from lcopa_bayes.bench.command import step
 from lcopa_bayes.data.record import Record
+from lcopa_bayes.identifiability.audit import audit
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.results.adequacy import _coverage, limitations
