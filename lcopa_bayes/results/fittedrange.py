@@ -94,6 +94,12 @@ class FittedRange:
         rests = [tuple(record.drive[0]) for record in self.records]
         return np.array(max(rests, key=lambda one: (rests.count(one), -rests.index(one))))
 
+    def resting_at(self, rest: Vector) -> list[int]:
+        """Positions of the fit records that rest as given, (axes,) [drive unit]; of all where none does."""
+        slack = _SLIGHT * (self.high - self.low)
+        alike = [k for k, one in enumerate(self.records) if (np.abs(one.drive[0] - rest) <= slack).all()]
+        return alike or list(range(len(self.records)))
+
     def other_rest(self, rest: Sequence[float]) -> list[str]:
         """A problem for every drive axis that rests where no fit record, nor anything between two, did."""
         slack = _SLIGHT * (self.high - self.low)

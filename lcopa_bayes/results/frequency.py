@@ -26,6 +26,10 @@ _POINTS = 120
 """Frequencies of the default grid."""
 _HALF_POWER = float(np.sqrt(0.5))
 """Gain over that at rest at the bandwidth [-]: 3 dB less."""
+_SEARCHED = 1e-2
+"""Share of the lowest frequency that the records resolve from which a bandwidth is searched, and of which the
+highest is that share of its end [-]."""
+_SEARCH_POINTS = 300
 _SIGN = 0.05
 """Share of draws with a gain of the other sign from which the phase has two values [-]."""
 
@@ -59,8 +63,8 @@ class PathResponse:
     phase: Bands
     """Phase, continuous from rest [deg]; a negative gain counts as -180 deg."""
     bandwidth: Estimate
-    """First frequency at which the magnitude is 3 dB below that at rest [cycles / time unit]; infinite where
-    it does not get there within the frequencies asked for."""
+    """First frequency at which the magnitude is 3 dB below that at rest [cycles / time unit], whatever the
+    frequencies asked for; infinite beyond a hundred times what the records resolve."""
     note: str = ""
 
     def as_json(self) -> dict[str, Any]:
@@ -192,6 +196,8 @@ def frequency_response(
         raise InputError(f"frequencies must be positive and increase [1/{time_unit}]; got {frequencies!r}")
     table, values = draws.table, draws.thinned(_DRAWS)
     magnitude, phase = transfer_function(table, values, frequency)
+    searched = np.geomspace(_SEARCHED * lowest, highest / _SEARCHED, _SEARCH_POINTS)
+    reached, _ = transfer_function(table, values, searched)
     gains, layout = table.gains(values), table.layout
     paths = []
     for i, response in enumerate(layout.responses):
@@ -200,7 +206,7 @@ def frequency_response(
             log_gain = Bands.of(np.log(np.maximum(magnitude[i, j], np.finfo(float).tiny)))
             negative = float(np.mean(gains[:, i, j] < 0))
             either = min(negative, 1 - negative) > _SIGN
-            wide = _bandwidth(frequency, magnitude[i, j], np.abs(gains[:, i, j]))
+            wide = _bandwidth(searched, reached[i, j], np.abs(gains[:, i, j]))
             paths.append(
                 PathResponse(
                     name,

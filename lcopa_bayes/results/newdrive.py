@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -190,10 +191,9 @@ def predict(
     """Bands for a drive, or for a record nobody has fitted, which is then scored too.
 
     A path is a record file; without responses it is a drive. `offset` "fitted" adds the offset of the fit
-    records to the response of a drive, each draw that of one of them; "zero" leaves the plant alone.
-    InputError
-    for other axes or units than the study's, for a drive that rests where no fit record did, for one too
-    long, and for a record that a fit of the study would refuse.
+    records that rest alike to the response of a drive, each draw that of one of them; "zero" leaves the plant
+    alone. InputError for other axes or units than the study's, for a drive that rests where no fit record
+    did, for one too long, and for a record that a fit of the study would refuse.
     """
     study = problem.study
     if isinstance(driven, Path | str):
@@ -257,10 +257,10 @@ def _unmeasured(problem: Problem, draws: Draws, drive: Drive, level: Level) -> t
     gaps = np.concatenate(([1.0], np.diff(times) / scales.period))
     values, plant = plant_draws(draws, problem.driven(drive, times))
     noise, out = problem.posterior.noise, []
-    rng = named_rng(study.seed, drive.name)
+    rng, alike = named_rng(study.seed, drive.name), fitted.resting_at(drive.drive[0])
     for axis, declared in enumerate(study.response_axes):
         parameters = values[:, [draws.table.at(name, axis) for name in noise.names]]
-        known = _level(draws, values, axis, level, rng)
+        known = _level(draws, values, axis, level, alike, rng)
         noises = noise.draw(parameters, gaps, rng)
         nothing = np.full(times.size, np.nan)
         out.append(band_of((drive.name, declared, False), times, nothing, plant[axis], noises, (*known, 0)))
@@ -285,17 +285,23 @@ def _times(drive: Drive, span: float, period: float) -> Vector:
 
 
 def _level(
-    draws: Draws, values: Array, axis: int, level: Level, rng: np.random.Generator
+    draws: Draws, values: Array, axis: int, level: Level, records: Sequence[int], rng: np.random.Generator
 ) -> tuple[Vector, str]:
-    """Offset of a response axis under a new drive for each draw, and where it comes from."""
+    """Offset of a response axis under a new drive for each draw, and where it comes from.
+
+    An offset per record is taken from one of `records`, those that rest as the drive does: of these the
+    level at rest is measured, of others it hangs on a gain times the difference.
+    """
     table = draws.table
-    places = [k for k in table.of_kind("offset") if table.rows[k].place.first == axis]
+    places = {
+        table.rows[k].place.second: k for k in table.of_kind("offset") if table.rows[k].place.first == axis
+    }
     if level == "zero" or not places:
         return np.zeros(values.shape[0]), "no offset"
-    if table.rows[places[0]].place.second == -1:
-        return values[:, places[0]], "shared with the fit records"
-    if len(places) == 1:
-        return values[:, places[0]], "that of the fit record"
-    chosen = rng.integers(len(places), size=values.shape[0])
-    picked = np.asarray(values[:, places])[np.arange(values.shape[0]), chosen]
-    return picked, f"in each draw that of one of the {len(places)} fit records"
+    if -1 in places:
+        return values[:, places[-1]], "shared with the fit records"
+    if len(records) == 1:
+        return values[:, places[records[0]]], "that of the fit record that rests alike"
+    chosen = np.array([places[r] for r in records])[rng.integers(len(records), size=values.shape[0])]
+    picked = np.asarray(values[np.arange(values.shape[0]), chosen])
+    return picked, f"in each draw that of one of the {len(records)} fit records that rest alike"

@@ -113,9 +113,13 @@ def test_what_the_records_do_not_resolve_is_said_and_the_default_stays_within():
     assert "bandwidth" in answered(draws)._repr_html_()
 
 
-def test_a_bandwidth_beyond_the_frequencies_is_open():
-    _, draws = known(TRUTH)
-    assert answered(draws, [0.001, 0.002]).paths[0].bandwidth.as_json()["value"] is None
+def test_a_bandwidth_does_not_hang_on_the_frequencies_and_is_open_when_far_beyond():
+    _, draws = known(TRUTH | {"order_1": 1.0})
+    exact = 1 / (2 * np.pi * TRUTH["time_1"])
+    for frequencies in ([0.001, 0.002], [5.0]):
+        assert answered(draws, frequencies).paths[0].bandwidth.value == pytest.approx(exact, rel=2e-3)
+    _, draws = known(TRUTH | {"time_1": 1e-5})
+    assert answered(draws).paths[0].bandwidth.as_json()["value"] is None
 
 
 @pytest.mark.parametrize("frequencies", [[], [0.0, 1.0], [2.0, 1.0], [-1.0], [np.nan], ["low"]])

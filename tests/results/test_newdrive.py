@@ -57,7 +57,7 @@ def test_bands_are_the_quantiles_of_offset_and_noise():
     """Offset with a known spread, noise of a known scale: both bands by hand, before the drive acts."""
     prepared = problem(record(camera=0.2))
     (band,) = predict(prepared, uncertain(prepared, offset=0.1), STEPS).bands
-    assert band.offset_from == "that of the fit record"
+    assert band.offset_from == "that of the fit record that rests alike"
     early = band.time < 1.0
     for rows, sd in ((band.plant, 0.1), (band.noisy, np.hypot(0.1, TRUTH["sigma"]))):
         exact = TRUTH["offset"] + sd * np.array([-1.645, -0.6745, 0.0, 0.6745, 1.645])
@@ -100,6 +100,20 @@ def test_offsets_of_several_records_are_drawn_from_all_of_them():
     (band,) = predict(prepared, draws_of(table, values), STEPS).bands
     assert "one of the 2 fit records" in band.offset_from
     assert_allclose(band.plant[[0, 4], 0], [-1.0, 2.0], atol=1e-9)
+
+
+def test_the_offset_is_of_the_records_that_rest_as_the_drive_does():
+    high = record(2, command=step(0.2, at=1.0, rest=1.0), camera=0.3, name="b")
+    prepared = problem(record(1, camera=0.3, name="a"), high)
+    table = prepared.posterior.table
+    values = np.tile(row_values(table, TRUTH | {"offset_a": -1.0, "offset_b": 2.0}), (40, 1))
+    for rest, level in ((0.0, -1.0), (1.0, 2.0)):
+        drive = Drive.steps(u=[(0.0, 0.5)], rest={"u": rest}, until=5.0)
+        (band,) = predict(prepared, draws_of(table, values), drive).bands
+        assert band.offset_from == "that of the fit record that rests alike"
+        assert_allclose(band.plant[:, 0], level + TRUTH["gain"] * rest)
+    between = Drive.steps(u=[(0.0, 0.5)], rest={"u": 0.4}, until=5.0)
+    assert "2 fit records" in predict(prepared, draws_of(table, values), between).bands[0].offset_from
 
 
 def test_a_drive_that_the_records_hold_is_inside_and_a_scaled_longer_faster_one_is_not():
