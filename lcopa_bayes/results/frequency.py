@@ -26,9 +26,9 @@ _POINTS = 120
 """Frequencies of the default grid."""
 _HALF_POWER = float(np.sqrt(0.5))
 """Gain over that at rest at the bandwidth [-]: 3 dB less."""
-_SEARCHED = 1e-2
-"""Share of the lowest frequency that the records resolve from which a bandwidth is searched, and of which the
-highest is that share of its end [-]."""
+_SEARCHED = (1e-6, 1e2)
+"""A bandwidth is searched from this share of the lowest to this multiple of the highest frequency that the fit
+records resolve [-]."""
 _SEARCH_POINTS = 300
 _SIGN = 0.05
 """Share of draws with a gain of the other sign from which the phase has two values [-]."""
@@ -64,7 +64,8 @@ class PathResponse:
     """Phase, continuous from rest [deg]; a negative gain counts as -180 deg."""
     bandwidth: Estimate
     """First frequency at which the magnitude is 3 dB below that at rest [cycles / time unit], whatever the
-    frequencies asked for; infinite beyond a hundred times what the records resolve."""
+    frequencies asked for; infinite beyond a hundred times the highest that the records resolve, 0 below a
+    millionth of the lowest: the steady gain of a slow tail is an extrapolation."""
     note: str = ""
 
     def as_json(self) -> dict[str, Any]:
@@ -196,7 +197,7 @@ def frequency_response(
         raise InputError(f"frequencies must be positive and increase [1/{time_unit}]; got {frequencies!r}")
     table, values = draws.table, draws.thinned(_DRAWS)
     magnitude, phase = transfer_function(table, values, frequency)
-    searched = np.geomspace(_SEARCHED * lowest, highest / _SEARCHED, _SEARCH_POINTS)
+    searched = np.geomspace(_SEARCHED[0] * lowest, _SEARCHED[1] * highest, _SEARCH_POINTS)
     reached, _ = transfer_function(table, values, searched)
     gains, layout = table.gains(values), table.layout
     paths = []
@@ -251,5 +252,5 @@ def _bandwidth(frequency: Vector, magnitude: Matrix, at_rest: Vector) -> Vector:
     at = np.log(frequency[before]) + (high - np.log(_HALF_POWER)) / fallen * np.log(
         frequency[first] / frequency[before]
     )
-    crossing = np.where(first > 0, np.exp(at), frequency[0])
+    crossing = np.where(first > 0, np.exp(at), 0.0)
     return np.where(below.any(axis=1), crossing, np.inf)

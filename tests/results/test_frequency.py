@@ -118,6 +118,8 @@ def test_a_bandwidth_does_not_hang_on_the_frequencies_and_is_open_when_far_beyon
     exact = 1 / (2 * np.pi * TRUTH["time_1"])
     for frequencies in ([0.001, 0.002], [5.0]):
         assert answered(draws, frequencies).paths[0].bandwidth.value == pytest.approx(exact, rel=2e-3)
+    _, draws = known(TRUTH | {"time_1": 1e9})
+    assert answered(draws).paths[0].bandwidth.value == 0.0
     _, draws = known(TRUTH | {"time_1": 1e-5})
     assert answered(draws).paths[0].bandwidth.as_json()["value"] is None
 
