@@ -27,8 +27,8 @@ _POINTS = 120
 _HALF_POWER = float(np.sqrt(0.5))
 """Gain over that at rest at the bandwidth [-]: 3 dB less."""
 _SEARCHED = (1e-6, 1e2)
-"""A bandwidth is searched from this share of the lowest to this multiple of the highest frequency that the fit
-records resolve [-]."""
+"""A bandwidth is searched from this share of the lowest to this multiple of the highest frequency that the
+fit records resolve [-]."""
 _SEARCH_POINTS = 300
 _SIGN = 0.05
 """Share of draws with a gain of the other sign from which the phase has two values [-]."""
