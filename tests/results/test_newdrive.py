@@ -231,6 +231,13 @@ def test_a_record_that_a_fit_would_refuse_is_not_scored(alone):
         alone.score(replace(HELD, time_unit="s"))
 
 
+def test_a_record_from_another_rest_is_scored_and_marked(alone):
+    high = record(8, command=step(0.4, at=2.0, rest=0.5), name="high")
+    result = alone.predict(high)
+    assert [one.kind for one in result.outside] == ["rest"]
+    assert "is at 0.5 V before its first change" in result.verdict
+
+
 def test_a_file_without_responses_cannot_be_scored(alone, tmp_path):
     path = tmp_path / "plan.csv"
     path.write_text("time_ms,drive_u_V\n0,0\n1,1\n9,1\n")
