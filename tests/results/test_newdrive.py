@@ -142,6 +142,33 @@ def test_a_drive_that_the_records_hold_is_inside_and_a_scaled_longer_faster_one_
     assert "drive u brings" in kinds["frequency"].sentence
 
 
+@pytest.mark.parametrize(("frequency", "marked"), [(0.15, False), (2.0, True)])
+def test_frequencies_are_marked_where_the_records_hold_less_than_a_hundredth(frequency, marked):
+    """A step of 1 V over T holds ``b / (pi^2 f)`` in a band of width ``b f``, a sinusoid of 1 V ``T / 2``: the
+    ratio ``pi^2 f T / (2 b)`` is 21 and 280 here at b = 0.38."""
+    prepared = problem(record(camera=0.2))
+    time = np.arange(0.0, 11.0, 0.02)
+    wave = Drive.of_arrays(time, u=np.sin(2 * np.pi * frequency * time), time_unit="ms")
+    kinds = {one.kind for one in predict(prepared, uncertain(prepared), wave).outside}
+    assert ("frequency" in kinds) == marked
+
+
+def test_noise_between_rows_that_are_closer_than_samples_is_correlated_by_their_distance():
+    prepared = problem(record(camera=0.2), noise="ar1")
+    table = prepared.posterior.table
+    values = np.tile(row_values(table, TRUTH | {"rho": 0.8}), (2000, 1))
+    time = np.arange(0.0, 4.0, 0.02)
+    drive = Drive.of_arrays(time, u=np.zeros(time.size), time_unit="ms")
+    (band,) = predict(prepared, draws_of(table, values), drive).bands
+    rng, link = np.random.default_rng(3), 0.8 ** (0.02 / prepared.scales.period)
+    noise = rng.standard_normal((4000, time.size))
+    for k in range(1, time.size):
+        noise[:, k] = link * noise[:, k - 1] + np.sqrt(1 - link**2) * noise[:, k]
+    exact = TRUTH["sigma"] * np.quantile(np.abs(noise).max(axis=1), 0.9)
+    half = (band.noisy_simultaneous[3] - band.noisy_simultaneous[0]).mean() / 2
+    assert half == pytest.approx(exact, rel=0.05)
+
+
 def test_the_energy_of_a_drive_over_all_frequencies_is_that_over_all_times():
     """Parseval: a pulse of height 2 over 3 ms holds 12 V^2 ms, and a hold of 1 from 1 to 5 ms holds 4."""
     prepared = problem(record(camera=0.2))
