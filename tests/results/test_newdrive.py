@@ -144,8 +144,10 @@ def test_a_drive_that_the_records_hold_is_inside_and_a_scaled_longer_faster_one_
 
 @pytest.mark.parametrize(("frequency", "marked"), [(0.15, False), (2.0, True)])
 def test_frequencies_are_marked_where_the_records_hold_less_than_a_hundredth(frequency, marked):
-    """A step of 1 V over T holds ``b / (pi^2 f)`` in a band of width ``b f``, a sinusoid of 1 V ``T / 2``: the
-    ratio ``pi^2 f T / (2 b)`` is 21 and 280 here at b = 0.38."""
+    """In a band of width ``b f`` a step of 1 V over T holds ``b / (pi^2 f)``, a sinusoid of 1 V ``T / 2``.
+
+    Their ratio ``pi^2 f T / (2 b)`` is 21 and 280 here at b = 0.38.
+    """
     prepared = problem(record(camera=0.2))
     time = np.arange(0.0, 11.0, 0.02)
     wave = Drive.of_arrays(time, u=np.sin(2 * np.pi * frequency * time), time_unit="ms")
