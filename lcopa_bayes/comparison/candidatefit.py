@@ -22,14 +22,13 @@ from lcopa_bayes.comparison.priorwidth import widths
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import plain
-from lcopa_bayes.core.files import writable_folder
+from lcopa_bayes.core.files import save_json, save_table, writable_folder
 from lcopa_bayes.data.settings import SamplerSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.likelihood import Peak
 from lcopa_bayes.results.fit import Fit, fit, plan_of
 from lcopa_bayes.results.provenance import digest, fingerprint, settings_of
-from lcopa_bayes.results.runfolder import save_json, save_table
 from lcopa_bayes.results.summary import residual_rms, scores
 from lcopa_bayes.sampling.convergence import Grade
 

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import final
 
+from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.record import Record
+from lcopa_bayes.data.record import Driven, Record
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.noise import NOISES
@@ -33,6 +34,18 @@ class Problem:
         """Samples of other records of the same axes, and the model that simulates them."""
         layout, period = self.posterior.table.layout, self.scales.period
         return prepared(self.study, layout, records, period, refinement=self.refinement)
+
+    def driven(self, drive: Driven, times: Vector) -> ForwardModel:
+        """The model that simulates a drive, read at `times` [time unit]."""
+        wanted, layout = self.study.model, self.posterior.table.layout
+        return forward_model(
+            layout,
+            [drive],
+            [times],
+            blocks=wanted.blocks,
+            exposure=wanted.exposure,
+            refinement=self.refinement,
+        )
 
     def refined(self, factor: int) -> Problem:
         """The same problem on blocks narrower by a further factor."""

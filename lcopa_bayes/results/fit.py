@@ -17,7 +17,9 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.results.adequacy import limitations
 from lcopa_bayes.results.discretisation import Discretisation, discretisation, resolved
+from lcopa_bayes.results.frequency import FrequencyResponse, frequency_response
 from lcopa_bayes.results.prediction import Band, bands
+from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.provenance import digest_of, fingerprint
 from lcopa_bayes.results.residuals import Residual, residuals
 from lcopa_bayes.results.sensitivity import Sensitivity, sensitivity
@@ -34,7 +36,7 @@ _QUICK = 4
 
 @final
 @dataclass(frozen=True, eq=False)
-class Fit:
+class Fit(Predictive):
     """A fitted study."""
 
     problem: Problem
@@ -49,12 +51,9 @@ class Fit:
     """None for a single ensemble, which cannot tell its error."""
     discretisation: Discretisation
     """How far the width of the blocks moves the posterior."""
+    frequency: FrequencyResponse
+    """Over the frequencies that the fit records resolve."""
     cross_check: CrossCheck | None = None
-
-    @property
-    def study(self) -> Study:
-        """The study that was fitted."""
-        return self.problem.study
 
 
 def fit(
@@ -110,15 +109,18 @@ def fit(
     width = discretisation(problem, draws)
     curves = step_curves(draws, problem.scales.span)
     draws = draws.limited([*width.limitations, *too_fast(draws, curves, problem.scales.period)])
-    noise, rng = problem.posterior.noise, np.random.default_rng([plan.seed, 2])
-    shown = bands(draws, problem.posterior.model, problem.posterior.samples, noise, held_out=False, rng=rng)
+    noise, seed = problem.posterior.noise, plan.seed
+    shown = bands(draws, problem.posterior.model, problem.posterior.samples, noise, held_out=False, seed=seed)
     if study.held_out:
         samples, model = problem.simulated(study.held_out)
-        shown += bands(draws, model, samples, noise, held_out=True, rng=rng)
+        shown += bands(draws, model, samples, noise, held_out=True, seed=seed)
     left = residuals(draws, shown, noise, problem.scales.period)
     draws = draws.limited(limitations(problem, draws, shown, left, np.random.default_rng([plan.seed, 4])))
     metrics = step_metrics(draws, curves, time_unit=study.time_unit)
     moved = sensitivity(draws, problem.posterior)
+    response = frequency_response(
+        draws, span=problem.scales.span, period=problem.scales.period, time_unit=study.time_unit
+    )
     return Fit(
         problem,
         run,
@@ -130,6 +132,7 @@ def fit(
         moved,
         weighed,
         width,
+        response,
         check,
     )
 

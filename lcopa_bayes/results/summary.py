@@ -9,7 +9,6 @@ import numpy as np
 
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.results.fit import Fit
-from lcopa_bayes.results.prediction import KIND, Band
 from lcopa_bayes.results.residuals import WHITE_P
 from lcopa_bayes.results.steps import share_unsettled
 from lcopa_bayes.sampling.convergence import Grade, shares_grade
@@ -121,23 +120,7 @@ def residual_rms(fit: Fit) -> dict[str, float]:
 
 def scores(fit: Fit, *, held_out: bool) -> list[dict[str, Any]]:
     """Error and coverage of every axis of the records that were held out, or of those fitted."""
-    return [_score(band) for band in fit.bands if band.held_out == held_out]
-
-
-def _score(band: Band) -> dict[str, Any]:
-    return {
-        "record": band.record,
-        "axis": band.axis,
-        "unit": band.unit,
-        "rmse": band.rmse,
-        "coverage_50": band.coverage(0.5),
-        "coverage_90": band.coverage(0.9),
-        "bands": KIND,
-        "samples": band.time.size,
-        "offset_from": band.offset_from,
-        "offset_samples": band.offset_samples,
-        "draws": band.draws,
-    }
+    return [band.score() for band in fit.bands if band.held_out == held_out]
 
 
 def _sampler(fit: Fit) -> Mapping[str, Any]:

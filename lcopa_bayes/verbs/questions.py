@@ -8,7 +8,7 @@ from typing import Any
 
 from lcopa_bayes.comparison.candidates import candidates_of
 from lcopa_bayes.comparison.compare import compare
-from lcopa_bayes.core.files import writable_folder
+from lcopa_bayes.core.files import save_json, writable_folder
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_candidates
 from lcopa_bayes.effectsearch.loop import loop
@@ -29,7 +29,7 @@ from lcopa_bayes.report.design import write_design
 from lcopa_bayes.report.loop import write_loop
 from lcopa_bayes.results.fit import Fit, fit
 from lcopa_bayes.results.provenance import provenance
-from lcopa_bayes.results.runfolder import save_fit, save_json
+from lcopa_bayes.results.runfolder import save_fit
 from lcopa_bayes.verbs.outcome import Told, place_of, study_of, with_report
 
 _QUICK = 4
