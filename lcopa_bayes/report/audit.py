@@ -64,31 +64,31 @@ def write_audit(folder: Path) -> Path:
     """
     path = folder / "audit.json"
     try:
-        told: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        results: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read ({error}); run `audit` to write it") from None
-    absent = [key for key in _NEEDS if key not in told]
+    absent = [key for key in _NEEDS if key not in results]
     if absent:
         raise InputError(f"{path}: lacks {', '.join(absent)}; run `audit` again with --resume")
     run = load_run(folder)
     with look():
-        sections = [*_tables(told), *_figures(told, run)]
-    verdict = Verdict(str(told["grade"]), str(told["verdict"]), str(told["grade_reason"]))
-    return write_page(folder, f"{told['study']}: identifiability", sections, verdict, NAME)
+        sections = [*_tables(results), *_figures(results, run)]
+    verdict = Verdict(str(results["grade"]), str(results["verdict"]), str(results["grade_reason"]))
+    return write_page(folder, f"{results['study']}: identifiability", sections, verdict, NAME)
 
 
-def _tables(told: Mapping[str, Any]) -> list[Section]:
-    """Everything of an audit that is words and numbers."""
-    return [_verdicts(told), _next(told), _symmetries(told), _functions(told), _delays(told)]
+def _tables(results: Mapping[str, Any]) -> list[Section]:
+    """The sections of an audit that hold text and tables."""
+    return [_verdicts(results), _next(results), _symmetries(results), _functions(results), _delays(results)]
 
 
-def _verdicts(told: Mapping[str, Any]) -> Section:
+def _verdicts(results: Mapping[str, Any]) -> Section:
     columns = (
         *(Column("name", "code"), Column("unit"), Column("verdict"), Column("profile, 90 %", "interval")),
         *(Column("contraction", "number"), Column("relative sd", "number")),
     )
     rows = []
-    for row in told["parameters"]:
+    for row in results["parameters"]:
         lower, upper = row["profile"]["lower"], row["profile"]["upper"]
         spread = None if lower is None or upper is None else (upper - lower) / 3.29
         rows.append(
@@ -110,36 +110,36 @@ def _verdicts(told: Mapping[str, Any]) -> Section:
         (Column("name", "code"), Column("why", "prose"), Column("partners", "prose")),
         tuple(
             (str(row["name"]), str(row["reason"]), ", ".join(row["partners"]) or NONE)
-            for row in told["parameters"]
+            for row in results["parameters"]
         ),
-        "Partners are parameters that can make up for this one, the most exact first.",
+        "Partners are parameters whose changes can compensate a change of this one, the most exact first.",
     )
     against = tuple(
         (str(row["name"]), str(row["verdict"]), "; ".join(row["disagreements"]))
-        for row in told["parameters"]
+        for row in results["parameters"]
         if row["disagreements"]
     )
     contrary = Table(
-        (Column("name", "code"), Column("verdict"), Column("what speaks against it, or limits it", "prose")),
+        (Column("name", "code"), Column("verdict"), Column("contrary evidence and limits", "prose")),
         against,
-        "Where the four methods disagree; a verdict follows the symmetries and the profile.",
+        "Where the four methods disagree; the verdict is that of the symmetries and the profile.",
     )
     tables = (Table(columns, tuple(rows), caption), why, *((contrary,) if against else ()))
     return Section("Verdicts", (), (), tables)
 
 
-def _next(told: Mapping[str, Any]) -> Section:
-    advice = told["next_measurement"]
-    limits = told["limitations"]
+def _next(results: Mapping[str, Any]) -> Section:
+    advice = results["next_measurement"]
+    limits = results["limitations"]
     if advice is None and limits:
         text = tuple(
-            f"{_sentence(one['reason'])} To do: {one['remedy'] or 'see the report'}." for one in limits
+            f"{_sentence(limit['reason'])} Remedy: {limit['remedy'] or 'see the report'}." for limit in limits
         )
         return Section(
             "What to measure next",
             (
-                "Given this model every parameter is identified, but the checks of the model speak against "
-                "it: first mend the model, then ask again.",
+                "Given this model every parameter is identified, but the checks of the model fail: "
+                "correct the model first, then repeat the audit.",
                 *text,
             ),
         )
@@ -153,18 +153,18 @@ def _next(told: Mapping[str, Any]) -> Section:
         return Section("What to measure next", text)
     columns = (
         *(Column("name", "code"), Column("best drive"), Column("relative sd", "number")),
-        *(Column("after a plain step", "number"), Column("why none", "prose")),
+        *(Column("after a plain step", "number"), Column("why no drive", "prose")),
     )
     rows = tuple(
         (
-            *(row["name"], row["drive"] or NONE, *(_promised(row, key) for key in ("", "_step"))),
+            *(row["name"], row["drive"] or NONE, *(_expected(row, key) for key in ("", "_step"))),
             row["reason"] or NONE,
         )
         for row in advice["parameters"]
     )
     caption = (
         f"Parameters that are not identified and what one more record of {advice['time']:g} "
-        f"{advice['time_unit']} promises for each by the drive that is best for it: median Cramer-Rao bounds "
+        f"{advice['time_unit']} is expected to give for each with its best drive: median Cramer-Rao bounds "
         "over draws of the posterior; above 1 it is still not determined. The verb design tries "
         "other times and confirms by simulation."
     )
@@ -176,40 +176,40 @@ def _sentence(clause: str) -> str:
     return f"{clause[0].upper()}{clause[1:]}."
 
 
-def _promised(row: Mapping[str, Any], which: str) -> str:
+def _expected(row: Mapping[str, Any], which: str) -> str:
     """Expected relative standard deviation after the best drive or after the plain step."""
-    found = row.get(f"expected_relative_sd{which}")
-    return NONE if found is None else figures(found["value"], 2)
+    expected = row.get(f"expected_relative_sd{which}")
+    return NONE if expected is None else figures(expected["value"], 2)
 
 
-def _symmetries(told: Mapping[str, Any]) -> Section:
-    text, printed = [], told["printed_form"]
-    found = [f"{one['kind']}: {one['sentence']}." for one in told["symmetries"]]
-    text += found or ["The model has no symmetry with these drives: every parameter acts on its own."]
-    if not told["structure"]["certain"]:
+def _symmetries(results: Mapping[str, Any]) -> Section:
+    text, printed = [], results["printed_form"]
+    sentences = [f"{symmetry['kind']}: {symmetry['sentence']}." for symmetry in results["symmetries"]]
+    text += sentences or ["The model has no symmetry with these drives: every parameter acts on its own."]
+    if not results["structure"]["certain"]:
         text.append(
             "The rank of the sensitivities changes with the tolerance: what is a symmetry and what is "
-            "merely too weak to compute cannot be told apart, and no parameter is called structurally "
+            "merely too weak to compute cannot be distinguished, and no parameter is called structurally "
             "unidentifiable."
         )
     if printed is not None:
         text.append(
             f"In the printed parametrisation (Ta et al. 2026, Eqs. 16, 21, 28) only {printed['rank']} of "
             f"{printed['parameters']} numbers act: "
-            + "; ".join(one["sentence"] for one in printed["symmetries"])
+            + "; ".join(symmetry["sentence"] for symmetry in printed["symmetries"])
             + "."
         )
-    if told["radial"] is not None:
-        moved, fall = told["radial"]["moved"], told["radial"]["fall"]
+    if results["radial"] is not None:
+        moved, fall = results["radial"]["moved"], results["radial"]["fall"]
         text.append(
-            f"Radial test: {figures(told['radial']['reached'], 2)} prior standard deviations away from the "
-            f"maximum twice the log likelihood has fallen by {figures(fall, 2)}; "
+            f"Radial test: {figures(results['radial']['reached'], 2)} prior standard deviations away from "
+            f"the maximum twice the log likelihood has fallen by {figures(fall, 2)}; "
             f"{', '.join(moved) or 'no parameter'} moved."
         )
     return Section("Symmetries", tuple(text))
 
 
-def _functions(told: Mapping[str, Any]) -> Section:
+def _functions(results: Mapping[str, Any]) -> Section:
     columns = (
         *(Column("function", "code"), Column("unit"), Column("median", "number")),
         *(Column("90 % interval", "interval"), Column("width / median", "number"), Column("verdict")),
@@ -221,10 +221,10 @@ def _functions(told: Mapping[str, Any]) -> Section:
             interval(row["lower"], row["upper"], _spread(row)),
             *(percent(row["relative_width"]), row["verdict"], row["grade"]),
         )
-        for row in told["functions"]
+        for row in results["functions"]
     )
-    caption = "Functions of the parameters, the most precisely known first; equal-tailed credible intervals."
-    return Section("What is known best", (), (), (Table(columns, rows, caption),))
+    caption = "Functions of the parameters, the most precise first; equal-tailed credible intervals."
+    return Section("Best-determined functions", (), (), (Table(columns, rows, caption),))
 
 
 def _spread(row: Mapping[str, Any]) -> float | None:
@@ -232,27 +232,27 @@ def _spread(row: Mapping[str, Any]) -> float | None:
     return None if None in ends else (ends[1] - ends[0]) / 3.29
 
 
-def _delays(told: Mapping[str, Any]) -> Section:
-    found = told["delays"]
-    sentence = str(found["sentence"])
+def _delays(results: Mapping[str, Any]) -> Section:
+    delays = results["delays"]
+    sentence = str(delays["sentence"])
     text = (f"{sentence[0].upper()}{sentence[1:]}.",)
-    rows: Sequence[Mapping[str, Any]] = found["separations"]
+    rows: Sequence[Mapping[str, Any]] = delays["separations"]
     if not rows:
         return Section("Delays of the paths", text)
-    unit = found["paths"][0]["unit"]
-    columns = (Column("pair", "code"), Column(f"told apart from [{unit}]", "number"))
+    unit = delays["paths"][0]["unit"]
+    columns = (Column("pair", "code"), Column(f"smallest resolved difference [{unit}]", "number"))
     cells = tuple((" / ".join(row["pair"]), figures(row["smallest_difference"], 2)) for row in rows)
-    caption = "Smallest difference a 90 % interval keeps apart from 0, linearised; a dash: none."
+    caption = "Smallest difference whose 90 % interval excludes 0, linearised; a dash: none."
     return Section("Delays of the paths", text, (), (Table(columns, cells, caption),))
 
 
-def _figures(told: Mapping[str, Any], run: SavedRun) -> list[Section]:
+def _figures(results: Mapping[str, Any], run: SavedRun) -> list[Section]:
     """Every figure of an audit."""
-    return [_profiles(told, run), _spectrum(told), _pairs(told, run)]
+    return [_profiles(results, run), _spectrum(results), _pairs(results, run)]
 
 
-def _profiles(told: Mapping[str, Any], run: SavedRun) -> Section:
-    rows = told["parameters"]
+def _profiles(results: Mapping[str, Any], run: SavedRun) -> Section:
+    rows = results["parameters"]
     caption = (
         "Line: fall of twice the log likelihood along the profile, its 90 % level dashed, an open side where "
         "the line stays below to the end. Filled: marginal posterior on the scale of the axis."
@@ -293,8 +293,8 @@ def _profile_page(rows: Sequence[Mapping[str, Any]], run: SavedRun) -> str:
     return svg_of(figure)
 
 
-def _spectrum(told: Mapping[str, Any]) -> Section:
-    rows = told["spectrum"]
+def _spectrum(results: Mapping[str, Any]) -> Section:
+    rows = results["spectrum"]
     if not rows:
         return Section("Sloppy spectrum", ("Only noise parameters are free.",))
     figure = blank(0.9 + 0.24 * len(rows))
@@ -314,15 +314,15 @@ def _spectrum(told: Mapping[str, Any]) -> Section:
     panel.set_xlabel("precision of the data over that of the prior [-]")
     panel.set_ylabel("direction")
     caption = (
-        "Eigenvalues of the Fisher information at the maximum, in prior standard deviations; left of 1 the "
-        "prior knows more than the data. Beside each, the parameters it moves."
+        "Eigenvalues of the Fisher information at the maximum, in prior standard deviations; below 1 the "
+        "prior is more informative than the data. Beside each, the parameters of its eigenvector."
     )
     return Section("Sloppy spectrum", drawings=(Drawing("sloppy_spectrum", svg_of(figure), caption),))
 
 
-def _pairs(told: Mapping[str, Any], run: SavedRun) -> Section:
+def _pairs(results: Mapping[str, Any], run: SavedRun) -> Section:
     pairs: dict[frozenset[str], tuple[str, str]] = {}
-    for row in told["parameters"]:
+    for row in results["parameters"]:
         if row["verdict"] != "identified":
             for partner in row["partners"][:2]:
                 pairs.setdefault(frozenset((row["name"], partner)), (row["name"], partner))
@@ -332,9 +332,9 @@ def _pairs(told: Mapping[str, Any], run: SavedRun) -> Section:
     figure, panels = grid(len(shown), columns=3, height=2.1)
     for panel, (a, b) in zip(panels, shown, strict=True):
         _pair(panel, run, a, b)
-    left = len(pairs) - len(shown)
+    omitted = len(pairs) - len(shown)
     caption = "Draws of parameters that are not identified against those that make up for them." + (
-        f" {left} more pairs are not drawn." if left else ""
+        f" {omitted} more pairs are not drawn." if omitted else ""
     )
     return Section("Degenerate pairs", drawings=(Drawing("degenerate_pairs", svg_of(figure), caption),))
 

@@ -38,25 +38,25 @@ def is_calibration(folder: Path) -> bool:
 
 def write_calibration(folder: Path) -> Path:
     """`report.html` with coverage, ranks and grades; returns its path. InputError when keys are missing."""
-    told: Mapping[str, Any] = json.loads((folder / "results.json").read_text(encoding="utf-8"))
-    absent = [key for key in _NEEDS if key not in told]
+    results: Mapping[str, Any] = json.loads((folder / "results.json").read_text(encoding="utf-8"))
+    absent = [key for key in _NEEDS if key not in results]
     if absent:
         raise InputError(
             f"{folder / 'results.json'}: lacks {', '.join(absent)}; run `calibrate` again with --resume"
         )
     with look():
-        sections = _sections(told)
-    verdict = Verdict(told["grade"], told["verdict"], told["grade_reason"])
-    return write_page(folder, f"{told['study']}: calibration", sections, verdict)
+        sections = _sections(results)
+    verdict = Verdict(results["grade"], results["verdict"], results["grade_reason"])
+    return write_page(folder, f"{results['study']}: calibration", sections, verdict)
 
 
-def _sections(told: Mapping[str, Any]) -> list[Section]:
+def _sections(results: Mapping[str, Any]) -> list[Section]:
     """Sections of a calibration's `results.json`."""
-    return [_coverage(told), _ranks(told), _differences(told), _replicas(told)]
+    return [_coverage(results), _ranks(results), _differences(results), _replicas(results)]
 
 
-def _coverage(told: Mapping[str, Any]) -> Section:
-    rows, reliable = told["coverage"], told["reliable"]
+def _coverage(results: Mapping[str, Any]) -> Section:
+    rows, reliable = results["coverage"], results["reliable"]
     others = {(row["parameter"], row["level"]): row for row in (reliable or {"coverage": ()})["coverage"]}
     table = Table(
         (
@@ -65,10 +65,11 @@ def _coverage(told: Mapping[str, Any]) -> Section:
             Column("observed in reliable replicas", "number"),
         ),
         tuple(_row(row, others.get((row["parameter"], row["level"]))) for row in rows),
-        f"Share of replicas whose equal-tailed interval holds the truth, over {told['replicas']} replicas. "
-        f"The band is {rows[0]['band']}'s at a confidence of {100 * rows[0]['confidence']:.2f} %: if every "
-        f"interval covers as stated, all {len(rows)} rows are within theirs together with a probability of "
-        f"{percent(told['simultaneous'])} or more. P-values are exact binomial, one row at a time.",
+        f"Share of replicas whose equal-tailed interval holds the truth, over {results['replicas']} "
+        f"replicas. The band is {rows[0]['band']}'s at a confidence of {100 * rows[0]['confidence']:.2f} %: "
+        f"if every interval covers as stated, all {len(rows)} rows are within theirs together with a "
+        f"probability of {percent(results['simultaneous'])} or more. P-values are exact binomial, each row "
+        "on its own.",
     )
     caption = (
         "Observed coverage with its simultaneous band against the stated level (dashed), over all replicas"
@@ -77,7 +78,7 @@ def _coverage(told: Mapping[str, Any]) -> Section:
     return Section(
         "Coverage",
         ("A step response counts at several times after the step, each path by itself.",),
-        (Drawing("calibration_coverage", _dots(told), caption),),
+        (Drawing("calibration_coverage", _dots(results), caption),),
         (table,),
     )
 
@@ -98,15 +99,15 @@ def _percent(share: float) -> str:
     return f"{100 * share:.1f} %"
 
 
-def _dots(told: Mapping[str, Any]) -> str:
+def _dots(results: Mapping[str, Any]) -> str:
     """One row per quantity, one panel per level."""
-    names = list(dict.fromkeys(row["parameter"] for row in told["coverage"]))
-    levels = sorted({row["level"] for row in told["coverage"]})
+    names = list(dict.fromkeys(row["parameter"] for row in results["coverage"]))
+    levels = sorted({row["level"] for row in results["coverage"]})
     figure = blank(0.9 + 0.27 * len(names))
     panels = figure.subplots(1, len(levels), sharey=True, squeeze=False)[0]
-    groups = [(told, BAND, f"all {told['replicas']}")]
-    if told["reliable"]:
-        groups.append((told["reliable"], HELD_OUT, f"{told['reliable']['replicas']} reliable"))
+    groups = [(results, BAND, f"all {results['replicas']}")]
+    if results["reliable"]:
+        groups.append((results["reliable"], HELD_OUT, f"{results['reliable']['replicas']} reliable"))
     for panel, level in zip(panels, levels, strict=True):
         panel.axvline(level, color=NOISE, lw=0.9, ls=(0, (4, 3)))
         for number, (group, colour, name) in enumerate(groups):
@@ -123,33 +124,33 @@ def _dots(told: Mapping[str, Any]) -> str:
     return svg_of(figure)
 
 
-def _ranks(told: Mapping[str, Any]) -> Section:
-    bins, among = told["rank_bins"], len(told["ranks"][0]["counts"]) - 1
+def _ranks(results: Mapping[str, Any]) -> Section:
+    bins, among = results["rank_bins"], len(results["ranks"][0]["counts"]) - 1
     caption = (
-        f"Ranks of the truth among {among} posterior draws, {told['replicas']} replicas in {bins['bins']} "
+        f"Ranks of the truth among {among} posterior draws, {results['replicas']} replicas in {bins['bins']} "
         "bins. Grey: where all bins of a histogram of uniform ranks lie with a probability of "
-        f"{percent(told['simultaneous'])} or more."
+        f"{percent(results['simultaneous'])} or more."
     )
     text = (
         "Ranks heaped in the middle mean intervals that are too wide, heaped at both ends too narrow, at "
         "one end biased. Of truths from the prior they are uniform if the whole procedure is exact; of a "
         "truth that is the same in every replica they need not be.",
-        f"Overall {probability(told['p_value'])}: {told['p_value_of']}.",
+        f"Overall {probability(results['p_value'])}: {results['p_value_of']}.",
     )
-    return Section("Ranks", text, _pages(told, "calibration_ranks", caption, 1.35, _histogram))
+    return Section("Ranks", text, _pages(results, "calibration_ranks", caption, 1.35, _histogram))
 
 
-def _differences(told: Mapping[str, Any]) -> Section:
+def _differences(results: Mapping[str, Any]) -> Section:
     caption = (
         "Share of ranks below a value minus what uniform ranks have there, over all replicas. Grey: corridor "
         "in which the whole curve of uniform ranks lies with a probability of "
-        f"{percent(told['simultaneous'])}. The p-value is that of this test, one quantity at a time."
+        f"{percent(results['simultaneous'])}. The p-value is that of this test, each quantity on its own."
     )
-    return Section("ECDF differences", (), _pages(told, "calibration_ecdf", caption, 1.35, _difference))
+    return Section("ECDF differences", (), _pages(results, "calibration_ecdf", caption, 1.35, _difference))
 
 
 def _pages(
-    told: Mapping[str, Any],
+    results: Mapping[str, Any],
     stem: str,
     caption: str,
     height: float,
@@ -157,12 +158,12 @@ def _pages(
 ) -> tuple[Drawing, ...]:
     """Figures of up to `_PER_FIGURE` panels, one per quantity."""
     out = []
-    pages = -(-len(told["ranks"]) // _PER_FIGURE)
-    for number, part in enumerate(np.array_split(np.arange(len(told["ranks"])), pages), start=1):
-        rows = [told["ranks"][k] for k in part]
+    pages = -(-len(results["ranks"]) // _PER_FIGURE)
+    for number, part in enumerate(np.array_split(np.arange(len(results["ranks"])), pages), start=1):
+        rows = [results["ranks"][k] for k in part]
         figure, panels = grid(len(rows), columns=3, height=height)
         for panel, row in zip(panels, rows, strict=True):
-            draw(panel, row, told)
+            draw(panel, row, results)
             panel.set_title(plain(row["parameter"]), loc="left", fontsize=7.5)
         for panel in panels[-3:]:
             panel.set_xlabel("rank [-]")
@@ -170,24 +171,24 @@ def _pages(
     return tuple(out)
 
 
-def _histogram(panel: Axes, row: Mapping[str, Any], told: Mapping[str, Any]) -> None:
-    counts, band = np.array(row["counts"]), told["rank_bins"]
+def _histogram(panel: Axes, row: Mapping[str, Any], results: Mapping[str, Any]) -> None:
+    counts, band = np.array(row["counts"]), results["rank_bins"]
     edges = np.linspace(0, counts.size, band["bins"] + 1)
     panel.axhspan(band["lower"], band["upper"], color=NOISE, alpha=0.3, lw=0)
-    panel.axhline(told["replicas"] / band["bins"], color=NOISE, lw=0.8)
+    panel.axhline(results["replicas"] / band["bins"], color=NOISE, lw=0.8)
     panel.stairs(counts.reshape(band["bins"], -1).sum(axis=1), edges, fill=True, color=BAND, alpha=0.75)
     panel.set_xlim(0, counts.size)
     panel.set_ylabel("replicas")
 
 
-def _difference(panel: Axes, row: Mapping[str, Any], told: Mapping[str, Any]) -> None:
-    counts, corridor = np.array(row["counts"]), told["rank_corridor"]
+def _difference(panel: Axes, row: Mapping[str, Any], results: Mapping[str, Any]) -> None:
+    counts, corridor = np.array(row["counts"]), results["rank_corridor"]
     at = np.arange(1, counts.size)
     expected = at / counts.size
-    lower, upper = (np.array(corridor[end]) / told["replicas"] - expected for end in ("lower", "upper"))
+    lower, upper = (np.array(corridor[end]) / results["replicas"] - expected for end in ("lower", "upper"))
     panel.fill_between(at, lower, upper, color=NOISE, alpha=0.3, lw=0, step="post")
     panel.axhline(0.0, color=NOISE, lw=0.6)
-    panel.step(at, np.cumsum(counts)[:-1] / told["replicas"] - expected, where="post", color=BAND)
+    panel.step(at, np.cumsum(counts)[:-1] / results["replicas"] - expected, where="post", color=BAND)
     panel.set_xlim(0, counts.size)
     panel.text(
         0.98,
@@ -201,18 +202,18 @@ def _difference(panel: Axes, row: Mapping[str, Any], told: Mapping[str, Any]) ->
     )
 
 
-def _replicas(told: Mapping[str, Any]) -> Section:
-    gap, seconds, counted = told["model_gap"], told["seconds"], told["grades"]
-    engine, width = told["engine"], told["discretisation"]
+def _replicas(results: Mapping[str, Any]) -> Section:
+    gap, seconds, counted = results["model_gap"], results["seconds"], results["grades"]
+    engine, width = results["engine"], results["discretisation"]
     rows = (
-        ("replicas asked for", str(told["asked"])),
+        ("replicas requested", str(results["asked"])),
         *((f"graded {name}" if name != "failed" else "failed", str(n)) for name, n in counted.items()),
-        ("truths", _origin(told["truths"])),
+        ("truths", _origin(results["truths"])),
         ("draws by importance sampling", f"{engine['importance']}"),
         ("draws by ensembles", f"{engine['sampling']}"),
         ("Pareto k of importance weights, median", _number(engine["median_k"])),
         ("Pareto k of importance weights, largest", _number(engine["largest_k"])),
-        ("seed", str(told["seed"])),
+        ("seed", str(results["seed"])),
         ("processor time of a replica, median [s]", figures(seconds["median"])),
         ("processor time of a replica, largest [s]", figures(seconds["largest"])),
         ("processor time in all [s]", figures(seconds["total"])),
@@ -222,10 +223,10 @@ def _replicas(told: Mapping[str, Any]) -> Section:
         ("shift by the width of the blocks is negligible", f"{width['negligible']} replicas"),
         ("shift by the width of the blocks, median [posterior sd]", figures(width["median"], 2)),
         ("shift by the width of the blocks, largest [posterior sd]", figures(width["largest"], 2)),
-        *((name.replace("_", " "), str(value)) for name, value in told["sampler"].items()),
+        *((name.replace("_", " "), str(value)) for name, value in results["sampler"].items()),
     )
     lists = [Table((Column("replicas"), Column("value", "number")), rows)]
-    if told["not_reliable"]:
+    if results["not_reliable"]:
         lists.append(
             Table(
                 (
@@ -236,24 +237,24 @@ def _replicas(told: Mapping[str, Any]) -> Section:
                 ),
                 tuple(
                     (str(row["replica"]), str(row["seed"]), row["grade"], row["reason"])
-                    for row in told["not_reliable"][:_MOST_ROWS]
+                    for row in results["not_reliable"][:_MOST_ROWS]
                 ),
-                _further(len(told["not_reliable"])),
+                _further(len(results["not_reliable"])),
             )
         )
-    if told["failures"]:
+    if results["failures"]:
         lists.append(
             Table(
                 (Column("failed replica", "number"), Column("seed", "code"), Column("error", "prose")),
                 tuple(
                     (str(row["replica"]), str(row["seed"]), row["error"])
-                    for row in told["failures"][:_MOST_ROWS]
+                    for row in results["failures"][:_MOST_ROWS]
                 ),
-                _further(len(told["failures"])),
+                _further(len(results["failures"])),
             )
         )
     text = (
-        "No replica is left out of what is said above but those that failed. The distance of the forward "
+        "Only failed replicas are excluded from the numbers above. The distance of the forward "
         "model from the bench, root sum of squares over all samples, bounds by how many posterior standard "
         "deviations discretisation alone can shift a result. Draws come from importance sampling around the "
         f"optima where the Pareto k of the weights is at most {figures(engine['largest_good_k'])} and enough "
@@ -263,7 +264,7 @@ def _replicas(told: Mapping[str, Any]) -> Section:
 
 
 def _origin(source: Mapping[str, Any]) -> str:
-    """Where truths come from, in words."""
+    """Where the true values come from."""
     stated = ", ".join(
         f"{name} = {value:g}"
         if isinstance(value, float | int)

@@ -36,28 +36,28 @@ def write_comparison(folder: Path) -> Path:
     """
     path = folder / "compare.json"
     try:
-        told: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        results: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read ({error}); run `compare` to write it") from None
-    absent = [key for key in _NEEDS if key not in told]
+    absent = [key for key in _NEEDS if key not in results]
     if absent:
         raise InputError(f"{path}: lacks {', '.join(absent)}; run `compare` again with --resume")
-    if any("containment" not in row for row in told["models"]):
+    if any("containment" not in row for row in results["models"]):
         raise InputError(f"{path}: written by an earlier version; run `compare` again")
     with look():
-        scores, *rest = _tables(told)
-        sections = [scores, *_figures(told, _curves(folder, told)), *rest]
-    graded = {row["name"]: row for row in told["models"]}
-    own = graded.get(told["preferred"])
-    grade, reason = (own["grade"], own["grade_reason"]) if own else ("unusable", told["why"])
-    verdict = Verdict(str(grade), f"{told['why']} {told['fractional']['sentence']}", str(reason))
-    return write_page(folder, f"{told['study']}: comparison", sections, verdict, NAME)
+        scores, *rest = _tables(results)
+        sections = [scores, *_figures(results, _curves(folder, results)), *rest]
+    graded = {row["name"]: row for row in results["models"]}
+    own = graded.get(results["preferred"])
+    grade, reason = (own["grade"], own["grade_reason"]) if own else ("unusable", results["why"])
+    verdict = Verdict(str(grade), f"{results['why']} {results['fractional']['sentence']}", str(reason))
+    return write_page(folder, f"{results['study']}: comparison", sections, verdict, NAME)
 
 
-def _curves(folder: Path, told: Mapping[str, Any]) -> dict[str, pd.DataFrame]:
+def _curves(folder: Path, results: Mapping[str, Any]) -> dict[str, pd.DataFrame]:
     """Curves of every candidate that has any; InputError when a table cannot be read."""
     out, problems = {}, []
-    for row in told["models"]:
+    for row in results["models"]:
         path = folder / "candidates" / folder_name(str(row["name"])) / "tables" / "curves.csv"
         try:
             out[str(row["name"])] = pd.read_csv(path, dtype={"record": str, "axis": str, "unit": str})
@@ -68,12 +68,12 @@ def _curves(folder: Path, told: Mapping[str, Any]) -> dict[str, pd.DataFrame]:
     return out
 
 
-def _tables(told: Mapping[str, Any]) -> list[Section]:
-    """Everything of a comparison that is words and numbers."""
-    return [_scores(told), _priors(told), _predicted(told), _orders(told), _heeded(told)]
+def _tables(results: Mapping[str, Any]) -> list[Section]:
+    """The sections of a comparison that hold text and tables."""
+    return [_scores(results), _priors(results), _predicted(results), _orders(results), _warnings(results)]
 
 
-def _scores(told: Mapping[str, Any]) -> Section:
+def _scores(results: Mapping[str, Any]) -> Section:
     columns = (
         *(Column("model", "code"), Column("what it is", "prose"), Column("parameters", "number")),
         *(Column("log evidence [nat]", "number"), Column("log Bayes factor", "number")),
@@ -87,7 +87,7 @@ def _scores(told: Mapping[str, Any]) -> Section:
             _with_error(row["probability"], row["probability_sd"], 3),
             str(row["grade"]),
         )
-        for row in told["models"]
+        for row in results["models"]
     )
     other_columns = (
         *(Column("model", "code"), Column("elpd [nat]", "number"), Column("less than best", "number")),
@@ -102,83 +102,95 @@ def _scores(told: Mapping[str, Any]) -> Section:
             _plain(row["stacking"], 2),
             *(_plain(row[key], 1) for key in ("max_log_likelihood", "aic", "bic")),
         )
-        for row in told["models"]
+        for row in results["models"]
     )
     caption = (
         "± is a standard error: of the evidence by bridge sampling, of predictive densities by the spread "
         "over stretches of the records. The Bayes factor is against the best, the probability among these "
-        "models alone, equally likely before. elpd is the log density of one forecast of what was left out, "
-        "each sample predicted from those before it. AIC and BIC are from the maximum of the likelihood and "
-        "know neither priors nor ridges."
+        "models alone, with equal prior probabilities. elpd is the log density of one forecast of held-out "
+        "data, each sample predicted from those before it. AIC and BIC are from the maximum of the "
+        "likelihood and take account of neither priors nor several modes."
     )
-    text = [str(told["agreement"]["sentence"])]
-    text += [f"{one['name']} is ranked nowhere: {one['reason']}." for one in told["unranked"]]
-    text += [f"{one['name']}: {one['reason']}; the other scores stand." for one in told["evidence_undefined"]]
-    text += [f"{row['name']} {note}." for row in told["models"] for note in row["notes"]]
+    text = [str(results["agreement"]["sentence"])]
+    text += [f"{entry['name']} is not ranked: {entry['reason']}." for entry in results["unranked"]]
+    text += [
+        f"{item['name']}: {item['reason']}; its other scores remain valid."
+        for item in results["evidence_undefined"]
+    ]
+    text += [f"{row['name']} {note}." for row in results["models"] for note in row["notes"]]
     text += [
         f"{row['name']} contains {', '.join(names)} and is at least as likely as what it contains."
-        for row in told["models"]
-        if (names := [one["model"] for one in row["containment"]["contains"]]) and row["containment"]["met"]
+        for row in results["models"]
+        if (names := [contained["model"] for contained in row["containment"]["contains"]])
+        and row["containment"]["met"]
     ]
     return Section("Scores", tuple(text), (), (Table(columns, rows), Table(other_columns, others, caption)))
 
 
-def _priors(told: Mapping[str, Any]) -> Section:
+def _priors(results: Mapping[str, Any]) -> Section:
     columns = (
         *(Column("model", "code"), Column("width of the priors", "number")),
-        *(Column("log evidence [nat]", "number"), Column("change", "number"), Column("road")),
+        *(Column("log evidence [nat]", "number"), Column("change", "number"), Column("method")),
         *(Column("ESS", "number"), Column("Pareto k", "number"), Column("priors changed", "prose")),
     )
     rows = []
-    for row in told["models"]:
-        for one in row["prior_widths"]:
-            change = None if one["log_evidence"] is None else one["log_evidence"] - row["log_evidence"]
+    for row in results["models"]:
+        for prior_width in row["prior_widths"]:
+            change = (
+                None
+                if prior_width["log_evidence"] is None
+                else prior_width["log_evidence"] - row["log_evidence"]
+            )
             rows.append(
                 (
-                    *(str(row["name"]), f"{one['factor']:g}"),
-                    _with_error(one["log_evidence"], one["sd"]),
+                    *(str(row["name"]), f"{prior_width['factor']:g}"),
+                    _with_error(prior_width["log_evidence"], prior_width["sd"]),
                     NONE if change is None else f"{change:+.2f}",
-                    str(one["road"]),
-                    f"{one['ess']:.0f}",
-                    figures(one["pareto_k"], 2),
-                    ", ".join(one["parameters"]) or "none",
+                    str(prior_width["road"]),
+                    f"{prior_width['ess']:.0f}",
+                    figures(prior_width["pareto_k"], 2),
+                    ", ".join(prior_width["parameters"]) or "none",
                 )
             )
     text = (
-        "An evidence moves with the width of the priors. Here gains, times and delays have priors half and "
+        "The evidence depends on the width of the priors. Here gains, times and delays have priors half and "
         "twice as wide; orders keep theirs, which are the ends of their domain. Importance weights use the "
-        "draws that are there; a refit moves them to the new posterior and bridges anew; undefined are "
-        "narrower priors that exclude what the data show: with one of these no win is claimed."
+        "existing draws; a refit moves them to the new posterior and repeats the bridge sampling; undefined "
+        "are narrower priors that exclude values the data support: with one of these no preference is stated."
     )
     tables = (Table(columns, tuple(rows)),) if rows else ()
-    return Section("The prior's part", (text,), (), tables)
+    return Section("Influence of the prior", (text,), (), tables)
 
 
-def _predicted(told: Mapping[str, Any]) -> Section:
+def _predicted(results: Mapping[str, Any]) -> Section:
     columns = (
         *(Column("model", "code"), Column("predicted", "code"), Column("how")),
         *(Column("samples", "number"), Column("log density [nat]", "number"), Column("if fitted", "number")),
-        *(Column("road"), Column("Pareto k", "number"), Column("ESS", "number"), Column("grade", "grade")),
+        *(Column("method"), Column("Pareto k", "number"), Column("ESS", "number"), Column("grade", "grade")),
         Column("level from", "prose"),
     )
     rows = tuple(
         (
-            *(str(row["name"]), str(one["part"]), str(one["kind"]), str(one["samples"])),
-            _with_error(one["elpd"], one["monte_carlo_sd"], 1),
-            *(_plain(one["in_sample"], 1), str(one["road"]), figures(one["pareto_k"], 2)),
-            *(f"{one['ess']:.0f}", str(one["grade"]), "; ".join(one["level_from"])),
+            *(str(row["name"]), str(prediction["part"]), str(prediction["kind"]), str(prediction["samples"])),
+            _with_error(prediction["elpd"], prediction["monte_carlo_sd"], 1),
+            *(
+                _plain(prediction["in_sample"], 1),
+                str(prediction["road"]),
+                figures(prediction["pareto_k"], 2),
+            ),
+            *(f"{prediction['ess']:.0f}", str(prediction["grade"]), "; ".join(prediction["level_from"])),
         )
-        for row in told["models"]
-        for one in row["predictions"]
+        for row in results["models"]
+        for prediction in row["predictions"]
     )
     held = tuple(
         (
-            *(str(row["name"]), str(one["record"]), str(one["axis"]), use, figures(one["rmse"])),
-            *(str(one["unit"]), percent(one["coverage_90"]), percent(one["coverage_50"])),
+            *(str(row["name"]), str(entry["record"]), str(entry["axis"]), use, figures(entry["rmse"])),
+            *(str(entry["unit"]), percent(entry["coverage_90"]), percent(entry["coverage_50"])),
         )
-        for row in told["models"]
+        for row in results["models"]
         for key, use in (("fit_scores", "fit"), ("held_out", "held out"))
-        for one in row[key]
+        for entry in row[key]
     )
     errors = (
         *(Column("model", "code"), Column("record", "code"), Column("axis", "code"), Column("use")),
@@ -187,18 +199,18 @@ def _predicted(told: Mapping[str, Any]) -> Section:
     )
     text = (
         "Whole records are predicted from the others, and the future of a record from its past where it is "
-        "the only one; single points are never left out, since their neighbours tell them. The log density "
-        "is that of one forecast: each sample given those before it. The noise, and the level where a model "
-        "gives every record one of its own, follow the record; all else is known from the others. "
-        "Samples at rest are known, the first one at least; all models predict the same samples. ± is the "
-        "Monte Carlo error. 'if fitted' is the density of the same samples under draws that have seen them, "
-        "which is larger; where it is not, the grade is lowered. Bands are pointwise: of every 100 samples "
-        "90 are expected inside, not whole curves."
+        "the only one; single samples are never held out, since their neighbours determine them. The log "
+        "density is that of one forecast: each sample given those before it. The noise, and the offset "
+        "where a model has one per record, are those of the predicted record; all other parameters come "
+        "from the other records. Samples at rest, at least the first, are given; all models predict the "
+        "same samples. ± is the Monte Carlo error. 'if fitted' is the density of the same samples under "
+        "draws of a fit that includes them, which is larger; where it is not, the grade is lowered. Bands "
+        "are pointwise: of every 100 samples 90 are expected inside, not whole curves."
     )
     return Section("Prediction", (text,), (), (Table(columns, rows), Table(errors, held)))
 
 
-def _orders(told: Mapping[str, Any]) -> Section:
+def _orders(results: Mapping[str, Any]) -> Section:
     columns = (
         *(Column("model", "code"), Column("order", "code"), Column("median", "number")),
         *(Column("90 % interval", "interval"), Column("nearest", "number")),
@@ -210,14 +222,14 @@ def _orders(told: Mapping[str, Any]) -> Section:
         ),
     )
     rows = []
-    for one in told["order_is_integer"]:
-        estimate, spread = one["estimate"], one["estimate"]["sd"]
-        said = _with_error(one["log_bayes_factor"], one["log_sd"])
+    for entry in results["order_is_integer"]:
+        estimate, spread = entry["estimate"], entry["estimate"]["sd"]
+        said = _with_error(entry["log_bayes_factor"], entry["log_sd"])
         rows.append(
             (
-                *(str(one["model"]), str(one["parameter"]), to_spread(estimate["value"], spread)),
+                *(str(entry["model"]), str(entry["parameter"]), to_spread(estimate["value"], spread)),
                 interval(estimate["lower"], estimate["upper"], spread),
-                *(str(one["nearest"]), said, str(one["road"]), str(one["answer"]), str(one["grade"])),
+                *(str(entry["nearest"]), said, str(entry["road"]), str(entry["answer"]), str(entry["grade"])),
             )
         )
     text = (
@@ -230,9 +242,11 @@ def _orders(told: Mapping[str, Any]) -> Section:
     return Section("Is this order an integer?", text, (), tables)
 
 
-def _heeded(told: Mapping[str, Any]) -> Section:
-    text = tuple(f"{one['model']}: {one['sentence']}." for one in told["flags"])
-    return Section("What to heed", text or ("No candidate leaves anything but noise in the fitted records.",))
+def _warnings(results: Mapping[str, Any]) -> Section:
+    text = tuple(f"{flag['model']}: {flag['sentence']}." for flag in results["flags"])
+    return Section(
+        "Warnings", text or ("The residuals of every candidate are compatible with its noise model.",)
+    )
 
 
 def _with_error(value: float | None, error: float | None, places: int = 2) -> str:
@@ -246,19 +260,19 @@ def _plain(value: float | None, places: int) -> str:
     return NONE if value is None else f"{value:.{places}f}"
 
 
-def _figures(told: Mapping[str, Any], curves: Mapping[str, pd.DataFrame]) -> list[Section]:
+def _figures(results: Mapping[str, Any], curves: Mapping[str, pd.DataFrame]) -> list[Section]:
     """Figures of a comparison; `curves` by candidate."""
-    drawings = [*_evidence(told), *_records(told, curves)]
+    drawings = [*_evidence(results), *_records(results, curves)]
     text = (
         "Each model in its own colour throughout; black dots are samples that were fitted, red ones samples "
-        "no model has seen.",
+        "that no model was fitted to.",
     )
-    return [Section("Rivals side by side", text, tuple(drawings))]
+    return [Section("Candidates side by side", text, tuple(drawings))]
 
 
-def _evidence(told: Mapping[str, Any]) -> list[Drawing]:
+def _evidence(results: Mapping[str, Any]) -> list[Drawing]:
     """Log evidence of every model, against the number of its terms."""
-    rows = [row for row in told["models"] if row["usable"] and row["log_evidence"] is not None]
+    rows = [row for row in results["models"] if row["usable"] and row["log_evidence"] is not None]
     if len(rows) < 2:
         return []
     best = max(row["log_evidence"] for row in rows)
@@ -278,10 +292,12 @@ def _evidence(told: Mapping[str, Any]) -> list[Drawing]:
             capsize=3,
             label=plain(row["name"]),
         )
-        for one in row["prior_widths"]:
-            if one["log_evidence"] is not None:
-                mark = "v" if one["factor"] < 1 else "^"
-                panel.plot([at], [one["log_evidence"] - best], mark, mfc="none", mec=colour, ms=5, ls="none")
+        for prior_width in row["prior_widths"]:
+            if prior_width["log_evidence"] is not None:
+                mark = "v" if prior_width["factor"] < 1 else "^"
+                panel.plot(
+                    [at], [prior_width["log_evidence"] - best], mark, mfc="none", mec=colour, ms=5, ls="none"
+                )
     low = min(row["log_evidence"] - best for row in rows)
     panel.set_ylim(bottom=max(1.1 * low, -_NEAR) - 3)
     panel.axhline(0.0, color=NOISE, lw=0.7)
@@ -300,9 +316,9 @@ def _evidence(told: Mapping[str, Any]) -> list[Drawing]:
     return [Drawing("compare_evidence", svg_of(figure), caption)]
 
 
-def _records(told: Mapping[str, Any], curves: Mapping[str, pd.DataFrame]) -> list[Drawing]:
+def _records(results: Mapping[str, Any], curves: Mapping[str, pd.DataFrame]) -> list[Drawing]:
     """Every axis of every record with the medians of all models, their residuals, and held-out bands."""
-    rows = [row for row in told["models"] if row["name"] in curves]
+    rows = [row for row in results["models"] if row["name"] in curves]
     if not rows:
         return []
     first = curves[rows[0]["name"]]
@@ -310,14 +326,14 @@ def _records(told: Mapping[str, Any], curves: Mapping[str, pd.DataFrame]) -> lis
     drawings = []
     for number, (record, axis, held) in enumerate(series.itertuples(index=False), start=1):
         parts = {
-            row["name"]: one[(one["record"] == record) & (one["axis"] == axis)]
+            row["name"]: entry[(entry["record"] == record) & (entry["axis"] == axis)]
             for row in rows
-            for one in [curves[row["name"]]]
+            for entry in [curves[row["name"]]]
         }
         drawings.append(
             Drawing(
                 f"compare_{number:02d}_{record}_{axis}",
-                _drawn(told, rows, parts, str(record), str(axis), held=bool(held)),
+                _drawn(results, rows, parts, str(record), str(axis), held=bool(held)),
                 _caption(rows, str(record), str(axis), held=bool(held)),
                 mark="held out" if held else "",
             )
@@ -326,7 +342,7 @@ def _records(told: Mapping[str, Any], curves: Mapping[str, pd.DataFrame]) -> lis
 
 
 def _drawn(
-    told: Mapping[str, Any],
+    results: Mapping[str, Any],
     rows: Sequence[Mapping[str, Any]],
     parts: Mapping[str, pd.DataFrame],
     record: str,
@@ -343,13 +359,13 @@ def _drawn(
     top.plot(time[at], seen[at], ".", ms=2.5, mew=0, color=colour, label="observed", zorder=1)
     for row, own in zip(rows, CYCLE * len(rows), strict=False):
         _rival(
-            top, below, parts[row["name"]], plain(row["name"]), own, row["name"] == told["preferred"], held
+            top, below, parts[row["name"]], plain(row["name"]), own, row["name"] == results["preferred"], held
         )
     top.set_title(plain(f"{record}, {axis}: {'held out' if held else 'fit'}"), loc="left", color=colour)
     top.set_ylabel(label(axis, unit))
     below.axhline(0.0, color=NOISE, lw=0.7)
     below.set_ylabel(label("residual", unit))
-    below.set_xlabel(label("time", told["time_unit"]))
+    below.set_xlabel(label("time", results["time_unit"]))
     figure.align_ylabels()
     figure.legend(*top.get_legend_handles_labels(), loc="outside upper center", ncols=5, markerscale=2)
     return svg_of(figure)
@@ -359,25 +375,25 @@ def _rival(
     top: Axes, below: Axes, part: pd.DataFrame, name: str, colour: str, preferred: bool, held: bool
 ) -> None:
     time, middle = part["time"].to_numpy(), part["middle"].to_numpy()
-    left = part["observed"].to_numpy() - middle
+    residual = part["observed"].to_numpy() - middle
     if held or preferred:
         low, high = part["low"].to_numpy(), part["high"].to_numpy()
         at = extremes(low, high)
         top.fill_between(time[at], low[at], high[at], color=colour, alpha=0.12, lw=0)
     at = extremes(middle)
     top.plot(time[at], middle[at], color=colour, lw=1.6 if preferred else 1.0, label=name, zorder=2)
-    at = extremes(left)
-    below.plot(time[at], left[at], color=colour, lw=0.9 if preferred else 0.6)
+    at = extremes(residual)
+    below.plot(time[at], residual[at], color=colour, lw=0.9 if preferred else 0.6)
 
 
 def _caption(rows: Sequence[Mapping[str, Any]], record: str, axis: str, *, held: bool) -> str:
     key = "held_out" if held else "fit_scores"
-    told = []
+    errors = []
     for row in rows:
-        for one in row[key]:
-            if (one["record"], one["axis"]) == (record, axis):
-                told.append(f"{row['name']} {figures(one['rmse'])} {one['unit']}")
+        for entry in row[key]:
+            if (entry["record"], entry["axis"]) == (record, axis):
+                errors.append(f"{row['name']} {figures(entry['rmse'])} {entry['unit']}")
     bands = f"the {POINTWISE} 90 % band" + (
         "s with noise of all" if held else " with noise of the preferred one"
     )
-    return f"Medians of the rivals, {bands}, and residuals below. RMSE: {', '.join(told)}."
+    return f"Medians of the candidates, {bands}, and residuals below. RMSE: {', '.join(errors)}."

@@ -32,21 +32,21 @@ def write_design(folder: Path) -> Path:
     """
     path = folder / "design.json"
     try:
-        told: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        results: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read ({error}); run `design` to write it") from None
-    absent = [key for key in _NEEDS if key not in told]
+    absent = [key for key in _NEEDS if key not in results]
     if absent:
         raise InputError(f"{path}: lacks {', '.join(absent)}; run `design` again with --resume")
     with look():
-        sections = _tables(told)
-    verdict = Verdict(str(told["grade"]), str(told["verdict"]), str(told["grade_reason"]))
-    return write_page(folder, f"{told['study']}: what to measure next", sections, verdict, NAME)
+        sections = _tables(results)
+    verdict = Verdict(str(results["grade"]), str(results["verdict"]), str(results["grade_reason"]))
+    return write_page(folder, f"{results['study']}: what to measure next", sections, verdict, NAME)
 
 
-def _tables(told: Mapping[str, Any]) -> list[Section]:
+def _tables(results: Mapping[str, Any]) -> list[Section]:
     """Every part of the page."""
-    return [_parameters(told), _curve(told), _drives(told), _confirmed(told)]
+    return [_parameters(results), _curve(results), _drives(results), _confirmed(results)]
 
 
 def _ranged(row: Mapping[str, Any] | None) -> str:
@@ -58,14 +58,14 @@ def _ranged(row: Mapping[str, Any] | None) -> str:
     return f"{figures(row['value'], 2)} ({interval(*ends, spread)})"
 
 
-def _parameters(told: Mapping[str, Any]) -> Section:
-    time, unit = told["time"], told["time_unit"]
+def _parameters(results: Mapping[str, Any]) -> Section:
+    time, unit = results["time"], results["time_unit"]
     text = [
-        f"Relative standard deviations are Cramer-Rao bounds at {told['draws']} draws of the posterior for "
-        f"{told['repeats']} record(s) of {time:g} {unit}. Far above 1 they say that a parameter is not "
-        "determined, not how far off an estimate would be."
+        f"Relative standard deviations are Cramer-Rao bounds at {results['draws']} draws of the posterior "
+        f"for {results['repeats']} record(s) of {time:g} {unit}. Far above 1 they mean that a parameter is "
+        "not determined, not how large an error would be."
     ]
-    text += [f"{row['name']}: {row['reason']}." for row in told["parameters"] if row["reason"]]
+    text += [f"{row['name']}: {row['reason']}." for row in results["parameters"] if row["reason"]]
     columns = (
         *(Column("name", "code"), Column("best drive"), Column("relative sd", "interval")),
         *(Column("after the winner", "interval"), Column("after the step", "interval")),
@@ -76,17 +76,17 @@ def _parameters(told: Mapping[str, Any]) -> Section:
             *(row["name"], row["best_drive"] or NONE, _ranged(row["relative_sd"])),
             *(_ranged(row["relative_sd_winner"]), _ranged(row["relative_sd_step"]), row["time_words"]),
         )
-        for row in told["parameters"]
+        for row in results["parameters"]
     )
     caption = f"What every parameter gains by the drive that is best for it: {_SPREAD}."
     return Section("What each parameter gains", tuple(text), (), (Table(columns, rows, caption),))
 
 
-def _curve(told: Mapping[str, Any]) -> Section:
-    curve = told["curve"]
+def _curve(results: Mapping[str, Any]) -> Section:
+    curve = results["curve"]
     names = list(curve[0]["best"])
     if not names:
-        return Section("Precision against bench time", ("No parameter is left to draw.",))
+        return Section("Precision against bench time", ("There is no parameter to draw.",))
     figure, panels = grid(len(names), columns=3, height=1.7)
     times = np.array([row["time"] for row in curve], dtype=float)
     for panel, name in zip(panels, names, strict=True):
@@ -97,7 +97,7 @@ def _curve(told: Mapping[str, Any]) -> Section:
         panel.set_xscale("log")
         panel.set_yscale("log")
         panel.set_title(plain(name), fontsize=7.5, loc="left")
-        panel.set_xlabel(label("bench time", told["time_unit"]))
+        panel.set_xlabel(label("bench time", results["time_unit"]))
         panel.set_ylabel("relative sd [-]")
     panels[0].legend()
     caption = (
@@ -109,25 +109,26 @@ def _curve(told: Mapping[str, Any]) -> Section:
     )
 
 
-def _drives(told: Mapping[str, Any]) -> Section:
+def _drives(results: Mapping[str, Any]) -> Section:
     ranges = "; ".join(
         f"{row['axis']} from {figures(row['low'])} to {figures(row['high'])} {row['unit']}"
-        for row in told["range"]
+        for row in results["range"]
     )
     text = [
-        f"Drives stay within {ranges} and change every {told['refresh']:g} {told['time_unit']} or less often."
+        f"Drives stay within {ranges} and change every {results['refresh']:g} {results['time_unit']} or less "
+        "often."
     ]
-    if told["winner"] is not None:
+    if results["winner"] is not None:
         text.append(
-            f"Best for the worst parameter: {told['winner']['drive']} ({told['winner']['words']}); "
-            f"D-optimal: {told['d_optimal']}. The winning drive is in "
-            f"{told['template']}, its responses still empty."
+            f"Best for the worst parameter: {results['winner']['drive']} ({results['winner']['words']}); "
+            f"D-optimal: {results['d_optimal']}. The winning drive is in "
+            f"{results['template']}, its responses still empty."
         )
     columns = (
         *(Column("drive"), Column("what it does", "prose"), Column("worst relative sd", "interval")),
         *(Column("times better than the step", "number"), Column("geometric mean sd", "number")),
     )
-    ordered = sorted(told["table"], key=lambda row: -(row["factor_over_step"] or 0.0))
+    ordered = sorted(results["table"], key=lambda row: -(row["factor_over_step"] or 0.0))
     rows = tuple(
         (
             *(row["drive"], row["words"], _ranged(row["worst"]), figures(row["factor_over_step"], 3)),
@@ -136,15 +137,15 @@ def _drives(told: Mapping[str, Any]) -> Section:
         for row in ordered
     )
     caption = (
-        f"All drives of {told['time']:g} {told['time_unit']}: worst over the parameters, {_SPREAD}; the "
-        "factor is the median of those at each draw; the geometric mean is along the axes of the confidence "
-        "region."
+        f"All drives of {results['time']:g} {results['time_unit']}: worst over the parameters, {_SPREAD}; "
+        "the factor is the median of those at each draw; the geometric mean is along the axes of the "
+        "confidence region."
     )
     return Section("Drives", tuple(text), (), (Table(columns, rows, caption),))
 
 
-def _confirmed(told: Mapping[str, Any]) -> Section:
-    trials = told["confirmed"]["trials"]
+def _confirmed(results: Mapping[str, Any]) -> Section:
+    trials = results["confirmed"]["trials"]
     if not trials:
         return Section("Confirmation", ("Nothing was simulated: no drive is better than the plain step.",))
     columns = (

@@ -55,7 +55,7 @@ _ADVICE = {
 @final
 @dataclass(frozen=True)
 class Verdict:
-    """What stands in the box on top of a page."""
+    """Grade, sentence and reason in the box at the top of a page."""
 
     grade: str
     sentence: str
@@ -68,10 +68,10 @@ class Verdict:
 
     @classmethod
     def of(cls, run: SavedRun) -> Verdict:
-        """Verdict of a run; the reason is not said twice."""
-        told = run.results
-        sentence, reason = str(told["verdict"]), str(told["grade_reason"])
-        return cls(str(told["grade"]), sentence, "" if reason in sentence else reason)
+        """Verdict of a run; the reason is not repeated."""
+        results = run.results
+        sentence, reason = str(results["verdict"]), str(results["grade_reason"])
+        return cls(str(results["grade"]), sentence, "" if reason in sentence else reason)
 
 
 def write_report(folder: Path) -> Path:

@@ -19,19 +19,19 @@ from lcopa_bayes.report.sections import claimfigures, director, farfields, ident
 from lcopa_bayes.report.theme import look
 
 
-def write_optics(folder: Path, made: StaticOptics) -> Path:
+def write_optics(folder: Path, calculated: StaticOptics) -> Path:
     """`report.html` with far fields, director, tilt law and chain; returns its path."""
     with look():
-        sections = [*farfields.sections(made), *director.sections(made)]
+        sections = [*farfields.sections(calculated), *director.sections(calculated)]
     return write_page(folder, "Static optics of the array", sections)
 
 
 def write_identification(
-    folder: Path, study: Study, found: Sequence[Identification], rows: Sequence[Row]
+    folder: Path, study: Study, identified: Sequence[Identification], rows: Sequence[Row]
 ) -> Path:
     """`identify.html` with models, Table 1 and records; returns its path."""
     with look():
-        sections = identification.sections(study.time_unit, found, rows, panels(study, found))
+        sections = identification.sections(study.time_unit, identified, rows, panels(study, identified))
     return write_page(folder, f"{study.name}: identification", sections, name="identify.html")
 
 

@@ -55,23 +55,23 @@ def write_prediction(folder: Path) -> Path:
 
 def _curves(values: Mapping[str, Any], bands: pd.DataFrame, drives: pd.DataFrame) -> Section:
     drawings, rows = [], []
-    for number, one in enumerate(values["axes"], start=1):
-        own = bands[bands["axis"] == str(one["axis"])]
+    for number, entry in enumerate(values["axes"], start=1):
+        own = bands[bands["axis"] == str(entry["axis"])]
         drawings.append(
             Drawing(
-                f"predict_{number:02d}_{one['axis']}",
+                f"predict_{number:02d}_{entry['axis']}",
                 _drawn(values, own, drives),
-                f"Response {one['axis']}, offset: {one['offset_from']}. {values['draws']} draws.",
+                f"Response {entry['axis']}, offset: {entry['offset_from']}. {values['draws']} draws.",
             )
         )
-        spread = (one["upper"] - one["lower"]) / 3.29
+        spread = (entry["upper"] - entry["lower"]) / 3.29
         rows.append(
             (
-                *(str(one["axis"]), figures(one["end"]), figures(one["value_at_end"])),
-                *(interval(one["lower"], one["upper"], spread), str(one["unit"])),
-                figures(one[f"half_width_{POINTWISE}"], 2),
-                figures(one[f"half_width_{SIMULTANEOUS}"], 2),
-                figures(one["half_width_noisy"], 2),
+                *(str(entry["axis"]), figures(entry["end"]), figures(entry["value_at_end"])),
+                *(interval(entry["lower"], entry["upper"], spread), str(entry["unit"])),
+                figures(entry[f"half_width_{POINTWISE}"], 2),
+                figures(entry[f"half_width_{SIMULTANEOUS}"], 2),
+                figures(entry["half_width_noisy"], 2),
             )
         )
     columns = (
@@ -149,7 +149,7 @@ def _bands(panel: Axes, rows: pd.DataFrame, *, measured: bool) -> None:
 
 
 def _range(values: Mapping[str, Any]) -> Section:
-    outside = [str(one["sentence"]) for one in values["outside"]]
+    outside = [str(entry["sentence"]) for entry in values["outside"]]
     inside = "Amplitude, duration and frequencies of the drive lie within those of the fit records."
     return Section("Fitted range", tuple(outside) or (inside,))
 

@@ -58,7 +58,7 @@ _PROVENANCE = ("command", "seed", "inputs_sha256", "python", "versions")
 @final
 @dataclass(frozen=True, eq=False)
 class SavedRun:
-    """What a run left in its folder."""
+    """Results, tables and draws read from a run folder."""
 
     results: Mapping[str, Any]
     provenance: Mapping[str, Any]
@@ -113,7 +113,7 @@ def load_run(folder: Path) -> SavedRun:
     if not problems:
         absent = [row["name"] for row in results["parameters"] if row["name"] not in draws]
         problems += [
-            f"{folder / 'posterior.nc'}: no draws of {name!r}, which results.json tells of; "
+            f"{folder / 'posterior.nc'}: no draws of {name!r}, which results.json lists; "
             "both must come from the same run, so run `fit` again"
             for name in absent
         ]
@@ -128,22 +128,22 @@ def _missing(path: Path) -> str:
 
 def _json(path: Path, needs: tuple[str, ...], problems: list[str]) -> dict[str, Any]:
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         problems.append(_missing(path))
         return {}
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         problems.append(f"{path}: cannot be read as JSON ({error}); run `fit` again to write it")
         return {}
-    if not isinstance(told, dict):
+    if not isinstance(content, dict):
         problems.append(f"{path}: expected a JSON object; run `fit` again to write it")
         return {}
     problems += [
         f"{path}: the key {key!r} is missing; run `fit` again with this version of lcopa-bayes"
         for key in needs
-        if key not in told
+        if key not in content
     ]
-    return told
+    return content
 
 
 def _table(path: Path, needs: tuple[str, ...], problems: list[str]) -> pd.DataFrame:

@@ -1,4 +1,4 @@
-"""What a page of the report is made of: sections of text, tables and figures."""
+"""Parts of a report page: sections of text, tables and figures."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Column:
 @final
 @dataclass(frozen=True)
 class Table:
-    """A table of cells that are already words; a cell of a `grade` column is one of the three grades."""
+    """A table of cells that are already formatted; a cell of a `grade` column is one of the three grades."""
 
     columns: tuple[Column, ...]
     rows: tuple[tuple[str, ...], ...]

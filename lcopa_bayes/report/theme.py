@@ -23,7 +23,7 @@ BAND = "#0072b2"
 NOISE = "#8a8a8a"
 STEADY = "#b3410b"
 CYCLE = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#7a6a00", "#000000")
-"""Okabe and Ito 2008, colours that people with any colour vision tell apart; yellow darkened."""
+"""Okabe and Ito 2008, distinguishable with any colour vision; yellow darkened."""
 WIDTH = 7.4
 """Width of a figure [in]."""
 _LOOK: Mapping[Any, Any] = {
@@ -103,11 +103,11 @@ def svg_of(figure: Figure) -> str:
     """The figure as SVG without dates or links to software, its coordinates to a hundredth of a point."""
     out = io.StringIO()
     figure.savefig(out, format="svg", metadata=_NO_METADATA)
-    return _COORDINATES.sub(lambda found: _LONG_DECIMALS.sub(r"\1", found[0]), out.getvalue())
+    return _COORDINATES.sub(lambda match: _LONG_DECIMALS.sub(r"\1", match[0]), out.getvalue())
 
 
 def inlined(svg: str, prefix: str) -> str:
-    """The `<svg>` element alone, its ids made unique by `prefix`, as it stands inside an HTML page."""
+    """The `<svg>` element alone, with `prefix` before its ids to keep them unique within an HTML page."""
     element = svg[svg.index("<svg") :]
     element = re.sub(r'\sxmlns(:\w+)?="[^"]*"', "", element)
     element = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", element, flags=re.DOTALL)

@@ -110,7 +110,7 @@ def test_the_page_shows_all_of_it_and_is_drawn_again_the_same(folder, told):
     assert path.read_text() == page
     assert not re.search(r'(?:src|href)="(?:http|//)', page)
     assert page.count("<svg") == 3  # evidence, the fitted record, the held-out one
-    for words in (*PICK, "The prior", "Is this order an integer?", "What to heed", "held out"):
+    for words in (*PICK, "Influence of the prior", "Is this order an integer?", "Warnings", "held out"):
         assert words in page
 
 

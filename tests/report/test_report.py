@@ -232,7 +232,7 @@ def test_open_sides_are_said_and_not_printed_as_numbers(html):
 def test_captions_carry_scores_and_mark_held_out_records(html):
     captions = [unescape(c) for c in re.findall(r"<figcaption>(.*?)</figcaption>", html)]
     fitted = next(c for c in captions if "Record step, axis x, fitted" in c)
-    held = next(c for c in captions if "never seen by the fit" in c)
+    held = next(c for c in captions if "held out of the fit" in c)
     assert "RMSE 1.84×10⁻⁴ rad" in fitted  # noqa: RUF001
     assert "91\u00a0% of the 80 samples" in fitted
     assert "Offset: fitted." in fitted

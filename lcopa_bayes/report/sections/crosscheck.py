@@ -18,20 +18,21 @@ _TITLE = "Second method"
 _PER_FIGURE = 12
 """Parameters on one figure."""
 _HOW = (
-    "The ensembles and nested sampling share the posterior, but neither proposals nor the way from the "
-    "prior. A p-value is the probability of a distance as large when both sample one posterior, adjusted for "
-    "all comparisons; below {alarm} every grade of this run is lowered."
+    "The ensembles and nested sampling share the posterior, but neither proposals nor tempering path. A "
+    "p-value is the probability of a distance as large when both sample one posterior, adjusted for all "
+    "comparisons; below {alarm} every grade of this run is lowered."
 )
 _WIDE = 1.645 * 2
 """Width of a normal distribution's 90 % interval in standard deviations [-]."""
 
 
 def section(run: SavedRun) -> Section:
-    """Verdict, marginals and evidences of both methods; a sentence where there was only one."""
+    """Verdict, marginals and evidences of both methods; a sentence where no second method was run."""
     check = run.results["cross_check"]
     if check is None:
         return Section(
-            _TITLE, ("Not run: `fit --cross-check` samples by an independent method too and compares.",)
+            _TITLE,
+            ("Not run: `fit --cross-check` also samples by an independent method and compares the results.",),
         )
     said = str(check["sentence"])
     density = run.tables["cross_check_density"]
@@ -61,11 +62,14 @@ def _marginals(check: Mapping[str, Any]) -> Table:
     )
     rows = []
     for row in check["parameters"]:
-        spread = max(row[one]["upper"] - row[one]["lower"] for one in ("run", "nested")) / _WIDE
+        spread = max(row[entry]["upper"] - row[entry]["lower"] for entry in ("run", "nested")) / _WIDE
         cells = [str(row["name"]), str(row["unit"])]
-        for one in (row["run"], row["nested"]):
-            cells += [to_spread(one["value"], spread), interval(one["lower"], one["upper"], spread)]
-            cells.append(f"{one['ess']:.0f}")
+        for estimate in (row["run"], row["nested"]):
+            cells += [
+                to_spread(estimate["value"], spread),
+                interval(estimate["lower"], estimate["upper"], spread),
+            ]
+            cells.append(f"{estimate['ess']:.0f}")
         noticed = f"{row['resolution']:.3f}" if row["resolution"] < 1 else NONE
         rows.append((*cells, f"{row['distance']:.3f}", noticed, figures(row["p"], 2)))
     return Table(
@@ -84,7 +88,7 @@ def _evidences(check: Mapping[str, Any]) -> Table:
         (
             "nested sampling",
             _with_error(check["log_evidence"], check["log_evidence_sd"]),
-            ", ".join(f"{one:.2f}" for one in check["run_log_evidences"]),
+            ", ".join(f"{entry:.2f}" for entry in check["run_log_evidences"]),
         ),
     ]
     caption = "± is the standard error. " + (

@@ -11,27 +11,27 @@ from lcopa_bayes.report.section import Column, Drawing, Section, Table
 from lcopa_bayes.report.theme import CYCLE, HELD_OUT, STEADY, blank, svg_of
 
 
-def sections(made: StaticOptics) -> list[Section]:
+def sections(calculated: StaticOptics) -> list[Section]:
     """Director, tilt law and steering chain."""
-    plan = made.plan
+    plan = calculated.plan
     text = (
         "Tilt counts from the plates; the director lies in one plane and varies across the cell only "
         f"(Eq. 20). Field: {plan.field.value}; pretilt {figures(plan.pretilt)} rad. Threshold "
-        f"pi sqrt(k1 / deps) = {figures(made.check.threshold, 4)} V."
+        f"pi sqrt(k1 / deps) = {figures(calculated.check.threshold, 4)} V."
     )
     director = Section(
         "Director",
         (text,),
         (
-            Drawing("director", _profiles(made), "Tilt across the cell at several voltages (Fig. 10)."),
+            Drawing("director", _profiles(calculated), "Tilt across the cell at several voltages (Fig. 10)."),
             Drawing(
                 "tilt_voltage",
-                _curve(made),
+                _curve(calculated),
                 "Spatial mean of the solved tilt against voltage, beside Eq. 24 as printed and with its "
                 "upper branch counted from the knee (Fig. 11). No tilt exceeds pi/2.",
             ),
         ),
-        (_tilts(made), _fits(made)),
+        (_tilts(calculated), _fits(calculated)),
     )
     chain = Section(
         "From volts to angle",
@@ -39,15 +39,15 @@ def sections(made: StaticOptics) -> list[Section]:
             "The printed lower branch: mean tilt by Eq. 24, phase step by Eq. 23, angle by Eq. 5 and, "
             "linearised, by Eq. 26; as far as the beam propagates.",
         ),
-        (Drawing("steering_chain", _chain(made), "Tilt, phase step, angle and error of Eq. 26."),),
+        (Drawing("steering_chain", _chain(calculated), "Tilt, phase step, angle and error of Eq. 26."),),
     )
     return [director, chain]
 
 
-def _profiles(made: StaticOptics) -> str:
+def _profiles(calculated: StaticOptics) -> str:
     figure = blank(2.8)
     panel = figure.subplots()
-    for profile, colour in zip(made.profiles, CYCLE * len(made.profiles), strict=False):
+    for profile, colour in zip(calculated.profiles, CYCLE * len(calculated.profiles), strict=False):
         panel.plot(profile.position, profile.tilt, color=colour, label=f"{profile.voltage:g} V")
     panel.axhline(np.pi / 2, color="#b0b0b0", lw=0.7, ls=(0, (4, 3)))
     panel.set_xlabel("position, fraction of the cell [-]")
@@ -57,8 +57,8 @@ def _profiles(made: StaticOptics) -> str:
     return svg_of(figure)
 
 
-def _curve(made: StaticOptics) -> str:
-    optics, curve = made.plan.optics, made.check.curve
+def _curve(calculated: StaticOptics) -> str:
+    optics, curve = calculated.plan.optics, calculated.check.curve
     figure = blank(3.0)
     panel = figure.subplots()
     panel.plot(curve.voltage, curve.mean, color=CYCLE[0], label="solved")
@@ -80,8 +80,8 @@ def _curve(made: StaticOptics) -> str:
     return svg_of(figure)
 
 
-def _chain(made: StaticOptics) -> str:
-    chain = made.chain
+def _chain(calculated: StaticOptics) -> str:
+    chain = calculated.chain
     figure = blank(4.2)
     (tilt, phase), (angle, error) = figure.subplots(2, 2, sharex=True)
     tilt.plot(chain.voltage, chain.tilt)
@@ -102,7 +102,7 @@ def _chain(made: StaticOptics) -> str:
     return svg_of(figure)
 
 
-def _tilts(made: StaticOptics) -> Table:
+def _tilts(calculated: StaticOptics) -> Table:
     columns = (
         *(Column("voltage [V]", "number"), Column("mean tilt [rad]", "number")),
         *(Column("largest tilt [rad]", "number"), Column("Eq. 24 as printed [rad]", "number")),
@@ -110,12 +110,12 @@ def _tilts(made: StaticOptics) -> Table:
     )
     rows = tuple(
         tuple(figures(float(value), 4) for value in (p.voltage, p.mean, p.largest, printed, continuous))
-        for p, printed, continuous in zip(made.profiles, *made.laws, strict=True)
+        for p, printed, continuous in zip(calculated.profiles, *calculated.laws, strict=True)
     )
     return Table(columns, rows)
 
 
-def _fits(made: StaticOptics) -> Table:
+def _fits(calculated: StaticOptics) -> Table:
     columns = (
         *(Column("range"), Column("from [V]", "number"), Column("to [V]", "number"), Column("law")),
         *(Column("R²", "number"), Column("largest error [rad]", "number")),
@@ -123,7 +123,7 @@ def _fits(made: StaticOptics) -> Table:
     )
     rows = []
     for k, name in enumerate(RANGES):
-        laws = (made.check.printed, made.check.continuous, made.check.best)
+        laws = (calculated.check.printed, calculated.check.continuous, calculated.check.best)
         for law, fit in zip(("as printed", "continuous", "best of this form"), laws, strict=True):
             one = fit[k]
             relative = one.largest_relative_error
@@ -136,7 +136,7 @@ def _fits(made: StaticOptics) -> Table:
             )
     caption = (
         "A dash: below the threshold the solved tilt is zero and the law is not. Stated: R² above "
-        f"{figures(made.plan.optics.tilt_fit_r_squared)}, error below "
-        f"{100 * made.plan.optics.tilt_fit_error:.2g} %."
+        f"{figures(calculated.plan.optics.tilt_fit_r_squared)}, error below "
+        f"{100 * calculated.plan.optics.tilt_fit_error:.2g} %."
     )
     return Table(columns, tuple(rows), caption)

@@ -19,20 +19,20 @@ _HOW = (
 
 def section(run: SavedRun) -> Section:
     """A sentence, and a table of both models' errors."""
-    told = run.results
-    if told["log_evidence"] is None:
-        said = "A single ensemble cannot tell the error of an evidence; none is given."
+    results = run.results
+    if results["log_evidence"] is None:
+        said = "The error of an evidence needs several ensembles; with a single one none is given."
     else:
         said = _HOW.format(
-            value=told["log_evidence"], sd=told["log_evidence_sd"], grade=told["log_evidence_grade"]
+            value=results["log_evidence"], sd=results["log_evidence_sd"], grade=results["log_evidence_grade"]
         )
-    rival = told["rival"]
+    rival = results["rival"]
     if rival is None:
         return Section(_TITLE, (said,))
-    return Section(_TITLE, (said, str(rival["sentence"])), tables=(_errors(told, rival),))
+    return Section(_TITLE, (said, str(rival["sentence"])), tables=(_errors(results, rival),))
 
 
-def _errors(told: Mapping[str, Any], rival: Mapping[str, Any]) -> Table:
+def _errors(results: Mapping[str, Any], rival: Mapping[str, Any]) -> Table:
     columns = (
         *(Column("record", "code"), Column("axis", "code"), Column("role"), Column("unit")),
         *(Column("free orders: RMSE", "number"), Column("in 90 % band", "number")),
@@ -40,10 +40,10 @@ def _errors(told: Mapping[str, Any], rival: Mapping[str, Any]) -> Table:
     )
     rows = []
     for key, role in (("fit_scores", "fit"), ("held_out", "held out")):
-        for own, other in zip(told[key], rival[key], strict=True):
+        for own, other in zip(results[key], rival[key], strict=True):
             cells = [str(own["record"]), str(own["axis"]), role, str(own["unit"])]
-            for one in (own, other):
-                cells += [figures(one["rmse"], 3), f"{100 * one['coverage_90']:.0f} %"]
+            for entry in (own, other):
+                cells += [figures(entry["rmse"], 3), f"{100 * entry['coverage_90']:.0f} %"]
             rows.append(tuple(cells))
     weighed = rival["log_evidence"]
     caption = f"The rival's grade is {rival['grade']}: {rival['grade_reason']}." + (

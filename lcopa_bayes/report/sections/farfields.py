@@ -17,9 +17,9 @@ _MOST = 1600
 """Points of a pattern that are drawn: its nulls are narrow."""
 
 
-def sections(made: StaticOptics) -> list[Section]:
+def sections(calculated: StaticOptics) -> list[Section]:
     """The far field along one axis and over both."""
-    optics = made.plan.optics
+    optics = calculated.plan.optics
     array = (
         f"{optics.elements} elements, {figures(1e6 * optics.pitch_in_wavelengths * optics.wavelength)} µm "
         f"= {figures(optics.pitch_in_wavelengths)} wavelengths apart, wavelength "
@@ -31,18 +31,18 @@ def sections(made: StaticOptics) -> list[Section]:
         (
             Drawing(
                 "farfield_1d",
-                _steered(made),
+                _steered(calculated),
                 "Far field steered to each target (Ta et al. 2026, Eq. 4, Fig. 3). Dashed: the target.",
             ),
         ),
-        (_steering(made), _lobes(made)),
+        (_steering(calculated), _lobes(calculated)),
     )
     both = Section(
         "Far field over both axes",
         drawings=(
             Drawing(
                 "farfield_2d",
-                _planar(made),
+                _planar(calculated),
                 "Far field of the square array in direction cosines (Eq. 12, Fig. 5): along the normal and "
                 "steered. Circle: the target; every other bright spot is a grating lobe.",
             ),
@@ -56,8 +56,8 @@ def _decibel(values: Matrix) -> Matrix:
         return np.asarray(np.maximum(10 * np.log10(values), _FLOOR))
 
 
-def _steered(made: StaticOptics) -> str:
-    patterns = made.patterns
+def _steered(calculated: StaticOptics) -> str:
+    patterns = calculated.patterns
     figure, panels = grid(patterns.target.size, columns=1, height=1.25)
     angle = np.degrees(patterns.angle)
     for panel, target, row in zip(panels, patterns.target, patterns.intensity, strict=True):
@@ -74,10 +74,10 @@ def _steered(made: StaticOptics) -> str:
     return svg_of(figure)
 
 
-def _planar(made: StaticOptics) -> str:
+def _planar(calculated: StaticOptics) -> str:
     figure = blank(3.7)
-    panels = figure.subplots(1, len(made.planar), squeeze=False)[0]
-    for panel, pattern in zip(panels, made.planar, strict=True):
+    panels = figure.subplots(1, len(calculated.planar), squeeze=False)[0]
+    for panel, pattern in zip(panels, calculated.planar, strict=True):
         ends = (pattern.u[0], pattern.u[-1], pattern.v[0], pattern.v[-1])
         shown = panel.imshow(
             _decibel(pattern.intensity).T, origin="lower", extent=ends, vmin=_FLOOR, vmax=0, cmap="viridis"
@@ -98,10 +98,10 @@ def _planar(made: StaticOptics) -> str:
     return svg_of(figure)
 
 
-def _steering(made: StaticOptics) -> Table:
+def _steering(calculated: StaticOptics) -> Table:
     columns = (
         *(Column("target [deg]", "number"), Column("phase step [rad]", "number")),
-        *(Column("main lobe found [deg]", "number"), Column("highest side lobe [dB]", "number")),
+        *(Column("main lobe [deg]", "number"), Column("highest side lobe [dB]", "number")),
     )
     rows = tuple(
         (
@@ -110,13 +110,13 @@ def _steering(made: StaticOptics) -> Table:
             figures(float(np.degrees(each.main_lobe)), 5),
             figures(float(10 * np.log10(each.side_lobe))),
         )
-        for each in made.steered
+        for each in calculated.steered
     )
     return Table(columns, rows, "Steering by sin(angle) = wavelength x phase step / (2 pi pitch), Eq. 5.")
 
 
-def _lobes(made: StaticOptics) -> Table:
-    fill = figures(made.plan.fill_factor)
+def _lobes(calculated: StaticOptics) -> Table:
+    fill = figures(calculated.plan.fill_factor)
     columns = (
         *(Column("target [deg]", "number"), Column("order", "number"), Column("angle [deg]", "number")),
         *(Column("isotropic", "number"), Column(f"fill factor {fill}", "number")),
@@ -129,7 +129,7 @@ def _lobes(made: StaticOptics) -> Table:
             figures(row.isotropic),
             figures(row.with_element if row.with_element > 1e-12 else 0.0),
         )
-        for row in made.lobes
+        for row in calculated.lobes
     )
     return Table(
         columns,

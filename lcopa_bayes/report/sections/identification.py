@@ -20,7 +20,7 @@ _COLOURS = dict(zip(KINDS, (CYCLE[0], CYCLE[1], CYCLE[2], CYCLE[3]), strict=True
 
 
 def sections(
-    time_unit: str, found: Sequence[Identification], rows: Sequence[Row], panels: Sequence[Panel]
+    time_unit: str, identified: Sequence[Identification], rows: Sequence[Row], panels: Sequence[Panel]
 ) -> list[Section]:
     """Models, records, metrics."""
     return [
@@ -32,7 +32,10 @@ def sections(
                 "scale of gain, viscosities and k is a convention: with k given as in Eq. 62, and with the "
                 "last viscosity 1 as in Eq. 65.",
             ),
-            tables=(_errors(found, time_unit), *(_coefficients(found, each) for each in Convention)),
+            tables=(
+                _errors(identified, time_unit),
+                *(_coefficients(identified, each) for each in Convention),
+            ),
         ),
         Section(
             "Records and models",
@@ -54,7 +57,7 @@ def sections(
     ]
 
 
-def _errors(found: Sequence[Identification], time_unit: str) -> Table:
+def _errors(identified: Sequence[Identification], time_unit: str) -> Table:
     columns = (
         *(Column("path"), Column("model"), Column("orders", "interval")),
         *(Column(f"delay [{time_unit}]", "number"), Column("steady gain", "number")),
@@ -63,15 +66,15 @@ def _errors(found: Sequence[Identification], time_unit: str) -> Table:
     )
     rows = tuple(
         (
-            *(each.data.name, made.method, ", ".join(figures(o) for o in made.model.form.orders)),
-            *(figures(made.model.delay, 4), figures(made.model.steady, 4), figures(made.equation_rmse)),
-            *(figures(made.output_rmse), NONE if made.candidates is None else f"{made.candidates}"),
-            "yes" if made.model.physical else "no",
+            *(each.data.name, result.method, ", ".join(figures(o) for o in result.model.form.orders)),
+            *(figures(result.model.delay, 4), figures(result.model.steady, 4), figures(result.equation_rmse)),
+            *(figures(result.output_rmse), NONE if result.candidates is None else f"{result.candidates}"),
+            "yes" if result.model.physical else "no",
         )
-        for each in found
-        for made in each.models
+        for each in identified
+        for result in each.models
     )
-    units = ", ".join(dict.fromkeys(f"{e.data.response_unit}/{e.data.drive_unit}" for e in found))
+    units = ", ".join(dict.fromkeys(f"{e.data.response_unit}/{e.data.drive_unit}" for e in identified))
     caption = (
         "Root mean square errors in the unit of the response; physical: viscosities and k are positive. The "
         f"steady gain is response over drive at rest [{units}]; scanned counts candidates."
@@ -79,19 +82,19 @@ def _errors(found: Sequence[Identification], time_unit: str) -> Table:
     return Table(columns, rows, caption)
 
 
-def _coefficients(found: Sequence[Identification], convention: Convention) -> Table:
+def _coefficients(identified: Sequence[Identification], convention: Convention) -> Table:
     columns = (
         *(Column("path"), Column("model"), Column("gain b", "number")),
         *(Column("viscosities", "interval"), Column("k", "number")),
     )
     rows = []
-    for each in found:
+    for each in identified:
         given = each.stiffness[0][0]
-        for made in each.models:
-            form = made.model.scaled(convention, given)
+        for result in each.models:
+            form = result.model.scaled(convention, given)
             etas = ", ".join(figures(eta) for eta in form.etas)
             rows.append(
-                (each.data.name, made.method, figures(form.gain, 4), etas, figures(form.stiffness, 4))
+                (each.data.name, result.method, figures(form.gain, 4), etas, figures(form.stiffness, 4))
             )
     return Table(columns, tuple(rows), f"Coefficients scaled so that: {convention.value}.")
 
@@ -104,7 +107,7 @@ def _drawing(number: int, panel: Panel, time_unit: str) -> Drawing:
         else ""
     )
     errors = "; ".join(f"{curve.kind} {figures(curve.rmse)}" for curve in panel.curves)
-    use = "never seen by the identification" if panel.held_out else "used for identification where it can be"
+    use = "held out of the identification" if panel.held_out else "used for identification where it can be"
     caption = (
         f"Record {panel.record}, axis {panel.axis}, {use}. {where}{level}RMSE [{panel.unit}]: {errors}. "
         f"{said(panel.time.size)}"
@@ -123,10 +126,10 @@ def _drawn(panel: Panel, time_unit: str) -> str:
         at = extremes(curve.response)
         shade, dashed = _COLOURS[curve.kind], (0, (4, 2)) if "," in curve.kind else "-"
         top.plot(panel.time[at], curve.response[at], color=shade, ls=dashed, label=curve.kind)
-        left = panel.observed - curve.response
+        residual = panel.observed - curve.response
         if "," not in curve.kind:
-            at = extremes(left)
-            below.plot(panel.time[at], left[at], ".", ms=2.2, mew=0, color=shade)
+            at = extremes(residual)
+            below.plot(panel.time[at], residual[at], ".", ms=2.2, mew=0, color=shade)
     if panel.printed_level is not None:
         top.axhline(panel.printed_level, color=STEADY, lw=0.8, ls=(0, (4, 3)), label="steady, as printed")
     below.axhline(0, color="#b0b0b0", lw=0.6, zorder=0)
@@ -165,10 +168,10 @@ def _metrics(rows: Sequence[Row]) -> Table:
     columns = (
         *(Column("path"), Column("metric"), Column("unit")),
         *(Column(heading, "number") for heading in _HEADINGS),
-        Column("Table 1: seen/fract./int.", "number"),
+        Column("Table 1: measured/fract./int.", "number"),
         *(Column("90 % credible", "interval"), Column("grade", "grade")),
     )
-    told = tuple(
+    cells = tuple(
         (
             *(row.path, row.metric, row.unit),
             *(_reached(row.values[kind]) for kind in KINDS),
@@ -178,17 +181,17 @@ def _metrics(rows: Sequence[Row]) -> Table:
         for row in rows
     )
     if all(row.posterior is None for row in rows):
-        columns, told = columns[:-2], tuple(row[:-2] for row in told)
+        columns, cells = columns[:-2], tuple(row[:-2] for row in cells)
     sizes = ", ".join(
         f"{path} {figures(size)}" for path, size in {row.path: row.size for row in rows}.items()
     )
     caption = (
         f"Steps in the unit of the drive: {sizes}. "
-        f"{OPEN}: not reached within the record. Printed values are those of Table 1 for what was seen and "
-        "for both models; it does not say into which band a response stabilises, so its one time stands in "
-        "both rows."
+        f"{OPEN}: not reached within the record. Printed values are those of Table 1 for the measured and "
+        "both modelled responses. The table does not state into which band a response stabilises, so its "
+        "single time is shown in both rows."
     )
-    return Table(columns, told, caption)
+    return Table(columns, cells, caption)
 
 
 def _reached(value: float) -> str:
@@ -202,9 +205,9 @@ def _printed(row: Row, column: str) -> str:
     return bound + figures(row.printed[column])
 
 
-def _credible(told: Mapping[str, Any] | None) -> tuple[str, str]:
-    if told is None:
+def _credible(estimate: Mapping[str, Any] | None) -> tuple[str, str]:
+    if estimate is None:
         return NONE, ""
-    lower, upper = told["lower"], told["upper"]
+    lower, upper = estimate["lower"], estimate["upper"]
     spread = abs(upper - lower) / 4 if lower is not None and upper is not None else None
-    return interval(lower, upper, spread), str(told["grade"])
+    return interval(lower, upper, spread), str(estimate["grade"])

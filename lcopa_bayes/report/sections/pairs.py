@@ -22,7 +22,7 @@ _MIDDLE = 0.995
 
 
 def ranked(names: list[str]) -> list[str]:
-    """Names by interest: times, orders, delays, gains, anything else, offsets, noise; ties as they come."""
+    """Names by interest: times, orders, delays, gains, anything else, offsets, noise; ties in their order."""
 
     def rank(name: str) -> int:
         kind = name.split("_")[0]
@@ -43,7 +43,7 @@ def section(run: SavedRun) -> Section:
         "Contours, smoothed, hold about 50 and 90 % of the draws of a pair; dashed "
         f"lines mark the 5, 50 and 95 % quantiles; each axis spans {100 * _MIDDLE:g} % of the draws."
     )
-    rest = f" Left out for room: {', '.join(left_out)}." if left_out else ""
+    rest = f" Not shown for lack of space: {', '.join(left_out)}." if left_out else ""
     return Section("Pairs of parameters", drawings=(Drawing("corner", _drawn(run, shown), caption + rest),))
 
 

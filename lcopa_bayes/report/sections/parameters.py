@@ -1,4 +1,4 @@
-"""The table of parameters: median, interval and how far to trust them."""
+"""The table of parameters: median, interval and grade."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lcopa_bayes.report.section import Column, Section, Table
 
 
 def section(run: SavedRun) -> Section:
-    """Free parameters with intervals and grades, those with several ridges, and the fixed ones."""
+    """Free parameters with intervals and grades, those with several modes, and the fixed ones."""
     free, fixed = run.results["parameters"], run.results["fixed"]
     kind = ", ".join(dict.fromkeys(f"{percent(row['level'])} {row['interval']}" for row in free))
     tables = [
@@ -23,13 +23,13 @@ def section(run: SavedRun) -> Section:
                 *(Column("R-hat", "number"), Column("grade", "grade")),
             ),
             tuple(_row(row) for row in free),
-            f"Intervals are {kind}. Digits go to the second significant one of the standard deviation. "
+            f"Intervals are {kind}. Digits end at the second significant digit of the standard deviation. "
             "ESS is the smaller of the effective sample sizes of bulk and tails; R-hat compares independent "
             "ensembles.",
         )
     ]
     if run.results["ridges"]:
-        tables.append(_ridges(run.results["ridges"]))
+        tables.append(_modes(run.results["ridges"]))
     if fixed:
         tables.append(
             Table(
@@ -41,29 +41,29 @@ def section(run: SavedRun) -> Section:
     return Section("Parameters", text, tables=tuple(tables))
 
 
-def _ridges(rows: list[Mapping[str, Any]]) -> Table:
-    """Shares of the hills of parameters whose marginal has several."""
+def _modes(rows: list[Mapping[str, Any]]) -> Table:
+    """Shares of the modes of parameters whose marginal has several."""
     columns = (
-        *(Column("several ridges in", "code"), Column("split at", "number"), Column("unit")),
-        *(Column("shares of all draws", "interval"), Column("between populations", "interval")),
-        *(Column("grade", "grade"), Column("in words", "prose")),
+        *(Column("several modes in", "code"), Column("split at", "number"), Column("unit")),
+        *(Column("shares of all draws", "interval"), Column("range over ensembles", "interval")),
+        *(Column("grade", "grade"), Column("statement", "prose")),
     )
     shown = []
     for row in rows:
         pooled = zip(row["pooled"], row["pooled_mcse"], strict=True)
-        hills = zip(*row["shares"], strict=True)
+        by_mode = zip(*row["shares"], strict=True)
         shown.append(
             (
                 *(str(row["parameter"]), ", ".join(figures(end) for end in row["boundaries"])),
                 *(str(row["unit"]), ", ".join(f"{share:.2f} ± {error:.2f}" for share, error in pooled)),
-                ", ".join(f"{min(hill):.2f} to {max(hill):.2f}" for hill in hills),
+                ", ".join(f"{min(shares):.2f} to {max(shares):.2f}" for shares in by_mode),
                 *(str(row["grade"]), str(row["sentence"])),
             )
         )
     return Table(
         columns,
         tuple(shown),
-        "The draws of these parameters lie on separate hills; medians and intervals mix them. "
+        "The draws of these parameters lie in separate modes; medians and intervals mix them. "
         "± is the Monte Carlo standard error.",
     )
 

@@ -1,4 +1,4 @@
-"""What was assumed of each parameter before the data, against what the data made of it."""
+"""Prior of each parameter against its posterior."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How the draws were made and where everything came from."""
+"""Settings of the sampler, versions and inputs of the run."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ _WORDS = {
     "weights_ess": "effective sample size of the weights [draws]",
     "steps": "steps taken",
     "most_steps": "steps allowed",
-    "thin": "one step kept of",
+    "thin": "thinning [steps per draw]",
     "acceptance": "mean acceptance [-]",
     "smallest_ess": "smallest effective sample size [draws]",
     "largest_rhat": "largest R-hat [-]",
-    "target_ess": "effective sample size asked for [draws]",
+    "target_ess": "effective sample size wanted [draws]",
 }
 
 
 def section(run: SavedRun) -> Section:
     """Sampler summary, command, seed, versions and hashes of the inputs."""
-    told = run.provenance
+    provenance = run.provenance
     origin = [
-        ("command", shlex.join(str(word) for word in told["command"])),
-        ("seed", str(told["seed"])),
-        ("python", str(told["python"])),
-        *((name, str(version)) for name, version in told["versions"].items()),
+        ("command", shlex.join(str(word) for word in provenance["command"])),
+        ("seed", str(provenance["seed"])),
+        ("python", str(provenance["python"])),
+        *((name, str(version)) for name, version in provenance["versions"].items()),
     ]
-    hashes = tuple((str(name), str(value)) for name, value in told["inputs_sha256"].items())
+    hashes = tuple((str(name), str(value)) for name, value in provenance["inputs_sha256"].items())
     return Section(
         "Sampler and provenance",
         tables=(

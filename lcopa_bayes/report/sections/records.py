@@ -113,7 +113,7 @@ def _drives(panel: Axes, drives: pd.DataFrame, unit: str) -> None:
 
 
 def _caption(score: Mapping[str, Any], record: str, axis: str, size: int, *, held: bool) -> str:
-    parts = [f"Record {record}, axis {axis}, {'never seen by the fit' if held else 'fitted'}."]
+    parts = [f"Record {record}, axis {axis}, {'held out of the fit' if held else 'fitted'}."]
     if score:
         parts.append(
             f"RMSE {figures(score['rmse'])} {score['unit']}; {percent(score['coverage_90'])} of the "
@@ -124,7 +124,7 @@ def _caption(score: Mapping[str, Any], record: str, axis: str, size: int, *, hel
 
 
 def _before(run: SavedRun, rows: pd.DataFrame, record: str) -> str:
-    """Says so when the drive began long before the samples that are shown."""
+    """A sentence when the drive began long before the samples that are shown."""
     drives = run.tables["drives"]
     begin = drives.loc[drives["record"] == record, "time"].min()
     first, last = rows["time"].min(), rows["time"].max()
@@ -151,6 +151,6 @@ def _scores(run: SavedRun) -> Table:
         columns,
         rows,
         f"RMSE is against the median of the plant; coverage is by the {POINTWISE} bands with noise. Where an "
-        "offset comes from all samples of a held-out record, a constant error of it cannot show in its "
+        "offset comes from all samples of a held-out record, a constant error is not visible in its "
         "scores.",
     )

@@ -46,11 +46,11 @@ def section(run: SavedRun) -> Section:
 def _drawn(run: SavedRun, rows: pd.DataFrame, record: str, axis: str, *, held: bool) -> str:
     figure = blank(3.9)
     panels = figure.subplot_mosaic([["time", "time"], ["lags", "spectrum"]], height_ratios=[1.0, 1.15])
-    time, left = rows["time"].to_numpy(), rows["residual"].to_numpy()
-    at = extremes(left)
+    time, residual = rows["time"].to_numpy(), rows["residual"].to_numpy()
+    at = extremes(residual)
     colour = HELD_OUT if held else SEEN
     panels["time"].axhline(0.0, color=NOISE, lw=0.7)
-    panels["time"].plot(time[at], left[at], ".-", ms=2, mew=0, lw=0.5, color=colour)
+    panels["time"].plot(time[at], residual[at], ".-", ms=2, mew=0, lw=0.5, color=colour)
     panels["time"].set_title(
         plain(f"{record}, {axis}: {'held out' if held else 'fit'}"), loc="left", color=colour
     )

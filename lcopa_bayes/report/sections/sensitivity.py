@@ -12,12 +12,12 @@ from lcopa_bayes.report.section import Column, Section, Table
 _MOST = 20
 """Parameters shown; the others are in the table of the run folder."""
 _HOW = (
-    "Sensitivity says how fast the posterior moves when the prior of all parameters, or the likelihood, is "
-    "raised to a power near 1 (Kallioinen et al. 2024). From {threshold} on it counts. Both counting is a "
-    "prior-data conflict, or a prior that was meant to be informative; the prior alone counting means that "
-    "the record says little about this parameter. Densities are on the scale a parameter is sampled on: "
-    "a uniform prior, and a log-uniform one of a time constant, has no power to scale, so what its bounds "
-    "do is not seen here."
+    "Sensitivity is how fast the posterior moves when the prior of all parameters, or the likelihood, is "
+    "raised to a power near 1 (Kallioinen et al. 2024). It is notable from {threshold} on. Where both are "
+    "notable there is a prior-data conflict, or a prior meant to be informative; where only that of the "
+    "prior is, the record has little information about this parameter. Densities are on the scale of "
+    "sampling: a uniform prior, and a log-uniform prior of a time constant, has no power to scale, so the "
+    "influence of its bounds is not visible here."
 )
 
 

@@ -1,4 +1,4 @@
-"""The draws of each parameter in the order they were made."""
+"""The draws of each parameter in their order."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ def section(run: SavedRun) -> Section:
     )
     return Section(
         "Traces",
-        ("Each colour is an independent ensemble. Do not trust draws whose colours separate or drift.",),
+        (
+            "Each colour is an independent ensemble. Draws whose colours separate or drift have not "
+            "converged.",
+        ),
         drawings,
     )
 
@@ -47,8 +50,8 @@ def _drawn(run: SavedRun, names: Sequence[str]) -> str:
         if run.spans_decades(name):
             panel.set_yscale("log")
             log_ticks(panel.yaxis, *panel.get_ylim())
-        told = "not defined" if rhat[name] is None else f"{rhat[name]:.3f}"
-        panel.set_title(f"{label(name, run.units[name])}   R-hat {told}", loc="left", fontsize=8)
+        shown = "not defined" if rhat[name] is None else f"{rhat[name]:.3f}"
+        panel.set_title(f"{label(name, run.units[name])}   R-hat {shown}", loc="left", fontsize=8)
         panel.margins(x=0.01)
     for panel in panels[-2:]:
         panel.set_xlabel("draw [-]")
