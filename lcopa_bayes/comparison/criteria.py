@@ -67,5 +67,5 @@ def highest(landscape: Landscape, values: Matrix) -> Peak:
     """The highest maximum of the likelihood reached from the best of some table values (n, rows)."""
     heights = landscape.log_likelihood(values)
     best = np.argsort(-heights)[:_CLIMBED]
-    peaks = [landscape.climb(values[k]) for k in best]
+    peaks = [landscape.maximise(values[k]) for k in best]
     return max([Peak(values[best[0]], float(heights[best[0]])), *peaks], key=lambda one: one.log_likelihood)

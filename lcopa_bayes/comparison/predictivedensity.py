@@ -18,7 +18,7 @@ from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.forward import ForwardModel
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.prediction import responses
-from lcopa_bayes.sampling.bridge import carried
+from lcopa_bayes.sampling.bridge import transferred
 from lcopa_bayes.sampling.convergence import TENTATIVE_RHAT, Grade, Level
 from lcopa_bayes.sampling.evidence import known_to
 from lcopa_bayes.sampling.importanceweights import FEWEST_EFFECTIVE, effective, smoothed, usable_k
@@ -131,7 +131,7 @@ def predictions(fit: Fit, *, held_out_only: bool = False) -> tuple[Predicted, ..
             found = scored(values, weights, "importance weights", k=k, known=target)
         else:
             seed = fit.run.plan.seed + 7_000 + len(out)
-            moved = carried(source, target, positions, seed, jump=False)
+            moved = transferred(source, target, positions, seed, jump=False)
             if part.kind == "future of the record":  # the next part knows still less
                 source, positions = target, moved.coordinates[:, :, -1]
             flat = moved.coordinates.reshape(-1, posterior.dimension)

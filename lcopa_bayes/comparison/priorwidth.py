@@ -14,7 +14,7 @@ from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.priors import Prior
 from lcopa_bayes.results.fit import Fit
-from lcopa_bayes.sampling.bridge import carried
+from lcopa_bayes.sampling.bridge import transferred
 from lcopa_bayes.sampling.evidence import evidence
 from lcopa_bayes.sampling.importanceweights import FEWEST_EFFECTIVE, smoothed, usable_k
 
@@ -111,7 +111,7 @@ def _refit(
     if not allowed.reshape(shape[:2]).any(axis=1).all():
         return Width(factor, None, None, "undefined", 0.0, k_hat, names)
     seed = fit.run.plan.seed + round(9_000 * factor)
-    found = carried(posterior, target, coordinates[:, :, -1], seed, jump=True)
+    found = transferred(posterior, target, coordinates[:, :, -1], seed, jump=True)
     again = evidence(target, found.coordinates, found.ess, seed)
     assert again is not None
     return Width(factor, again.value, again.sd, "refit", found.ess, k_hat, names)

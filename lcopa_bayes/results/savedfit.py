@@ -25,7 +25,7 @@ from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.provenance import digest_of
 from lcopa_bayes.sampling.convergence import Limitation, Quality
 from lcopa_bayes.sampling.draws import Draws
-from lcopa_bayes.sampling.modes import Ridges
+from lcopa_bayes.sampling.modes import Modes
 
 NAME = "fit.json"
 """The file beside `posterior.nc`."""
@@ -60,7 +60,7 @@ def fit_to_json(problem: Problem, draws: Draws) -> dict[str, Any]:
                 "shares": one.shares.tolist(),
                 "errors": one.errors.tolist(),
             }
-            for one in draws.ridges
+            for one in draws.modes
         ],
         "study": study_to_json(problem.study),
     }
@@ -97,7 +97,7 @@ def load_fit(folder: Path | str) -> SavedFit:
         parts = (
             tuple(Quality(**_numbers(one)) for one in values["qualities"]),
             float(values["target_ess"]),
-            tuple(Ridges(**one | {"boundaries": tuple(one["boundaries"])}) for one in values["ridges"]),
+            tuple(Modes(**one | {"boundaries": tuple(one["boundaries"])}) for one in values["ridges"]),
             tuple(
                 Limitation(**one | {"parameters": tuple(one["parameters"])}) for one in values["limitations"]
             ),

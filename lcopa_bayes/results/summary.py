@@ -84,7 +84,7 @@ def results(fit: Fit) -> dict[str, Any]:
             "fit_scores": scores(fit, held_out=False),
             "ridges": [
                 r.as_json() | {"grade": fit.draws.level(r.parameter, shares_grade(r))}
-                for r in fit.draws.ridges
+                for r in fit.draws.modes
             ],
             "sensitivity": [moved.as_json() for moved in fit.sensitivity],
             "step_metrics": [metric.as_json() for metric in fit.metrics],

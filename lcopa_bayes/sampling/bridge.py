@@ -1,9 +1,9 @@
-"""Draws carried from one posterior to another of the same coordinates, without starting from the prior.
+"""Draws transferred from one posterior to another of the same coordinates, without starting from the prior.
 
-Populations that stand in one posterior follow ``source^(1-b) target^b`` while b rises from 0 to 1, resampled
+Populations of one posterior follow ``source^(1-b) target^b`` while b rises from 0 to 1, resampled
 and moved at every rise (Del Moral, Doucet and Jasra 2006, J. R. Statist. Soc. B 68), and then sample the
-target. This refits a model to fewer samples, or under other priors, at a fraction of the cost; what no
-walker of the source could see, as a hill the left-out data excluded, only moves can find.
+target. This refits a model to fewer samples, or under other priors, at a fraction of the cost. Modes
+that no walker of the source was in, such as one excluded by the omitted data, are reached by moves alone.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from scipy.special import logsumexp
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.mixturemoves import learned
-from lcopa_bayes.sampling.ridgemoves import walking
+from lcopa_bayes.sampling.ridgemoves import emcee_sampler
 
 _EFFECTIVE = 0.5
 """Share of a population that stays effective in one rise."""
@@ -36,7 +36,7 @@ _THIN = 5
 
 @final
 @dataclass(frozen=True, eq=False)
-class Carried:
+class Transferred:
     """Draws of the target."""
 
     coordinates: Array
@@ -47,7 +47,9 @@ class Carried:
     """Largest nested R-hat between ensembles [-]."""
 
 
-def carried(source: Posterior, target: Posterior, positions: Array, seed: int, *, jump: bool) -> Carried:
+def transferred(
+    source: Posterior, target: Posterior, positions: Array, seed: int, *, jump: bool
+) -> Transferred:
     """Draws of `target` from walkers (ensembles, walkers, dimension) of `source`.
 
     With `jump` in one rise: for posteriors whose supports differ, but little else. Deterministic given
@@ -67,12 +69,12 @@ def carried(source: Posterior, target: Posterior, positions: Array, seed: int, *
             heat = 1.0 if heat + rise > 1.0 - 1e-9 else heat + rise
             position = position[_resampled(rise * gain, rng)]
             moves = _BURN if heat == 1.0 else _MOVES
-            sampler = walking(target, _Between(source, target, heat), len(position), mixture, random)
+            sampler = emcee_sampler(target, _Between(source, target, heat), len(position), mixture, random)
             state = sampler.run_mcmc(
                 emcee.State(_parted(position, rng)), moves, skip_initial_state_check=True, store=False
             )
             position, random = np.array(state.coords), tuple(sampler.random_state)
-        sampler = walking(target, target.log_density, len(position), mixture, random)
+        sampler = emcee_sampler(target, target.log_density, len(position), mixture, random)
         sampler.run_mcmc(emcee.State(position), _KEPT, thin_by=_THIN, skip_initial_state_check=True)
         chains.append(sampler.get_chain().swapaxes(0, 1))
     return _judged(np.stack(chains))
@@ -81,7 +83,7 @@ def carried(source: Posterior, target: Posterior, positions: Array, seed: int, *
 @final
 @dataclass(frozen=True, eq=False)
 class _Between:
-    """Log density on the way."""
+    """Log density between source and target."""
 
     source: Posterior
     target: Posterior
@@ -100,7 +102,7 @@ class _Between:
 
 
 def _parted(position: Matrix, rng: np.random.Generator) -> Matrix:
-    """Walkers in another sequence: the stretch of copies that resampling leaves is spread."""
+    """Walkers in another sequence: the runs of copies that resampling makes are spread."""
     return position[rng.permutation(len(position))]
 
 
@@ -124,7 +126,7 @@ def _resampled(log_weights: Vector, rng: np.random.Generator) -> np.ndarray[tupl
     return np.minimum(np.searchsorted(np.cumsum(weights), places), weights.size - 1)
 
 
-def _judged(coordinates: Array) -> Carried:
+def _judged(coordinates: Array) -> Transferred:
     ensembles, walkers = coordinates.shape[:2]
     owner = np.repeat(np.arange(ensembles), walkers)
     chains = coordinates.reshape(ensembles * walkers, *coordinates.shape[2:])
@@ -132,4 +134,4 @@ def _judged(coordinates: Array) -> Carried:
     for k in range(chains.shape[-1]):
         ess.append(float(array_stats.ess(chains[..., k], method="bulk")))  # type: ignore[no-untyped-call]
         rhat.append(float(array_stats.rhat_nested(chains[..., k], owner)))  # type: ignore[no-untyped-call]
-    return Carried(coordinates, min(ess), max(rhat))
+    return Transferred(coordinates, min(ess), max(rhat))

@@ -22,7 +22,7 @@ _ARRAYS = ("chain", "log_density", "position", "position_log_density", "accepted
 @final
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """How far a run has come."""
+    """Progress of a run."""
 
     ensembles: tuple[Ensemble, ...] = ()
     weighted: Weighted | None = None
@@ -48,7 +48,7 @@ def save_chain(path: Path, chain: Chain, fingerprint: str) -> None:
                 for name in _ARRAYS:
                     group.create_dataset(name, data=getattr(ensemble, name))
                 group.attrs["steps"] = ensemble.steps
-                group.attrs["way"] = ensemble.way
+                group.attrs["way"] = ensemble.tempering_moves
                 kind, keys, position, has_gauss, gauss = ensemble.random
                 group.attrs["random_kind"] = kind
                 group.create_dataset("random_keys", data=keys)
@@ -81,10 +81,16 @@ def load_chain(path: Path, fingerprint: str) -> Chain:
                 _read_weighted(file["weighted"]) if "weighted" in file else None,
                 tuple(int(done) for done in file.attrs["failed"]),
             )
-    except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:  # as h5py meets damage
+    except (
+        OSError,
+        KeyError,
+        TypeError,
+        ValueError,
+        RuntimeError,
+    ) as error:  # raised by h5py for damaged files
         raise InputError(f"{path}: not a chain this program wrote, or damaged ({error}); {advice}") from None
     if not own:
-        raise InputError(f"{path}: made from other records, settings or seed; {advice}")
+        raise InputError(f"{path}: written with other records, settings or seed; {advice}")
     return chain
 
 
@@ -109,7 +115,7 @@ def _read_weighted(group: h5py.Group) -> Weighted:
         float(group.attrs["log_evidence"][0]),
         float(group.attrs["log_evidence"][1]),
         sampled,
-        tuple(bool(one) for one in group.attrs["logarithmic"]),
+        tuple(bool(logarithmic) for logarithmic in group.attrs["logarithmic"]),
     )
     if group.attrs["digest"] != _weighted_digest(weighted):
         raise ValueError(f"{group.name} is not what was written")
@@ -131,9 +137,9 @@ def _ensemble(group: h5py.Group) -> Ensemble:
     )
     at, has_gauss, gauss = group.attrs["random_rest"]
     random = (group.attrs["random_kind"], group["random_keys"][()], int(at), int(has_gauss), float(gauss))
-    steps, way = int(group.attrs["steps"]), int(group.attrs["way"])
+    steps, tempering_moves = int(group.attrs["steps"]), int(group.attrs["way"])
     ensemble = Ensemble(
-        chain, log_density, position, position_log_density, accepted, steps, random, trail, way
+        chain, log_density, position, position_log_density, accepted, steps, random, trail, tempering_moves
     )
     if group.attrs["digest"] != _digest(ensemble):
         raise ValueError(f"{group.name} is not what was written")
@@ -143,7 +149,7 @@ def _ensemble(group: h5py.Group) -> Ensemble:
 def _digest(ensemble: Ensemble) -> str:
     """Hash of all that an ensemble holds."""
     kind, keys, *rest = ensemble.random
-    numbers = [float(number) for number in (*rest, ensemble.steps, ensemble.way)]
+    numbers = [float(number) for number in (*rest, ensemble.steps, ensemble.tempering_moves)]
     held = hashlib.sha256(repr((kind, numbers)).encode())
     for array in (keys, *(getattr(ensemble, name) for name in _ARRAYS)):
         held.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())

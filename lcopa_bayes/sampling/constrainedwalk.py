@@ -1,4 +1,4 @@
-"""A walk of many points through the prior, confined to likelihoods above a level.
+"""Random walk of many points in the prior, confined to likelihoods above a level.
 
 Metropolis steps that leave the prior unchanged where the likelihood exceeds the level. Five proposals:
 the difference of two members of a population in the sampled coordinates (ter Braak 2006, Statistics and
@@ -21,20 +21,20 @@ from lcopa_bayes.sampling.unitcube import UnitCube
 _JITTER = 1e-3
 """Relative perturbation of a difference, so that no point is confined to a lattice [-]."""
 _WHOLE = 0.1
-"""Share of differences taken whole, which leads from hill to hill [-]."""
+"""Share of differences of full length, which lead from mode to mode [-]."""
 _KINDS = {"difference": 0.10, "follow": 0.60, "slide": 0.15, "roam": 0.10, "swap": 0.05}
-"""How often each proposal is made [-]: of six mixtures tried on the paper's step at four levels of the
-likelihood, the one after which 512 points had best forgotten where they started."""
+"""Share of each proposal [-]: of six mixtures tried on the paper's step at four levels of the likelihood,
+the mixture after which 512 points had the lowest correlation with their start."""
 _NEAR, _FAR = 0.01, 1.5
 """Shortest and longest slide of the orders, in differences [-]."""
 _WANDER = 0.02
-"""Deviation added to the differences that slides are made of [-]."""
+"""Deviation added to the differences that slides consist of [-]."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Walk:
-    """How points travel."""
+    """Moves of points within the constraint."""
 
     cube: UnitCube
     steps: int
@@ -43,7 +43,7 @@ class Walk:
     def travelled(
         self, start: Matrix, level: float, population: Matrix, rng: np.random.Generator
     ) -> tuple[Matrix, Vector, int]:
-        """Where points are in the end, their log likelihood (-inf of one that never moved), evaluations.
+        """Final positions, their log likelihood (-inf of a point that never moved), evaluations.
 
         `start` (batch, dimension) must have a log likelihood above `level`; `population`
         (members, dimension), at least two, gives the differences and should be spread like `start`.
@@ -56,11 +56,11 @@ class Walk:
             taken = np.log(rng.random(z.shape[0])) < new - prior + log_jacobian
             chosen = np.flatnonzero(taken & (proposed != z).any(axis=1))
             if chosen.size:
-                found = self.cube.log_likelihood_inside(proposed[chosen])
+                proposed_height = self.cube.log_likelihood_inside(proposed[chosen])
                 evaluations += chosen.size
-                above = found > level
+                above = proposed_height > level
                 moved = chosen[above]
-                z[moved], prior[moved], height[moved] = proposed[moved], new[moved], found[above]
+                z[moved], prior[moved], height[moved] = proposed[moved], new[moved], proposed_height[above]
         return z, height, evaluations
 
     @cached_property
@@ -69,7 +69,7 @@ class Walk:
 
     @cached_property
     def _range(self) -> tuple[float, float]:
-        """Log of the lowest and of the highest frequency the records tell about [log 1 / time unit]."""
+        """Log of the lowest and of the highest frequency the records resolve [log 1 / time unit]."""
         grids = [experiment.mesh.grid for experiment in self.cube.posterior.model.experiments]
         span, step = max(grid.n * grid.step for grid in grids), min(grid.step for grid in grids)
         return float(np.log(0.5 / span)), float(np.log(0.5 / step))
@@ -77,7 +77,7 @@ class Walk:
     def _proposal(
         self, kind: str, z: Matrix, population: Matrix, rng: np.random.Generator
     ) -> tuple[Matrix, Vector]:
-        """Proposed coordinates and the log of the Jacobian; each as likely as its way back."""
+        """Proposed coordinates and the log of the Jacobian; each as likely as its reverse."""
         batch, dimension = z.shape
         a, b = _pairs(batch, population, rng)
         if kind == "difference" or not self._elements:
@@ -149,10 +149,10 @@ def _scales(batch: int, moving: Vector | int, rng: np.random.Generator) -> Matri
 
 
 def _swapped(element: Element, z: Matrix, rng: np.random.Generator) -> Matrix:
-    """The times of two neighbouring terms exchanged: where their orders meet, this is a small change."""
+    """The times of two neighbouring terms exchanged: where their orders are equal, this is a small change."""
     out, rows = z.copy(), np.arange(z.shape[0])
     if element.times.size > 1:
-        one = rng.integers(element.times.size - 1, size=z.shape[0])
-        first, second = element.times[one], element.times[one + 1]
+        index = rng.integers(element.times.size - 1, size=z.shape[0])
+        first, second = element.times[index], element.times[index + 1]
         out[rows, first], out[rows, second] = z[rows, second], z[rows, first]
     return out

@@ -1,4 +1,4 @@
-"""How far draws can be trusted, in numbers and in words."""
+"""Convergence of draws: diagnostics, grades and their reasons."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 from scipy.stats import chi2, norm, rankdata, spearmanr
 
 from lcopa_bayes.core.arrays import Array, Vector
-from lcopa_bayes.sampling.modes import Ridges
+from lcopa_bayes.sampling.modes import Modes
 
 Level = Literal["reliable", "tentative", "unusable"]
 
 RELIABLE_RHAT = 1.02
 """Nested R-hat of independent ensembles [-] (Margossian et al. 2024, Bayesian Analysis 19)."""
 TENTATIVE_RHAT = 1.1
-"""Above it the ensembles tell different stories."""
+"""Above it the estimates of the ensembles differ."""
 RELIABLE_MEMORY = 0.5
-"""Walkers have left where they started [-]."""
+"""Walkers are nearly independent of their start [-]."""
 TENTATIVE_MEMORY = 0.7
-"""Above it walkers hardly travel [-]."""
+"""Above it walkers hardly move [-]."""
 TENTATIVE_ESS = 100.0
-"""Below it not even a mean is known well [draws]."""
+"""Below it not even a mean is accurate [draws]."""
 RELIABLE_SCATTER = 0.3
 """Error of one ensemble's mean that is excluded at `_CONFIDENCE` [posterior standard deviations]: four
-ensembles that are each this far off know the mean to 0.15 of them, as 44 independent draws would."""
+ensembles, each with this error, give the mean to 0.15 of them, as 44 independent draws do."""
 _CONFIDENCE = 0.9
 """Of the upper bound on the scatter between ensembles [-]. Two ensembles with errors of 0.3 pass once in ten
 times, where R-hat lets every other pair pass; the price is that to pass nine times in ten two ensembles
@@ -36,9 +36,9 @@ without an error need 3 800 effective draws, three 800 and four 500."""
 CERTAIN = 3.0
 """Standard errors from which a drift is certain [-]."""
 RELIABLE_SHARES = 0.05
-"""Difference of a hill's share between ensembles, beyond Monte Carlo error, that moves little [-]."""
+"""Difference of a mode's share between ensembles, beyond Monte Carlo error, that has little influence [-]."""
 TENTATIVE_SHARES = 0.2
-"""Above it the weights of the hills are not known."""
+"""Above it the posterior mass of the modes is not known."""
 _RANK: dict[Level, int] = {"reliable": 0, "tentative": 1, "unusable": 2}
 
 
@@ -55,21 +55,21 @@ class Quality:
     rhat: float
     """Nested rank R-hat between ensembles [-]."""
     memory: float = 0.0
-    """Rank correlation, over walkers, of where they stand at the start and at the end of the draws [-];
-    walkers that do not travel have 1, and their number says nothing about the posterior."""
+    """Rank correlation, over walkers, between their positions at the start and at the end of the draws [-];
+    walkers that do not move have 1, and their number has no information about the posterior."""
     ess_between: float = np.inf
     """Number of independent draws whose mean scatters as the means of the ensembles do [draws]; also of the
-    shares of modes where there are several. It sees errors that all walkers of an ensemble share."""
+    shares of modes where there are several. It includes errors common to all walkers of an ensemble."""
     ess_drift: float = np.inf
     """Number of independent draws whose mean is as uncertain as the draws drift from their first to their
-    last third [draws]; infinite where no drift is certain. It sees what all ensembles have in common: a mode
+    last third [draws]; infinite where no drift is certain. It includes errors common to all ensembles: a mode
     that none of them had filled at the start."""
     scatter: float = 0.0
     """Upper bound at 90 % confidence on the error of one ensemble's mean [posterior standard deviations]."""
 
     @property
     def ess(self) -> float:
-        """The smallest of the effective sample sizes, NaN when one is [draws]."""
+        """The smallest of the effective sample sizes, NaN when any is [draws]."""
         return float(np.min([self.ess_bulk, self.ess_tail, self.ess_between, self.ess_drift]))
 
     def grade(self, target_ess: float) -> Grade:
@@ -91,40 +91,40 @@ class Quality:
         return Grade(
             level,
             f"{self.name}: R-hat {self.rhat:.3f}, effective sample size {self.ess:.0f}, "
-            f"walkers' memory {self.memory:.2f}",
+            f"rank correlation with the start {self.memory:.2f}",
         )
 
     def remedy(self, target_ess: float) -> str:
-        """In plain words: what keeps this parameter from being reliable, and what to do."""
+        """Why this parameter is not reliable, and the remedy."""
         if np.isnan(self.rhat) or np.isnan(self.ess):
             return "its draws do not vary; sample more steps, and check its prior"
-        wrong, steps = [], "sample more steps"
+        reasons, steps = [], "sample more steps"
         if self.rhat > RELIABLE_RHAT:
-            wrong.append(
-                f"the independent populations tell different stories about it (R-hat {self.rhat:.3f}, at "
-                f"most {RELIABLE_RHAT:g} when they agree): the posterior has several hills or a long ridge"
+            reasons.append(
+                f"its estimates differ between the independent ensembles (R-hat {self.rhat:.3f}, at most "
+                f"{RELIABLE_RHAT:g} when they agree): the posterior has several modes or a strong correlation"
             )
         if self.memory > RELIABLE_MEMORY:
-            wrong.append(
-                f"the walkers have hardly travelled (memory of their start {self.memory:.2f}, at most "
-                f"{RELIABLE_MEMORY:g} when they have)"
+            reasons.append(
+                f"the walkers still depend on where they started (rank correlation {self.memory:.2f}, at "
+                f"most {RELIABLE_MEMORY:g} is wanted)"
             )
         if self.rhat <= RELIABLE_RHAT and self.scatter > RELIABLE_SCATTER:
-            wrong.append(
-                f"the mean of each ensemble may be off by {self.scatter:.2f} standard deviations (at most "
-                f"{RELIABLE_SCATTER:g} when they agree closely enough)"
+            reasons.append(
+                f"the mean of each ensemble may have an error of {self.scatter:.2f} standard deviations (at "
+                f"most {RELIABLE_SCATTER:g} when they agree closely enough)"
             )
             steps += ", or with more ensembles"
         if self.ess_drift < target_ess:
-            wrong.append(
-                "its draws still drift: a mode that was hard to find is filling in all ensembles alike"
+            reasons.append(
+                "its draws still drift: a mode that is hard to reach is still filling in all ensembles"
             )
         if self.ess < target_ess:
-            wrong.append(f"it has {self.ess:.0f} effective draws where {target_ess:.0f} are wanted")
+            reasons.append(f"it has {self.ess:.0f} effective draws where {target_ess:.0f} are wanted")
             steps += f", about {max(2, ceil(target_ess / max(self.ess, 1.0)))} times as many"
         if self.rhat > RELIABLE_RHAT:
-            steps += "; or fix or narrow what the record cannot tell"
-        return f"{'; '.join(wrong)}; {steps}"
+            steps += "; or fix parameters that the record does not determine, or narrow their priors"
+        return f"{'; '.join(reasons)}; {steps}"
 
 
 @final
@@ -148,7 +148,7 @@ class Limitation:
     graded better than `level`."""
 
     level: Level
-    """The best grade while it stands."""
+    """The best grade under this limitation."""
     reason: str
     """A clause without a full stop, such as "intervals hold only if the noise model explains the rest"."""
     remedy: str = ""
@@ -173,18 +173,20 @@ class Limitation:
 def limited(grade: Grade, limitations: Sequence[Limitation]) -> Grade:
     """`grade`, or the lowest level of the limitations where that is lower.
 
-    The reason names each limitation, the most severe first, then the remedies; what was said of the sampling
+    The reason names each limitation, the most severe first, then the remedies; the reason of the sampling
     comes first where it is as low, else last.
     """
     if not limitations:
         return grade
-    ordered = sorted(limitations, key=lambda one: -_RANK[one.level])
-    remedies = dict.fromkeys(one.remedy for one in ordered if one.remedy)  # what several ask for is said once
-    said = "; ".join([*(one.reason for one in ordered), *remedies])
+    ordered = sorted(limitations, key=lambda limitation: -_RANK[limitation.level])
+    remedies = dict.fromkeys(
+        limitation.remedy for limitation in ordered if limitation.remedy
+    )  # a remedy of several limitations is given once
+    reasons = "; ".join([*(limitation.reason for limitation in ordered), *remedies])
     if _RANK[grade.level] >= _RANK[ordered[0].level]:
         joint = "but " if grade.level == "reliable" else "also, "
-        return Grade(grade.level, f"{grade.reason}; {joint}{said}")
-    return Grade(ordered[0].level, f"{said}; the sampling by itself is {grade.level}: {grade.reason}")
+        return Grade(grade.level, f"{grade.reason}; {joint}{reasons}")
+    return Grade(ordered[0].level, f"{reasons}; the sampling by itself is {grade.level}: {grade.reason}")
 
 
 def qualities(names: Sequence[str], values: Array) -> tuple[Quality, ...]:
@@ -212,14 +214,15 @@ def qualities(names: Sequence[str], values: Array) -> tuple[Quality, ...]:
 
 
 def _shared(values: Array) -> tuple[float, float, float]:
-    """What errors that walkers share are worth: `between`, with `drift` second."""
+    """Effective sample sizes by errors that walkers share: `between`, with `drift` second."""
     worth, scatter = between(values)
     return worth, drift(values), scatter
 
 
 def drift(values: Array) -> float:
     """Effective sample size by the drifts of draws (ensembles, walkers, draws) that are certain [draws]:
-    with variance v, a mean that drifts by d is worth ``v / d^2`` draws; infinite where none is certain."""
+    with variance v, a drift d of the mean corresponds to ``v / d^2`` draws; infinite where none is
+    certain."""
     worth = [variance / moved**2 for moved, error, variance in drifts(values) if abs(moved) > CERTAIN * error]
     return min(worth, default=np.inf)
 
@@ -229,19 +232,20 @@ def drifts(values: Array) -> tuple[tuple[float, float, float], ...]:
     and the variance of the draws: of their normal scores, of the shares beyond the 5 and the 95 % quantile.
 
     All ensembles start from populations of one kind, so that they may agree while a mode that few walkers
-    found still fills (after Geweke 1992, Bayesian Statistics 4). The error is by how walkers and by how
-    ensembles differ, the larger one. None for fewer than three draws and for draws that do not vary.
+    reached still fills (after Geweke 1992, Bayesian Statistics 4). The error is that of the scatter between
+    walkers or between ensembles, whichever is larger. None for fewer than three draws and for draws that do
+    not vary.
     """
     third, out = values.shape[2] // 3, []
     if third == 0 or np.ptp(values) == 0.0:
         return ()
     low, high = np.quantile(values, (0.05, 0.95))
-    for seen in (_scores(values), (values <= low).astype(float), (values >= high).astype(float)):
-        apart = seen[..., -third:].mean(axis=2) - seen[..., :third].mean(axis=2)
+    for scored in (_scores(values), (values <= low).astype(float), (values >= high).astype(float)):
+        apart = scored[..., -third:].mean(axis=2) - scored[..., :third].mean(axis=2)
         error = float(apart.std(ddof=1) / np.sqrt(apart.size))
         if apart.shape[0] > 1:
             error = max(error, float(apart.mean(axis=1).std(ddof=1) / np.sqrt(apart.shape[0])))
-        out.append((float(apart.mean()), error, float(seen.var())))
+        out.append((float(apart.mean()), error, float(scored.var())))
     return tuple(out)
 
 
@@ -257,9 +261,9 @@ def between(values: Array) -> tuple[float, float]:
     ranks.
 
     With K ensembles, variance v of all draws and variance B of the ensembles' means, the mean of all has the
-    variance B / K and is worth ``K v / B`` draws. As ``(K - 1) B / sigma^2`` has the chi-square law with
-    K - 1 degrees of freedom, sigma is below ``sqrt((K - 1) B / chi2)`` at the lower quantile of that law. NaN
-    for a single ensemble and for draws that do not vary.
+    variance B / K and corresponds to ``K v / B`` draws. As ``(K - 1) B / sigma^2`` has the chi-square law
+    with K - 1 degrees of freedom, sigma is below ``sqrt((K - 1) B / chi2)`` at the lower quantile of that
+    law. NaN for a single ensemble and for draws that do not vary.
     """
     ensembles = values.shape[0]
     if ensembles < 2 or np.ptp(values) == 0.0:
@@ -272,9 +276,9 @@ def between(values: Array) -> tuple[float, float]:
     return worth, float(np.sqrt((ensembles - 1) * apart / least / variance))
 
 
-def with_shares(quality: Quality, found: Sequence[Ridges]) -> Quality:
+def with_shares(quality: Quality, modes: Sequence[Modes]) -> Quality:
     """The quality of a parameter with modes: exchange between them may be slower than what moves its mean."""
-    shares = [one.ess for one in found if one.parameter == quality.name]
+    shares = [mode.ess for mode in modes if mode.parameter == quality.name]
     return replace(quality, ess_between=float(np.min([quality.ess_between, *shares])))
 
 
@@ -285,41 +289,41 @@ def rank_correlation(before: Vector, after: Vector) -> float:
     return float(spearmanr(before, after).statistic)
 
 
-def shares_grade(found: Ridges) -> Grade:
-    """Grade of how alike the ensembles weigh the hills of a parameter."""
+def shares_grade(modes: Modes) -> Grade:
+    """Grade of how well the ensembles agree on the posterior mass of a parameter's modes."""
     level: Level = (
         "reliable"
-        if found.spread <= RELIABLE_SHARES
+        if modes.spread <= RELIABLE_SHARES
         else "tentative"
-        if found.spread <= TENTATIVE_SHARES
+        if modes.spread <= TENTATIVE_SHARES
         else "unusable"
     )
-    return Grade(level, found.sentence())
+    return Grade(level, modes.sentence())
 
 
-def overall(found: Sequence[Quality], target_ess: float, ridges: Sequence[Ridges] = ()) -> Grade:
-    """Grade of a run: the worst parameter's, lowered where ensembles weigh hills differently, with what is
-    wrong and the remedy when it is not reliable."""
-    told = _by_quality(found, target_ess)
-    graded = sorted(((one.spread, shares_grade(one)) for one in ridges), key=lambda pair: -pair[0])
+def overall(qualities: Sequence[Quality], target_ess: float, modes: Sequence[Modes] = ()) -> Grade:
+    """Grade of a run: the worst parameter's, lowered where ensembles weigh modes differently, with the reason
+    and the remedy when it is not reliable."""
+    by_quality = _by_quality(qualities, target_ess)
+    graded = sorted(((mode.spread, shares_grade(mode)) for mode in modes), key=lambda pair: -pair[0])
     uneven = [grade for _, grade in graded if grade.level != "reliable"]
     if not uneven:
-        return told
+        return by_quality
     others = f" (and {len(uneven) - 1} more like this)" if len(uneven) > 1 else ""
-    reason = uneven[0].reason + others + ("" if told.level == "reliable" else f"; {told.reason}")
-    return Grade(Grade.worst([told, uneven[0]]).level, reason)
+    reason = uneven[0].reason + others + ("" if by_quality.level == "reliable" else f"; {by_quality.reason}")
+    return Grade(Grade.worst([by_quality, uneven[0]]).level, reason)
 
 
-def _by_quality(found: Sequence[Quality], target_ess: float) -> Grade:
+def _by_quality(qualities: Sequence[Quality], target_ess: float) -> Grade:
     """The worst parameter's grade, and why."""
-    worst = max(found, key=lambda quality: (_RANK[quality.grade(target_ess).level], -quality.ess))
+    worst = max(qualities, key=lambda quality: (_RANK[quality.grade(target_ess).level], -quality.ess))
     grade = worst.grade(target_ess)
-    weak = [quality.name for quality in found if quality.grade(target_ess).level == grade.level]
+    weak = [quality.name for quality in qualities if quality.grade(target_ess).level == grade.level]
     if grade.level == "reliable":
         return Grade(
             "reliable",
-            f"independent ensembles agree (largest R-hat {max(q.rhat for q in found):.3f}) and the smallest "
-            f"effective sample size is {min(q.ess for q in found):.0f} ({worst.name})",
+            f"independent ensembles agree (largest R-hat {max(q.rhat for q in qualities):.3f}) and the "
+            f"smallest effective sample size is {min(q.ess for q in qualities):.0f} ({worst.name})",
         )
     others = f" (also {', '.join(n for n in weak if n != worst.name)})" if len(weak) > 1 else ""
     return Grade(grade.level, f"{worst.name}{others}: {worst.remedy(target_ess)}")

@@ -63,7 +63,7 @@ class Chart:
     def charted(self, z: Matrix) -> tuple[Matrix, Vector]:
         """Chart of sampled coordinates (batch, dimension), and log |d chart / d coordinates|, (batch,).
 
-        Exchangeable terms are sorted first. Infinite where a coordinate stands on one of its ends.
+        Exchangeable terms are sorted first. Infinite where a coordinate is at one of its ends.
         """
         z = self.terrain.sorted(z)
         y, log_volume = z.copy(), np.zeros(len(z))

@@ -26,7 +26,7 @@ _FIRST = 8
 _DIVISIONS = 2
 """Divisions of the points among charts."""
 _NEGLIGIBLE = 0.02
-"""Charts that explain a smaller share of the points are left out [-]."""
+"""Charts that explain a smaller share of the points are omitted [-]."""
 _MOST_CHARTS = 16
 """Most charts that are tried; elements beyond hold no term."""
 _WIDER, _DEFENSIVE = 1.6, 0.25
@@ -90,13 +90,13 @@ class Cover:
         """Independent draws of the sampled coordinates, chart by chart; fewer than `count` where a chart
         has no point."""
         shares = np.array([mixture.weights.sum() for mixture in self.mixtures])
-        found = []
+        coordinates = []
         for (_, chart), mixture, number in zip(
             self.charts, self.mixtures, rng.multinomial(count, shares / shares.sum()), strict=True
         ):
             z, exists = chart.uncharted(mixture.draw(int(number), rng))
-            found.append(z[exists])
-        return np.concatenate(found)
+            coordinates.append(z[exists])
+        return np.concatenate(coordinates)
 
     def log_density(self, z: Matrix) -> Vector:
         """Log density of the sampled coordinates, exchangeable terms by decreasing order, (n,)."""

@@ -1,8 +1,8 @@
 """Importance draws from a cover of where ensembles have been.
 
-Ensembles that share a way of starting can agree while a mode that is hard to reach still fills in all of
+Ensembles that start alike can agree while a mode that is hard to reach still fills in all of
 them alike. Independent draws of a cover fitted to what they visited, weighted by the posterior, have shares
-and means of their own, whose errors are known from the weights. They are the better result where the weights
+and means of their own, whose errors follow from the weights. They are the better result where the weights
 converge in the whole and in each tail and mode by itself; where they do not, ensembles go on.
 """
 
@@ -23,11 +23,11 @@ from lcopa_bayes.sampling.weighted import Weighted
 _COMPONENTS = 60
 """Components of the cover."""
 _PILOT = 20_000
-"""First draws, which tell how many are needed."""
+"""First draws, from which the number needed is estimated."""
 _MOST = 320_000
 """Most draws."""
 _SPARE = 1.15
-"""Factor on the number of draws that those so far say are needed [-]."""
+"""Factor on the estimated number of draws needed [-]."""
 _PART = 500
 """Fewest draws of a task."""
 _TASKS = 8
@@ -49,9 +49,9 @@ class _Density:
 def cover_draws(
     posterior: Posterior, visited: Matrix, wanted: float, seed: int, crew: Crew
 ) -> Weighted | None:
-    """Weighted draws worth `wanted` effective ones for the centre, the tails and the shares of modes of every
-    sampled parameter, from a cover of the points `visited` (n, dimension); None where no number of draws in
-    reach gives them or the weights do not converge.
+    """Weighted draws equivalent to `wanted` independent draws for the centre, the tails and the shares of
+    modes of every sampled parameter, from a cover of the points `visited` (n, dimension); None where no
+    number of draws in reach gives them or the weights do not converge.
 
     Deterministic given the arguments; FloatingPointError where the density is NaN.
     """
@@ -63,10 +63,10 @@ def cover_draws(
         drawn.append(_drawn(posterior, cover, wanted_count - count, rng, crew))
         count = wanted_count
         z, density, raw = (np.concatenate(part) for part in zip(*drawn, strict=True))
-        found = Weighted.of(posterior, z, density, raw, count, smooth=False)
-        worth = found.smallest_ess(rng)
+        weighted = Weighted.of(posterior, z, density, raw, count, smooth=False)
+        worth = weighted.smallest_ess(rng)
         if worth >= wanted:
-            return found
+            return weighted
         needed = ceil(_SPARE * count * wanted / worth)
         if count >= 2 * _PILOT and needed > 2 * _MOST:
             return None
@@ -77,7 +77,7 @@ def cover_draws(
 def _drawn(
     posterior: Posterior, cover: Cover, count: int, rng: np.random.Generator, crew: Crew
 ) -> tuple[Matrix, Vector, Vector]:
-    """`count` draws of a cover, those that no chart or no prior has left out: coordinates, log density and
+    """`count` draws of a cover, without those outside the charts or the prior: coordinates, log density and
     log weight."""
     z = rng.permutation(cover.draw(count, rng))
     parts = np.array_split(z, max(1, min(_TASKS, len(z) // _PART)))

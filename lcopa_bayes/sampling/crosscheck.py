@@ -17,12 +17,12 @@ from lcopa_bayes.sampling.draws import Draws
 from lcopa_bayes.sampling.nested import Nested
 
 ALARM = 0.01
-"""Probability that two samples of one posterior are said to disagree, over all comparisons together [-]: a
-study in a hundred is graded too low, and a hill that one method missed has p-values far below."""
+"""Probability that two samples of one posterior are reported to disagree, over all comparisons together [-]:
+a study in a hundred is graded too low, and a mode that one method missed has p-values far below."""
 _LOWER: dict[Level, Level] = {"reliable": "tentative", "tentative": "unusable", "unusable": "unusable"}
 _REMEDY = (
-    "one of the two has missed or misjudged part of the posterior; sample more steps, with more ensembles "
-    "and without --quick, or fix or narrow what the record cannot tell"
+    "one of the two has missed a mode or its posterior mass; sample more steps, with more ensembles and "
+    "without --quick, or fix parameters that the record does not determine, or narrow their priors"
 )
 
 
@@ -110,7 +110,7 @@ class CrossCheck:
             pair = Summary.of(ours, quality.ess), Summary.of(theirs, float(nested.ess[k]))
             pairs.append(pair)
             distances.append(_distance(ours, theirs))
-            scales.append(_scale(*(one.ess for one in pair)))
+            scales.append(_scale(*(summary.ess for summary in pair)))
         raw = [float(kstwobign.sf(d * s)) for d, s in zip(distances, scales, strict=True)]
         with_evidence = log_evidence is not None and log_evidence_sd is not None
         if log_evidence is not None and log_evidence_sd is not None:
@@ -141,8 +141,8 @@ class CrossCheck:
     @cached_property
     def _apart(self) -> tuple[Compared, ...]:
         """Parameters that raise the alarm, the largest distance first."""
-        apart = [one for one in self.parameters if one.p < ALARM]
-        return tuple(sorted(apart, key=lambda one: -one.distance))
+        apart = [parameter for parameter in self.parameters if parameter.p < ALARM]
+        return tuple(sorted(apart, key=lambda parameter: -parameter.distance))
 
     @property
     def _evidence_apart(self) -> bool:
@@ -150,14 +150,14 @@ class CrossCheck:
 
     @property
     def sentence(self) -> str:
-        """What was found, in words, without a full stop."""
+        """Result of the comparison as a sentence without a full stop."""
         if self.agrees:
-            coarse = max(self.parameters, key=lambda one: one.resolution)
+            coarse = max(self.parameters, key=lambda parameter: parameter.resolution)
             noticed = (
                 f"a difference of {coarse.resolution:.2f} in a cumulative probability of {coarse.name}, the "
-                "least well resolved, would have been noticed"
+                "least well resolved, would have been detected"
                 if coarse.resolution < 1
-                else f"but there are too few effective draws of {coarse.name} to notice any"
+                else f"but there are too few effective draws of {coarse.name} to detect any"
             )
             return (
                 "nested sampling, an independent method, agrees: no marginal differs by more than chance "
@@ -166,7 +166,7 @@ class CrossCheck:
         said = []
         if self._apart:
             worst = self._apart[0]
-            others = [one.name for one in self._apart[1:]]
+            others = [parameter.name for parameter in self._apart[1:]]
             also = f" (also {', '.join(others)})" if others else ""
             said.append(
                 f"the marginal of {worst.name} differs by {worst.distance:.2f} in cumulative probability, "
@@ -190,7 +190,7 @@ class CrossCheck:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        told: dict[str, Any] = plain(
+        fields: dict[str, Any] = plain(
             {
                 "agrees": self.agrees,
                 "sentence": self.sentence,
@@ -204,35 +204,35 @@ class CrossCheck:
                 "evaluations": self.nested.evaluations,
                 "parameters": [
                     {
-                        "name": one.name,
-                        "unit": one.unit,
-                        "run": one.run.as_json(),
-                        "nested": one.nested.as_json(),
-                        "distance": one.distance,
-                        "p": one.p,
-                        "resolution": one.resolution,
+                        "name": parameter.name,
+                        "unit": parameter.unit,
+                        "run": parameter.run.as_json(),
+                        "nested": parameter.nested.as_json(),
+                        "distance": parameter.distance,
+                        "p": parameter.p,
+                        "resolution": parameter.resolution,
                     }
-                    for one in self.parameters
+                    for parameter in self.parameters
                 ],
             }
         )
-        return told
+        return fields
 
 
 def holm(p: Sequence[float]) -> list[float]:
     """p-values adjusted for their number [-]: the chance that the least of them is below a level, when
-    nothing is the matter, is at most that level."""
+    both sample one posterior, is at most that level."""
     order = np.argsort(p, kind="stable")
     steps = np.asarray(p)[order] * np.arange(len(p), 0, -1)
     out = np.empty(len(p))
     out[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
-    return [float(one) for one in out]
+    return [float(value) for value in out]
 
 
 def _distance(first: Vector, second: Vector) -> float:
     """Largest difference of two empirical distribution functions [-]."""
     at = np.concatenate([first, second])
-    shares = [np.searchsorted(np.sort(one), at, side="right") / one.size for one in (first, second)]
+    shares = [np.searchsorted(np.sort(values), at, side="right") / values.size for values in (first, second)]
     return float(np.abs(shares[0] - shares[1]).max())
 
 

@@ -1,6 +1,6 @@
 """Evidence and weights of nested sampling from its dead points, whatever runs they come from.
 
-A run with N live points is N strands: each starts in the prior and climbs to higher likelihood, point by
+A run with N live points is N strands: each starts in the prior and continues to higher likelihood, point by
 point (Higson et al. 2018, Bayesian Analysis 13). Strands of several runs together are a run with
 all their live points; drawing strands again with replacement gives the sampling error.
 """
@@ -54,7 +54,7 @@ class Strands:
         """Log of each point's share of the evidence, (points,) [nat]; their sum is the evidence.
 
         The prior volume above a point shrinks by ``n / (n + m)`` as m copies of it leave n live points.
-        `copies`, (strands,), says how often each strand is there; once by default.
+        `copies`, (strands,), is how often each strand is counted; once by default.
         """
         count = np.ones(self.strands, dtype=np.intp) if copies is None else copies
         leaving = count[self.strand]

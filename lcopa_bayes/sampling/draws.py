@@ -26,7 +26,7 @@ from lcopa_bayes.sampling.convergence import (
     shares_grade,
     with_shares,
 )
-from lcopa_bayes.sampling.modes import Ridges, ridges
+from lcopa_bayes.sampling.modes import Modes, modes_of
 from lcopa_bayes.sampling.sampler import Run, sampled_qualities
 from lcopa_bayes.sampling.weighted import Weighted
 
@@ -51,9 +51,9 @@ class Draws:
     qualities: tuple[Quality, ...]
     """Of every free parameter, in table order."""
     target_ess: float
-    """Effective sample size asked for [draws]."""
-    ridges: tuple[Ridges, ...] = ()
-    """Of the sampled parameters whose marginal has more than one hill."""
+    """Effective sample size wanted [draws]."""
+    modes: tuple[Modes, ...] = ()
+    """Of the sampled parameters whose marginal has more than one mode."""
     limitations: tuple[Limitation, ...] = ()
     """Conditions under which the intervals hold: each caps the grades of the numbers it concerns."""
 
@@ -65,7 +65,7 @@ class Draws:
     @cached_property
     def sampling_grade(self) -> Grade:
         """Grade of the sampling alone, whatever limits the numbers beside it."""
-        return overall(self.qualities, self.target_ess, self.ridges)
+        return overall(self.qualities, self.target_ess, self.modes)
 
     def limited(self, limitations: Sequence[Limitation]) -> Draws:
         """The same draws under further limitations."""
@@ -73,7 +73,9 @@ class Draws:
 
     def level(self, parameter: str, grade: Grade) -> Level:
         """Level of a number of a parameter graded `grade`, under the limitations that concern it."""
-        return limited(grade, [one for one in self.limitations if one.concerns(parameter)]).level
+        return limited(
+            grade, [limitation for limitation in self.limitations if limitation.concerns(parameter)]
+        ).level
 
     @property
     def flat(self) -> Matrix:
@@ -96,7 +98,7 @@ class Draws:
 
     def estimates(self) -> tuple[Estimate, ...]:
         """Median, interval and grade of every free parameter."""
-        shares = {found.parameter: [shares_grade(found)] for found in self.ridges}
+        shares = {modes.parameter: [shares_grade(modes)] for modes in self.modes}
         return tuple(
             Estimate.of(
                 quality.name,
@@ -125,15 +127,15 @@ def gather(posterior: Posterior, run: Run) -> Draws:
     rng = np.random.default_rng(np.random.SeedSequence(run.plan.seed, spawn_key=(1_000,)))
     flat = coordinates.reshape(-1, coordinates.shape[-1])
     values = _completed(posterior, flat, rng).reshape(*coordinates.shape[:3], -1)
-    found = {quality.name: quality for quality in sampled_qualities(posterior, run)}
+    by_name = {quality.name: quality for quality in sampled_qualities(posterior, run)}
     if posterior.linear:
         names = [posterior.table.names[k] for k in posterior.linear]
-        found |= {q.name: q for q in qualities(names, values[..., posterior.linear])}
+        by_name |= {q.name: q for q in qualities(names, values[..., posterior.linear])}
     rows = [(k, posterior.table.rows[k]) for k in posterior.sampled]
-    hills = [ridges(row.name, row.unit, values[..., k], log_scale=row.log_scale) for k, row in rows]
-    several = tuple(one for one in hills if one.boundaries)
-    free = [name for name in posterior.table.names if name in found]
-    ordered = tuple(with_shares(found[name], several) for name in free)
+    marginals = [modes_of(row.name, row.unit, values[..., k], log_scale=row.log_scale) for k, row in rows]
+    multimodal = tuple(marginal for marginal in marginals if marginal.boundaries)
+    free = [name for name in posterior.table.names if name in by_name]
+    ordered = tuple(with_shares(by_name[name], multimodal) for name in free)
     by_draw = values.swapaxes(1, 2).reshape(ensembles, -1, values.shape[-1])
     densities = log_density.swapaxes(1, 2).reshape(ensembles, -1)
     picked = np.linspace(0, by_draw.shape[1] - 1, min(_PER_ENSEMBLE, by_draw.shape[1])).astype(int)
@@ -143,7 +145,7 @@ def gather(posterior: Posterior, run: Run) -> Draws:
         densities[:, picked],
         ordered,
         run.plan.target_ess,
-        several,
+        multimodal,
         _unconfirmed(run.unconfirmed),
     )
 
@@ -157,7 +159,7 @@ def _unconfirmed(parameters: tuple[str, ...]) -> tuple[Limitation, ...]:
             "tentative",
             f"modes of {', '.join(parameters)} filled while the ensembles ran, and independent draws of a "
             "cover could not confirm their shares",
-            "allow more steps, or fix or narrow what the record cannot tell",
+            "allow more steps, or fix parameters that the record does not determine, or narrow their priors",
             parameters,
         ),
     )
@@ -175,13 +177,13 @@ def _resampled(
 ) -> Draws:
     """Draws at positions of weighted ones.
 
-    Parts of the weighted draws stand for the ensembles of a sampler: being independent, they let R-hat and
-    scatter see a mean that hangs on a few draws. Effective sample sizes are those of the weights and of the
-    number of draws together.
+    Parts of the weighted draws take the place of the ensembles of a sampler: being independent, they let
+    R-hat and scatter show a mean that depends on a few draws. Effective sample sizes are those of the weights
+    and of the number of draws together.
     """
     values = _completed(posterior, weighted.coordinates[chosen.ravel()], rng)
     values = values.reshape(*chosen.shape, -1)
-    several, rows = [], posterior.table.rows
+    multimodal, rows = [], posterior.table.rows
     # an effective size of independent draws joined with the number of those delivered; infinite where fixed
     centre, tail = (
         own * chosen.size / (own + chosen.size)
@@ -190,12 +192,12 @@ def _resampled(
     sizes = {k: (float(centre[at]), float(tail[at])) for at, k in enumerate(posterior.sampled)}
     linear = (float(min(centre, default=weighted.ess)), float(min(tail, default=weighted.ess)))
     for at, k in enumerate(posterior.sampled):
-        # draws are in random order: a few of them stand for those of a walker
+        # draws are in random order: a few of them take the place of a walker
         walkers = values[..., k].reshape(len(chosen), -1, 1)
-        found = ridges(rows[k].name, rows[k].unit, walkers, log_scale=rows[k].log_scale)
-        if found.boundaries:
-            by_weights = weighted.share_errors(weighted.sampled[:, at], found.boundaries)
-            several.append(replace(found, errors=np.hypot(found.errors, by_weights)))
+        modes = modes_of(rows[k].name, rows[k].unit, walkers, log_scale=rows[k].log_scale)
+        if modes.boundaries:
+            by_weights = weighted.share_errors(weighted.sampled[:, at], modes.boundaries)
+            multimodal.append(replace(modes, errors=np.hypot(modes.errors, by_weights)))
     measured = tuple(
         with_shares(
             Quality(
@@ -204,13 +206,13 @@ def _resampled(
                 float(array_stats.rhat_nested(values[..., k], np.arange(len(chosen)))),  # type: ignore[no-untyped-call]
                 scatter=between(values[:, None, :, k])[1],
             ),
-            several,
+            multimodal,
         )
         for k, row in enumerate(rows)
         if row.free
     )
     density = weighted.log_density[chosen]
-    return Draws(posterior.table, values, density, measured, target_ess, tuple(several))
+    return Draws(posterior.table, values, density, measured, target_ess, tuple(multimodal))
 
 
 def _completed(posterior: Posterior, flat: Matrix, rng: np.random.Generator) -> Matrix:

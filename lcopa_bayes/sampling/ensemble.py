@@ -1,4 +1,4 @@
-"""One emcee ensemble as a value that can be advanced, stored and taken up again."""
+"""One emcee ensemble as a value that can be advanced, stored and resumed."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ import numpy as np
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.mixture import Mixture
-from lcopa_bayes.sampling.ridgemoves import walking
+from lcopa_bayes.sampling.ridgemoves import emcee_sampler
 from lcopa_bayes.sampling.tempering import temper
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Ensemble:
-    """Kept draws of one ensemble and all it needs to go on."""
+    """Kept draws of one ensemble and the state it continues from."""
 
     chain: Array
     """Sampled coordinates, (draws, walkers, dimension)."""
     log_density: Matrix
     """(draws, walkers)."""
     position: Matrix
-    """Where the walkers stand, (walkers, dimension)."""
+    """Positions of the walkers, (walkers, dimension)."""
     position_log_density: Vector
     """(walkers,)."""
     accepted: Vector
@@ -35,16 +35,18 @@ class Ensemble:
     random: tuple[Any, ...]
     """State of the legacy generator that emcee draws from."""
     trail: Matrix
-    """Where the population stood on the last part of its way from the prior, (points, dimension)."""
-    way: int
-    """Moves per walker that the way from the prior took [-]."""
+    """Positions of the population on the last part of the tempering path, (points, dimension)."""
+    tempering_moves: int
+    """Moves of tempering per walker [-]."""
 
     @classmethod
-    def born(cls, posterior: Posterior, walkers: int, sweeps: int, seed: np.random.SeedSequence) -> Ensemble:
+    def tempered(
+        cls, posterior: Posterior, walkers: int, sweeps: int, seed: np.random.SeedSequence
+    ) -> Ensemble:
         """A population tempered from the prior; emcee needs a legacy generator, seeded here and nowhere
         else."""
-        draw, walk = seed.spawn(2)
-        random = tuple(np.random.RandomState(np.random.MT19937(walk)).get_state())
+        draw, moves = seed.spawn(2)
+        random = tuple(np.random.RandomState(np.random.MT19937(moves)).get_state())
         population, random = temper(posterior, walkers, sweeps, np.random.default_rng(draw), random)
         return cls(
             np.empty((0, walkers, posterior.dimension)),
@@ -77,7 +79,7 @@ def advance(
     the same draws, in whatever process.
     """
     walkers = ensemble.position.shape[0]
-    sampler = walking(posterior, posterior.log_density, walkers, mixture, ensemble.random)
+    sampler = emcee_sampler(posterior, posterior.log_density, walkers, mixture, ensemble.random)
     state = emcee.State(ensemble.position, log_prob=ensemble.position_log_density)
     last = sampler.run_mcmc(state, draws, thin_by=thin, skip_initial_state_check=True)
     return Ensemble(
@@ -89,5 +91,5 @@ def advance(
         ensemble.steps + draws * thin,
         tuple(sampler.random_state),
         ensemble.trail,
-        ensemble.way,
+        ensemble.tempering_moves,
     )

@@ -2,8 +2,8 @@
 
 Meng and Wong (1996), Statistica Sinica 6; Gronau et al. (2017), J. Math. Psychol. 81. Each ensemble gives
 an estimate of its own: a mixture fitted to the draws of the others, in the chart of the posterior, is
-bridged to its draws. So no draw is used twice, and the spread of the estimates tells the error of
-populations that have not found the same hills.
+bridged to its draws. So no draw is used twice, and the spread of the estimates includes the error of
+populations that have not reached the same modes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _RELIABLE = 0.5
 """Largest standard error of a reliable log evidence or log predictive density: a model comparison turns on a
 few nats [nat]."""
 _TENTATIVE = 2.0
-"""Above it the ensembles tell different stories [nat]."""
+"""Above it the estimates of the ensembles differ [nat]."""
 _BRIDGED = 3_000
 """Draws of each side of a bridge."""
 _SETTLED = 1e-10
@@ -46,7 +46,7 @@ class Evidence:
 
     @property
     def grade(self) -> Grade:
-        """Reliable when known to half a nat, unusable when not to two."""
+        """Reliable with an error of at most half a nat, unusable with more than two."""
         return Grade(known_to(self.sd), f"log evidence {self.value:.2f}, standard error {self.sd:.2f} nat")
 
 
@@ -58,11 +58,14 @@ def known_to(error: float) -> Level:
 def evidence_of(posterior: Posterior, run: Run, ess: float) -> Evidence | None:
     """Log evidence of a run: the mean weight of importance draws, with that of every batch; or `evidence` of
     its ensembles, None for a single one. `ess` as there."""
-    found = run.weighted
-    if found is None:
+    weighted = run.weighted
+    if weighted is None:
         return evidence(posterior, run.kept()[0], ess, run.plan.seed)
-    by_batch = [logsumexp(found.raw[part]) - np.log(found.count / len(found.parts)) for part in found.parts]
-    return Evidence(found.log_evidence, found.log_evidence_sd, tuple(map(float, by_batch)))
+    by_batch = [
+        logsumexp(weighted.raw[part]) - np.log(weighted.count / len(weighted.parts))
+        for part in weighted.parts
+    ]
+    return Evidence(weighted.log_evidence, weighted.log_evidence_sd, tuple(map(float, by_batch)))
 
 
 def evidence(posterior: Posterior, coordinates: Array, ess: float, seed: int) -> Evidence | None:
@@ -75,23 +78,23 @@ def evidence(posterior: Posterior, coordinates: Array, ess: float, seed: int) ->
         return None
     random = np.random.RandomState(np.random.MT19937(np.random.SeedSequence(seed, spawn_key=(2_000,))))
     chart = Chart.of(posterior)
-    pools = [chart.usable(spread_evenly(one.reshape(-1, dimension), _BRIDGED)) for one in coordinates]
-    found = []
+    pools = [chart.usable(spread_evenly(draws.reshape(-1, dimension), _BRIDGED)) for draws in coordinates]
+    estimates = []
     for k, (pool, y, log_volume) in enumerate(pools):
         others = np.concatenate([points for j, (_, points, _) in enumerate(pools) if j != k])
         mixture = Mixture.fitted(others, seed)
         drawn = mixture.draw(_BRIDGED, random)
         own = posterior.log_density(pool) + posterior.table.log_permutations - log_volume
-        found.append(
+        estimates.append(
             bridge(
                 own - mixture.log_density(y),
                 charted_density(posterior, chart, drawn) - mixture.log_density(drawn),
                 ess / ensembles,
             )
         )
-    values = [value for value, _ in found]
+    values = [value for value, _ in estimates]
     spread = float(np.std(values, ddof=1))
-    claimed = float(np.sqrt(np.mean([error**2 for _, error in found])))
+    claimed = float(np.sqrt(np.mean([error**2 for _, error in estimates])))
     return Evidence(float(np.mean(values)), float(max(spread, claimed) / np.sqrt(ensembles)), tuple(values))
 
 
@@ -99,7 +102,8 @@ def bridge(posterior_side: Vector, mixture_side: Vector, ess: float) -> tuple[fl
     """Log of the ratio of two normalising constants, and its standard error [nat].
 
     Both arguments are log (unnormalised density / normalised density of the mixture): at draws of the
-    first, worth `ess` independent ones, and at independent draws of the mixture; -inf is allowed there.
+    first, equivalent to `ess` independent draws, and at independent draws of the mixture; -inf is allowed
+    there.
     """
     ess = min(ess, float(posterior_side.size))
     centre = float(np.median(posterior_side))

@@ -7,7 +7,7 @@ column of ones, at terms + 1 real frequencies s_k: the response ``gain / D(s_k)`
     (y_0, y) = A'^-1 diag(exp(step)) A (1, c),   c' = y / y_0,   gain' = gain exp(gain_step) / y_0,
 
 whatever the new orders in A'. The homography from c to c' has the Jacobian
-``|det A| exp(sum_k step_k) / (|det A'| y_0^(terms + 1))``; with the opposite steps it leads back.
+``|det A| exp(sum_k step_k) / (|det A'| y_0^(terms + 1))``; the opposite steps reverse it.
 """
 
 from __future__ import annotations

@@ -3,11 +3,11 @@
 The proposal is a mixture of Student components in the chart of the posterior, one group per local optimum,
 fitted to its own weighted draws in a few rounds (Cappé, Douc, Guillin, Marin and Robert 2008, Statistics and
 Computing 18) and widened in part, so that its tails are heavier than the posterior's. Draws of a last, fixed
-proposal carry the result. Their weights are smoothed by a generalised Pareto distribution, whose shape k
-tells whether averages over them converge (Vehtari, Simpson, Gelman, Yao and Gabry 2024, JMLR 25).
+proposal give the result. Their weights are smoothed by a generalised Pareto distribution, whose shape k
+shows whether averages over them converge (Vehtari, Simpson, Gelman, Yao and Gabry 2024, JMLR 25).
 
-What no draw of the proposal reaches, no weight can show: a mode that neither the starts of the optimisation
-nor the tails of the proposal meet is missed. Tempered ensembles (`sampler`) are the method for posteriors
+No weight shows what no draw of the proposal reaches: a mode outside the starts of the optimisation and the
+tails of the proposal is missed. Tempered ensembles (`sampler`) are the method for posteriors
 with several modes, and what a caller falls back to where `Importance.good` is false.
 """
 
@@ -30,7 +30,7 @@ from lcopa_bayes.sampling.weighted import Weighted, tail_smoothed
 
 LEAST_EFFICIENCY = 0.4
 """Effective draws per draw of a good result [-]. A small k alone is not enough: a two-term posterior gave
-k = 0.4 at an efficiency of 0.2 while a third of its mass had not been met."""
+k = 0.4 at an efficiency of 0.2 while a third of its mass was not covered."""
 _MOST = 12
 """Components beyond which a further attempt takes more draws alone [-]."""
 _LIGHT = 0.2
@@ -40,7 +40,7 @@ _LIGHT = 0.2
 @final
 @dataclass(frozen=True)
 class Effort:
-    """How much work one attempt may spend."""
+    """Limits on the work of one attempt."""
 
     draws: int
     """Draws of the last proposal."""
@@ -56,11 +56,11 @@ class ImportancePlan:
     """How much work importance sampling may spend."""
 
     efforts: tuple[Effort, ...] = (Effort(4_000, 1_000, 6), Effort(8_000, 3_000, 6))
-    """Attempts, each going on from the one before with more components, until one is good."""
+    """Attempts, each continuing the previous attempt with more components, until one is good."""
     starts: int = 6
     """Starts of the least-squares search."""
     wanted: float = 400.0
-    """Effective draws of a good one."""
+    """Effective draws of a good attempt."""
 
 
 @final
@@ -120,12 +120,12 @@ def importance(
                 break
         y = proposal.draw(effort.draws, rng)
         density = charted_density(posterior, chart, y)
-        found = _weighed(posterior, chart, y, density, density - proposal.log_density(y))
-        if found.good(plan.wanted):
+        weighted = _weighed(posterior, chart, y, density, density - proposal.log_density(y))
+        if weighted.good(plan.wanted):
             break
         seen = seen.joined(proposal, y, density)
-    spent = sum(map(len, seen.points)) + (len(y) if found.good(plan.wanted) else 0)
-    return replace(found, modes=len(chosen), evaluations=spent)
+    spent = sum(map(len, seen.points)) + (len(y) if weighted.good(plan.wanted) else 0)
+    return replace(weighted, modes=len(chosen), evaluations=spent)
 
 
 def _weighed(posterior: Posterior, chart: Chart, y: Matrix, charted: Vector, raw: Vector) -> Importance:

@@ -1,4 +1,4 @@
-"""Importance weights smoothed by a generalised Pareto tail, and how far they can be trusted.
+"""Importance weights smoothed by a generalised Pareto tail, and diagnostics of their reliability.
 
 Vehtari, Simpson, Gelman, Yao and Gabry 2024, JMLR 25. The only place that calls the library: its function
 takes the logarithm of the *inverse* weights, as of likelihoods that are to be taken away.
@@ -33,8 +33,8 @@ def smoothed(log_weights: Vector, *, r_eff: float = 1.0) -> tuple[Vector, float]
     """
     if log_weights.size < _FEWEST_DRAWS or _bounded(log_weights):
         return np.asarray(log_weights - logsumexp(log_weights)), float("nan")
-    found, k = array_stats.psislw(-log_weights, r_eff=r_eff)  # type: ignore[no-untyped-call]
-    out = np.asarray(found, dtype=float)
+    smoothed, k = array_stats.psislw(-log_weights, r_eff=r_eff)  # type: ignore[no-untyped-call]
+    out = np.asarray(smoothed, dtype=float)
     return np.asarray(out - logsumexp(out)), float(k)
 
 
@@ -44,7 +44,7 @@ def usable_k(draws: int) -> float:
 
 
 def effective(log_weights: Vector) -> float:
-    """Number of draws that normalised weights are worth, ``1 / sum w^2`` [draws]."""
+    """Effective sample size of normalised weights, ``1 / sum w^2`` [draws]."""
     return float(np.exp(-logsumexp(2 * log_weights)))
 
 

@@ -1,9 +1,9 @@
-"""Modes of a posterior that something other than its own ensembles has found, as proposals of a move.
+"""Modes of a posterior that are known from elsewhere than its own ensembles, as proposals of a move.
 
 A population started on such modes is moved in the posterior; a mixture learned from where it went is blended
 into the mixture that independence proposals are drawn from (`sampler`, `mixturemoves`). That mixture is fixed
 while it is used and every proposal is accepted by Metropolis and Hastings' rule, so the posterior stays
-invariant whatever the starts were: a mode of no mass is left again, one of all the mass is entered at the
+invariant whatever the starts were: walkers leave a mode of no mass, and enter one of all the mass at the
 first proposals. No walker is put anywhere by hand.
 """
 
@@ -17,7 +17,7 @@ from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.mixturemoves import learned
-from lcopa_bayes.sampling.ridgemoves import walking
+from lcopa_bayes.sampling.ridgemoves import emcee_sampler
 
 _MOVES = 120
 """Moves of the population; what it did in the first half is forgotten."""
@@ -33,19 +33,19 @@ _LOST = 2.0
 def around(posterior: Posterior, starts: Matrix, seed: int) -> Mixture:
     """Mixture over the modes that `starts`, table values (starts, rows), lie on.
 
-    Starts outside the prior are left out; InputError when none is inside. Deterministic given `seed`.
+    Starts outside the prior are omitted; InputError when none is inside. Deterministic given `seed`.
     """
     sequence = np.random.SeedSequence(seed, spawn_key=(4_000,))
-    rng, walk = np.random.default_rng(sequence), sequence.spawn(1)[0]
+    rng, moves = np.random.default_rng(sequence), sequence.spawn(1)[0]
     z = posterior.coordinates(starts)
     z = z[np.isfinite(z).all(axis=1)]
     z = z[np.isfinite(posterior.log_density(z))]
     if not len(z):
-        raise InputError("none of the known starts of this posterior lies inside its prior; leave them out")
+        raise InputError("none of the known starts of this posterior lies inside its prior; omit them")
     count = max(_WALKERS * posterior.dimension, len(z))
     population = _filled(posterior, z, count + count % 2, rng)
-    random = tuple(np.random.RandomState(np.random.MT19937(walk)).get_state())
-    sampler = walking(posterior, posterior.log_density, len(population), None, random)
+    random = tuple(np.random.RandomState(np.random.MT19937(moves)).get_state())
+    sampler = emcee_sampler(posterior, posterior.log_density, len(population), None, random)
     sampler.run_mcmc(emcee.State(population), _MOVES // _THIN, thin_by=_THIN, skip_initial_state_check=True)
     chain = sampler.get_chain()
     return learned(posterior, [chain[len(chain) // 2 :]], seed).levelled()
@@ -62,7 +62,7 @@ def _filled(posterior: Posterior, z: Matrix, count: int, rng: np.random.Generato
         spread = spread if near.mean() > 0.1 else 0.5 * spread
     if len(out) < count:
         raise InputError(
-            "a known start of this posterior stands at an edge of its prior or on a needle that sampling "
+            "a known start of this posterior lies at an edge of its prior or on a narrow peak that sampling "
             "cannot resolve; leave it out"
         )
     return np.asarray(out[:count])

@@ -12,7 +12,7 @@ from lcopa_bayes.sampling.mixturemoves import learned
 LEARNING = 2
 """Rounds before the mixture is learned from the draws of all ensembles."""
 _WIDE = 1.0
-"""Share of the mixture that is learned from the populations on their way from the prior, times rounds [-]."""
+"""Share of the mixture that is learned from the populations of the tempering path, times rounds [-]."""
 _KNOWN = 0.2
 """Share of modes that are known from elsewhere, where there are any [-]."""
 
@@ -20,7 +20,8 @@ _KNOWN = 0.2
 def due(done: int) -> bool:
     """Whether the mixture is learned again after so many rounds: 2, 3, ... 8, then 10, 12, 14, 16, 20, ...
 
-    Often at first, for a mode that few walkers have met gains components each time; then ever more rarely.
+    Often at first, for a mode that few walkers have reached gains components each time; then ever more
+    rarely.
     """
     return done >= LEARNING and done % (1 << max(0, done.bit_length() - 3)) == 0
 
@@ -29,8 +30,8 @@ def taught(
     posterior: Posterior, ensembles: Sequence[Ensemble], per_round: int, seed: int, known: Mixture | None
 ) -> Mixture:
     """The mixture that moves follow: learned from the later half of the draws when it was last due,
-    and in part from the populations on their way from the prior, which saw modes that few walkers stand
-    on; blended with the modes `known` from elsewhere.
+    and in part from the populations of the tempering path, which covered modes that few walkers
+    are in; blended with the modes `known` from elsewhere.
 
     `per_round` draws are kept of each walker in a round. A function of the chains alone, so that a resumed
     run learns the same; learning thins out, as the ergodicity of adaptive sampling asks (Roberts and
@@ -41,9 +42,9 @@ def taught(
     while last and not due(last):
         last -= 1
     if last == 0:
-        found = wide
+        mixture = wide
     else:
         first, end = per_round * last // 2, per_round * last
         own = learned(posterior, [ensemble.chain[first:end] for ensemble in ensembles], seed)
-        found = own.levelled().blended(wide, _WIDE / last)
-    return found if known is None else found.blended(known, _KNOWN)
+        mixture = own.levelled().blended(wide, _WIDE / last)
+    return mixture if known is None else mixture.blended(known, _KNOWN)

@@ -20,7 +20,7 @@ _COMPONENTS = 40
 _FITTED = 8_000
 """Most points a mixture is fitted to."""
 FREEDOM = 5.0
-"""Degrees of freedom of the components: tails heavy enough to cover what the fit has not seen [-]."""
+"""Degrees of freedom of the components: tails heavy enough to cover what the fit does not include [-]."""
 _ROUNDS = 60
 """Most rounds of expectation maximisation: a good cover is wanted, not the maximum."""
 _RIDGE = 1e-6
@@ -60,7 +60,8 @@ class Mixture:
         return cls(np.asarray(fit.weights_), shift + spread * fit.means_, factors)
 
     def levelled(self) -> Mixture:
-        """The same components with equal weights, so that a small hill is tried as often as a large one."""
+        """The same components with equal weights, so that a small mode is proposed as often as a large
+        one."""
         return Mixture(np.full(self.weights.size, 1 / self.weights.size), self.means, self.factors)
 
     def blended(self, other: Mixture, share: float) -> Mixture:

@@ -17,7 +17,7 @@ from lcopa_bayes.sampling.moves import PopulationMove, scales
 def learned(posterior: Posterior, chains: Sequence[Array], seed: int) -> Mixture:
     """Mixture in the chart of a posterior, fitted to chains (draws, walkers, dimension).
 
-    From the draws of all ensembles: what one has found, all can then reach.
+    From the draws of all ensembles: a mode that one has reached, all can then reach.
     """
     pooled = np.concatenate([chain.reshape(-1, posterior.dimension) for chain in chains])
     return Mixture.fitted(Chart.of(posterior).usable(pooled)[1], seed)

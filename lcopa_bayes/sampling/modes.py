@@ -1,4 +1,4 @@
-"""Separate hills in the marginal of a parameter, and how differently the ensembles weigh them."""
+"""Modes of the marginal of a parameter, and how differently the ensembles weigh them."""
 
 from __future__ import annotations
 
@@ -16,54 +16,54 @@ from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector, frozen
 from lcopa_bayes.core.estimate import plain
 
 DEPTH = 0.5
-"""A valley is lower than this share of the lower hill beside it [-] ..."""
+"""The minimum between two modes is below this share of the lower of both [-] ..."""
 CERTAINTY = 3.0
 """... by this many Monte Carlo errors [-]."""
 LEAST_SHARE = 0.02
-"""A hill holds this share of all draws at least [-]: less changes no number by what a grade allows."""
+"""Smallest share of all draws in a mode [-]: less changes no number by what a grade allows."""
 _CELLS = 1024
 """Cells of the grid on which the density is smoothed."""
 _TAIL = 0.002
 """Share of the draws beyond each end of the grid [-]."""
 _SMOOTHED_AS = (200.0, 2000.0)
-"""Effective draws [draws] that the width of smoothing is chosen for, at least and at most: ensembles on
-different hills have few, yet each hill is full of draws."""
+"""Effective draws [draws] that the width of smoothing is chosen for, at least and at most: ensembles in
+different modes have few, although every mode holds many draws."""
 _NARROW = 0.6
-"""Width of smoothing over Silverman's [-], which blurs hills four standard deviations apart; that noise
-makes more valleys does not matter, as each has to be certain."""
+"""Width of smoothing over Silverman's [-], which merges modes four standard deviations apart; additional
+minima due to noise do not matter, as each has to be certain."""
 _COUNT = {2: "two", 3: "three", 4: "four"}
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class Ridges:
-    """Hills of one parameter's marginal, from the lowest up; one when there are no boundaries."""
+class Modes:
+    """Modes of one parameter's marginal, in increasing order; a single mode without boundaries."""
 
     parameter: str
     unit: str
     boundaries: tuple[float, ...]
-    """Bottoms of the valleys between them, increasing, in `unit`."""
+    """Minima of the density between them, increasing, in `unit`."""
     shares: Matrix
-    """Share of each ensemble's draws on each hill, (ensembles, hills) [-]."""
+    """Share of each ensemble's draws in each mode, (ensembles, modes) [-]."""
     errors: Matrix
-    """Monte Carlo standard errors of the shares, (ensembles, hills) [-]."""
+    """Monte Carlo standard errors of the shares, (ensembles, modes) [-]."""
 
     def __post_init__(self) -> None:
         for key in ("shares", "errors"):
             object.__setattr__(self, key, frozen(getattr(self, key), name=key, ndim=2))
-        hills = len(self.boundaries) + 1
-        if self.shares.shape != self.errors.shape or self.shares.shape[1] != hills:
-            raise ValueError(f"need a share and an error of {hills} hills; got {self.shares.shape}")
+        modes = len(self.boundaries) + 1
+        if self.shares.shape != self.errors.shape or self.shares.shape[1] != modes:
+            raise ValueError(f"need a share and an error of {modes} modes; got {self.shares.shape}")
 
     @property
     def pooled(self) -> Vector:
-        """Share of all draws on each hill, (hills,) [-]."""
+        """Share of all draws in each mode, (modes,) [-]."""
         return np.asarray(self.shares.mean(axis=0))
 
     @property
     def pooled_errors(self) -> Vector:
-        """Their Monte Carlo standard errors, (hills,) [-]: what the ensembles' own errors say, or how they
-        differ where that is more."""
+        """Their Monte Carlo standard errors, (modes,) [-]: the errors within ensembles, or the scatter
+        between ensembles where that is larger."""
         ensembles = self.shares.shape[0]
         within = np.sqrt(np.sum(self.errors**2, axis=0)) / ensembles
         between = self.shares.std(axis=0, ddof=1) / np.sqrt(ensembles) if ensembles > 1 else 0.0
@@ -71,24 +71,25 @@ class Ridges:
 
     @property
     def ess(self) -> float:
-        """Number of independent draws that would know the shares as well, of the mode known worst [draws]."""
+        """Number of independent draws that give a share with the same error, of the least certain mode
+        [draws]."""
         share = self.pooled
         return float(np.min(share * (1 - share) / self.pooled_errors**2)) if self.boundaries else np.inf
 
     @property
     def spread(self) -> float:
-        """Largest difference of a hill's share between two ensembles beyond Monte Carlo error [-]: of those
+        """Largest difference of a mode's share between two ensembles beyond Monte Carlo error [-]: of those
         above `CERTAINTY` standard errors; 0 when there is none."""
         worst = 0.0
-        for one, other in combinations(range(self.shares.shape[0]), 2):
-            apart = np.abs(self.shares[one] - self.shares[other])
-            error = np.hypot(self.errors[one], self.errors[other])
+        for first, second in combinations(range(self.shares.shape[0]), 2):
+            apart = np.abs(self.shares[first] - self.shares[second])
+            error = np.hypot(self.errors[first], self.errors[second])
             worst = max([worst, *apart[apart > CERTAINTY * error]])
         return float(worst)
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values; shares by ensemble and hill."""
-        told: dict[str, Any] = plain(
+        """Plain values; shares by ensemble and mode."""
+        fields: dict[str, Any] = plain(
             {
                 "parameter": self.parameter,
                 "unit": self.unit,
@@ -101,45 +102,46 @@ class Ridges:
                 "sentence": self.sentence(),
             }
         )
-        return told
+        return fields
 
     def sentence(self) -> str:
-        """What was found, and the remedy when the ensembles weigh the hills differently."""
+        """Number, position and shares of the modes, and the remedy when the ensembles weigh them
+        differently."""
         if not self.boundaries:
-            return f"one ridge in {self.parameter}"
-        hills = len(self.boundaries) + 1
+            return f"one mode of {self.parameter}"
+        modes = len(self.boundaries) + 1
         where = " and ".join(f"{boundary:.3g}" for boundary in self.boundaries)
-        split = f"below and above {where}" if hills == 2 else f"parted at {where}"
-        told = f"{_COUNT.get(hills, str(hills))} ridges in {self.parameter} ({split})"
+        split = f"below and above {where}" if modes == 2 else f"separated at {where}"
+        counted = f"{_COUNT.get(modes, str(modes))} modes of {self.parameter} ({split})"
         if self.spread == 0.0:
             shares = " and ".join(f"{share:.2f}" for share in self.pooled)
-            return f"{told}, shares {shares}, the same in all populations within Monte Carlo error"
+            return f"{counted}, shares {shares}, equal in all ensembles within Monte Carlo error"
         k = int(np.argmax(np.ptp(self.shares, axis=0)))
-        which = ("the lower one" if k == 0 else "the upper one") if hills == 2 else f"number {k + 1}"
+        which = ("the lower mode" if k == 0 else "the upper mode") if modes == 2 else f"mode {k + 1}"
         low, high = self.shares[:, k].min(), self.shares[:, k].max()
-        return f"{told}, share of {which} {low:.2f} to {high:.2f} between populations: run longer"
+        return f"{counted}, share of {which} {low:.2f} to {high:.2f} over the ensembles: run longer"
 
 
-def ridges(parameter: str, unit: str, values: Array, *, log_scale: bool = False) -> Ridges:
-    """Hills of a parameter's marginal from draws (ensembles, walkers, draws) [unit].
+def modes_of(parameter: str, unit: str, values: Array, *, log_scale: bool = False) -> Modes:
+    """Modes of a parameter's marginal from draws (ensembles, walkers, draws) [unit].
 
     The pooled draws, by their logarithm with `log_scale`, are smoothed with a Gaussian narrower than
     Silverman's (1986, Density Estimation, Eq. 3.31) for the effective sample size. From all minima of that
     density those are removed that cut off less than `LEAST_SHARE` and then, the least certain first, those
-    not below `DEPTH` times the lower hill beside them by `CERTAINTY` Monte Carlo errors of that difference.
-    Errors come from how walkers differ; an ensemble that stays on one hill gets that of one
+    not below `DEPTH` times the lower mode beside them by `CERTAINTY` Monte Carlo errors of that difference.
+    Errors come from the scatter between walkers; an ensemble that stays in one mode gets that of one
     walker, 1 / walkers. ValueError unless draws are finite, and positive with `log_scale`.
     """
     if values.ndim != 3 or not np.isfinite(values).all() or (log_scale and values.min() <= 0):
         raise ValueError(f"{parameter}: draws must be finite, (ensembles, walkers, draws), positive for logs")
     x = np.log(values) if log_scale else values
     boundaries = _boundaries(x)
-    hill = np.searchsorted(boundaries, x)
-    on = np.stack([hill == k for k in range(boundaries.size + 1)]).astype(float)
+    mode = np.searchsorted(boundaries, x)
+    on = np.stack([mode == k for k in range(boundaries.size + 1)]).astype(float)
     shares = on.mean(axis=(2, 3)).T
-    errors = np.array([[_error(one) for one in ensemble] for ensemble in on.swapaxes(0, 1)])
+    errors = np.array([[_error(visits) for visits in ensemble] for ensemble in on.swapaxes(0, 1)])
     back = np.exp(boundaries) if log_scale else boundaries
-    return Ridges(parameter, unit, tuple(float(b) for b in back), shares, errors)
+    return Modes(parameter, unit, tuple(float(b) for b in back), shares, errors)
 
 
 def _error(visits: Matrix) -> float:
@@ -157,7 +159,7 @@ def _batch_error(chains: Matrix) -> float:
 
 
 def _boundaries(x: Array) -> Vector:
-    """Bottoms of the valleys of the pooled draws, increasing."""
+    """Minima of the density of the pooled draws, increasing."""
     chains = x.reshape(-1, x.shape[-1])
     low, high = np.quantile(x, [_TAIL, 1 - _TAIL])
     width = _width(chains)
@@ -173,7 +175,7 @@ def _boundaries(x: Array) -> Vector:
         shares = np.diff(np.searchsorted(np.sort(x, axis=None), [-np.inf, *centre[bottoms], np.inf])) / x.size
         lower = [min(pair, key=lambda at: density[at]) for pair in pairwise(tops)]
         slight = np.flatnonzero(np.minimum(shares[:-1], shares[1:]) < LEAST_SHARE)
-        if slight.size:  # the shallowest first: splinters of one hill join each other before another hill
+        if slight.size:  # the shallowest first: parts of one mode are merged before two modes
             bottoms = np.delete(bottoms, slight[np.argmax((density[bottoms] / density[lower])[slight])])
             continue
         certain = [
@@ -196,7 +198,7 @@ def _width(chains: Matrix) -> float:
 
 
 def _bottoms(density: Vector) -> Index:
-    """Positions of the minima between hills, the middle of those that are wide."""
+    """Positions of the minima between modes, the middle of those that are wide."""
     steps = np.flatnonzero(np.diff(density))
     falls = np.diff(density)[steps] < 0
     turns = [(a, b) for (a, down), (b, up) in pairwise(zip(steps, falls, strict=True)) if down and not up]

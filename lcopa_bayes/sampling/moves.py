@@ -1,4 +1,4 @@
-"""Moves of a population, as moves of emcee, and the one made in the sampled coordinates."""
+"""Moves of a population, as moves of emcee, and the move in the sampled coordinates."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ LARGEST_ORDER = 2.0
 @final
 @dataclass(frozen=True, eq=False)
 class Terrain:
-    """What moves need to know of a posterior."""
+    """Properties of a posterior that moves use."""
 
     elements: tuple[ElementColumns, ...]
     exchangeable: tuple[bool, ...]
     """Per entry of `elements`: whether its terms are sampled in any order."""
     slowest: float
-    """Lowest frequency the records tell about [1 / time unit]."""
+    """Lowest frequency the records resolve [1 / time unit]."""
     fastest: float
-    """Highest frequency the records tell about [1 / time unit]."""
+    """Highest frequency the records resolve [1 / time unit]."""
 
     @classmethod
     def of(cls, posterior: Posterior) -> Terrain:
@@ -52,7 +52,7 @@ class Terrain:
         return out
 
     def in_order(self, z: Matrix) -> Flags:
-        """Whether exchangeable terms stand by decreasing order, (batch,)."""
+        """Whether exchangeable terms are in decreasing order, (batch,)."""
         ordered = np.ones(len(z), dtype=bool)
         for element, same in zip(self.elements, self.exchangeable, strict=True):
             if same:
@@ -70,7 +70,7 @@ class PopulationMove(emcee.moves.Move):  # type: ignore[misc]
 
     crosses = False
     """Whether exchangeable terms may change places in the order. A step taken from sorted terms to sorted
-    terms does not lead back the way it came when they crossed, unless it treats all terms alike."""
+    terms is not reversible when they crossed, unless it treats all terms alike."""
 
     def __init__(self, terrain: Terrain) -> None:
         self.terrain = terrain
@@ -87,16 +87,16 @@ class PopulationMove(emcee.moves.Move):  # type: ignore[misc]
         order = model.random.permutation(log_density.size)
         for half in (0, 1):
             moving, still = order[half::2], order[1 - half :: 2]
-            found, factor = self.proposal(coordinates[moving], coordinates[still], model.random)
-            void = ~np.isfinite(found).all(axis=1) | (factor == -np.inf)
+            proposed, factor = self.proposal(coordinates[moving], coordinates[still], model.random)
+            void = ~np.isfinite(proposed).all(axis=1) | (factor == -np.inf)
             if not self.crosses:
-                void |= ~self.terrain.in_order(found)
-            found[void] = coordinates[moving[void]]  # evaluated for a full batch, never accepted
-            new = np.asarray(model.compute_log_prob_fn(found)[0], dtype=float)
+                void |= ~self.terrain.in_order(proposed)
+            proposed[void] = coordinates[moving[void]]  # evaluated for a full batch, never accepted
+            new = np.asarray(model.compute_log_prob_fn(proposed)[0], dtype=float)
             gain = np.where(void, -np.inf, new - log_density[moving] + np.where(void, 0.0, factor))
             taken: Flags = np.log(model.random.rand(moving.size)) < gain
             chosen = moving[taken]
-            coordinates[chosen], log_density[chosen], accepted[chosen] = found[taken], new[taken], True
+            coordinates[chosen], log_density[chosen], accepted[chosen] = proposed[taken], new[taken], True
         return emcee.State(coordinates, log_prob=log_density, random_state=state.random_state), accepted
 
     def element(self, random: Any) -> ElementColumns:

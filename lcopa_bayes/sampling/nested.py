@@ -1,8 +1,8 @@
-"""Nested sampling of a posterior with dynesty: draws and evidence by another road than the ensembles.
+"""Nested sampling of a posterior with dynesty: draws and evidence by a method other than the ensembles.
 
 Independent runs of dynesty (Speagle 2020, MNRAS 493) compress the prior towards high likelihood. New
-points travel by `constrainedwalk` instead of dynesty's own proposals, which on narrow curved ridges forget
-nothing in hundreds of evaluations, and a whole queue travels at once, because the likelihood of a batch
+points travel by `constrainedwalk` instead of dynesty's own proposals, which in narrow curved modes stay
+correlated over hundreds of evaluations, and a whole queue moves at once, because the likelihood of a batch
 costs a tenth per point.
 """
 
@@ -31,13 +31,13 @@ _REMAINDER = 0.01
 _DRAWS = 4_000
 """Draws delivered."""
 _REDRAWN = 100
-"""Times the strands are drawn again for errors: these are then known to 7 %."""
+"""Times the strands are drawn again for errors: these then have an error of 7 %."""
 _PROBES = np.linspace(0.05, 0.95, 19)
 """Probabilities at which the errors of the marginals are measured [-]."""
 _QUEUE = 128
-"""Most points travelling at once: a batch of 32 costs twice as much per point, one of 512 a fourth less."""
+"""Most points moved at once: a batch of 32 costs twice as much per point, one of 512 a fourth less."""
 _LATE = 0.5
-"""Most points travelling at once, of the live points [-]: a fifth of these arrive too late to be used."""
+"""Most points moved at once, of the live points [-]: a fifth of these arrive too late to be used."""
 _CHUNK = 128
 """Draws completed at a time."""
 
@@ -52,7 +52,7 @@ class NestedPlan:
     live: int
     """Live points per run [-]."""
     steps: int
-    """Proposals on the way to a new point [-]."""
+    """Proposals per new point [-]."""
     seed: int
     """Root of all randomness."""
 
@@ -131,7 +131,7 @@ def _normalised(log_ratios: Vector) -> Vector:
 
 
 def _effective(draws: Vector, ratios: Matrix, owner: Index) -> float:
-    """Independent draws that would know the marginal as well, at most as many as there are."""
+    """Independent draws that give the marginal as accurately, at most as many as there are."""
     below = draws[:, None] <= np.quantile(draws, _PROBES)
     share = below.mean(axis=0)
     variance = float(np.mean(np.var(ratios @ below, axis=0, ddof=1)))
@@ -163,7 +163,7 @@ def _run(task: tuple[Posterior, NestedPlan, np.random.SeedSequence]) -> tuple[St
         cube.dimension,
         nlive=plan.live,
         bound="none",
-        sample=_Travellers(walk=walk, ndim=cube.dimension),
+        sample=_ConstrainedSampler(walk=walk, ndim=cube.dimension),
         rstate=rng,
         pool=_Together,
         queue_size=min(_QUEUE, int(_LATE * plan.live)),
@@ -172,25 +172,27 @@ def _run(task: tuple[Posterior, NestedPlan, np.random.SeedSequence]) -> tuple[St
         first_update={"min_ncall": 1, "min_eff": 100.0},
     )
     sampler.run_nested(dlogz=_REMAINDER, print_progress=False, save_bounds=False)
-    found = sampler.results
+    results = sampler.results
     strands = Strands.of(
-        np.array(found.samples), np.array(found.logl), np.unique(found.samples_id, return_inverse=True)[1]
+        np.array(results.samples),
+        np.array(results.logl),
+        np.unique(results.samples_id, return_inverse=True)[1],
     )
-    return strands, plan.live + int(np.sum(found.ncall))
+    return strands, plan.live + int(np.sum(results.ncall))
 
 
 class _Together:
-    """What dynesty takes for its pool of workers: a queue of travellers is evolved as one batch."""
+    """What dynesty takes for its pool of workers: a queue of points is moved as one batch."""
 
     @staticmethod
     def map(function: Callable[[Any], Any], given: Iterable[Any]) -> list[Any]:
-        if function is _Travellers.sample:
+        if function is _ConstrainedSampler.sample:
             return _travelled(list(given))
-        return [function(one) for one in given]
+        return [function(argument) for argument in given]
 
 
 @final
-class _Travellers(InternalSampler):  # type: ignore[misc]
+class _ConstrainedSampler(InternalSampler):  # type: ignore[misc]
     """How dynesty finds new live points; see dynesty.internal_samplers.InternalSampler."""
 
     def __init__(self, **given: Any) -> None:
@@ -210,7 +212,7 @@ class _Travellers(InternalSampler):  # type: ignore[misc]
 
 def _travelled(queue: list[SamplerArgument]) -> list[SamplerReturn]:
     walk: Walk = queue[0].kwargs["walk"]
-    start = walk.cube.coordinates(np.array([one.u for one in queue]))
+    start = walk.cube.coordinates(np.array([argument.u for argument in queue]))
     rng = np.random.default_rng(queue[0].rseed)
     z, height, evaluations = walk.travelled(start, queue[0].loglstar, queue[0].kwargs["population"], rng)
     still = np.flatnonzero(height == -np.inf)

@@ -17,7 +17,7 @@ from lcopa_bayes.sampling.importanceweights import effective
 from lcopa_bayes.sampling.mixture import FREEDOM, Mixture
 
 _NEGLIGIBLE = 20.0
-"""Optima whose Gaussian mass lies this far below the best one's are left out [nat]."""
+"""Optima whose Gaussian mass lies this far below that of the best are omitted [nat]."""
 _GROUP = 3
 """Components that start around one optimum: a curved or skewed posterior needs more than one [-]."""
 _AROUND = 400
@@ -39,7 +39,7 @@ _STEPS = 4
 _NO_WEIGHT = 1e-9
 """Draws with less than this share of the mean weight do not take part in the fit [-]."""
 _NO_MASS = 1e-4
-"""Components with less than this share of the weight are left out [-]."""
+"""Components with less than this share of the weight are omitted [-]."""
 
 
 def weighty(optima: Sequence[Optimum]) -> list[Optimum]:
@@ -114,7 +114,7 @@ class Seen:
         return np.asarray(self.log_densities[-1] - self.proposals[-1].log_density(self.points[-1]))
 
     def log_weights(self) -> Vector:
-        """One per point, not normalised [nat]."""
+        """Log density of each point, not normalised [nat]."""
         y = np.concatenate(self.points)
         each = np.array([proposal.log_density(y) for proposal in self.proposals])
         return np.asarray(np.concatenate(self.log_densities) - logsumexp(each, axis=0))

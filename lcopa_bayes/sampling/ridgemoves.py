@@ -35,11 +35,11 @@ _DENSE = 3.0
 _ANEW = 0.3
 """Share of moves that draw anew from the mixture."""
 _NEARBY = 0.3
-"""Share of moves that walk along it."""
+"""Share of moves along it."""
 
 
 class RidgeMove(PopulationMove):
-    """A move that says where ratios, orders and held times of one element go; the other times follow."""
+    """A move of ratios, orders and held times of one element; the other times follow."""
 
     def rebuilt(
         self,
@@ -107,11 +107,11 @@ class ShapeMove(RidgeMove):
                     level = (a[:, column] - shapes[1].log_level) - (b[:, column] - shapes[2].log_level)
                     proposed[:, column] = here[:, column] + scale[:, 0] * level
                 else:
-                    own, one, other = (
+                    own, first, second = (
                         points[:, column] * np.exp(-shape.log_level)
                         for points, shape in zip((here, a, b), shapes, strict=True)
                     )
-                    moved = own + scale[:, 0] * (one - other)
+                    moved = own + scale[:, 0] * (first - second)
                     proposed[:, column] = moved * np.exp(shapes[0].log_level)
             ratios = shapes[0].log_ratios + scale * jittered(
                 shapes[1].log_ratios - shapes[2].log_ratios, random
@@ -159,12 +159,13 @@ class OrderRoam(RidgeMove):
 
 @final
 class TermRedraw(RidgeMove):
-    """One term is drawn anew and the others follow: free travel where it is negligible or a spring."""
+    """One term is drawn anew and the others follow: large moves where it is negligible or a spring."""
 
     crosses = True
 
     def proposal(self, here: Matrix, others: Matrix, random: Any) -> tuple[Matrix, Vector]:
-        """See `PopulationMove.proposal`; each walker chooses its term, for the way back may need another."""
+        """See `PopulationMove.proposal`; each walker chooses its term, for the reverse move may need
+        another."""
         element = self.element(random)
         term = random.randint(element.terms, size=len(here))
         frequencies = self.terrain.frequencies(element.terms - 1, random)
@@ -177,7 +178,7 @@ class TermRedraw(RidgeMove):
     def _redrawn(
         self, here: Matrix, element: ElementColumns, frequencies: Vector, random: Any
     ) -> tuple[Matrix, Vector]:
-        """The held term drawn anew: log time evenly, order dense at 0, half of the orders left alone."""
+        """The held term drawn anew: log time evenly, order dense at 0, half of the orders unchanged."""
         time, order = (columns[element.held] for columns in (element.times, element.orders))
         low, high = (bound[element.held] for bound in element.reach)
         proposed = here.copy()
@@ -192,7 +193,7 @@ class TermRedraw(RidgeMove):
 
 
 def moves(posterior: Posterior, mixture: Mixture | None = None) -> list[tuple[emcee.moves.Move, float]]:
-    """The moves a posterior is sampled with, and how often each is made; with `mixture` also moves
+    """The moves a posterior is sampled with, and the share of each; with `mixture` also moves
     that follow it."""
     terrain = Terrain.of(posterior)
     local: list[tuple[emcee.moves.Move, float]] = (
@@ -216,7 +217,7 @@ def moves(posterior: Posterior, mixture: Mixture | None = None) -> list[tuple[em
     ]
 
 
-def walking(
+def emcee_sampler(
     posterior: Posterior,
     log_density: Callable[[Matrix], Vector],
     walkers: int,
@@ -225,7 +226,8 @@ def walking(
 ) -> emcee.EnsembleSampler:
     """emcee with these moves, at a state of its generator.
 
-    Its own wrapper, which prints what an exception or an interrupt meets, is left out: the caller tells.
+    Its own wrapper, which prints the arguments at an exception or interrupt, is not used: the caller reports
+    it.
     """
     sampler = emcee.EnsembleSampler(
         walkers, posterior.dimension, log_density, moves=moves(posterior, mixture), vectorize=True

@@ -27,7 +27,7 @@ from lcopa_bayes.sampling.ensemble import Ensemble, advance
 from lcopa_bayes.sampling.knownmodes import around
 from lcopa_bayes.sampling.learning import due, taught
 from lcopa_bayes.sampling.mixture import Mixture
-from lcopa_bayes.sampling.modes import Ridges, ridges
+from lcopa_bayes.sampling.modes import Modes, modes_of
 from lcopa_bayes.sampling.weighted import BATCHES, CHAIN, Weighted
 
 _ROUND = 20
@@ -35,12 +35,12 @@ _ROUND = 20
 _MEMORY = 0.4
 """Largest memory of a walker at which sampling stops [-]."""
 _SWEEPS = 80
-"""Most moves of every walker at each temperature on the way from the prior."""
+"""Most moves of every walker at each temperature of the tempering path."""
 _LEAST = 5
-"""Rounds before sampling may stop: what is kept of them comes after the first learning."""
+"""Rounds before sampling may stop: the draws kept of them come after the proposal was first adapted."""
 _AS_LONG = 0.4
-"""Sampling takes at least this share of the moves that the way from the prior took: a posterior that was
-hard to reach has hills that fill slowly [-]."""
+"""Sampling takes at least this share of the moves that tempering took: a posterior that was hard to reach
+has modes that fill slowly [-]."""
 _TREND = 2.0
 """Standard errors below which a drift of the kept draws is taken for chance where the run as a whole drifts
 [-]: there chance is the less likely reason, and to go on costs little."""
@@ -89,7 +89,7 @@ class SamplePlan:
         target_ess: float = 400,
         method: Method = "ensembles",
     ) -> SamplePlan:
-        """A plan with what is left open chosen from the number of sampled parameters."""
+        """A plan with unset entries chosen from the number of sampled parameters."""
         least = 2 * dimension + 2
         return cls(
             ensembles,
@@ -133,8 +133,8 @@ class Run:
     def kept(self) -> tuple[Array, Array]:
         """Draws of equal weight: coordinates (ensembles, walkers, draws, dimension), and log density.
 
-        Of importance draws resampled ones, whose batches stand for ensembles; of ensembles the last three
-        fifths.
+        Of importance draws resampled ones, whose batches take the place of ensembles; of ensembles the last
+        three fifths.
         """
         if self.weighted is not None and self.chosen is not None:
             order = self.chosen.reshape(BATCHES, -1, CHAIN)
@@ -183,7 +183,7 @@ def sample(
             _store(chain_file, Chain(ensembles), fingerprint)
         bar.set_description("sampling")
         mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
-        hardest = max(ensemble.way for ensemble in ensembles)
+        hardest = max(ensemble.tempering_moves for ensemble in ensembles)
         least = max(_LEAST, round(_AS_LONG * hardest / (_ROUND * plan.thin)))
         failed = stored.failed
         while True:
@@ -211,9 +211,9 @@ def _filling(posterior: Posterior, run: Run) -> tuple[str, ...]:
     """Sampled parameters with several modes that drift over the whole run with certainty."""
     whole = _sampled_values(posterior, run, kept=False)
     return tuple(
-        found.parameter
-        for column, found in enumerate(_sampled_ridges(posterior, run))
-        if found.boundaries
+        modes.parameter
+        for column, modes in enumerate(_sampled_modes(posterior, run))
+        if modes.boundaries
         and any(abs(apart) > CERTAIN * error for apart, error, _ in drifts(whole[..., column]))
     )
 
@@ -227,22 +227,22 @@ def finished(posterior: Posterior, run: Run, bar: tqdm[Any] | None = None) -> bo
     """Whether every sampled parameter agrees between ensembles and has its effective sample size, and the
     shares of its modes have.
 
-    Walkers travel a little further than a grade asks, so that the linear parameters, which are drawn
+    Walkers move a little further than a grade requires, so that the linear parameters, which are drawn
     afterwards, have too.
     """
-    found = sampled_qualities(posterior, run)
+    qualities = sampled_qualities(posterior, run)
     if bar is not None:
-        ess, rhat = float(np.min([q.ess for q in found])), float(np.max([q.rhat for q in found]))
-        memory = float(np.max([q.memory for q in found]))
+        ess, rhat = float(np.min([q.ess for q in qualities])), float(np.max([q.rhat for q in qualities]))
+        memory = float(np.max([q.memory for q in qualities]))
         acceptance = np.mean([ensemble.acceptance for ensemble in run.ensembles])
         bar.set_postfix(
             acceptance=f"{acceptance:.2f}", ess=f"{ess:.0f}", rhat=f"{rhat:.3f}", memory=f"{memory:.2f}"
         )
     target = run.plan.target_ess
-    good = all(q.grade(target).level == "reliable" and q.memory <= _MEMORY for q in found)
+    good = all(q.grade(target).level == "reliable" and q.memory <= _MEMORY for q in qualities)
     return (
         good
-        and all(one.ess >= target for one in _sampled_ridges(posterior, run))
+        and all(modes.ess >= target for modes in _sampled_modes(posterior, run))
         and _settled(posterior, run)
     )
 
@@ -250,8 +250,8 @@ def finished(posterior: Posterior, run: Run, bar: tqdm[Any] | None = None) -> bo
 def _settled(posterior: Posterior, run: Run) -> bool:
     """Whether what drifts over the whole run with certainty shows no trend any more in what is kept of it.
 
-    A mode that few walkers had found at the start fills slowly and in all ensembles alike, so that neither
-    their agreement nor the effective sample size of what is kept can tell how much is still to come.
+    A mode that few walkers had reached at the start fills slowly and in all ensembles alike, so that neither
+    their agreement nor the effective sample size of the kept draws shows how much is still missing.
     """
     whole, kept = (_sampled_values(posterior, run, kept=part) for part in (False, True))
     for column in range(whole.shape[-1]):
@@ -268,12 +268,12 @@ def sampled_qualities(posterior: Posterior, run: Run) -> tuple[Quality, ...]:
     return qualities(names, _sampled_values(posterior, run))
 
 
-def _sampled_ridges(posterior: Posterior, run: Run) -> Iterator[Ridges]:
+def _sampled_modes(posterior: Posterior, run: Run) -> Iterator[Modes]:
     """Modes of the sampled parameters over the kept part of a run."""
     values = _sampled_values(posterior, run)
     for column, k in enumerate(posterior.sampled):
         row = posterior.table.rows[k]
-        yield ridges(row.name, row.unit, values[..., column], log_scale=row.log_scale)
+        yield modes_of(row.name, row.unit, values[..., column], log_scale=row.log_scale)
 
 
 def _sampled_values(posterior: Posterior, run: Run, *, kept: bool = True) -> Array:
@@ -292,7 +292,7 @@ class _Birth:
     walkers: int
 
     def __call__(self, posterior: Posterior, seed: np.random.SeedSequence) -> Ensemble:
-        return Ensemble.born(posterior, self.walkers, _SWEEPS, seed)
+        return Ensemble.tempered(posterior, self.walkers, _SWEEPS, seed)
 
 
 @final
@@ -312,7 +312,7 @@ def _crew(posterior: Posterior, jobs: int) -> Iterator[Crew]:
     """A map of a task over its inputs, in this process or in `jobs` others."""
     if jobs <= 1:
         with threadpool_limits(1):
-            yield lambda task, inputs: (task(posterior, one) for one in inputs)
+            yield lambda task, inputs: (task(posterior, argument) for argument in inputs)
         return
     with ProcessPoolExecutor(
         jobs, mp_context=get_context("spawn"), initializer=_take_up, initargs=(posterior,)
@@ -326,7 +326,7 @@ _posterior: Posterior | None = None
 
 def _take_up(posterior: Posterior) -> None:
     global _posterior
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # an interrupt ends a worker without a word
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # an interrupt ends a worker silently
     threadpool_limits(1)
     _posterior = posterior
 

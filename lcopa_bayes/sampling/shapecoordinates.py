@@ -34,7 +34,7 @@ class Shape(NamedTuple):
 @final
 @dataclass(frozen=True, eq=False)
 class ElementColumns:
-    """Where an element stands among the sampled coordinates; its times are sampled by logarithm."""
+    """Columns of an element among the sampled coordinates; its times are sampled by logarithm."""
 
     number: int
     """Which of the layout's elements it is."""

@@ -1,4 +1,5 @@
-"""From the prior to the posterior by adaptive tempering, so that every ridge is found in its share.
+"""From the prior to the posterior by adaptive tempering, so that every mode is reached in proportion to its
+mass.
 
 A population drawn from the prior follows ``prior * likelihood^b`` while b rises from 0 to 1. Each rise is
 as large as keeps half the population effective; the population is then resampled and moved by the same
@@ -19,35 +20,35 @@ from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.convergence import rank_correlation
 from lcopa_bayes.sampling.mixturemoves import learned
-from lcopa_bayes.sampling.ridgemoves import walking
+from lcopa_bayes.sampling.ridgemoves import emcee_sampler
 
 _WARM = 0.01
-"""Below this power of the likelihood a population travels fast and a third of the sweeps is enough."""
+"""Below this power of the likelihood a population mixes fast and a third of the sweeps is enough."""
 _NEAR = 0.1
-"""From this power on populations are remembered: they lie where the posterior does, only wider."""
+"""From this power on populations are kept: they cover the posterior, only wider."""
 _EFFECTIVE = 0.5
 """Share of the population that stays effective in one rise of the temperature."""
 _CROWD = 4
 """How many times more walkers come from the prior than are kept."""
 _BLOCK = 5
-"""Moves of every walker between two looks at how far they have travelled."""
+"""Moves of every walker between two checks of how far they have moved."""
 _TRAVELLED = 0.3
-"""Memory of a population at which it has travelled enough at one temperature [-]."""
+"""Rank correlation with its start at which a population has moved enough at one temperature [-]."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Population:
-    """Walkers that have come from the prior to the posterior."""
+    """Walkers tempered from the prior to the posterior."""
 
     position: Matrix
     """(walkers, dimension)."""
     log_density: Vector
     """Log posterior density, (walkers,) [nat]."""
     trail: Matrix
-    """Where the population stood on the last part of its way, (points, dimension)."""
+    """Positions of the population on the last part of the tempering path, (points, dimension)."""
     moves: int
-    """Moves per walker delivered that the way took [-]."""
+    """Moves of tempering per walker delivered [-]."""
 
 
 def temper(
@@ -55,25 +56,25 @@ def temper(
 ) -> tuple[Population, tuple[Any, ...]]:
     """A population of the posterior and the state of emcee's generator afterwards.
 
-    At each temperature every walker makes moves until the population has left where it stood, at most
-    `sweeps` of them and a third while the temperature is low. Deterministic given `rng` and `random`.
+    At each temperature every walker makes moves until the population has lost its correlation with its start,
+    at most `sweeps` of them and a third while the temperature is low. Deterministic given `rng` and `random`.
     """
     crowd = _CROWD * walkers
     position = posterior.coordinates(posterior.table.draw(crowd, rng))
     prior = posterior.log_prior(position)
     likelihood = posterior.log_density(position) - prior
-    heat, rises, made, trail = 0.0, 0, 0, []
+    heat, rises, moves, trail = 0.0, 0, 0, []
     while heat < 1.0:
         rise = _rise(likelihood, 1.0 - heat)
         heat, rises = (1.0 if heat + rise > 1.0 - 1e-9 else heat + rise), rises + 1
         kept = _resampled(rise * likelihood, rng)
         position, prior, likelihood = position[kept], prior[kept], likelihood[kept]
         mixture = learned(posterior, [position], rises)
-        sampler = walking(posterior, _Tempered(posterior, heat), crowd, mixture, random)
+        sampler = emcee_sampler(posterior, _Tempered(posterior, heat), crowd, mixture, random)
         state = emcee.State(position, log_prob=prior + heat * likelihood)
         for _ in range(max(1, (sweeps if heat > _WARM else sweeps // 3) // _BLOCK)):
             state = sampler.run_mcmc(state, _BLOCK, skip_initial_state_check=True, store=False)
-            made += _CROWD * _BLOCK
+            moves += _CROWD * _BLOCK
             if _memory(posterior, position, state.coords) <= _TRAVELLED:
                 break
         random = tuple(sampler.random_state)
@@ -83,11 +84,12 @@ def temper(
         if heat > _NEAR:
             trail.append(position)
     kept = rng.permutation(crowd)[:walkers]
-    return Population(position[kept], (prior + likelihood)[kept], np.concatenate(trail), made), random
+    return Population(position[kept], (prior + likelihood)[kept], np.concatenate(trail), moves), random
 
 
 def _memory(posterior: Posterior, before: Matrix, after: Matrix) -> float:
-    """Largest rank correlation over walkers of where they stood and stand, of any sampled parameter."""
+    """Largest rank correlation over walkers between earlier and present positions, of any sampled
+    parameter."""
     then, now = (posterior.values(z)[:, posterior.sampled] for z in (before, after))
     return max(rank_correlation(then[:, k], now[:, k]) for k in range(then.shape[1]))
 

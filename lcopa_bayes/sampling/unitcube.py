@@ -18,7 +18,7 @@ class UnitCube:
     """Points of the cube are prior probabilities, one per sampled parameter in its own prior.
 
     Uniform points give the prior of the parameters before their orders are compared. Where the terms of
-    an element are exchangeable, each point stands for the plant with its terms by decreasing order;
+    an element are exchangeable, each point represents the plant with its terms by decreasing order;
     elsewhere points whose orders do not decrease are outside (`inside`). Uniform points inside are
     draws of the normalised prior that `Posterior.log_prior` is the density of.
     """
@@ -98,7 +98,7 @@ class UnitCube:
         """The same where all coordinates are known to be inside; FloatingPointError where it is NaN."""
         out = self.posterior.log_likelihood(self.posterior.values(coordinates))
         if np.isnan(out).any():
-            self.posterior.log_density(coordinates[np.isnan(out)])  # raises and says where
+            self.posterior.log_density(coordinates[np.isnan(out)])  # raises with the position
         return out
 
     def draw(self, size: int, rng: np.random.Generator) -> Matrix:

@@ -1,8 +1,8 @@
 """Weighted draws of a posterior: independent draws of a proposal with importance weights.
 
-Weights are smoothed by a generalised Pareto distribution, whose shape k tells whether averages over them
+Weights are smoothed by a generalised Pareto distribution, whose shape k shows whether averages over them
 converge (Vehtari, Simpson, Gelman, Yao and Gabry 2024, JMLR 25). As the draws are independent the error of
-every average is known from the weights themselves (Owen 2013, Monte Carlo theory, methods and examples, 9).
+every average follows from the weights themselves (Owen 2013, Monte Carlo theory, methods and examples, 9).
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from scipy.stats import norm
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.importanceweights import effective, smoothed
-from lcopa_bayes.sampling.modes import ridges
+from lcopa_bayes.sampling.modes import modes_of
 
 BATCHES = 4
 """Independent parts of weighted draws, compared as ensembles are."""
 CHAIN = 8
-"""Resampled draws that stand for those of one walker."""
+"""Resampled draws that take the place of one walker."""
 _TAILS = (0.05, 0.95)
 """Quantiles whose error counts."""
 _LOOKED_AT = 4_000
-"""Resampled draws by which modes are found."""
+"""Resampled draws in which modes are sought."""
 
 
 @final
@@ -44,7 +44,7 @@ class Weighted:
     raw: Vector
     """Log of the posterior density over that of the proposal, (draws,) [nat]."""
     log_weights: Vector
-    """Normalised, and Pareto-smoothed where asked for, (draws,) [nat]."""
+    """Normalised, and Pareto-smoothed where requested, (draws,) [nat]."""
     pareto_k: float
     """Shape of the weights' tail [-]; infinite where too few draws have any weight."""
     count: int
@@ -130,8 +130,8 @@ class Weighted:
         chosen = self.resampled(_LOOKED_AT, rng).reshape(BATCHES, -1, CHAIN)
         worth = [*self.centre_ess, *self.tail_ess]
         for column, logarithmic in zip(self.sampled.T, self.logarithmic, strict=True):
-            found = ridges("", "", column[chosen], log_scale=logarithmic)
-            worth += self.share_ess(column, found.boundaries)
+            modes = modes_of("", "", column[chosen], log_scale=logarithmic)
+            worth += self.share_ess(column, modes.boundaries)
         return float(np.min(worth))
 
     def share_ess(self, column: Vector, boundaries: Sequence[float]) -> list[float]:
@@ -183,7 +183,7 @@ def tail_smoothed(log_weights: Vector) -> tuple[Vector, float]:
 
 
 def _worth(values: Vector, weights: Vector) -> float:
-    """Number of independent draws that would know the mean as well as normalised weights do; infinite where
+    """Number of independent draws that give the mean as accurately as the normalised weights; infinite where
     nothing varies.
 
     The variance of the mean is itself an average, which few draws may dominate: n of them know it to

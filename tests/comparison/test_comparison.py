@@ -22,7 +22,7 @@ from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.priors import Prior
-from lcopa_bayes.sampling.bridge import carried
+from lcopa_bayes.sampling.bridge import transferred
 
 
 @pytest.fixture
@@ -204,14 +204,14 @@ def test_draws_carried_to_fewer_data_are_those_of_the_smaller_posterior(rng):
 
     mean, sd = exact(data)
     positions = rng.normal(mean, sd, (3, 60, 2))
-    found = carried(source, target, positions, 5, jump=False)
+    found = transferred(source, target, positions, 5, jump=False)
     wanted, spread = exact(data[:3])
     assert abs(wanted - mean) > 4 * sd  # far enough to be a test
     draws = found.coordinates.reshape(-1, 2)
     np.testing.assert_allclose(draws.mean(axis=0), wanted, atol=4 * spread / np.sqrt(found.ess))
     np.testing.assert_allclose(draws.std(axis=0), spread, rtol=0.15)
     assert found.rhat < 1.1
-    again = carried(source, target, positions, 5, jump=False)
+    again = transferred(source, target, positions, 5, jump=False)
     np.testing.assert_array_equal(found.coordinates, again.coordinates)
 
 

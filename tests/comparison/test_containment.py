@@ -176,7 +176,7 @@ def test_a_richer_model_starts_from_the_optimum_of_what_it_contains(monkeypatch,
     small, large = (problem_of(each.study) for each in (one, two))
     landscape = Landscape(small.posterior)
     true = row_values(small.posterior.table, RIGHT)
-    top = landscape.climb(true)
+    top = landscape.maximise(true)
     wrong = true.copy()
     wrong[small.posterior.table.names.index("delay")] = trapped or 2.37
     found = lifted(wrong[None], small.posterior, large.posterior, np.random.default_rng(1))

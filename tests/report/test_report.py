@@ -25,7 +25,7 @@ from lcopa_bayes.report.savedrun import load_run
 from lcopa_bayes.report.section import Column, Drawing, Section, Table
 from lcopa_bayes.report.sections import pairs, parameters, records, residuals, sensitivity, steps
 from lcopa_bayes.report.theme import inlined
-from lcopa_bayes.sampling.modes import Ridges
+from lcopa_bayes.sampling.modes import Modes
 
 PARAMETERS = {
     "gain": ("rad/V", "reliable", False),
@@ -452,7 +452,7 @@ def with_results(folder: Path, **more: object):
 
 def test_several_ridges_are_shown_with_their_shares(folder):
     assert len(parameters.section(load_run(folder)).tables) == 2
-    found = Ridges("time_1", "ms", (1.1,), np.array([[0.3, 0.7], [0.5, 0.5]]), np.full((2, 2), 0.02))
+    found = Modes("time_1", "ms", (1.1,), np.array([[0.3, 0.7], [0.5, 0.5]]), np.full((2, 2), 0.02))
     row = found.as_json() | {"grade": "tentative"}
     table = parameters.section(with_results(folder, ridges=[row])).tables[1]
     assert table.rows[0][:6] == (

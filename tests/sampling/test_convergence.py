@@ -17,7 +17,7 @@ from lcopa_bayes.sampling.convergence import (
     qualities,
     with_shares,
 )
-from lcopa_bayes.sampling.modes import Ridges
+from lcopa_bayes.sampling.modes import Modes
 
 SHAPE = (4, 16, 60)
 """Ensembles, walkers, draws."""
@@ -50,7 +50,7 @@ def test_ensembles_on_different_hills_are_unusable_however_many_draws():
     assert quality.grade(1).level == "unusable"
     told = overall([quality], 1)
     assert told.level == "unusable"
-    assert "several hills" in told.reason
+    assert "several modes" in told.reason
 
 
 def test_hills_that_all_ensembles_weigh_differently_are_not_reliable():
@@ -218,14 +218,14 @@ def test_ensembles_that_scatter_too_much_say_so_and_what_to_do():
     quality = Quality("it", 900.0, 900.0, 1.01, ess_between=60.0, scatter=0.5)
     grade = quality.grade(400)
     assert (grade.level, quality.ess) == ("tentative", 60.0)
-    assert "off by 0.50 standard deviations" in quality.remedy(400)
+    assert "an error of 0.50 standard deviations" in quality.remedy(400)
     assert "more ensembles" in quality.remedy(400)
 
 
 def test_slow_exchange_between_modes_counts():
     """A mean that is known well beside shares of modes that are not."""
     shares = np.array([[0.02, 0.98], [0.04, 0.96], [0.06, 0.94], [0.04, 0.96]])
-    found = Ridges("it", "-", (1.0,), shares, np.full((4, 2), 0.001))
+    found = Modes("it", "-", (1.0,), shares, np.full((4, 2), 0.001))
     exact = 0.04 * 0.96 / (shares[:, 0].var(ddof=1) / 4)
     assert found.ess == pytest.approx(exact)
     assert with_shares(Quality("it", 900.0, 900.0, 1.0), [found]).ess == pytest.approx(exact)

@@ -87,7 +87,7 @@ def test_fewer_effective_draws_prove_less():
     assert f"a difference of {check.parameters[0].resolution:.2f}" in check.sentence
     blind = CrossCheck.of(ours(ess=np.nan), shifted(0.5))
     assert blind.agrees
-    assert "too few effective draws of gain to notice any" in blind.sentence
+    assert "too few effective draws of gain to detect any" in blind.sentence
 
 
 def test_the_distance_that_is_called_a_disagreement_is_where_the_p_value_is():

@@ -35,7 +35,7 @@ def assert_same(a: Run, b: Run) -> None:
     for one, other in zip(a.ensembles, b.ensembles, strict=True):
         for name in ("chain", "log_density", "position", "position_log_density", "accepted", "trail"):
             assert_array_equal(getattr(one, name), getattr(other, name))
-        assert (one.steps, one.way) == (other.steps, other.way)
+        assert (one.steps, one.tempering_moves) == (other.steps, other.tempering_moves)
         assert_array_equal(one.random[1], other.random[1])
         assert one.random[2:] == other.random[2:]
 
@@ -122,7 +122,7 @@ def test_a_chain_reads_back_exactly(tmp_path, uninterrupted):
 def test_a_foreign_chain_is_refused(tmp_path, uninterrupted):
     path = tmp_path / "chain.h5"
     stored(uninterrupted, path)
-    with pytest.raises(InputError, match="made from other records, settings or seed") as caught:
+    with pytest.raises(InputError, match="written with other records, settings or seed") as caught:
         load_chain(path, "another")
     assert "--resume" in caught.value.problems[0]
     with pytest.raises(InputError, match=r"chain\.h5"):
