@@ -1,4 +1,4 @@
-"""The verb `audit`: what the records of a study determine, joined from four ways of asking."""
+"""The verb `audit`: what the records of a study determine, combined from four methods."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.resonance import unresolved
 
 _POINTS = 24
-"""Prior draws at which symmetries are looked for, besides likely ones."""
+"""Prior draws at which symmetries are sought, besides likely ones."""
 _WITNESSES = 400
 """Draws that profiles are started from."""
 _CLIMBED = 8
@@ -66,30 +66,30 @@ class Audit:
     def sentence(self) -> str:
         """The audit in a sentence."""
         counted: dict[str, list[str]] = {}
-        for found in self.findings:
-            counted.setdefault(found.verdict, []).append(found.profile.parameter)
-        told = "; ".join(f"{verdict}: {', '.join(names)}" for verdict, names in counted.items())
+        for finding in self.findings:
+            counted.setdefault(finding.verdict, []).append(finding.profile.parameter)
+        verdicts = "; ".join(f"{verdict}: {', '.join(names)}" for verdict, names in counted.items())
         best = self.known[0].estimate.name if self.known else ""
-        limits = "; ".join(one.reason for one in self.fit.draws.limitations)
+        limits = "; ".join(limitation.reason for limitation in self.fit.draws.limitations)
         return (
-            f"Given this model, {told}."
-            + (f" Known best: {best}." if best else "")
+            f"Given this model, {verdicts}."
+            + (f" Best determined: {best}." if best else "")
             + (f" But {limits}." if limits else "")
         )
 
     def as_json(self) -> dict[str, Any]:
         """Every number of the audit; what is open, infinite or undefined is None."""
         draws = self.fit.draws
-        told: dict[str, Any] = plain(
+        fields: dict[str, Any] = plain(
             {
                 "study": self.fit.study.name,
                 "verdict": self.sentence,
                 "grade": draws.grade.level,
                 "grade_reason": draws.grade.reason,
-                "limitations": [one.as_json() for one in draws.limitations],
+                "limitations": [limitation.as_json() for limitation in draws.limitations],
                 "time_unit": self.fit.study.time_unit,
-                "parameters": [found.as_json() for found in self.findings],
-                "symmetries": [found.as_json() for found in self.structure.symmetries],
+                "parameters": [entry.as_json() for entry in self.findings],
+                "symmetries": [entry.as_json() for entry in self.structure.symmetries],
                 "structure": _structure(self.structure),
                 "printed_form": None if self.printed is None else _structure(self.printed),
                 "spectrum": [] if self.curvature is None else self.curvature.spectrum(),
@@ -101,21 +101,21 @@ class Audit:
                 "next_measurement": None,
             }
         )
-        return told
+        return fields
 
 
-def _structure(found: Structure) -> dict[str, Any]:
+def _structure(structure: Structure) -> dict[str, Any]:
     return {
-        "parameters": found.parameters,
-        "rank": found.rank,
-        "certain": found.certain,
-        "singular_values": found.singular,
-        "symmetries": [one.as_json() for one in found.symmetries],
+        "parameters": structure.parameters,
+        "rank": structure.rank,
+        "certain": structure.certain,
+        "singular_values": structure.singular,
+        "symmetries": [symmetry.as_json() for symmetry in structure.symmetries],
     }
 
 
 def audit(fit: Fit, *, jobs: int = 1) -> Audit:
-    """Verdict for every free parameter of a fitted study; profiles are made in `jobs` processes."""
+    """Verdict for every free parameter of a fitted study; profiles are calculated in `jobs` processes."""
     posterior, seed = fit.problem.posterior, fit.run.plan.seed
     landscape, rng = Landscape(posterior), np.random.default_rng([seed, 5])
     with threadpool_limits(1):
@@ -125,7 +125,7 @@ def audit(fit: Fit, *, jobs: int = 1) -> Audit:
         thinned = fit.draws.thinned(_WITNESSES)
         likely = thinned[np.argsort(-landscape.log_likelihood(thinned))[:_CLIMBED]]
         starts = np.concatenate([optima, likely])
-        peak = max((landscape.climb(v) for v in starts), key=lambda found: found.log_likelihood)
+        peak = max((landscape.maximise(v) for v in starts), key=lambda peak: peak.log_likelihood)
         known = known_best(fit.draws, prior, fit.problem.scales.span, time_unit=fit.study.time_unit)
     profiles, peak = _profiles(landscape, peak, np.concatenate([thinned, optima]), jobs)
     points = (
@@ -144,10 +144,10 @@ def audit(fit: Fit, *, jobs: int = 1) -> Audit:
     fast = unresolved(fit.draws, scales.period)
     findings = tuple(
         judged(
-            *(one, belief, symmetric, curved, _flat(row), Tolerance.of(row, scales)),
+            *(profile, belief, symmetric, curved, _flat(row), Tolerance.of(row, scales)),
             next((f.sentence(scales.period, fit.study.time_unit) for f in fast if f.concerns(row)), ""),
         )
-        for one, belief, row in zip(profiles, believed, rows, strict=True)
+        for profile, belief, row in zip(profiles, believed, rows, strict=True)
     )
     apart = delays(fit.study, posterior.table, peak.values)
     return Audit(fit, findings, symmetric, printed, curved, moved, known, apart, peak)
@@ -163,14 +163,14 @@ def _profiles(landscape: Landscape, peak: Peak, witnesses: Matrix, jobs: int) ->
     """Profiles of all free parameters about one maximum, and that maximum."""
     for _ in range(_TRIES):
         tasks = [_Task(k, peak, witnesses, _first_step(landscape, k, witnesses)) for k in landscape.free]
-        made = list(_performed(landscape, tasks, jobs))
-        top = max(made, key=lambda one: one.best)
+        profiles = list(_performed(landscape, tasks, jobs))
+        top = max(profiles, key=lambda profile: profile.best)
         better = top.best - peak.log_likelihood
         if better > 0:
             peak = Peak(top.top, top.best)
         if better <= _BETTER:
             break
-    return [replace(one, best=max(peak.log_likelihood, one.best)) for one in made], peak
+    return [replace(profile, best=max(peak.log_likelihood, profile.best)) for profile in profiles], peak
 
 
 def _first_step(landscape: Landscape, k: int, witnesses: Matrix) -> float:
@@ -183,7 +183,7 @@ def _first_step(landscape: Landscape, k: int, witnesses: Matrix) -> float:
 @final
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """One profile to make."""
+    """One profile to calculate."""
 
     k: int
     peak: Peak
@@ -195,7 +195,7 @@ class _Task:
 
 
 def _performed(landscape: Landscape, tasks: Sequence[_Task], jobs: int) -> Iterable[Profile]:
-    """Profiles in the order of the tasks, from this process or from others; the same either way."""
+    """Profiles in the order of the tasks, from this process or from others, with the same result."""
     if min(jobs, len(tasks)) <= 1:
         with threadpool_limits(1):
             yield from (task(landscape) for task in tasks)

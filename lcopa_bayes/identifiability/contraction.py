@@ -1,4 +1,4 @@
-"""What the draws say: contraction, companions, and the functions of parameters that are known best."""
+"""Evidence of the draws: contraction, correlated parameters and the best-determined functions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _PRIOR_DRAWS = 4000
 _COMPANION = 0.6
 """Rank correlation from which two parameters move together [-]."""
 _STRAYING = 1000.0
-"""A width relative to the median beyond this says nothing any more [-]."""
+"""A width relative to the median beyond this has no information [-]."""
 
 
 @final
@@ -30,34 +30,35 @@ class Belief:
 
     parameter: str
     contraction: float
-    """``1 - var(posterior) / var(prior)`` on the sampled scale [-]: the data's share of what is known."""
+    """``1 - var(posterior) / var(prior)`` on the sampled scale [-]: the share of the prior variance that the
+    data remove."""
     companions: tuple[str, ...]
     """Parameters whose draws are rank-correlated with this one's, strongest first."""
     correlations: tuple[float, ...]
     """Spearman's rank correlations with them [-]."""
-    hills: int
-    """Separate hills of the marginal."""
+    modes: int
+    """Separate modes of the marginal."""
     sensitivity: Sensitivity | None
     estimate: Estimate
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        told: dict[str, Any] = plain(
+        fields: dict[str, Any] = plain(
             {
                 "parameter": self.parameter,
                 "contraction": self.contraction,
                 "companions": dict(zip(self.companions, self.correlations, strict=True)),
-                "hills": self.hills,
+                "hills": self.modes,
                 "power_scaling": None if self.sensitivity is None else self.sensitivity.diagnosis,
             }
         )
-        return told
+        return fields
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Known:
-    """A function of the parameters beside what the prior says of it."""
+    """A function of the parameters, by the posterior and by the prior."""
 
     estimate: Estimate
     relative_width: float
@@ -67,14 +68,14 @@ class Known:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        told: dict[str, Any] = self.estimate.as_json() | plain(
+        fields: dict[str, Any] = self.estimate.as_json() | plain(
             {
                 "relative_width": self.relative_width,
                 "prior_relative_width": self.prior_relative_width,
                 "verdict": self.verdict,
             }
         )
-        return told
+        return fields
 
     @property
     def verdict(self) -> str:
@@ -113,9 +114,9 @@ def beliefs(
     spread = ranks.std(axis=0)
     centred = (ranks - ranks.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
     spearman = centred.T @ centred / ranks.shape[0]
-    by_name = {one.parameter: one for one in moved}
-    estimates = {one.name: one for one in draws.estimates()}
-    hills = {one.parameter: len(one.boundaries) + 1 for one in draws.ridges}
+    by_name = {sensitivity.parameter: sensitivity for sensitivity in moved}
+    estimates = {estimate.name: estimate for estimate in draws.estimates()}
+    modes = {mode.parameter: len(mode.boundaries) + 1 for mode in draws.modes}
     out = []
     for p, (k, name) in enumerate(zip(landscape.free, names, strict=True)):
         order = [q for q in np.argsort(-np.abs(spearman[p])) if q != p and abs(spearman[p, q]) >= _COMPANION]
@@ -125,7 +126,7 @@ def beliefs(
                 float(1 - columns[:, p].var() / prior_sd[k] ** 2),
                 tuple(names[q] for q in order),
                 tuple(float(spearman[p, q]) for q in order),
-                hills.get(name, 1),
+                modes.get(name, 1),
                 by_name.get(name),
                 estimates[name],
             )
@@ -134,16 +135,17 @@ def beliefs(
 
 
 def known_best(draws: Draws, prior: Matrix, span: float, *, time_unit: str) -> tuple[Known, ...]:
-    """Step metrics and steepest slopes of every path, the most precisely known first.
+    """Step metrics and steepest slopes of every path, the most precise first.
 
     `prior`, (draws, rows): draws of the prior; `span`: length of the record [time unit].
     """
     before = replace(draws, values=prior[None], log_density=np.zeros((1, prior.shape[0])))
-    told = [_functions(each, span, time_unit) for each in (draws, before)]
-    found = [
-        Known(after, _width(after), _width(first)) for after, first in zip(told[0], told[1], strict=True)
+    functions = [_functions(each, span, time_unit) for each in (draws, before)]
+    known = [
+        Known(after, _width(after), _width(first))
+        for after, first in zip(functions[0], functions[1], strict=True)
     ]
-    return tuple(sorted(found, key=lambda known: known.relative_width))
+    return tuple(sorted(known, key=lambda known: known.relative_width))
 
 
 def _functions(draws: Draws, span: float, time_unit: str) -> list[Estimate]:

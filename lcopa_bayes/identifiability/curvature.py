@@ -34,7 +34,7 @@ class Curvature:
     """Standard deviation over the size of the value, (parameters,) [-]; infinite likewise."""
     eigenvalues: Vector
     """Of the Fisher information in units of prior standard deviations, decreasing [-]: how many times as
-    precise as the prior the data are along a direction; below 1 the prior knows more."""
+    precise as the prior the data are along a direction; below 1 the prior is more informative."""
     directions: Matrix
     """Unit vectors in units of prior standard deviations, one per row, (parameters, parameters) [-]."""
     correlations: Matrix
@@ -61,9 +61,9 @@ class Curvature:
         return tuple(self.names[p] for p in order if self.names[p] != name and row[p] >= least)
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values without the spectrum; infinite ones are None."""
+        """Plain values without the spectrum; infinite values are None."""
         pairs = sorted(combinations(range(len(self.names)), 2), key=lambda ab: -abs(self.overlap[ab]))
-        told: dict[str, Any] = plain(
+        fields: dict[str, Any] = plain(
             {
                 "relative_sd": dict(zip(self.names, self.relative_sd, strict=True)),
                 "collinearity": self.collinearity,
@@ -79,7 +79,7 @@ class Curvature:
                 "correlations": self.correlations,
             }
         )
-        return told
+        return fields
 
     def spectrum(self) -> list[dict[str, Any]]:
         """Directions by falling precision with the parameters that make them up."""
@@ -94,18 +94,18 @@ class Curvature:
                     "prior_knows_more": bool(value < 1),
                 }
             )
-        told: list[dict[str, Any]] = plain(out)
-        return told
+        fields: list[dict[str, Any]] = plain(out)
+        return fields
 
 
 def curvature(landscape: Landscape, values: Vector, prior_sd: Vector) -> Curvature:
-    """Fisher information of the plant parameters at table values, noise parameters as they stand there.
+    """Fisher information of the plant parameters at table values, including those of the noise parameters.
 
     `prior_sd`, (rows,): standard deviations of the prior on the sampled scale. The mean of the samples does
-    not depend on noise parameters, so that theirs is a block of its own and is left out.
+    not depend on noise parameters, so that theirs is a separate block and is omitted.
     """
-    found = sensitivities(landscape, values)
-    slopes, columns = found.matrix, landscape.least.columns
+    derivatives = sensitivities(landscape, values)
+    slopes, columns = derivatives.matrix, landscape.least.columns
     norms = np.linalg.norm(slopes, axis=0)
     unit = slopes / np.where(norms > 0, norms, 1.0)
     overlap = unit.T @ unit
@@ -119,13 +119,13 @@ def curvature(landscape: Landscape, values: Vector, prior_sd: Vector) -> Curvatu
     scale = np.sqrt(np.diag(shape))
     correlations = shape / np.outer(np.where(scale > 0, scale, 1.0), np.where(scale > 0, scale, 1.0))
     correlations[~np.isfinite(sd)] = correlations[:, ~np.isfinite(sd)] = np.nan
-    sizes = np.where(found.logarithmic, 1.0, np.abs(found.values))
+    sizes = np.where(derivatives.logarithmic, 1.0, np.abs(derivatives.values))
     with np.errstate(divide="ignore"):
         relative = np.where(sizes > 0, sd / np.where(sizes > 0, sizes, 1.0), np.inf)
     eigenvalues, directions = _spectral(slopes * prior_sd[columns])
     least = float(singular[-1])
     return Curvature(
-        found.names,
+        derivatives.names,
         sd,
         relative,
         eigenvalues,

@@ -1,4 +1,4 @@
-"""Can the delays of several paths be told apart, given which drives moved and when."""
+"""Whether the delays of several paths can be distinguished, given which drives moved and when."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from lcopa_bayes.inference.parameters import ParameterTable
 @final
 @dataclass(frozen=True)
 class Separation:
-    """How different the delays of two paths must be to be told apart."""
+    """Smallest difference of the delays of two paths that the records resolve."""
 
     pair: tuple[str, str]
     """Names of the paths."""
     smallest: float
     """Smallest difference that a two-sided interval at `LEVEL` keeps apart from 0 [time unit]; infinite
-    where the records say nothing about one of the two."""
+    where the records have no information about one of the two."""
 
 
 @final
@@ -44,20 +44,20 @@ class Delays:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; what is infinite is None."""
-        told: dict[str, Any] = plain(
+        fields: dict[str, Any] = plain(
             {
                 "paths": [
                     {"path": path, "sd": sd, "unit": self.time_unit}
                     for path, sd in zip(self.paths, self.sd, strict=True)
                 ],
                 "separations": [
-                    {"pair": one.pair, "smallest_difference": one.smallest, "level": LEVEL}
-                    for one in self.separations
+                    {"pair": separation.pair, "smallest_difference": separation.smallest, "level": LEVEL}
+                    for separation in self.separations
                 ],
                 "sentence": self.sentence,
             }
         )
-        return told
+        return fields
 
 
 def delays(study: Study, table: ParameterTable, values: Vector) -> Delays:
@@ -68,7 +68,7 @@ def delays(study: Study, table: ParameterTable, values: Vector) -> Delays:
         for j in range(len(table.layout.drives))
     ]
     if len(paths) == 1:
-        return Delays((), (), (), study.time_unit, "one path: there are no delays to tell apart")
+        return Delays((), (), (), study.time_unit, "one path: there are no delays to compare")
     priors = {name: prior for name, prior in study.priors.items() if name.split("_")[0] != "delay"}
     apart = replace(study, model=replace(study.model, delay="path"), priors=priors)
     landscape = Landscape(problem_of(apart).posterior)
@@ -80,26 +80,34 @@ def delays(study: Study, table: ParameterTable, values: Vector) -> Delays:
             at[k] = values[table.at("delay", table.layout.delay_of[i][j])]
         else:
             at[k] = values[table.names.index(row.name)]
-    found = curvature(landscape, at, np.ones(at.size))
-    where = [found.names.index(f"delay_{path}") for path in paths]
+    curved = curvature(landscape, at, np.ones(at.size))
+    where = [curved.names.index(f"delay_{path}") for path in paths]
     wide = float(norm.ppf(0.5 + LEVEL / 2))
     separations = []
     for a, b in combinations(range(len(paths)), 2):
         p, q = where[a], where[b]
-        both = np.isfinite(found.sd[[p, q]]).all()
-        mixed = 2 * found.correlations[p, q] * found.sd[p] * found.sd[q] if both else 0.0
-        spread = np.sqrt(max(found.sd[p] ** 2 + found.sd[q] ** 2 - mixed, 0.0)) if both else np.inf
+        both = np.isfinite(curved.sd[[p, q]]).all()
+        mixed = 2 * curved.correlations[p, q] * curved.sd[p] * curved.sd[q] if both else 0.0
+        spread = np.sqrt(max(curved.sd[p] ** 2 + curved.sd[q] ** 2 - mixed, 0.0)) if both else np.inf
         separations.append(Separation((paths[a], paths[b]), float(wide * spread)))
-    sd = tuple(float(found.sd[p]) for p in where)
-    return Delays(tuple(paths), sd, tuple(separations), study.time_unit, _said(separations, study.time_unit))
+    sd = tuple(float(curved.sd[p]) for p in where)
+    return Delays(
+        tuple(paths), sd, tuple(separations), study.time_unit, _sentence(separations, study.time_unit)
+    )
 
 
-def _said(separations: list[Separation], unit: str) -> str:
-    lost = [one for one in separations if not np.isfinite(one.smallest)]
-    if len(lost) == len(separations):
-        return "no two path delays can be told apart: the records bound at most one of them"
-    worst = max((one for one in separations if one not in lost), key=lambda one: one.smallest)
-    told = f"{worst.pair[0]} and {worst.pair[1]} from a difference of {worst.smallest:.2g} {unit} on"
-    if lost:
-        return f"{len(lost)} of {len(separations)} pairs of path delays can never be told apart; {told}"
-    return f"all path delays can be told apart, {told} at worst"
+def _sentence(separations: list[Separation], unit: str) -> str:
+    unresolved = [separation for separation in separations if not np.isfinite(separation.smallest)]
+    if len(unresolved) == len(separations):
+        return "no two path delays can be distinguished: the records bound at most one of them"
+    worst = max(
+        (separation for separation in separations if separation not in unresolved),
+        key=lambda separation: separation.smallest,
+    )
+    smallest = f"{worst.pair[0]} and {worst.pair[1]} from a difference of {worst.smallest:.2g} {unit}"
+    if unresolved:
+        return (
+            f"{len(unresolved)} of {len(separations)} pairs of path delays cannot be distinguished; the "
+            f"least resolved of the others: {smallest}"
+        )
+    return f"all path delays can be distinguished, the least resolved pair {smallest}"

@@ -1,4 +1,4 @@
-"""Profile likelihood: how far one parameter may move while all others make up for it."""
+"""Profile likelihood: how far one parameter may move while all others compensate."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LEVELS = (0.68, LEVEL, 0.95)
 @final
 @dataclass(frozen=True)
 class Freedom:
-    """How many samples stand against how many fitted parameters."""
+    """Numbers of samples and of fitted parameters."""
 
     samples: int
     fitted: int
@@ -44,10 +44,10 @@ class Freedom:
         function of Student's t. The quantile of chi^2 is its limit for many samples; with 20 samples and 5
         parameters an interval of 90 % that is read at the quantile holds the truth in 83 %.
         """
-        left = self.samples - self.fitted
-        if self.scale_known or left < 1:
+        degrees = self.samples - self.fitted
+        if self.scale_known or degrees < 1:
             return float(chi2.ppf(level, 1))
-        return self.samples * float(np.log1p(t.ppf((1 + level) / 2, left) ** 2 / left))
+        return self.samples * float(np.log1p(t.ppf((1 + level) / 2, degrees) ** 2 / degrees))
 
 
 @final
@@ -71,11 +71,11 @@ class Profile:
     best: float
     """Largest log likelihood known [nat]."""
     at_bound: tuple[str, ...]
-    """Other parameters that stand at an end of their search within the widest interval."""
+    """Other parameters that are at an end of their search within the widest interval."""
     ends: tuple[float, float]
     """Ends of the search, in `unit`."""
     moving: tuple[str, ...]
-    """Other parameters that move within that interval to make up for this one, farthest first."""
+    """Other parameters that move within that interval to compensate this one, farthest first."""
     top: Vector
     """Table values of the highest point, (rows,)."""
     freedom: Freedom
@@ -109,7 +109,7 @@ class Profile:
         return tuple(side for side, end in (("below", lower), ("above", upper)) if end is None)
 
     def said_end(self, side: int) -> str:
-        """An end of the search as a reader wrote it: the edge that is kept from it, 1e-6, is left out."""
+        """An end of the search as the study states it, without the margin of 1e-6 that is kept from it."""
         linear = bool(np.all(self.coordinates == self.values))
         at = self.ends[side]
         return f"{0.0 if linear and abs(at) < 1e-5 * np.ptp(self.ends) else at:.4g}"
@@ -123,7 +123,7 @@ class Profile:
     def as_json(self) -> dict[str, Any]:
         """Plain values; an open side is None."""
         lower, upper = self.intervals[LEVEL]
-        told: dict[str, Any] = plain(
+        fields: dict[str, Any] = plain(
             {
                 "lower": lower,
                 "upper": upper,
@@ -141,4 +141,4 @@ class Profile:
                 "fall": self.fall,
             }
         )
-        return told
+        return fields

@@ -1,4 +1,4 @@
-"""The way along a profile: an optimiser at every point, started from its neighbours and from draws."""
+"""Points of a profile: an optimiser at every point, started from its neighbours and from draws."""
 
 from __future__ import annotations
 
@@ -11,38 +11,38 @@ from lcopa_bayes.identifiability.profile import LEVELS, Freedom, Profile
 from lcopa_bayes.inference.likelihood import Landscape, Peak
 
 _BEYOND = 1.3
-"""Fall at which a walk ends, relative to that of the largest level [-]."""
+"""Fall at which a sequence of points ends, relative to that of the largest level [-]."""
 _STRIDE = 0.4
 """Wanted change of the root of the fall per step [-]."""
 _MOST_POINTS = 30
-"""Steps of a walk."""
+"""Most steps in one direction."""
 _LONGEST = 1 / 8
 """Longest step, relative to the search [-]."""
 _GAP = 1 / 12
 """Widest gap between points inside, relative to the search [-]."""
 _HALVINGS = 3
 _AT_TOP = 0.01
-"""A point within this fall is as high as it need be [nat]."""
+"""A point within this fall is not optimised again [nat]."""
 _AGAIN = 25
 """Evaluations of a second attempt at a point."""
 _MOVED = 0.1
-"""Way of another parameter along the profile, relative to its search, that is told [-]."""
+"""Movement of another parameter along the profile, relative to its search, that is reported [-]."""
 _FAR = 3
-"""Draws beyond the end of a walk from which another hill is sought."""
+"""Draws beyond the last point from which another mode is sought."""
 
 
 def profile(landscape: Landscape, k: int, peak: Peak, witnesses: Matrix, first_step: float) -> Profile:
     """Profile of the parameter at table position `k` from the maximum `peak`.
 
-    Walks to both sides with steps that follow the fall, each point started from the one before; then back,
+    Points to both sides with steps that follow the fall, each started from the previous point; then again,
     each from its outer neighbour; then each from the best of `witnesses` (draws, rows) near it. Where a
-    draw beyond the end of a walk is nearly as likely as the maximum the walk is taken up from there.
+    draw beyond the last point is nearly as likely as the maximum, the sequence continues from there.
     """
-    return _Walk(landscape, k, peak, witnesses).run(first_step)
+    return _Path(landscape, k, peak, witnesses).run(first_step)
 
 
-class _Walk:
-    """Points of one profile while it is made."""
+class _Path:
+    """Points of one profile under construction."""
 
     def __init__(self, landscape: Landscape, k: int, peak: Peak, witnesses: Matrix) -> None:
         self.landscape, self.k, self.peak = landscape, k, peak
@@ -57,39 +57,40 @@ class _Walk:
         self.likely = landscape.log_likelihood(witnesses) if witnesses.size else np.empty(0)
 
     def run(self, first_step: float) -> Profile:
-        """Both walks, the way back, the draws."""
+        """Both directions, each point again from its neighbours, then from the draws."""
         for side in (-1, 1):
-            self.walk(self.start, side, first_step)
+            self.extend(self.start, side, first_step)
             self.seek(side)
         self.refine()
         for at in (sorted(self.points), sorted(self.points, reverse=True)):
             for near, far in pairwise(at):  # from either end through to the other
                 self.improve(far, self.points[near].values)
         self.from_draws()
-        self.carry_on()
+        self.extend_ends()
         self.refine()
-        return self.made()
+        return self.profile()
 
     def solve(self, u: float, start: Vector, *, most: int = 60) -> Peak:
         """Maximum with the parameter held at coordinate `u`."""
         begin = start.copy()
         begin[self.k] = self.landscape.value(self.k, u)
-        return self.landscape.climb(begin, held=self.k, most=most)
+        return self.landscape.maximise(begin, held=self.k, most=most)
 
     def improve(self, u: float, start: Vector) -> None:
-        """Keep what another start finds at a point, where it is better and there is better to be had."""
+        """Keep the optimum from another start at a point where it is better; points near the top are
+        skipped."""
         if self.fall(self.points[u]) < _AT_TOP:
             return
-        found = self.solve(u, start, most=_AGAIN)
-        if found.log_likelihood > self.points[u].log_likelihood:
-            self.points[u] = found
+        solved = self.solve(u, start, most=_AGAIN)
+        if solved.log_likelihood > self.points[u].log_likelihood:
+            self.points[u] = solved
 
     def fall(self, point: Peak) -> float:
-        """Below the best known."""
+        """Fall of twice the log likelihood below the best point [nat]."""
         best = max(known.log_likelihood for known in self.points.values())
         return max(2 * (best - point.log_likelihood), 0.0)
 
-    def walk(self, start: float, side: int, step: float) -> None:
+    def extend(self, start: float, side: int, step: float) -> None:
         """From a point outwards until the likelihood has fallen or the search ends."""
         u, here = start, self.points[start]
         end, width = (self.low if side < 0 else self.high), self.high - self.low
@@ -101,13 +102,13 @@ class _Walk:
             ahead = u + side * step
             if side * (end - ahead) < 0.2 * step:
                 ahead = end
-            found = self.solve(ahead, self._ahead(here, u, before, ahead))
-            moved = abs(np.sqrt(self.fall(found)) - np.sqrt(self.fall(here)))
+            solved = self.solve(ahead, self._ahead(here, u, before, ahead))
+            moved = abs(np.sqrt(self.fall(solved)) - np.sqrt(self.fall(here)))
             if moved > 3 * _STRIDE and abs(ahead - u) > 1e-7 * width:
                 step = 0.4 * abs(ahead - u)
-                self.points[ahead] = found  # kept: it may already bracket a level
+                self.points[ahead] = solved  # kept: it may already bracket a level
                 continue
-            before, u, here = (u, here), ahead, found
+            before, u, here = (u, here), ahead, solved
             self.points[u] = here
             step = min(step * float(np.clip(_STRIDE / max(moved, 1e-9), 0.4, 2.5)), _LONGEST * width)
         self.points.setdefault(end, self.solve(end, here.values))
@@ -127,7 +128,7 @@ class _Walk:
                     self.points[middle] = max(tried, key=lambda peak: peak.log_likelihood)
 
     def _ahead(self, here: Peak, u: float, before: tuple[float, Peak] | None, ahead: float) -> Vector:
-        """Start for the next point: the others carried on along the way they moved."""
+        """Start for the next point: the other parameters extrapolated linearly."""
         if before is None or before[0] == u:
             return here.values
         share = float(np.clip((ahead - u) / (u - before[0]), 0.0, 2.0))
@@ -141,7 +142,7 @@ class _Walk:
         return out
 
     def seek(self, side: int) -> None:
-        """Another hill beyond the end of the walk, where draws say there is one."""
+        """Another mode beyond the last point, where draws indicate one."""
         last = max(self.points) if side > 0 else min(self.points)
         best = max(point.log_likelihood for point in self.points.values())
         far = (side * (self.where - last) > 0) & (2 * (best - self.likely) < 4 * self.beyond)
@@ -152,12 +153,12 @@ class _Walk:
             u = float(self.where[index])
             if side * (u - last) <= 0:
                 continue
-            found = self.solve(u, self.witnesses[index])
-            self.points[u] = found
-            if self.fall(found) < self.beyond:
+            solved = self.solve(u, self.witnesses[index])
+            self.points[u] = solved
+            if self.fall(solved) < self.beyond:
                 step = abs(u - last) / 4
-                self.walk(u, -side, step) if abs(u - last) > 0 else None
-                self.walk(u, side, step)
+                self.extend(u, -side, step) if abs(u - last) > 0 else None
+                self.extend(u, side, step)
                 last = max(self.points) if side > 0 else min(self.points)
 
     def from_draws(self) -> None:
@@ -171,15 +172,15 @@ class _Walk:
             if near.size:
                 self.improve(float(u), self.witnesses[near[np.argmax(self.likely[near])]])
 
-    def carry_on(self) -> None:
-        """Outwards again where the outermost point has been improved and is inside after all."""
+    def extend_ends(self) -> None:
+        """Further outwards where the outermost point has improved and is now inside."""
         for side, end in ((-1, self.low), (1, self.high)):
             last, before = sorted(self.points, key=lambda u: -side * u)[:2]
             if last != end and self.fall(self.points[last]) < self.beyond:
-                self.walk(last, side, abs(last - before) / 2)
+                self.extend(last, side, abs(last - before) / 2)
 
-    def made(self) -> Profile:
-        """What the points say."""
+    def profile(self) -> Profile:
+        """The profile through the points."""
         row = self.landscape.posterior.table.rows[self.k]
         at = np.array(sorted(self.points))
         peaks = [self.points[u] for u in at]
@@ -189,7 +190,7 @@ class _Walk:
         flagged = dict.fromkeys(
             name for point in inside for name in self.landscape.at_bound(point.values, but=self.k)
         )
-        travelled = {
+        range_of = {
             self.landscape.posterior.table.names[k]: np.ptp(
                 self.landscape.column(k, np.array([point.values for point in inside]))
             )
@@ -197,7 +198,7 @@ class _Walk:
             for k in self.landscape.free
             if k != self.k
         }
-        moving = sorted((n for n in travelled if travelled[n] > _MOVED), key=lambda n: -travelled[n])
+        moving = sorted((n for n in range_of if range_of[n] > _MOVED), key=lambda n: -range_of[n])
         ends = (self.landscape.value(self.k, self.low), self.landscape.value(self.k, self.high))
         return Profile(
             row.name,

@@ -1,4 +1,4 @@
-"""One fit that asks whether anything moves freely: far from the maximum at nearly its likelihood."""
+"""Radial test: a fit far from the maximum, whose likelihood shows whether a direction is free."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _WEIGHT = 10.0
 @final
 @dataclass(frozen=True)
 class Radial:
-    """What the radial test found (Kreutz 2018, Bioinformatics 34)."""
+    """Result of the radial test (Kreutz 2018, Bioinformatics 34)."""
 
     radius: float
-    """Distance that was asked for, in prior standard deviations [-]."""
+    """Distance requested, in prior standard deviations [-]."""
     reached: float
-    """Distance that was reached [-]."""
+    """Distance reached [-]."""
     fall: float
     """``2 (max L - L)`` there [nat]."""
     moved: tuple[str, ...]
@@ -34,8 +34,8 @@ class Radial:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        told: dict[str, Any] = plain(vars(self))
-        return told
+        fields: dict[str, Any] = plain(vars(self))
+        return fields
 
 
 def radial(landscape: Landscape, peak: Peak, prior_sd: Vector, direction: Vector, radius: float) -> Radial:
@@ -65,7 +65,7 @@ def radial(landscape: Landscape, peak: Peak, prior_sd: Vector, direction: Vector
     def jacobian_of(x: Vector) -> Matrix:
         return pulled(x)[1]
 
-    found = []
+    candidates = []
     for sign in (-1.0, 1.0):
         start = np.clip(centre + 0.1 * sign * radius * scale * direction, *ends)
         solved = least_squares(
@@ -77,5 +77,7 @@ def radial(landscape: Landscape, peak: Peak, prior_sd: Vector, direction: Vector
         order = [p for p in np.argsort(-away) if away[p] > _MOVED * radius]
         fall = float(residual @ residual - base @ base)
         reached = float(np.linalg.norm(away))
-        found.append(Radial(radius, reached, max(fall, 0.0), tuple(names[p] for p in order)))
-    return min(found, key=lambda one: one.fall + (_WEIGHT * (one.reached / radius - 1)) ** 2)
+        candidates.append(Radial(radius, reached, max(fall, 0.0), tuple(names[p] for p in order)))
+    return min(
+        candidates, key=lambda candidate: candidate.fall + (_WEIGHT * (candidate.reached / radius - 1)) ** 2
+    )

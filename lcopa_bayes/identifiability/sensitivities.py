@@ -16,7 +16,7 @@ from lcopa_bayes.inference.posterior import Posterior
 @final
 @dataclass(frozen=True, eq=False)
 class Sensitivities:
-    """Derivatives of the samples, made white by the noise model, at one set of values.
+    """Derivatives of the samples, whitened by the noise model, at one set of values.
 
     Their products are the Fisher information, under Student noise too.
     """

@@ -1,4 +1,4 @@
-"""Symmetries: ways to move parameters that change no sample, from the rank of sensitivities."""
+"""Symmetries: directions in which parameters change no sample, from the rank of sensitivities."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _CLEAR = 6
 _MOVES = 1e-6
 """Share of the largest entry from which a parameter takes part in a null vector [-]."""
 _NOTHING = 1e-10
-"""Relative change of the responses below which a parameter does nothing [-]."""
+"""Relative change of the responses below which a parameter has no effect [-]."""
 
 
 @final
@@ -45,7 +45,7 @@ class Symmetry:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        told: dict[str, Any] = plain(
+        fields: dict[str, Any] = plain(
             {
                 "kind": self.kind,
                 "parameters": self.parameters,
@@ -53,7 +53,7 @@ class Symmetry:
                 "sentence": self.sentence,
             }
         )
-        return told
+        return fields
 
 
 @final
@@ -75,13 +75,16 @@ class Structure:
     def blind(self) -> frozenset[str]:
         """Names that take part in a continuous symmetry."""
         return frozenset(
-            name for found in self.symmetries if found.kind != "exchange" for name in found.parameters
+            name
+            for symmetries in self.symmetries
+            if symmetries.kind != "exchange"
+            for name in symmetries.parameters
         )
 
     def partners(self, name: str) -> tuple[str, ...]:
-        """The other parameters of the continuous symmetries of one."""
-        found = [s.parameters for s in self.symmetries if s.kind != "exchange" and name in s.parameters]
-        return tuple(dict.fromkeys(other for group in found for other in group if other != name))
+        """The other parameters of the continuous symmetries of `name`."""
+        symmetries = [s.parameters for s in self.symmetries if s.kind != "exchange" and name in s.parameters]
+        return tuple(dict.fromkeys(other for group in symmetries for other in group if other != name))
 
 
 def structure(
@@ -101,17 +104,19 @@ def structure(
     names = tuple(names)
     largest = [max(float(np.linalg.norm(m, axis=0).max()), 1e-300) for m in slopes]
     reach = [np.linalg.norm(m, axis=0) / top for m, top in zip(slopes, largest, strict=True)]
-    acting = [p for p in range(len(names)) if any(one[p] > _NOTHING for one in reach)]
-    found = [
+    acting = [p for p in range(len(names)) if any(shares[p] > _NOTHING for shares in reach)]
+    symmetries = [
         Symmetry("no effect", (names[p],), (1.0,), f"{names[p]} changes no sample: nothing excites it")
         for p in range(len(names))
         if p not in acting
     ]
-    points = [m[:, acting] for m, one in zip(slopes, reach, strict=True) if one[acting].min(initial=1) > 0]
-    at = [v[acting] for v, one in zip(values, reach, strict=True) if one[acting].min(initial=1) > 0]
+    points = [
+        m[:, acting] for m, shares in zip(slopes, reach, strict=True) if shares[acting].min(initial=1) > 0
+    ]
+    at = [v[acting] for v, shares in zip(values, reach, strict=True) if shares[acting].min(initial=1) > 0]
     kept = [names[p] for p in acting]
     if not points or not kept:
-        return Structure(tuple(found), len(names), 0, True, np.empty(0))
+        return Structure(tuple(symmetries), len(names), 0, True, np.empty(0))
     spectra = [_spectrum(m) for m in points]
     ranks = {t: max(int(np.sum(s > t)) for s in spectra) for t in tolerances}
     rank = ranks[tolerances[1]]
@@ -119,9 +124,9 @@ def structure(
     if rank < len(kept) and certain:
         clear = np.argsort([-s[rank - 1] for s in spectra], kind="stable")[:_CLEAR]
         columns, labels, members, grouped = _merged([points[p] for p in clear], [at[p] for p in clear], kept)
-        found += [*grouped, *_directions(columns, labels, members)]
+        symmetries += [*grouped, *_directions(columns, labels, members)]
     best = max(spectra, key=lambda s: float(s[rank - 1]))
-    return Structure(tuple(found), len(names), rank, certain, best)
+    return Structure(tuple(symmetries), len(names), rank, certain, best)
 
 
 def _spectrum(matrix: Matrix) -> Vector:
@@ -133,15 +138,15 @@ def _spectrum(matrix: Matrix) -> Vector:
 def _merged(
     points: Sequence[Matrix], values: Sequence[Vector], names: Sequence[str]
 ) -> tuple[list[Matrix], list[str], list[tuple[str, ...]], list[Symmetry]]:
-    """Columns with those that are proportional at every point made one; their labels and members; what was
-    found."""
+    """Columns with those that are proportional at every point merged; their labels and members; the
+    symmetries."""
     unit = [m / np.linalg.norm(m, axis=0) for m in points]
     groups: list[list[int]] = []
     for p in range(len(names)):
         own = (g for g in groups if all(_same(m[:, g[0]], m[:, p]) for m in unit))
         group = next(own, None)
         groups.append([p]) if group is None else group.append(p)
-    found, labels, columns = [], [], [np.empty((m.shape[0], len(groups))) for m in points]
+    symmetries, labels, columns = [], [], [np.empty((m.shape[0], len(groups))) for m in points]
     for g, group in enumerate(groups):
         members = tuple(names[p] for p in group)
         labels.append(members[0])
@@ -153,27 +158,27 @@ def _merged(
         sizes = np.array([v[group] / v[group[0]] for v in values])
         if _constant(shares):
             powers = _round(shares.mean(axis=0))
-            told = " ".join(f"{n}^{p:g}" if p != 1 else n for n, p in zip(members, powers, strict=True))
-            found.append(Symmetry("product", members, powers, f"only the product {told} acts"))
-            labels[-1] = f"the product {told}"
+            label = " ".join(f"{n}^{p:g}" if p != 1 else n for n, p in zip(members, powers, strict=True))
+            symmetries.append(Symmetry("product", members, powers, f"only the product {label} acts"))
+            labels[-1] = f"the product {label}"
         elif _constant(shares / sizes):
             weights = _round((shares / sizes).mean(axis=0))
             parts = (n if w == 1 else f"{w:g} {n}" for n, w in zip(members, weights, strict=True))
-            told = " + ".join(parts).replace("+ -", "- ")
-            found.append(Symmetry("sum", members, weights, f"only the sum {told} acts"))
-            labels[-1] = f"the sum {told}"
+            label = " + ".join(parts).replace("+ -", "- ")
+            symmetries.append(Symmetry("sum", members, weights, f"only the sum {label} acts"))
+            labels[-1] = f"the sum {label}"
             for column, m in zip(columns, points, strict=True):
                 column[:, g] = m[:, group].sum(axis=1)
         else:
-            told = ", ".join(members)
-            found.append(Symmetry("combination", members, (), f"only one combination of {told} acts"))
-    return columns, labels, [tuple(names[p] for p in group) for group in groups], found
+            label = ", ".join(members)
+            symmetries.append(Symmetry("combination", members, (), f"only one combination of {label} acts"))
+    return columns, labels, [tuple(names[p] for p in group) for group in groups], symmetries
 
 
 def _directions(
     columns: Sequence[Matrix], labels: Sequence[str], members: Sequence[tuple[str, ...]]
 ) -> list[Symmetry]:
-    """Blind directions that are left, each group counting as one parameter."""
+    """Remaining blind directions, each group counting as one parameter."""
     kernels = [_kernel(m) for m in columns]
     width = min(kernel.shape[1] for kernel in kernels)
     kernels = [kernel for kernel in kernels if kernel.shape[1] == width]
@@ -181,16 +186,16 @@ def _directions(
         return []
     reach = np.max([np.abs(kernel).max(axis=1) for kernel in kernels], axis=0)
     taking = [p for p in range(len(labels)) if reach[p] > _MOVES * reach.max()]
-    told, parameters = [labels[p] for p in taking], tuple(n for p in taking for n in members[p])
+    names, parameters = [labels[p] for p in taking], tuple(n for p in taking for n in members[p])
     if width == 1:
         vectors = np.array([k[taking, 0] / k[taking[0], 0] for k in kernels])
         if _constant(vectors):
             powers = _round(vectors.mean(axis=0))
-            parts = (n if w == 1 else f"{n} (to the power {w:g})" for n, w in zip(told, powers, strict=True))
-            sentence = f"a common factor on {', '.join(parts)} changes nothing"
-            return [Symmetry("scale", parameters, powers if len(parameters) == len(told) else (), sentence)]
-    many = f"{width} ways" if width > 1 else "one way"
-    sentence = f"{many} to move {', '.join(told)} together without any effect"
+            parts = (n if w == 1 else f"{n} (to the power {w:g})" for n, w in zip(names, powers, strict=True))
+            sentence = f"a common factor on {', '.join(parts)} has no effect"
+            return [Symmetry("scale", parameters, powers if len(parameters) == len(names) else (), sentence)]
+    many = f"{width} directions" if width > 1 else "one direction"
+    sentence = f"{many} in which {', '.join(names)} move together without any effect"
     return [Symmetry("combination", parameters, (), sentence)]
 
 
@@ -214,7 +219,7 @@ def _constant(rows: Matrix) -> bool:
 
 def _round(entries: Vector) -> tuple[float, ...]:
     """Entries to the digits that are sure."""
-    return tuple(float(f"{entry:.4g}") + 0.0 for entry in entries)
+    return tuple(float(f"{shares:.4g}") + 0.0 for shares in entries)
 
 
 def exchanges(table: ParameterTable) -> tuple[Symmetry, ...]:

@@ -12,8 +12,8 @@ FACTOR = 2.0
 """Upper over lower end of a gain, a time constant or a noise scale [-]: a controller that suits one end has
 used up its customary gain margin, 6 dB, at the other, and a corner frequency is not known to an octave."""
 ORDER = 0.5
-"""Width of an order [-]: it turns the phase by 45 degrees, a customary phase margin, and does not tell a half
-from a whole order."""
+"""Width of an order [-]: it turns the phase by 45 degrees, a customary phase margin, and does not distinguish
+a half from a whole order."""
 CORRELATION = 0.5
 """Width of a noise correlation [-]: half of all it may be."""
 LEVEL = 0.5

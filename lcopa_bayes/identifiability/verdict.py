@@ -1,4 +1,4 @@
-"""One verdict per parameter from symmetries, curvature, profile and draws, with what speaks against it."""
+"""One verdict per parameter from symmetries, curvature, profile and draws, with contrary evidence."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ Verdict = Literal[
     "prior-dominated",
 ]
 HALF = 0.5
-"""Contraction below which the prior knows more than the data [-]."""
+"""Contraction below which the prior is more informative than the data [-]."""
 _NARROW = 0.9
-"""Contraction of draws that look well determined [-]."""
+"""Contraction of draws that appear well determined [-]."""
 _APART = 3.0
 """Factor between local and profile widths from which they disagree [-]."""
 
@@ -34,7 +34,7 @@ _APART = 3.0
 @final
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """What became of one parameter."""
+    """Verdict of one parameter with its evidence."""
 
     profile: Profile
     belief: Belief
@@ -48,7 +48,7 @@ class Finding:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        told: dict[str, Any] = plain(
+        fields: dict[str, Any] = plain(
             {
                 "name": self.profile.parameter,
                 "unit": self.profile.unit,
@@ -63,7 +63,7 @@ class Finding:
                 "disagreements": self.disagreements,
             }
         )
-        return told
+        return fields
 
 
 def judged(
@@ -77,11 +77,12 @@ def judged(
 ) -> Finding:
     """Verdict of one parameter.
 
-    Unresolved: of an element that resonates faster than the samples resolve, as `unresolved` says.
+    Unresolved: of an element that resonates faster than the samples resolve, as given in `unresolved`.
     Structurally unidentifiable: part of a symmetry. Otherwise by the profile at `LEVEL`: no side closed,
     practically unidentifiable, or prior-dominated where the prior is not flat on the sampled scale; one
     side closed, one-sided; both closed, identified, or weakly identified where the interval exceeds the
-    tolerance, or prior-dominated where the prior knows more than the data (contraction below a half).
+    tolerance, or prior-dominated where the prior is more informative than the data (contraction below a
+    half).
     """
     name, open_sides = profile.parameter, profile.open_sides
     partners = dict.fromkeys(
@@ -110,14 +111,14 @@ def _decided(
     if symmetry is not None:
         return "structurally unidentifiable", f"before any noise, {symmetry.sentence}"
     level, low, high = f"{100 * LEVEL:g} %", *profile.intervals[LEVEL]
-    moving = f" while {', '.join(profile.moving[:3])} make up for it" if profile.moving else ""
+    moving = f" while {', '.join(profile.moving[:3])} compensate" if profile.moving else ""
     if low is None and high is None:
         a, b = profile.said_end(0), profile.said_end(1)
         most = float(profile.fall.max())
-        said = f"between {a} and {b}{unit} twice the log likelihood falls by at most {most:.2g}{moving}"
+        detail = f"between {a} and {b}{unit} twice the log likelihood falls by at most {most:.2g}{moving}"
         if flat_prior:
-            return "practically unidentifiable", f"the data bound it on neither side: {said}"
-        return "prior-dominated", f"only its prior bounds it: {said}"
+            return "practically unidentifiable", f"the data bound it on neither side: {detail}"
+        return "prior-dominated", f"only its prior bounds it: {detail}"
     if low is None or high is None:
         side, end = ("above", high) if low is None else ("below", low)
         other, limit = ("below", profile.said_end(0)) if low is None else ("above", profile.said_end(1))
@@ -129,10 +130,10 @@ def _decided(
     within = f"{low:.4g} to {high:.4g}{unit} ({level})"
     if share < HALF:
         return "prior-dominated", (
-            f"bounded within {within}, but the data take only {100 * share:.0f} % off the variance of "
-            "its prior"
+            f"bounded within {within}, but the data reduce the variance of its prior by "
+            f"{100 * share:.0f} % only"
         )
-    parts = f", in {profile.parts} separate stretches" if profile.parts > 1 else ""
+    parts = f", in {profile.parts} separate intervals" if profile.parts > 1 else ""
     wide = tolerance.exceeded(low, high)
     if wide:
         return "weakly identified", f"the data alone bound it, but only within {within}, {wide}{parts}"
@@ -140,7 +141,7 @@ def _decided(
 
 
 def _against(verdict: Verdict, profile: Profile, belief: Belief, sd: float | None) -> list[str]:
-    """What one method says against the verdict."""
+    """Evidence of single methods against the verdict."""
     out, (low, high) = [], profile.intervals[LEVEL]
     if low is not None and high is not None and sd is not None:
         ends = np.interp([low, high], profile.values, profile.coordinates)
@@ -155,11 +156,11 @@ def _against(verdict: Verdict, profile: Profile, belief: Belief, sd: float | Non
             )
     if profile.open_sides and belief.contraction > _NARROW:
         out.append(
-            f"draws: contraction {belief.contraction:.2f} looks determined, but on the open side it is the "
-            "volume left to other parameters that makes values rare, not the data"
+            f"draws: a contraction of {belief.contraction:.2f} suggests a determined parameter, but on the "
+            "open side the volume of the other parameters makes values rare, not the data"
         )
-    if belief.hills > 1:
-        out.append(f"draws: {belief.hills} separate hills")
+    if belief.modes > 1:
+        out.append(f"draws: {belief.modes} separate modes")
     moved = belief.sensitivity
     bounded = verdict in ("identified", "weakly identified")
     if bounded and moved is not None and moved.diagnosis not in ("-", "not trusted"):
@@ -169,5 +170,5 @@ def _against(verdict: Verdict, profile: Profile, belief: Belief, sd: float | Non
     if (ends_95[0] is not None and middle < ends_95[0]) or (ends_95[1] is not None and middle > ends_95[1]):
         out.append(f"draws: their median {middle:.3g} lies outside the profile's 95 % interval")
     if profile.at_bound and bounded:
-        out.append(f"profile: leans on the bounds of {', '.join(profile.at_bound)}")
+        out.append(f"profile: depends on the bounds of {', '.join(profile.at_bound)}")
     return out

@@ -104,7 +104,7 @@ class Landscape:
         """Of canonical table values (batch, rows), (batch,) [nat]."""
         return self.posterior.joint_log_likelihood(values)
 
-    def climb(self, start: Vector, *, held: int | None = None, most: int = _EVALUATIONS) -> Peak:
+    def maximise(self, start: Vector, *, held: int | None = None, most: int = _EVALUATIONS) -> Peak:
         """A local maximum from table values; the parameter `held` keeps the value it starts with.
 
         Plant and noise parameters are maximised in turn until nothing is gained.

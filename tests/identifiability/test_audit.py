@@ -18,7 +18,7 @@ from lcopa_bayes.identifiability.contraction import beliefs, prior_draws, prior_
 from lcopa_bayes.identifiability.curvature import curvature
 from lcopa_bayes.identifiability.printedform import printed_form, printed_structure
 from lcopa_bayes.identifiability.profile import Freedom, Profile
-from lcopa_bayes.identifiability.profilepath import _Walk, profile
+from lcopa_bayes.identifiability.profilepath import _Path, profile
 from lcopa_bayes.identifiability.radial import radial
 from lcopa_bayes.identifiability.sensitivities import sensitivities
 from lcopa_bayes.identifiability.symmetries import Structure, structure
@@ -46,7 +46,7 @@ def structure_of(posterior: Posterior) -> Structure:
 
 def maximum(landscape: Landscape, seed: int = 3) -> Peak:
     optima = find_optima(landscape.posterior, np.random.default_rng(seed), starts=4)
-    return max((landscape.climb(o.values) for o in optima), key=lambda peak: peak.log_likelihood)
+    return max((landscape.maximise(o.values) for o in optima), key=lambda peak: peak.log_likelihood)
 
 
 def profile_of(landscape: Landscape, name: str, peak: Peak) -> Profile:
@@ -212,7 +212,7 @@ def test_profile_of_a_gain_alone_is_the_parabola():
     known = KNOWN | {"gain": FLAT_GAIN, "sigma": TRUTH["sigma"]}
     posterior = problem(SHORT, priors=known).posterior
     landscape = Landscape(posterior)
-    peak = landscape.climb(np.array([TRUTH[name] for name in posterior.table.names]))
+    peak = landscape.maximise(np.array([TRUTH[name] for name in posterior.table.names]))
     made = profile_of(landscape, "gain", peak)
     found = curvature(landscape, peak.values, np.ones(peak.values.size)).at("gain")
     assert found is not None
@@ -224,17 +224,17 @@ def test_profile_of_a_gain_alone_is_the_parabola():
     assert made.open_sides == ()
 
 
-def test_a_walk_goes_on_from_an_end_that_turns_out_to_be_inside():
+def test_a_profile_is_extended_from_an_end_that_is_inside():
     known = KNOWN | {"gain": FLAT_GAIN, "sigma": TRUTH["sigma"], "offset": TRUTH["offset"]}
     landscape = Landscape(problem(SHORT, priors=known).posterior)
-    peak = landscape.climb(np.array([TRUTH[name] for name in landscape.posterior.table.names]))
+    peak = landscape.maximise(np.array([TRUTH[name] for name in landscape.posterior.table.names]))
     k = landscape.posterior.table.names.index("gain")
-    walk = _Walk(landscape, k, peak, np.empty((0, peak.values.size)))
+    path = _Path(landscape, k, peak, np.empty((0, peak.values.size)))
     for u in (peak.values[k] - 1e-4, peak.values[k] + 1e-4):
-        walk.points[u] = walk.solve(u, peak.values)
-    walk.carry_on()
-    outermost = [walk.fall(walk.points[end]) for end in (min(walk.points), max(walk.points))]
-    assert min(outermost) > walk.beyond
+        path.points[u] = path.solve(u, peak.values)
+    path.extend_ends()
+    outermost = [path.fall(path.points[end]) for end in (min(path.points), max(path.points))]
+    assert min(outermost) > path.beyond
 
 
 def test_profile_of_a_noise_scale_is_its_closed_form():

@@ -126,7 +126,7 @@ def told(**changes: object) -> dict:
     delay = {
         "paths": [{"unit": "ms"}],
         "separations": [pair],
-        "sentence": "all path delays can be told apart",
+        "sentence": "all path delays can be distinguished",
     }
     whole = {
         "study": "s",
@@ -208,7 +208,7 @@ def test_paths_driven_one_after_the_other_are_told_apart_and_an_idle_drive_is_no
     finite = {one.pair for one in single.separations if one.smallest < float("inf")}
     assert finite == {("x_x", "y_x")}
     assert single.as_json()["paths"][1]["sd"] is None
-    assert "can never be told apart" in single.sentence
+    assert "cannot be distinguished" in single.sentence
 
 
 # -- what is said when every parameter is identified ----------------------------------------------
@@ -219,13 +219,13 @@ def advice(limitations: list[dict]) -> str:
     return " ".join(section.text)
 
 
-def test_a_model_that_stands_needs_no_further_record():
+def test_a_model_that_passes_its_checks_needs_no_further_record():
     assert advice([]).startswith("Given this model every parameter is identified")
 
 
-def test_a_model_that_does_not_stand_is_mended_first():
+def test_a_model_that_fails_its_checks_is_corrected_first():
     limit = Limitation("tentative", "intervals hold only if A", "add terms").as_json()
     said = advice([limit])
     assert "nothing more" not in said
-    assert "speak against it" in said
-    assert "Intervals hold only if A. To do: add terms." in said
+    assert "checks of the model fail" in said
+    assert "Intervals hold only if A. Remedy: add terms." in said
