@@ -1,4 +1,4 @@
-"""Campaigns: the records of the paper made again, and folders of records that make a study."""
+"""Campaigns: the records of the paper simulated again, and folders of records as a study."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ def paper_step_records(
     ``x_on`` 0 to pi/2 on x (Fig. 13), ``x_off`` from rest at pi/2 to 0 (Fig. 14), ``x_quarter`` and
     ``y_quarter`` pi/4 on one axis alone (Fig. 16), ``xy`` pi/3 on x with pi/5 on y (Fig. 17).
     """
-    told = PAPER.records
-    alone = step(told.single_axis_drive)
+    printed = PAPER.records
+    alone = step(printed.single_axis_drive)
     commands = {
-        "x_on": two_axis(step(told.step_drive), quiet()),
-        "x_off": two_axis(step(0.0, rest=told.step_drive), quiet()),
+        "x_on": two_axis(step(printed.step_drive), quiet()),
+        "x_off": two_axis(step(0.0, rest=printed.step_drive), quiet()),
         "x_quarter": two_axis(alone, quiet()),
         "y_quarter": two_axis(quiet(), alone),
-        "xy": two_axis(*map(step, told.two_axis_drive)),
+        "xy": two_axis(*map(step, printed.two_axis_drive)),
     }
     return tuple(
         simulate(device, bench, command, duration=PAPER_DURATION, name=name, rng=rng)
@@ -61,12 +61,12 @@ def write_campaign(
     """Write one CSV per record and a ``study.toml`` that names them; return the paths, study last.
 
     Parameters: `held_out`, names of records not for fitting; `name` of the study, by default that of
-    the folder; `seed` of the study, left out when None; `note`, a comment at the head of the study;
+    the folder; `seed` of the study, omitted when None; `note`, a comment at the head of the study;
     `settings`, further tables of the study file.
     Everything is written beside its place first and then renamed, the study last: a campaign cut
     short leaves no file half written and no new study without its records. Raises InputError when a file
     is there already (unless `overwrite`), names repeat or cannot be file names, time units differ, a
-    held-out name is unknown, nothing is left to fit, or the folder or a file in it cannot be written.
+    held-out name is unknown, no record remains to fit, or the folder or a file in it cannot be written.
     """
     held_out = tuple(held_out)
     names = [record.name for record in records]
@@ -88,7 +88,7 @@ def write_campaign(
         if each not in names
     ]
     if not fit:
-        problems.append("no record is left to fit; hold out fewer")
+        problems.append("no record remains to fit; hold out fewer")
     if len({record.time_unit for record in records}) > 1:
         problems.append("all records of a study must have the same time unit")
     if folder.exists() and not folder.is_dir():

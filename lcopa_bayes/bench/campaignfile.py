@@ -21,7 +21,7 @@
     held_out = false
 
 Times are milliseconds, angles radians. A table ``[undeclared]`` with `effects`, `drives`, `correlation` and
-`noise_sd` stands for bench, paths and records: see `undeclared.UndeclaredPlan`.
+`noise_sd` replaces bench, paths and records: see `undeclared.UndeclaredPlan`.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Plan:
     records: tuple[Mapping[str, Any], ...]
 
     settings: ClassVar[str] = ""
-    """What the study file says beside the records."""
+    """Tables of the study file beside the records."""
 
     @property
     def held_out(self) -> tuple[str, ...]:
@@ -85,27 +85,29 @@ class Plan:
 def load_plan(path: Path) -> Plan | UndeclaredPlan:
     """Read a campaign file; InputError with everything wrong in it."""
     try:
-        told = tomllib.loads(path.read_text(encoding="utf-8"))
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path}: is not valid TOML: {error}") from None
-    problems = [f"{path}: unknown table [{key}]{nearest(key, _TABLES)}" for key in told if key not in _TABLES]
-    heading = told.get("campaign", {})
+    problems = [
+        f"{path}: unknown table [{key}]{nearest(key, _TABLES)}" for key in tables if key not in _TABLES
+    ]
+    heading = tables.get("campaign", {})
     problems += _unknown(path, "[campaign]", heading, {"name", "seed"})
-    if "undeclared" in told and not problems:
-        return _undeclared(path, told)
+    if "undeclared" in tables and not problems:
+        return _undeclared(path, tables)
     bench_keys = {field.name for field in fields(Bench)}
-    problems += _unknown(path, "[bench]", told.get("bench", {}), bench_keys)
-    for number, entry in enumerate(told.get("path", []), start=1):
+    problems += _unknown(path, "[bench]", tables.get("bench", {}), bench_keys)
+    for number, entry in enumerate(tables.get("path", []), start=1):
         problems += _unknown(path, f"[[path]] {number}", entry, _PATH_KEYS)
         problems += _missing(path, f"[[path]] {number}", entry, _PATH_KEYS)
-    records = told.get("record", [])
+    records = tables.get("record", [])
     if not records:
         problems.append(f"{path}: has no [[record]]; add one with `name`, `duration` and a drive")
     if problems:
         raise InputError(problems)
-    device = _device(path, told.get("path", []))
+    device = _device(path, tables.get("path", []))
     known = {"name", "duration", "held_out"} | {axis.name for axis in device.drive_axes}
     for number, entry in enumerate(records, start=1):
         problems += _unknown(path, f"[[record]] {number}", entry, known)
@@ -114,18 +116,20 @@ def load_plan(path: Path) -> Plan | UndeclaredPlan:
             problems += _drive_problems(f"{path}: [[record]] {number}, {axis.name}", entry.get(axis.name))
     if problems:
         raise InputError(problems)
-    settings = {name: getattr(PAPER_BENCH, name) for name in bench_keys} | told.get("bench", {})
+    settings = {name: getattr(PAPER_BENCH, name) for name in bench_keys} | tables.get("bench", {})
     sd = settings["noise_sd"]
     bench = Bench(**settings | {"noise_sd": tuple(sd) if isinstance(sd, list) else sd})
     return Plan(heading.get("name", path.stem), int(heading.get("seed", 0)), device, bench, tuple(records))
 
 
-def _undeclared(path: Path, told: Mapping[str, Any]) -> UndeclaredPlan:
+def _undeclared(path: Path, tables: Mapping[str, Any]) -> UndeclaredPlan:
     """A campaign with hidden effects."""
-    heading, table = told.get("campaign", {}), told["undeclared"]
+    heading, table = tables.get("campaign", {}), tables["undeclared"]
     known = {field.name for field in fields(UndeclaredPlan)} - {"name", "seed"}
     problems = _unknown(path, "[undeclared]", table, known)
-    problems += [f"{path}: [{k}] is not used beside [undeclared]; remove it" for k in told if k in _MEASURED]
+    problems += [
+        f"{path}: [{k}] is not used beside [undeclared]; remove it" for k in tables if k in _MEASURED
+    ]
     if problems:
         raise InputError(problems)
     values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table.items()}
@@ -144,7 +148,7 @@ def _missing(path: Path, where: str, table: Mapping[str, Any], needed: set[str])
 
 
 def _device(path: Path, entries: list[Mapping[str, Any]]) -> Device:
-    """The device of the ``[[path]]`` tables, or the paper's; a path not listed does nothing."""
+    """The device of the ``[[path]]`` tables, or the paper's; a path not listed has gain 0."""
     if not entries:
         return PAPER_DEVICE
     drives = list(dict.fromkeys(entry["drive"] for entry in entries))
@@ -155,10 +159,10 @@ def _device(path: Path, entries: list[Mapping[str, Any]]) -> Device:
         values = {key: entry[key] for key in _PATH_KEYS - {"response", "drive"}}
         values |= {"etas": tuple(entry["etas"]), "orders": tuple(entry["orders"])}
         try:
-            made = TransferPath(**values)
+            path_model = TransferPath(**values)
         except InputError as error:
             raise InputError([f"{path}: [[path]] {problem}" for problem in error.problems]) from None
-        table[responses.index(entry["response"])][drives.index(entry["drive"])] = made
+        table[responses.index(entry["response"])][drives.index(entry["drive"])] = path_model
     return Device(
         tuple(tuple(row) for row in table),
         tuple(Axis(name, "rad") for name in drives),
@@ -167,20 +171,20 @@ def _device(path: Path, entries: list[Mapping[str, Any]]) -> Device:
     )
 
 
-def _drive_problems(where: str, told: object) -> list[str]:
-    if told is None:
+def _drive_problems(where: str, entry: object) -> list[str]:
+    if entry is None:
         return []
-    if not isinstance(told, dict):
-        return [f"{where}: must be a table such as {{ step = 1.5 }}; got {told!r}"]
+    if not isinstance(entry, dict):
+        return [f"{where}: must be a table such as {{ step = 1.5 }}; got {entry!r}"]
     problems = [
         f"{where}: unknown key {key!r}{nearest(key, _COMMAND_KEYS)}"
-        for key in told
+        for key in entry
         if key not in _COMMAND_KEYS
     ]
-    kinds = [key for key in told if key in _KINDS]
+    kinds = [key for key in entry if key in _KINDS]
     if len(kinds) != 1:
         problems.append(f"{where}: name exactly one of {', '.join(sorted(_KINDS))}; got {kinds}")
-    elif kinds[0] != "step" and "hold" not in told:
+    elif kinds[0] != "step" and "hold" not in entry:
         problems.append(f"{where}: {kinds[0]} needs `hold`, the time of each level [ms]")
     return problems
 
@@ -194,17 +198,17 @@ def _command(record: Mapping[str, Any], device: Device, rng: np.random.Generator
 
 
 def _axis_command(
-    told: Mapping[str, Any] | None, record: Mapping[str, Any], rng: np.random.Generator
+    entry: Mapping[str, Any] | None, record: Mapping[str, Any], rng: np.random.Generator
 ) -> Command:
-    if told is None:
+    if entry is None:
         return quiet()
-    at, rest = told.get("at", 0.0), told.get("rest", 0.0)
-    if "step" in told:
-        return step(told["step"], at=at, rest=rest)
-    if "on_off" in told:
-        return on_off(told["on_off"], hold=told["hold"], at=at, rest=rest)
-    if "staircase" in told:
-        return staircase(told["staircase"], hold=told["hold"], start=at, rest=rest)
-    low, high = told["prbs"]
+    at, rest = entry.get("at", 0.0), entry.get("rest", 0.0)
+    if "step" in entry:
+        return step(entry["step"], at=at, rest=rest)
+    if "on_off" in entry:
+        return on_off(entry["on_off"], hold=entry["hold"], at=at, rest=rest)
+    if "staircase" in entry:
+        return staircase(entry["staircase"], hold=entry["hold"], start=at, rest=rest)
+    low, high = entry["prbs"]
     duration = float(record["duration"]) - at
-    return prbs(low, high, hold=told["hold"], duration=duration, rng=rng, start=at, rest=rest)
+    return prbs(low, high, hold=entry["hold"], duration=duration, rng=rng, start=at, rest=rest)

@@ -23,7 +23,7 @@ ACCURACY = 1e-9
 
 
 class Responsive(Protocol):
-    """Anything that answers a command: a device, or one with something hidden in it."""
+    """Anything that responds to a command: a device, or a device with a hidden effect."""
 
     @property
     def drive_axes(self) -> tuple[Axis, ...]: ...  # noqa: D102
@@ -40,7 +40,7 @@ class TransferPath:
     """``gain exp(-delay s) / (sum_i eta_i s^order_i + stiffness)`` (Ta et al. 2026, Eq. 31).
 
     Raises InputError for a gain that is not finite, a delay that is negative or not finite, and as
-    `Compliance` does. A gain of 0 is a path that does nothing.
+    `Compliance` does. A path of gain 0 has no effect.
     """
 
     gain: float

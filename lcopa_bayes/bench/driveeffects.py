@@ -22,7 +22,7 @@ def unsigned(low: float, high: float, rng: np.random.Generator) -> float:
 
 
 def joined(times: list[Vector], jumps: list[Vector], rest: Vector) -> Command:
-    """Command whose axis i jumps by ``jumps[i]`` at ``times[i]``, in any order; jumps of 0 are left out."""
+    """Command whose axis i jumps by ``jumps[i]`` at ``times[i]``, in any order; jumps of 0 are omitted."""
     times = [at[change != 0] for at, change in zip(times, jumps, strict=True)]
     jumps = [change[change != 0] for change in jumps]
     instants = np.unique(np.concatenate(times))

@@ -26,7 +26,7 @@ _FINE = 8
 @final
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """What a hidden effect may know about the record being taken."""
+    """Properties of the record being simulated that a hidden effect may use."""
 
     epoch: float
     """Place in the campaign, -1/2 to 1/2 [-]."""
@@ -162,11 +162,11 @@ def bent(
     moved = command.values - command.rest
     means = [step_means(edges, command.times + path.delay, moved[:, i]) for i, path in enumerate(paths)]
     rest = gains * command.rest
-    made = [make(shot, step) for make in balances]
+    forces = [make(shot, step) for make in balances]
 
     def balance(f: Vector, y: Vector, rate: Vector, number: int) -> Vector:
-        for one in made:
-            f = one(f, y, rate, number)
+        for force in forces:
+            f = force(f, y, rate, number)
         return f
 
     level = rest

@@ -2,8 +2,8 @@
 
 The Bromwich integral is taken on Talbot's cotangent contour with the optimal parameters of Weideman,
 SIAM J. Numer. Anal. 44 (2006) 2342, scaled to each time. Poles that the contour could cut off (lightly
-damped ones at late times) are found beforehand, counted by the argument principle and removed by
-their residues, so that one short contour serves every time.
+damped ones at late times) are located beforehand, counted by the argument principle and removed by
+their residues, so that one short contour is enough for every time.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ _Complex = NDArray[np.complex128]
 _NODES = (24, 32)
 """Nodes of the two contours compared; each alone is good to about ``exp(-1.36 nodes)`` before rounding."""
 _NEAR = 0.3
-"""A pole with ``|pole| time`` below this lies deep inside either contour and is left to it."""
+"""A pole with ``|pole| time`` below this lies deep inside either contour and is not removed."""
 _BLOCK = 1 << 15
 """Times treated at once."""
 
 
 class InversionError(ArithmeticError):
-    """Two contours disagree; carries the worst `time`, the `difference` there and the `allowed` one."""
+    """Two contours disagree; holds the worst `time`, the `difference` there and the `allowed` difference."""
 
     def __init__(self, time: float, difference: float, allowed: float) -> None:
         self.time, self.difference, self.allowed = time, difference, allowed

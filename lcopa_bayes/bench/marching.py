@@ -19,7 +19,7 @@ _CLOSE = 1e-13
 
 
 class MarchError(ArithmeticError):
-    """The deflection has left every bound; carries the `time` reached."""
+    """The deflection is unbounded; holds the `time` reached."""
 
     def __init__(self, time: float) -> None:
         self.time = time
@@ -54,7 +54,7 @@ def marched(
     for k in range(n):
         history = np.einsum("ij,ij->i", acting[:, :k], backward[:, n - k - 1 : n - 1])
         now = history + kernel[:, 0] * (acting[:, k - 1] if k else 0.0)
-        with np.errstate(over="ignore", invalid="ignore"):  # what runs away is told below
+        with np.errstate(over="ignore", invalid="ignore"):  # divergence raises below
             for _ in range(_SWEEPS):
                 v = balance(force[:, k], level + 0.5 * (now + before), (now - before) / step, k) - level
                 new = history + kernel[:, 0] * v

@@ -16,10 +16,10 @@ from lcopa_bayes.core.arrays import Array, Matrix, Vector
 def pointwise(curve: Callable[[Vector, Vector, Vector, Shot], Vector]) -> Callable[[Shot, float], Balance]:
     """Balance from (force, deflection, rate, shot)."""
 
-    def made(shot: Shot, step: float) -> Balance:
+    def balance(shot: Shot, step: float) -> Balance:
         return lambda f, y, rate, number: curve(f, y, rate, shot)
 
-    return made
+    return balance
 
 
 def cubic_stiffness(rng: np.random.Generator) -> Hidden:
@@ -30,7 +30,7 @@ def cubic_stiffness(rng: np.random.Generator) -> Hidden:
 
 
 def rise_fall_asymmetry(rng: np.random.Generator) -> Hidden:
-    """Slower on the way back."""
+    """Slower on the return."""
     e = unsigned(0.08, 0.8, rng)
 
     def force(f: Vector, y: Vector, rate: Vector, shot: Shot) -> Vector:

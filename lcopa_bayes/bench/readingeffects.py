@@ -79,25 +79,26 @@ def cross_fade(rng: np.random.Generator) -> Hidden:
         begins = np.append(command.times + shot.delay, np.inf)
         path = CubicSpline(times, y)
         late = np.zeros((times.size, y.shape[1]))
-        owed = np.zeros(y.shape[1])
+        lag = np.zeros(y.shape[1])
         for k, target in enumerate(command.values @ shot.steady.T):
             origin = path(np.clip(begins[k], times[0], times[-1]))
             end = path(np.clip(begins[k + 1], times[0], times[-1]))[None]
             rows = (times >= begins[k]) & (times < begins[k + 1])
             for axis in range(y.shape[1]):
-                way = target[axis] - origin[axis]
-                late[rows, axis] = _late(y[rows, axis] - origin[axis], way, owed[axis], strength)
-                owed[axis] = _late(end[:, axis] - origin[axis], way, owed[axis], strength)[0]
+                change = target[axis] - origin[axis]
+                late[rows, axis] = _late(y[rows, axis] - origin[axis], change, lag[axis], strength)
+                lag[axis] = _late(end[:, axis] - origin[axis], change, lag[axis], strength)[0]
         return y + late
 
     return Hidden("cross_fade", {"strength": strength}, seen=seen)
 
 
-def _late(done: Vector, way: float, owed: float, strength: float) -> Vector:
-    """How far the centroid is from the director, part of the way done; what it owed at the start fades."""
-    part = np.full(done.shape, 1.0) if way == 0 else np.minimum(np.maximum(done / way, 0.0), 1.0)
+def _late(moved: Vector, change: float, lag: float, strength: float) -> Vector:
+    """Distance of the centroid from the director after a part `moved` of the change; the initial `lag`
+    decays."""
+    part = np.full(moved.shape, 1.0) if change == 0 else np.minimum(np.maximum(moved / change, 0.0), 1.0)
     new, old = np.sinc(1 - part) ** 2, np.sinc(part) ** 2
-    return np.asarray(owed * (1 - part) + strength * way * (new / (new + old) - part))
+    return np.asarray(lag * (1 - part) + strength * change * (new / (new + old) - part))
 
 
 def sensor_lag(rng: np.random.Generator) -> Hidden:

@@ -65,7 +65,7 @@ def rich_schedules(rng: np.random.Generator) -> list[Schedule]:
     check_x = _levels([0.75, -0.4, 0.9, 0.0], start(), _holds(3, 6.0, 14.0, rng))
     check_y = _levels([-0.6, 0.85, 0.2], start(), _holds(2, 8.0, 16.0, rng))
     still = quiet()
-    told = [
+    entries = [
         (full, still, 50.0, False),
         (half, still, 45.0, False),
         (quarter, still, 60.0, False),
@@ -78,7 +78,7 @@ def rich_schedules(rng: np.random.Generator) -> list[Schedule]:
         (_random_signs(start(), 8, rng), _random_signs(start(), 8, rng), 60.0, True),
         (full, still, 50.0, False),
     ]
-    return [Schedule(two_axis(x, y), duration, held) for x, y, duration, held in told]
+    return [Schedule(two_axis(x, y), duration, held) for x, y, duration, held in entries]
 
 
 def plain_schedules(rng: np.random.Generator) -> list[Schedule]:

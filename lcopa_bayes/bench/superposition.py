@@ -22,11 +22,11 @@ _PAIRS = 1 << 18
 """Pairs of sample and change treated at once."""
 _RESOLUTION = 1e-12
 """Lags closer than this part of their span are one: a sample and a change at one instant in different
-rounding must not see the steep onset of a low order."""
+rounding must not resolve the steep onset of a low order."""
 
 
 class TableError(ArithmeticError):
-    """A response too rough to tabulate; carries the `time` reached and the remaining `error`."""
+    """A response too rough to tabulate; holds the `time` reached and the remaining `error`."""
 
     def __init__(self, time: float, error: float) -> None:
         self.time, self.error = time, error
@@ -47,24 +47,24 @@ def tabulated(response: Response, first: float, last: float, *, tolerance: float
     to_series = np.linalg.inv(chebyshev.chebvander(nodes, _DEGREE))
     low, high = np.log(first) - 1e-9, np.log(last) + 1e-9
     edges = np.linspace(low, high, 2 + int(high - low))
-    left, right = edges[:-1], edges[1:]
+    lower, upper = edges[:-1], edges[1:]
     done: list[tuple[Vector, Array]] = []
     for halvings in range(_HALVINGS + 1):
-        middle, half = (left + right)[:, None] / 2, (right - left)[:, None] / 2
+        middle, half = (lower + upper)[:, None] / 2, (upper - lower)[:, None] / 2
         values = response(np.exp(middle + half * np.concatenate([nodes, between])))
         series = values[:, : nodes.size] @ to_series.T
         error = np.abs(series @ chebyshev.chebvander(between, _DEGREE).T - values[:, nodes.size :]).max(
             axis=1
         )
         rough = ~(error <= tolerance)
-        done.append((left[~rough], series[~rough]))
+        done.append((lower[~rough], series[~rough]))
         if not rough.any():
             break
         if rough.sum() > _PANELS or halvings == _HALVINGS:
             worst = int(np.argmax(error))
             raise TableError(float(np.exp(middle[worst, 0])), float(error[worst]))
-        left, right, middle = left[rough], right[rough], middle[rough, 0]
-        left, right = np.concatenate([left, middle]), np.concatenate([middle, right])
+        lower, upper, middle = lower[rough], upper[rough], middle[rough, 0]
+        lower, upper = np.concatenate([lower, middle]), np.concatenate([middle, upper])
     starts, panels = np.concatenate([start for start, _ in done]), np.vstack([series for _, series in done])
     rank = np.argsort(starts)
     edges = np.append(starts[rank], high)

@@ -27,26 +27,26 @@ Maker = Callable[[np.random.Generator], Hidden]
 
 
 def _makers(*modules: ModuleType) -> dict[str, Maker]:
-    """Functions of one Generator that make a hidden effect, by name."""
-    found: dict[str, Maker] = {}
+    """Functions of one Generator that return a hidden effect, by name."""
+    makers: dict[str, Maker] = {}
     for module in modules:
-        for name, made in inspect.getmembers(module, inspect.isfunction):
-            told = inspect.signature(made)
-            if told.return_annotation == "Hidden" and made.__module__ == module.__name__:
-                found[name] = made
-    return found
+        for name, maker in inspect.getmembers(module, inspect.isfunction):
+            signature = inspect.signature(maker)
+            if signature.return_annotation == "Hidden" and maker.__module__ == module.__name__:
+                makers[name] = maker
+    return makers
 
 
 NAMED: dict[str, Maker] = _makers(driveeffects, planteffects, readingeffects)
-"""Effects that a catalogue may name."""
+"""Effects that a catalogue may contain."""
 OUTSIDE: dict[str, Maker] = _makers(unnamedeffects)
-"""Effects that none names."""
+"""Effects that no catalogue contains."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Campaign:
-    """Records of one device with hidden effects, and what only the judge may see."""
+    """Records of one device with hidden effects, and what only the evaluation may read."""
 
     fit: tuple[Record, ...]
     held_out: tuple[Record, ...]
@@ -87,7 +87,7 @@ def drawn(names: Sequence[str], rng: np.random.Generator) -> tuple[Hidden, ...]:
     """Effects of these names at sizes drawn at random; InputError for a name that is not known."""
     known = NAMED | OUTSIDE
     wrong = [
-        f"no hidden effect is called {name!r}{nearest(name, known)}" for name in names if name not in known
+        f"there is no hidden effect {name!r}{nearest(name, known)}" for name in names if name not in known
     ]
     if wrong:
         raise InputError(wrong)
@@ -108,7 +108,7 @@ def campaign(
 
     Parameters: hidden effects, none for a control; `correlation` [-] of successive noise samples (AR(1));
     `noise_sd` [rad]; `device`, by default a `steerer` drawn at random; `steps` per camera period where
-    forces are changed. Records have 30 to 100 ms at 10 kHz and, when rich, quiet stretches before the drive.
+    forces are changed. Records have 30 to 100 ms at 10 kHz and, when rich, a part at rest before the drive.
     """
     device = device or steerer(rng)
     schedules = rich_schedules(rng) if drives == "rich" else plain_schedules(rng)
@@ -150,12 +150,12 @@ def _taken(
     steps: int,
 ) -> Record:
     """A record without noise."""
-    made = HiddenDevice(device, hidden, shot, steps)
-    return truth(made, bench, schedule.command, duration=schedule.duration, name=name)
+    disturbed = HiddenDevice(device, hidden, shot, steps)
+    return truth(disturbed, bench, schedule.command, duration=schedule.duration, name=name)
 
 
 def shot_of(device: Device, epoch: float, rng: np.random.Generator) -> Shot:
-    """What effects may know, for drives up to the largest of the schedules."""
+    """Properties of the record that effects use, for drives up to the largest of the schedules."""
     steady = np.array([[path.steady for path in row] for row in device.paths])
     drive = np.full(steady.shape[1], LARGEST)
     return Shot(epoch, drive, np.abs(np.diag(steady)) * drive, device.paths[0][0].delay, steady, rng)
@@ -181,7 +181,7 @@ class UndeclaredPlan:
 
     held_out: ClassVar[tuple[str, ...]] = ("run04", "run07", "run10")
     settings: ClassVar[str] = '[model]\nterms = { direct = 2, cross = 1 }\nshare = "paper"'
-    """What the study file says of the model: nothing of any effect."""
+    """Model table of the study file, without any effect."""
 
     def __post_init__(self) -> None:
         drawn(self.effects, np.random.default_rng(0))
@@ -189,12 +189,12 @@ class UndeclaredPlan:
             raise InputError(f'[undeclared] drives must be "rich" or "plain"; got {self.drives!r}')
         Bench(noise_sd=self.noise_sd, noise_correlation=self.correlation)
 
-    def made(self, rng: np.random.Generator) -> Campaign:
-        """The campaign with what only the judge may see."""
+    def draw(self, rng: np.random.Generator) -> Campaign:
+        """The campaign with what only the evaluation may read."""
         hidden = drawn(self.effects, rng)
         return campaign(hidden, rng, drives=self.drives, correlation=self.correlation, noise_sd=self.noise_sd)
 
     def run(self, rng: np.random.Generator) -> tuple[Record, ...]:
         """All records in the order taken."""
-        made = self.made(rng)
-        return tuple(sorted((*made.fit, *made.held_out), key=lambda record: record.name))
+        records = self.draw(rng)
+        return tuple(sorted((*records.fit, *records.held_out), key=lambda record: record.name))

@@ -1,4 +1,5 @@
-"""Hidden effects that no catalogue of named effects has, to see whether a name is forced on them."""
+"""Hidden effects that no catalogue of named effects has, to test whether a loop reports a wrong name for
+them."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from lcopa_bayes.bench.readingeffects import static
 from lcopa_bayes.core.arrays import Matrix, Vector
 
 _PARTS = 24
-"""Small steps that stand for an exponential approach."""
+"""Small steps that approximate an exponential approach."""
 
 
 def torque_memory(rng: np.random.Generator) -> Hidden:
@@ -47,7 +48,7 @@ def duffing_with_memory(rng: np.random.Generator) -> Hidden:
     """Cubic restoring force of the deflection as it was."""
     c, time = signed(0.08, 0.4, rng), unsigned(5.0, 25.0, rng)
 
-    def made(shot: Shot, step: float) -> Balance:
+    def balance(shot: Shot, step: float) -> Balance:
         memory = np.zeros(shot.deflection.size)
         latest, reached = memory.copy(), -1
 
@@ -62,7 +63,7 @@ def duffing_with_memory(rng: np.random.Generator) -> Hidden:
 
         return force
 
-    return Hidden("duffing_with_memory", {"c": c, "time": time}, balance=made)
+    return Hidden("duffing_with_memory", {"c": c, "time": time}, balance=balance)
 
 
 def stick_slip(rng: np.random.Generator) -> Hidden:

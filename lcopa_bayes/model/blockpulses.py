@@ -14,7 +14,7 @@ _DIRECT = 16
 """Second differences are taken directly below this index and from their series above it, where
 direct subtraction would cancel all but ``2 log10(p)`` digits."""
 _SERIES_TERMS = 6
-"""Terms of the series: the first one left out is below 1e-16 of the leading one (``0.01 * 16**-12``)."""
+"""Terms of the series: the first omitted one is below 1e-16 of the leading one (``0.01 * 16**-12``)."""
 
 
 @lru_cache(maxsize=64)

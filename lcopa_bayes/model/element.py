@@ -1,4 +1,4 @@
-"""The fractional generalised Kelvin element and the paper's two ways to scale it."""
+"""The fractional generalised Kelvin element and the paper's two conventions of its scale."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Block widths of a record, where its samples lie on them, and reading from blocks that stand still.
+"""Block widths of a record, where its samples lie on them, and reading from fixed blocks.
 
 Responses are computed on blocks that begin at the delayed change of the drive, wherever it falls (`Lattice`
 says how the samples lie on them). Effects that act between drive and reading are computed on blocks at fixed

@@ -1,17 +1,17 @@
 r"""Legendre wavelets and their operational matrices, dense and as printed (Ta et al. 2026, Eqs. 32-61).
 
-Vectors of basis functions stand on the left in the paper, ``(I^a Phi)(t) = P^a Phi(t)``, so that the
+Vectors of basis functions are on the left in the paper, ``(I^a Phi)(t) = P^a Phi(t)``, so that the
 coefficients of a function are rows and its matrices the transposes of those in `blockpulses`:
 ``F^a = integration_matrix(a).T`` and ``E = shift_matrix(j).T``, both upper triangular.
 
-What is printed does not agree with itself in three places, and this module says what it does there:
+The printed equations are inconsistent in three places; this module uses:
 
 - Eq. 37 with m = 1 has unit norm and zero mean on one level, but the levels k = 1..K of Eq. 38 are not
   orthogonal to each other: a ramp is not orthogonal to the shorter ramps inside it. The inner product of
   nested wavelets is ``2^(-3/2 (k' - k))``. So Eq. 38's ``c = <f, psi>`` are not the coefficients of the
   expansion; they are taken from the sampled matrix, ``c^T = f^T Psi^-1``.
 - Wavelets live on [0, 1) and block pulses on [0, Tf): Eqs. 46 and 48 equate functions of different
-  arguments. Here the wavelets are functions of t / Tf and the integrals carry the unit.
+  arguments. Here the wavelets are functions of t / Tf and the integrals have the unit.
 - Eq. 46, ``Phi = Psi B``, holds at the nodes t_i only. Taken as a definition, everything after it is
   the block-pulse method in other coordinates: ``P^a = Psi F^a Psi^-1`` is a similarity transform.
 """

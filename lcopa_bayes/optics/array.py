@@ -15,7 +15,7 @@ from lcopa_bayes.data.literature import PAPER, StatedOptics
 from lcopa_bayes.optics.checks import finite, unless_positive
 
 _ROUNDING = 4 * float(np.finfo(float).eps)
-"""A direction cosine beyond 1 by no more than this [-] is end-fire seen through rounding."""
+"""A direction cosine beyond 1 by no more than this [-] is end-fire within rounding."""
 
 
 @final

@@ -65,7 +65,7 @@ class StaticChain:
         return self._volts(self.array.phase_step(angle) / self.phase_per_volt)
 
     def voltage_linearised(self, angle: ArrayLike) -> Array:
-        """Voltage [V] said by Eq. 26 to deflect to `angle` [rad]; inverse of `angle_linearised`."""
+        """Voltage [V] that by Eq. 26 deflects to `angle` [rad]; inverse of `angle_linearised`."""
         phase = finite(angle, name="angle", unit="rad") / _gain(self.array)
         return self._volts(phase / self.phase_per_volt)
 
@@ -165,7 +165,7 @@ def linearisation_table(stated: Stated = PAPER) -> tuple[LinearisationRow, ...]:
 @final
 @dataclass(frozen=True)
 class GeometryCheck:
-    """Does one pitch serve the simulation and the experiment (claim S4)?"""
+    """Whether one pitch agrees with both the simulation and the experiment (claim S4)."""
 
     step: float
     """Phase step of the experiment [rad]."""
@@ -184,9 +184,9 @@ class GeometryCheck:
     implied_pitch_in_wavelengths: float
     """[-]."""
     pitch_ratio: float
-    """Implied over simulated pitch [-]; 1 if one geometry serves both."""
+    """Implied over simulated pitch [-]; 1 if one geometry agrees with both."""
     angle_ratio: float
-    """Simulated over measured angle [-]; 1 if one geometry serves both."""
+    """Simulated over measured angle [-]; 1 if one geometry agrees with both."""
     element_width: float
     """x of Eq. 21 [m]."""
     angle_at_element_width: float

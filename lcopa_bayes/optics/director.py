@@ -17,11 +17,11 @@ from lcopa_bayes.optics.freeenergy import Expansion, expand, newton_step
 CELLS = 800
 """Default number of grid cells [-]; keeps the mean tilt of the paper's cell within 1.1e-5 rad up to 5 V."""
 _PER_LAYER = 4
-"""Least grid cells per wall layer ``sqrt(k1 / deps) / V`` [-]; coarser grids do not see the wall."""
+"""Least grid cells per wall layer ``sqrt(k1 / deps) / V`` [-]; coarser grids do not resolve the wall."""
 
 
 class NotConverged(RuntimeError):  # noqa: N818 - a state of the iteration, named as such
-    """Newton's iteration stopped short; carries the voltage, the residual reached and the iterations."""
+    """Newton's iteration stopped short; holds the voltage, the residual reached and the iterations."""
 
     def __init__(self, voltage: float, residual: float, iterations: int) -> None:
         self.voltage, self.residual, self.iterations = voltage, residual, iterations

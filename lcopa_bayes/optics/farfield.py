@@ -1,8 +1,8 @@
 """Far fields of linear and planar arrays, by sum and in closed form (Ta et al. 2026, Eqs. 2-4, 7-12).
 
 Directions are direction cosines, ``u = sin th cos ph`` and ``v = sin th sin ph`` (``u = sin th`` on one
-axis), where a planar pattern is a product of two linear ones. The obliquity factor of Eq. 1 is left out, as
-in Eqs. 2-12; an element of finite width carries a constant phase and the factor sinc^2 of a slit.
+axis), where a planar pattern is a product of two linear ones. The obliquity factor of Eq. 1 is omitted, as
+in Eqs. 2-12; an element of finite width has a constant phase and the factor sinc^2 of a slit.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def intensity(array: LinearArray, u: ArrayLike, step: float) -> Array:
     main = float(element_factor(array, direction))
     if main < 1e-12:
         raise InputError(
-            f"steering to direction cosine {float(direction):.6g} meets a zero of the element factor: "
+            f"steering to direction cosine {float(direction):.6g} is at a zero of the element factor: "
             "there is no main lobe to normalise to; use a smaller fill factor or another angle."
         )
     return np.asarray(array_factor(array, u, step) ** 2 * element_factor(array, u) / main)
@@ -117,9 +117,9 @@ def planar_sum(
     across = finite(u, name="u", lower=-1.0, upper=1.0)
     along = finite(v, name="v", lower=-1.0, upper=1.0)
     weights = _weights((array.x.elements, array.y.elements), phases, amplitudes)
-    left = np.exp(-2j * pi / array.x.period * np.outer(across, np.arange(array.x.elements)))
-    right = np.exp(-2j * pi / array.y.period * np.outer(np.arange(array.y.elements), along))
-    return np.asarray(left @ weights @ right)
+    along_x = np.exp(-2j * pi / array.x.period * np.outer(across, np.arange(array.x.elements)))
+    along_y = np.exp(-2j * pi / array.y.period * np.outer(np.arange(array.y.elements), along))
+    return np.asarray(along_x @ weights @ along_y)
 
 
 @final

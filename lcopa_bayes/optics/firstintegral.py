@@ -1,4 +1,4 @@
-"""Director by quadrature: the first integral of the equilibrium equation, a road that shares no grid.
+"""Director by quadrature: the first integral of the equilibrium equation, a method without a grid.
 
 ``K(th) (dth/dz)^2`` plus the electric term is constant across the cell, so position, voltage and mean tilt
 are integrals over the tilt between plate and middle (Deuling 1972 for the self-consistent field). With
@@ -105,7 +105,7 @@ def quadrature(cell: Cell, voltage: float, *, field: Field = Field.UNIFORM) -> Q
     """Tilted equilibrium of `cell` at `voltage` [V] in a `field` by root finding on the middle tilt.
 
     Raises InputError at and below threshold without pretilt, at 0 V with pretilt, and where the middle tilt
-    comes within 1e-12 rad of pi/2, where no digits are left.
+    comes within 1e-12 rad of pi/2, where no digits remain.
     """
     volts = float(finite(voltage, name="voltage", lower=0.0, unit="V"))
     flat = cell.threshold if cell.pretilt == 0 else 0.0
@@ -116,7 +116,7 @@ def quadrature(cell: Cell, voltage: float, *, field: Field = Field.UNIFORM) -> Q
 
     low, high = -27.0, 27.0
     if volts <= flat * (1 + 1e-9) or excess(low) > 0:
-        raise InputError(f"at {volts:.9g} V the director is flat; ask above {flat:.9g} V.")
+        raise InputError(f"at {volts:.9g} V the director is flat; give a voltage above {flat:.9g} V.")
     if excess(high) < 0:
         raise InputError(f"at {volts:.6g} V the middle tilt is pi/2 to rounding; use `director.equilibrium`.")
     root = float(brentq(excess, low, high, xtol=1e-13, rtol=1e-14))

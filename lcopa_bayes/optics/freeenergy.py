@@ -37,10 +37,10 @@ def expand(cell: Cell, field: Field, drive: float, tilt: Vector) -> Expansion:
     modulus = 1 + a * sine2
     k, rise = (modulus[1:] + modulus[:-1]) / 2, np.diff(tilt)
     slope, bend = a * np.sin(2 * tilt), 2 * a * np.cos(2 * inner)
-    left, right, squares = rise[:-1], rise[1:], rise[:-1] ** 2 + rise[1:] ** 2
-    gradient = (2 * k[:-1] * left - 2 * k[1:] * right + slope[1:-1] * squares / 2) / h
+    lower, upper, squares = rise[:-1], rise[1:], rise[:-1] ** 2 + rise[1:] ** 2
+    gradient = (2 * k[:-1] * lower - 2 * k[1:] * upper + slope[1:-1] * squares / 2) / h
     band = np.zeros((2, inner.size))
-    band[1] = (2 * (k[:-1] + k[1:]) + 2 * slope[1:-1] * (left - right) + bend * squares / 2) / h
+    band[1] = (2 * (k[:-1] + k[1:]) + 2 * slope[1:-1] * (lower - upper) + bend * squares / 2) / h
     band[0, 1:] = (-2 * k[1:-1] + (slope[1:-2] - slope[2:-1]) * rise[1:-1]) / h
     elastic = float(k @ rise**2) / h
     end = (sine2[0] + sine2[-1]) / 2

@@ -60,38 +60,38 @@ def lobes(array: LinearArray, step: float) -> tuple[Lobe, ...]:
     """
     start, period = float(array.direction_cosine(step)), array.period
     intensity(array, start, step)  # refuses a main lobe on a zero of the element factor
-    edge = 1 + 1e-12  # a lobe at grazing emergence counts, whatever rounding says
+    edge = 1 + 1e-12  # a lobe at grazing emergence counts despite rounding
     orders = range(ceil((-edge - start) / period), floor((edge - start) / period) + 1)
-    found = []
+    visible = []
     for order in orders:
         u = start + order * period
         u = float(np.sign(u)) if abs(u) > 1 else u
         # The array factor is 1 here by construction; evaluating it would only add its rounding.
         height = float(element_factor(array, u)) / float(element_factor(array, start)) if order else 1.0
-        found.append(Lobe(order, u, asin(u), height))
-    return tuple(found)
+        visible.append(Lobe(order, u, asin(u), height))
+    return tuple(visible)
 
 
 def planar_lobes(array: PlanarArray, steps: tuple[float, float]) -> tuple[PlanarLobe, ...]:
     """Every propagating lobe of a planar array for two phase steps [rad]; the main lobe has orders (0, 0)."""
     array.steering_angles(*steps)
-    found = []
+    visible = []
     for a in lobes(array.x, steps[0]):
         for b in lobes(array.y, steps[1]):
             sine = float(np.hypot(a.direction_cosine, b.direction_cosine))
             if sine <= 1:
                 turn = float(np.arctan2(b.direction_cosine, a.direction_cosine))
-                found.append(PlanarLobe((a.order, b.order), asin(sine), turn, a.intensity * b.intensity))
-    return tuple(found)
+                visible.append(PlanarLobe((a.order, b.order), asin(sine), turn, a.intensity * b.intensity))
+    return tuple(visible)
 
 
 def main_lobe(array: LinearArray, step: float) -> float:
-    """Angle [rad] of the maximum of the pattern around the steered direction, found on the pattern itself.
+    """Angle [rad] of the maximum of the pattern around the steered direction, located on the pattern itself.
 
     For `array` and phase `step` [rad]: a grid over the half period either side of Eq. 5, then the root of the
     derivative of the field, a sum over elements; accurate to 1e-13 rad away from end-fire. Isotropic elements
-    peak where Eq. 5 says; a slit pulls the peak towards the normal, by less than ``(lambda / (N d))^2`` up to
-    20 degrees on the array of Section 2.
+    peak at the angle of Eq. 5; a slit pulls the peak towards the normal, by less than ``(lambda / (N d))^2``
+    up to 20 degrees on the array of Section 2.
     """
     centre, period = float(array.direction_cosine(step)), array.period
     low, high = max(-1.0, centre - period / 2), min(1.0, centre + period / 2)
@@ -173,8 +173,8 @@ def strongest_grating_lobe(
     """
     array = paper_array(optics, fill_factor=fill_factor)
     goals = frozen(finite(targets, name="targets", unit="rad"), name="targets")
-    found = [lobes(array, float(array.phase_step(goal))) for goal in goals]
-    return np.array([max((lobe.intensity for lobe in row if lobe.order), default=0.0) for row in found])
+    visible = [lobes(array, float(array.phase_step(goal))) for goal in goals]
+    return np.array([max((lobe.intensity for lobe in row if lobe.order), default=0.0) for row in visible])
 
 
 def _slope(u: float, array: LinearArray, step: float) -> float:

@@ -53,16 +53,16 @@ def director_curve(
     volts = frozen(finite(np.atleast_1d(voltages), name="voltages", lower=0.0, unit="V"), name="voltages")
     if volts.size == 0 or (np.diff(volts) <= 0).any():
         raise InputError("`voltages` must hold at least one value and ascend strictly [V]: sort them.")
-    found = []
+    profiles = []
     guess: Vector | None = None
     for volt in volts[::-1]:
         profile = equilibrium(cell, float(volt), field=field, cells=cells, guess=guess)
-        found.append(profile)
+        profiles.append(profile)
         guess = profile.tilt
-    found.reverse()
-    tilt = frozen([p.tilt for p in found], name="tilt", ndim=2)
-    mean = frozen([p.mean for p in found], name="mean")
-    return DirectorCurve(field, volts, found[0].position, tilt, mean)
+    profiles.reverse()
+    tilt = frozen([p.tilt for p in profiles], name="tilt", ndim=2)
+    mean = frozen([p.mean for p in profiles], name="mean")
+    return DirectorCurve(field, volts, profiles[0].position, tilt, mean)
 
 
 @final

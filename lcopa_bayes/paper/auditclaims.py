@@ -16,7 +16,7 @@ DELAY_DIGIT = 1e-3
 """Last digit of the printed delays, by which they can differ at most [ms]."""
 _NEEDS = ("study", "grade", "parameters", "printed_form", "spectrum", "local", "delays")
 _CLAIMED = ("gain", "time", "order", "delay")
-"""Kinds of parameters that the claim is about; a time stands for the viscosity."""
+"""Kinds of parameters that the claim is about; a time constant counts as a viscosity."""
 
 Test = Callable[[Stated, Evidence], Verdict]
 Reading = Callable[[Stated, Mapping[str, Any]], Verdict]
@@ -28,17 +28,17 @@ def load_audit(folder: Path) -> Mapping[str, Any]:
 
 
 def from_audit(reading: Reading, question: str) -> Test:
-    """A test that reads the audits in turn, and says what it waits for where there is none."""
+    """A test that reads the audits in turn, and names the missing audit where there is none."""
 
     def test(stated: Stated, evidence: Evidence) -> Verdict:
-        told = needs_audit(question)(stated, evidence)
+        verdict = needs_audit(question)(stated, evidence)
         for audit in evidence.audits:
-            found = reading(stated, audit)
-            how = f"Audit of the study {audit['study']} (draws: {audit['grade']}): {found.how}"
-            told = Verdict(found.kind, found.number, found.unit, how)
-            if told.kind is not Kind.UNDECIDED:
+            result = reading(stated, audit)
+            how = f"Audit of the study {audit['study']} (draws: {audit['grade']}): {result.how}"
+            verdict = Verdict(result.kind, result.number, result.unit, how)
+            if verdict.kind is not Kind.UNDECIDED:
                 break
-        return told
+        return verdict
 
     return test
 
@@ -51,7 +51,7 @@ def unique_map(stated: Stated, audit: Mapping[str, Any]) -> Verdict:
             Kind.UNDECIDED, None, "-", "it has no certain rank of a single path in its printed form."
         )
     blind = form["parameters"] - form["rank"]
-    said = "; ".join(one["sentence"] for one in form["symmetries"])
+    said = "; ".join(symmetry["sentence"] for symmetry in form["symmetries"])
     how = (
         f"of the {form['parameters']} numbers of Eqs. 16, 21 and 28 for one path, {form['rank']} act on the "
         f"response{': ' + said if said else ''}. Number: directions without any effect; the claim holds at 0."
@@ -62,11 +62,11 @@ def unique_map(stated: Stated, audit: Mapping[str, Any]) -> Verdict:
 def full_excitation(stated: Stated, audit: Mapping[str, Any]) -> Verdict:
     """I2: contradicted by directions of which the data know less than the prior."""
     open_directions = [row for row in audit["spectrum"] if row["prior_knows_more"]]
-    told = "; ".join(", ".join(row["direction"]) for row in open_directions)
+    directions = "; ".join(", ".join(row["direction"]) for row in open_directions)
     how = (
         f"{len(open_directions)} of {len(audit['spectrum'])} directions of the Fisher information at the "
-        f"maximum are known worse from the record than from the prior{f' ({told})' if told else ''}. "
-        "Number: these directions; the claim holds at 0."
+        "maximum are less precise from the record than from the "
+        f"prior{f' ({directions})' if directions else ''}. Number: these directions; the claim holds at 0."
     )
     return Verdict(Kind.of(not open_directions), float(len(open_directions)), "-", how)
 
@@ -115,21 +115,23 @@ def dominant_order(stated: Stated, audit: Mapping[str, Any]) -> Verdict:
     how = (
         f"profile interval of the largest order ({100 * row['profile']['level']:g} %) from {ends[0]} to "
         f"{ends[1]} within {searched[0]:.2g} to {searched[1]:.2g}; stated {wanted:g}. The data set the order "
-        "when both sides are closed about it. Number: the width that is left, an open side to its end."
+        "when both sides are closed about it. Number: the remaining width, an open side to its end."
     )
     return Verdict(Kind.of(holds), width, "-", how)
 
 
 def separate_delays(stated: Stated, audit: Mapping[str, Any]) -> Verdict:
-    """I6: by the smallest difference of two path delays that the record could show."""
-    found = audit["delays"]
-    unit = found["paths"][0]["unit"] if found["paths"] else "-"
-    if not found["separations"] or unit != "ms":
-        return Verdict(Kind.UNDECIDED, None, "-", f"{found['sentence']}; it takes a record of several paths.")
-    smallest = [one["smallest_difference"] for one in found["separations"]]
+    """I6: by the smallest difference of two path delays that the record resolves."""
+    delays = audit["delays"]
+    unit = delays["paths"][0]["unit"] if delays["paths"] else "-"
+    if not delays["separations"] or unit != "ms":
+        return Verdict(
+            Kind.UNDECIDED, None, "-", f"{delays['sentence']}; a record of several paths is needed."
+        )
+    smallest = [separation["smallest_difference"] for separation in delays["separations"]]
     worst = None if None in smallest else max(smallest)
     how = (
-        f"{found['sentence']}. The printed delays differ by less than {DELAY_DIGIT:g} ms; the claim holds "
-        "when all pairs could be told apart from such a difference on. Number: the worst pair's."
+        f"{delays['sentence']}. The printed delays differ by less than {DELAY_DIGIT:g} ms; the claim holds "
+        "when such a difference is resolved for all pairs. Number: that of the worst pair."
     )
     return Verdict(Kind.of(worst is not None and worst < DELAY_DIGIT), worst, "ms", how)

@@ -64,7 +64,7 @@ CLAIMS: tuple[Claim, ...] = (
     ),
     Claim(
         "I6",
-        "Four independent path delays can be told apart, though all print as 3.027.",
+        "Four independent path delays can be distinguished, though all print as 3.027.",
         "Section 3.2, Eq. 31",
         from_audit(
             auditclaims.separate_delays,

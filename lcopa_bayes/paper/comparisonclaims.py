@@ -38,23 +38,23 @@ def from_comparison(
 ) -> Test:
     """A test that reads the comparison.
 
-    Without a comparison the verdict is that of `none`. `otherwise` is a second road to the claim: it must
-    bear it out too, and decides alone where the comparison leaves it open or is absent.
+    Without a comparison the verdict is that of `none`. `otherwise` is a second test of the claim: it must
+    support the claim too, and decides alone where the comparison is undecided or absent.
     """
 
     def test(stated: Stated, evidence: Evidence) -> Verdict:
         if evidence.compare is None:
             return (none or otherwise or needs_comparison(question))(stated, evidence)
-        found = reading(stated, evidence.compare)
-        how = f"Comparison on the study {evidence.compare['study']}: {found.how}"
+        result = reading(stated, evidence.compare)
+        how = f"Comparison on the study {evidence.compare['study']}: {result.how}"
         if otherwise is None:
-            return Verdict(found.kind, found.number, found.unit, how)
+            return Verdict(result.kind, result.number, result.unit, how)
         other = otherwise(stated, evidence)
-        if found.kind is Kind.UNDECIDED:
+        if result.kind is Kind.UNDECIDED:
             return Verdict(other.kind, other.number, other.unit, f"{other.how} {how}")
-        if other.kind is Kind.CONTRADICTED:  # both roads must bear the claim out
+        if other.kind is Kind.CONTRADICTED:  # both tests must support the claim
             return Verdict(other.kind, other.number, other.unit, f"{other.how} {how}")
-        return Verdict(found.kind, found.number, found.unit, f"{how} {other.how}")
+        return Verdict(result.kind, result.number, result.unit, f"{how} {other.how}")
 
     return test
 
@@ -89,10 +89,10 @@ def fractional_against_integer(stated: Stated, compare: Mapping[str, Any]) -> Ve
 def same_steady_state(stated: Stated, compare: Mapping[str, Any]) -> Verdict:
     """M2: whether the credible intervals of both steady states lie within the stated error of each other."""
     pair = _rivals(compare)
-    found = [] if pair is None else [_metric(model, _STEADY) for model in pair]
-    if len(found) < 2 or None in found:
+    metrics = [] if pair is None else [_metric(model, _STEADY) for model in pair]
+    if len(metrics) < 2 or None in metrics:
         return Verdict(Kind.UNDECIDED, None, "-", "no steady state of both kinds of model is in it.")
-    free, whole = (one for one in found if one is not None)
+    free, whole = (metric for metric in metrics if metric is not None)
     ends = [free["lower"], free["upper"], whole["lower"], whole["upper"]]
     if None in ends or free["value"] == 0:
         return Verdict(Kind.UNDECIDED, None, "-", "a steady state has an open interval.")
@@ -121,7 +121,7 @@ def three_needed(stated: Stated, compare: Mapping[str, Any]) -> Verdict:
     few = [model for model in fractional if model["terms"] < 3]
     if not many or not few:
         return Verdict(Kind.UNDECIDED, None, "nat", "it lacks usable models of three terms or of fewer.")
-    best, other = (max(models, key=lambda one: float(one["log_evidence"])) for models in (many, few))
+    best, other = (max(models, key=lambda model: float(model["log_evidence"])) for models in (many, few))
     gain = best["log_evidence"] - other["log_evidence"]
     sd = hypot(best["log_evidence_sd"], other["log_evidence_sd"])
     kind = (
@@ -141,81 +141,81 @@ def three_needed(stated: Stated, compare: Mapping[str, Any]) -> Verdict:
 
 
 def dominant_order(stated: Stated, compare: Mapping[str, Any]) -> Verdict:
-    """I5: the largest order of every model that the evidence leaves standing."""
+    """I5: the largest order of every model that the evidence does not exclude."""
     ranked = [model for model in _ranked(compare) if not model["integer"]]
     best = max((model["log_evidence"] for model in ranked), default=None)
     names = [model["name"] for model in ranked if best is not None and best - model["log_evidence"] < STRONG]
     rows = [
-        one
-        for one in compare["order_is_integer"]
-        if one["model"] in names and one["parameter"] in _LARGEST and one["grade"] != "unusable"
+        row
+        for row in compare["order_is_integer"]
+        if row["model"] in names and row["parameter"] in _LARGEST and row["grade"] != "unusable"
     ]
     if not rows:
         return Verdict(Kind.UNDECIDED, None, "-", "no usable largest order is in it.")
     wanted = stated.records.dominant_order
-    inside = [one["estimate"]["lower"] <= wanted <= one["estimate"]["upper"] for one in rows]
-    settled = [one["answer"] == "not an integer" for one in rows]
-    width = max(one["estimate"]["upper"] for one in rows) - min(one["estimate"]["lower"] for one in rows)
+    inside = [row["estimate"]["lower"] <= wanted <= row["estimate"]["upper"] for row in rows]
+    settled = [row["answer"] == "not an integer" for row in rows]
+    width = max(row["estimate"]["upper"] for row in rows) - min(row["estimate"]["lower"] for row in rows)
     said = ", ".join(
-        f"{one['estimate']['lower']:.3g} to {one['estimate']['upper']:.3g} in {one['model']} "
-        f"({one['answer']})"
-        for one in rows
+        f"{row['estimate']['lower']:.3g} to {row['estimate']['upper']:.3g} in {row['model']} "
+        f"({row['answer']})"
+        for row in rows
     )
     how = (
         f"{100 * rows[0]['estimate']['level']:g} % intervals of the largest order in the models the evidence "
-        f"leaves standing: {said}; stated {wanted:g}. The data set it when every interval holds the stated "
+        f"does not exclude: {said}; stated {wanted:g}. The data set it when every interval holds the stated "
         "order and the nearest integer is excluded. Number: the width of all intervals together."
     )
     return Verdict(Kind.of(all(inside) and all(settled)), width, "-", how)
 
 
 def jointly(first: Test, second: Test) -> Test:
-    """A claim that both tests must bear out; one that cannot decide leaves it to the other."""
+    """A claim that both tests must support; where one is undecided the other decides."""
 
     def test(stated: Stated, evidence: Evidence) -> Verdict:
-        found = [first(stated, evidence), second(stated, evidence)]
-        decided = [one for one in found if one.kind is not Kind.UNDECIDED]
+        verdicts = [first(stated, evidence), second(stated, evidence)]
+        decided = [verdict for verdict in verdicts if verdict.kind is not Kind.UNDECIDED]
         if not decided:
-            return found[0]
-        worst = next((one for one in decided if one.kind is Kind.CONTRADICTED), decided[0])
-        others = [one.how for one in decided if one is not worst]
+            return verdicts[0]
+        worst = next((verdict for verdict in decided if verdict.kind is Kind.CONTRADICTED), decided[0])
+        others = [verdict.how for verdict in decided if verdict is not worst]
         return Verdict(worst.kind, worst.number, worst.unit, " ".join([worst.how, *others]))
 
     return test
 
 
 def _ranked(compare: Mapping[str, Any]) -> list[Model]:
-    return [one for one in compare["models"] if one["usable"] and one["log_evidence"] is not None]
+    return [model for model in compare["models"] if model["usable"] and model["log_evidence"] is not None]
 
 
 def _rivals(compare: Mapping[str, Any]) -> tuple[Model, Model] | None:
     """The best fractional and the best integer model by evidence."""
     ranked = _ranked(compare)
-    kinds = [[one for one in ranked if one["integer"] is kind] for kind in (False, True)]
+    kinds = [[model for model in ranked if model["integer"] is kind] for kind in (False, True)]
     if not all(kinds):
         return None
-    free, whole = (max(models, key=lambda one: float(one["log_evidence"])) for models in kinds)
+    free, whole = (max(models, key=lambda model: float(model["log_evidence"])) for models in kinds)
     return free, whole
 
 
 def _rmse(model: Model) -> float | None:
     """Root mean square error over all records, fitted and held out [rad]; None in another unit."""
     rows: Sequence[Mapping[str, Any]] = [*model["fit_scores"], *model["held_out"]]
-    if not rows or any(one["unit"] != "rad" for one in rows):
+    if not rows or any(row["unit"] != "rad" for row in rows):
         return None
-    total = sum(one["rmse"] ** 2 * one["samples"] for one in rows)
-    return float((total / sum(one["samples"] for one in rows)) ** 0.5)
+    total = sum(row["rmse"] ** 2 * row["samples"] for row in rows)
+    return float((total / sum(row["samples"] for row in rows)) ** 0.5)
 
 
 def _metric(model: Model, names: Sequence[str]) -> Mapping[str, Any] | None:
-    return next((one for one in model["step_metrics"] if one["name"] in names), None)
+    return next((metric for metric in model["step_metrics"] if metric["name"] in names), None)
 
 
 def _predicted(best: Model, other: Model) -> str:
     if best["elpd"] is None or other["elpd"] is None:
         return ""
-    gain, told = best["elpd"] - other["elpd"], ""
-    against = next((one for one in (best, other) if one["elpd_difference_sd"]), None)
+    gain, error = best["elpd"] - other["elpd"], ""
+    against = next((model for model in (best, other) if model["elpd_difference_sd"]), None)
     if against is not None and 0.0 in (best["elpd_difference"], other["elpd_difference"]):
-        told = f" ± {against['elpd_difference_sd']:.2f}"  # the other of the two predicts best of all
-    return f", and predicts what was left out by {gain:+.2f}{told} nats"
+        error = f" ± {against['elpd_difference_sd']:.2f}"  # the other of the two predicts best of all
+    return f", and predicts held-out data by {gain:+.2f}{error} nats"

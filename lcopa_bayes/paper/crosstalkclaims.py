@@ -49,7 +49,7 @@ def crosstalk_rules(stated: Stated) -> Mapping[str, tuple[float, float]]:
     """
     plant, records = stated.plant, stated.records
     coupling = ((plant.yx, plant.xx), (plant.xy, plant.yy))
-    one = {
+    by_rule = {
         "b / k": [cross.gain / cross.stiffness for cross, _ in coupling],
         "b": [cross.gain for cross, _ in coupling],
         "b / k of the direct path": [cross.gain / direct.stiffness for cross, direct in coupling],
@@ -65,7 +65,7 @@ def crosstalk_rules(stated: Stated) -> Mapping[str, tuple[float, float]]:
     return {
         rule + more: (factor * pair[0], factor * pair[1])
         for more, factor in drives.items()
-        for rule, pair in one.items()
+        for rule, pair in by_rule.items()
     }
 
 
@@ -99,7 +99,7 @@ def two_axis_steady(stated: Stated, evidence: Evidence) -> Verdict:
     records, model = stated.records, PrintedModel(stated)
     readings = (model.steady(*records.two_axis_drive), model.at_end(*records.two_axis_drive))
     gaps = [
-        max(abs(a - b) for a, b in zip(found, records.two_axis_steady, strict=True)) for found in readings
+        max(abs(a - b) for a, b in zip(reading, records.two_axis_steady, strict=True)) for reading in readings
     ]
     limit = records.fractional_rmse_two_axes / SETTLED_PART**0.5
     said = " and ".join(f"({x:.5f}, {y:.5f})" for x, y in readings)

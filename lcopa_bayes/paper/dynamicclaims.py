@@ -16,7 +16,7 @@ def steady_state(stated: Stated, evidence: Evidence) -> Verdict:
     """M2: the model's steady state against the measured one, and the integer model's against the model's.
 
     "Steady" is read twice, as the value tended to and as the value at the end of the record; the claim
-    stands or falls when both readings say so, and is undecided otherwise. Both models must be within the
+    is decided when both readings agree, and undecided otherwise. Both models must be within the
     stated error.
     """
     records, model = stated.records, PrintedModel(stated)

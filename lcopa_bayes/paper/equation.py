@@ -3,7 +3,7 @@ r"""The integrated equation of one path, and its two errors (Ta et al. 2026, Eqs
 ``b I^a1 u(t - tau) = sum_i eta_i I^(a1 - a_i) y + k I^a1 y`` in block pulses. It is homogeneous in
 (etas, k, b), so one of them is a convention: Eq. 62 takes k as known, Eq. 65 prints the last eta as 1.
 Least squares on it minimises the *equation error*. With k known, etas and b come out proportional to k
-and the response does not depend on k at all: no output error can tell values of k apart. The two
+and the response does not depend on k at all: no output error distinguishes values of k. The two
 conventions give the same answer on exact data and different ones under noise, because they leave
 different noisy columns on the right.
 """
@@ -70,8 +70,8 @@ def columns(blocks: Blocks, orders: Sequence[float], delay: float) -> Matrix:
     weights = integration_weights(exponents, n, step)
     drive = blocks.drive.block_means(blocks.grid.edges, np.array([delay]))[0][0]
     matrices = [lower_toeplitz(row) for row in weights]
-    left = [matrix @ blocks.response for matrix in matrices]
-    return np.stack([*left, -matrices[-1] @ drive], axis=1)
+    columns = [matrix @ blocks.response for matrix in matrices]
+    return np.stack([*columns, -matrices[-1] @ drive], axis=1)
 
 
 def known_column(convention: Convention, terms: int) -> int:
@@ -97,8 +97,8 @@ def least_squares(
     others = np.delete(np.arange(stacked.shape[1]), fixed)
     norms = np.linalg.norm(stacked, axis=0)
     scaled = stacked[:, others] / norms[others]
-    found = np.linalg.lstsq(scaled, -known * stacked[:, fixed], rcond=None)[0] / norms[others]
-    values = np.insert(found, fixed, known)
+    solution = np.linalg.lstsq(scaled, -known * stacked[:, fixed], rcond=None)[0] / norms[others]
+    values = np.insert(solution, fixed, known)
     *etas, stiffness, gain = (float(value) for value in values)
     return PathModel(PaperForm(gain, tuple(etas), tuple(orders), stiffness), delay)
 
@@ -161,7 +161,7 @@ def output_rmse(records: Sequence[PathRecord], model: PathModel, *, blocks: int 
 def differenced_integrals(exponents: Vector, circle: Circle, step: float) -> Spectrum:
     """``1 - z`` times the integrals of these orders on the circle, (exponents, points).
 
-    Numerators and denominators carry the same factor; without it weights of orders above 1 grow.
+    Numerators and denominators have the same factor; without it weights of orders above 1 grow.
     """
     weights = integration_weights(exponents, circle.n, step)
     weights[:, 1:] -= weights[:, :-1].copy()

@@ -30,7 +30,7 @@ from lcopa_bayes.paper.paths import Blocks
 _CELLS = 1 << 16
 """Candidates times blocks evaluated at once: 256 candidates of a 250-sample record, 1 MB an array."""
 _ROUND = 9
-"""Decimals to which exponents are told apart."""
+"""Decimals to which exponents are distinguished."""
 
 
 @final
@@ -117,7 +117,7 @@ def evaluate(
     """Least squares and output error of every candidate.
 
     Accuracy: coefficients as `least_squares` to the square of its condition number times rounding; the
-    winner's are found again without squaring it.
+    winner's are solved again without squaring it.
     """
     orders = candidates.orders
     table = np.round(np.concatenate((orders[:, :1] - orders, orders[:, :1]), axis=1), _ROUND)
@@ -161,11 +161,11 @@ def _solved(gram: Array, fixed: int) -> Matrix:
     others = np.delete(np.arange(norms.shape[1]), fixed)
     system, right = scaled[:, others[:, None], others], -scaled[:, others, fixed, None]
     try:
-        found = np.linalg.solve(system, right)[..., 0]
+        solution = np.linalg.solve(system, right)[..., 0]
     except np.linalg.LinAlgError:  # columns that depend on each other exactly
-        found = (np.linalg.pinv(system, rcond=1e-12, hermitian=True) @ right)[..., 0]
+        solution = (np.linalg.pinv(system, rcond=1e-12, hermitian=True) @ right)[..., 0]
     values = np.ones_like(norms)
-    values[:, others] = found / norms[:, others] * norms[:, fixed, None]
+    values[:, others] = solution / norms[:, others] * norms[:, fixed, None]
     out[acting] = values
     return out
 

@@ -27,9 +27,9 @@ _SAME_DRIVE = 1e-3
 """Drives closer than this are the same step [rad]; the text gives fractions of pi."""
 
 
-def model_of(found: Identification, kind: str) -> Identified:
+def model_of(identified: Identification, kind: str) -> Identified:
     """The identified model of a path of one of the `KINDS`."""
-    models = (found.scan, found.integer, found.output_error, found.integer_output_error)
+    models = (identified.scan, identified.integer, identified.output_error, identified.integer_output_error)
     return dict(zip(KINDS, models, strict=True))[kind]
 
 
@@ -67,7 +67,7 @@ class Panel:
     """Steady response that the text gives for this axis [response unit]; None when it gives none."""
 
 
-def panels(study: Study, found: Sequence[Identification], stated: Stated = PAPER) -> tuple[Panel, ...]:
+def panels(study: Study, identified: Sequence[Identification], stated: Stated = PAPER) -> tuple[Panel, ...]:
     """Every response axis of every record, fitted records first, with the models of `KINDS`.
 
     `found` are the paths of the study. A model of an axis is the sum over the drives that move; its resting
@@ -81,7 +81,7 @@ def panels(study: Study, found: Sequence[Identification], stated: Stated = PAPER
                 taken = np.isfinite(record.response[:, i])
                 if taken.any() and _moved(record):
                     time, seen = record.time[taken], record.response[taken, i]
-                    sums = {kind: _response(study, found, record, i, kind) for kind in KINDS}
+                    sums = {kind: _response(study, identified, record, i, kind) for kind in KINDS}
                     curves = tuple(
                         Curve(
                             kind,
@@ -128,13 +128,13 @@ def _moved(record: Record) -> list[Drive]:
 
 
 def _response(
-    study: Study, found: Sequence[Identification], record: Record, response: int, kind: str
+    study: Study, identified: Sequence[Identification], record: Record, response: int, kind: str
 ) -> Vector:
     taken = np.isfinite(record.response[:, response])
     times, seen = record.time[taken], record.response[taken, response]
     begin = min(float(drive.times[0]) for drive in _moved(record))
     out = np.full(times.size, resting_level(times, seen, begin)[0])
-    for each in found:
+    for each in identified:
         drive = Drive.of_rows(record.time, record.drive[:, each.data.drive])
         if each.data.response == response and drive.moves:
             model: PathModel = model_of(each, kind).model

@@ -44,7 +44,7 @@ class Identified:
 @final
 @dataclass(frozen=True)
 class Identification:
-    """One path of a study, identified in several ways from the same records."""
+    """One path of a study, identified by several methods from the same records."""
 
     data: PathData
     scan: Identified
@@ -88,8 +88,8 @@ def identify(
     workers = min(jobs, len(paths))
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         count = len(paths)
-        made = pool.map(_identify, [study] * count, paths, [plan] * count)
-        return tuple(tqdm(made, total=count, unit="path", disable=quiet))
+        identified = pool.map(_identify, [study] * count, paths, [plan] * count)
+        return tuple(tqdm(identified, total=count, unit="path", disable=quiet))
 
 
 def scannable(study: Study, plan: Scan | None = None) -> tuple[PathData, ...]:
@@ -147,8 +147,8 @@ def _identify(study: Study, data: PathData, plan: Scan, bar: tqdm[Any] | None = 
             if bar is not None:
                 bar.set_description(f"{data.name}, {title}")
             blocks = [each.blocks for each in data.records]
-            made = scan(blocks, count, data.span, limits, convention=convention, bar=bar)
-            scanned.append(_of_scan(f"scan, {title}", data, made))
+            best = scan(blocks, count, data.span, limits, convention=convention, bar=bar)
+            scanned.append(_of_scan(f"scan, {title}", data, best))
         winner = scanned[0].model
         if bar is not None:
             bar.set_description(f"{data.name}, output error")
@@ -180,30 +180,30 @@ def _described(method: str, data: PathData, model: PathModel) -> Identified:
     return Identified(method, model, equation_rmse(blocks, model), output_rmse(data.records, model))
 
 
-def _of_scan(method: str, data: PathData, made: Scanned) -> Identified:
+def _of_scan(method: str, data: PathData, scanned: Scanned) -> Identified:
     return replace(
-        _described(method, data, made.model),
-        candidates=made.candidates,
-        physical=made.physical,
-        unconstrained_rmse=made.unconstrained_rmse,
+        _described(method, data, scanned.model),
+        candidates=scanned.candidates,
+        physical=scanned.physical,
+        unconstrained_rmse=scanned.unconstrained_rmse,
     )
 
 
-def results(study: Study, found: tuple[Identification, ...], plan: Scan | None = None) -> dict[str, Any]:
+def results(study: Study, identified: tuple[Identification, ...], plan: Scan | None = None) -> dict[str, Any]:
     """Every number as plain JSON values; units beside them."""
     stiffness = (plan or Scan()).stiffness[0]
-    told: dict[str, Any] = plain(
+    fields: dict[str, Any] = plain(
         {
             "study": study.name,
             "time_unit": study.time_unit,
-            "paths": [_path(each, stiffness, study.time_unit) for each in found],
+            "paths": [_path(each, stiffness, study.time_unit) for each in identified],
         }
     )
-    return told
+    return fields
 
 
-def _path(found: Identification, stiffness: float, time_unit: str) -> dict[str, Any]:
-    data = found.data
+def _path(identified: Identification, stiffness: float, time_unit: str) -> dict[str, Any]:
+    data = identified.data
     return {
         "path": data.name,
         "response_unit": data.response_unit,
@@ -214,15 +214,15 @@ def _path(found: Identification, stiffness: float, time_unit: str) -> dict[str, 
             {"record": each.record.name, "level": each.level, "level_from": each.level_from}
             for each in data.records
         ],
-        "models": [_model(each, stiffness, time_unit) for each in found.models],
-        "stiffness_scan": [{"stiffness": k, "output_rmse": rmse} for k, rmse in found.stiffness],
+        "models": [_model(each, stiffness, time_unit) for each in identified.models],
+        "stiffness_scan": [{"stiffness": k, "output_rmse": rmse} for k, rmse in identified.stiffness],
     }
 
 
-def _model(made: Identified, stiffness: float, time_unit: str) -> dict[str, Any]:
-    model = made.model
+def _model(identified: Identified, stiffness: float, time_unit: str) -> dict[str, Any]:
+    model = identified.model
     return {
-        "method": made.method,
+        "method": identified.method,
         "orders": model.form.orders,
         "delay": model.delay,
         "delay_unit": time_unit,
@@ -233,9 +233,9 @@ def _model(made: Identified, stiffness: float, time_unit: str) -> dict[str, Any]
         },
         "steady": model.steady,
         "physical": model.physical,
-        "equation_rmse": made.equation_rmse,
-        "output_rmse": made.output_rmse,
-        "candidates": made.candidates,
-        "physical_candidates": made.physical,
-        "unconstrained_output_rmse": made.unconstrained_rmse,
+        "equation_rmse": identified.equation_rmse,
+        "output_rmse": identified.output_rmse,
+        "candidates": identified.candidates,
+        "physical_candidates": identified.physical,
+        "unconstrained_output_rmse": identified.unconstrained_rmse,
     }

@@ -29,7 +29,7 @@ class Interval(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """What one round of the scan tries: every row of orders with every delay."""
+    """Candidates of one round of the scan: every row of orders with every delay."""
 
     orders: Matrix
     """(rows, terms) [-], decreasing along a row."""
@@ -127,7 +127,7 @@ class Scan:
     def next_round(
         self, orders: Sequence[float], delay: float, number: int, span: float, block: float
     ) -> Candidates:
-        """Three finer steps each way around a candidate, within the intervals; `number` counts from 1."""
+        """Three finer steps to both sides of a candidate, within the intervals; `number` counts from 1."""
         step = self.order_step / 3.0**number
         around = np.arange(-3, 4)
         values = [

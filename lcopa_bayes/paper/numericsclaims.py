@@ -23,17 +23,17 @@ def wavelets(stated: Stated, evidence: Evidence) -> Verdict:
 
     Wavelets are better if they change the answer, simpler if they cost less.
     """
-    found = wavelet_cost(stated)
-    better, cheaper = found.difference > SAME_ANSWER, found.ratio < 1
+    cost = wavelet_cost(stated)
+    better, cheaper = cost.difference > SAME_ANSWER, cost.ratio < 1
     how = (
-        f"At N = {found.n} both forms of Eq. 61 give one response to {found.difference:.0e} of it, for "
+        f"At N = {cost.n} both forms of Eq. 61 give one response to {cost.difference:.0e} of it, for "
         "P = Psi F inverse(Psi) is a change of coordinates; the wavelet form "
         f"{'costs less' if cheaper else 'costs more'} because its matrices are "
         f"{'not full' if cheaper else 'full where those of block pulses are triangular'}. The printed "
-        f"wavelets are not orthogonal either: inner products up to {found.largest_overlap:.2f}. Number: "
+        f"wavelets are not orthogonal either: inner products up to {cost.largest_overlap:.2f}. Number: "
         "relative difference of the responses."
     )
-    return Verdict(Kind.of(better or cheaper), found.difference, "-", how)
+    return Verdict(Kind.of(better or cheaper), cost.difference, "-", how)
 
 
 @lru_cache(maxsize=4)

@@ -50,8 +50,9 @@ def tilt_law(stated: Stated, evidence: Evidence) -> Verdict:
         f"{100 * close:.0f} % of the tilt over all voltages above the threshold of {checks[0].threshold:.3f} "
         f"V and {100 * above:.1f} % from {optics.knee_voltage:g} V on (stated below "
         f"{100 * optics.tilt_fit_error:g} %). Its "
-        f"jump of {jump:.3f} rad at {optics.knee_voltage:g} V meets a solved change of {solved:.1e} rad over "
-        f"2 mV; at {optics.largest_voltage:g} V it says {top:.3f} rad, and no tilt exceeds {limit:.3f} rad."
+        f"jump of {jump:.3f} rad at {optics.knee_voltage:g} V compares with a solved change of {solved:.1e} "
+        f"rad over 2 mV; at {optics.largest_voltage:g} V it says {top:.3f} rad, and no tilt exceeds "
+        f"{limit:.3f} rad."
     )
     return Verdict(Kind.of(fitted and physical), best[0].r_squared, "-", how)
 
@@ -108,13 +109,13 @@ def linearised_steering(stated: Stated, evidence: Evidence) -> Verdict:
 
 def one_geometry(stated: Stated, evidence: Evidence) -> Verdict:
     """S4: the pitch that the measured step implies over the pitch of Section 2."""
-    found = geometry_check(stated)
+    check = geometry_check(stated)
     how = (
-        f"By Eq. 5 {found.step:.4f} rad -> {found.measured_angle:g} rad needs d = "
-        f"{found.implied_pitch_in_wavelengths:.2f} lambda = {1e6 * found.implied_pitch:.2f} um, where "
+        f"By Eq. 5 {check.step:.4f} rad -> {check.measured_angle:g} rad needs d = "
+        f"{check.implied_pitch_in_wavelengths:.2f} lambda = {1e6 * check.implied_pitch:.2f} um, where "
         f"Section 2 has {stated.optics.pitch_in_wavelengths:g} lambda, which would deflect by "
-        f"{found.simulated_angle:.4f} rad; one geometry would agree within {100 * SAME_PITCH:.0f} %. The "
-        f"element width of Eq. 21, {1e6 * found.element_width:.2f} um, gives "
-        f"{found.angle_at_element_width:.4f} rad. Number: implied over simulated pitch."
+        f"{check.simulated_angle:.4f} rad; one geometry would agree within {100 * SAME_PITCH:.0f} %. The "
+        f"element width of Eq. 21, {1e6 * check.element_width:.2f} um, gives "
+        f"{check.angle_at_element_width:.4f} rad. Number: implied over simulated pitch."
     )
-    return Verdict(Kind.of(abs(found.pitch_ratio - 1) <= SAME_PITCH), found.pitch_ratio, "-", how)
+    return Verdict(Kind.of(abs(check.pitch_ratio - 1) <= SAME_PITCH), check.pitch_ratio, "-", how)

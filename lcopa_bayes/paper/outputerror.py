@@ -36,12 +36,12 @@ def output_error_fit(
     default normal prior of the gain, five times the record's, is the only penalty. k is 1 in the result.
     """
     posterior = _posterior(study, data, terms, orders)
-    found = [optimum.values for optimum in find_optima(posterior, rng, starts=starts)]
+    solutions = [optimum.values for optimum in find_optima(posterior, rng, starts=starts)]
     if start is not None and start.physical:
         least = LeastSquares(posterior)
         values = least.with_noise(_values(posterior, start))
-        found.append(least.solve(values)[0])
-    models = [_model(posterior, values) for values in found]
+        solutions.append(least.solve(values)[0])
+    models = [_model(posterior, values) for values in solutions]
     return min(models, key=lambda model: output_rmse(data.records, model))
 
 

@@ -24,7 +24,7 @@ _RESTING = 5
 _AT_MOST = 0.1
 """Largest share of a record's samples whose mean is taken for its resting level [-]."""
 _DEPARTED = 3.5
-"""A sample this many noise sd from the mean of those before it has left the resting level."""
+"""A sample this many noise sd from the mean of those before it is no longer at the resting level."""
 
 
 @final
@@ -42,7 +42,7 @@ class Blocks:
     def of(cls, record: Record, exposure: float = 0.0) -> Blocks:
         """From a record of one drive and one response, both deviations from rest.
 
-        A sample stands for the middle of its `exposure` [time unit].
+        A sample is the value at the middle of its `exposure` [time unit].
 
         Equidistant samples are taken as the means of blocks around them. Others, or more than
         `MOST_BLOCKS`, give the exact block means of straight lines between samples.
@@ -79,7 +79,7 @@ def _means(grid: Grid, knots: Vector, heights: Vector) -> Vector:
 @final
 @dataclass(frozen=True, eq=False)
 class PathRecord:
-    """What one record says about one path."""
+    """Data of one record for one path."""
 
     record: Record
     """One drive, less its resting value; one response, less its resting level."""

@@ -27,7 +27,7 @@ from lcopa_bayes.results.steps import settling
 RECORD_LENGTH = 25.0
 """Length of the paper's records [ms]: the axes of Figs. 13 to 17 end between 20 and 25 ms."""
 SETTLING_BANDS = (0.02, 0.05)
-"""Bands about the steady value in customary use [-]; Table 1 does not say which one it means."""
+"""Bands about the steady value in customary use [-]; Table 1 does not state which."""
 _LONG = 40.0
 """Record lengths over which a settling time is looked for [-]."""
 _POINTS = 40001
@@ -58,8 +58,8 @@ class PrintedModel:
 
     def at_end(self, drive_x: float, drive_y: float) -> tuple[float, float]:
         """Responses `RECORD_LENGTH` after a step of both phases [rad], from rest [rad]."""
-        found = self.device.response(step([drive_x, drive_y]), [RECORD_LENGTH])[0]
-        return float(found[0]), float(found[1])
+        response = self.device.response(step([drive_x, drive_y]), [RECORD_LENGTH])[0]
+        return float(response[0]), float(response[1])
 
     @cached_property
     def times(self) -> Vector:

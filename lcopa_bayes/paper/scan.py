@@ -22,7 +22,7 @@ class Scanned:
 
     model: PathModel
     """Least output error among candidates with positive viscosities and stiffness, or among all when there
-    is none (`PathModel.physical` tells); in the scan's convention, the fixed coefficient 1."""
+    is none (`PathModel.physical` is False); in the scan's convention, the fixed coefficient 1."""
     rmse: float
     """Its output error over the blocks [response unit]."""
     unconstrained_rmse: float
@@ -59,13 +59,13 @@ def scan(
         if bar is not None and bar.total is not None:
             bar.total += candidates.size
             bar.refresh()
-        made = evaluate(records, candidates, convention, bar)
-        tried, physical = tried + candidates.size, physical + int(made.physical.sum())
-        unconstrained = min(unconstrained, float(made.squares.min()))
-        at = made.best()
-        found = (not made.physical[at], float(made.squares[at]))
-        if best is None or found < best[0]:
-            best = (found, *made.of(at))
+        evaluated = evaluate(records, candidates, convention, bar)
+        tried, physical = tried + candidates.size, physical + int(evaluated.physical.sum())
+        unconstrained = min(unconstrained, float(evaluated.squares.min()))
+        at = evaluated.best()
+        rank = (not evaluated.physical[at], float(evaluated.squares[at]))
+        if best is None or rank < best[0]:
+            best = (rank, *evaluated.of(at))
     assert best is not None
     (_, squares), orders, delay = best
     model = least_squares(records, orders, delay, convention=convention)

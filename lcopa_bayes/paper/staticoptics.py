@@ -33,7 +33,7 @@ class Steered:
     phase_step: float
     """[rad]."""
     main_lobe: float
-    """Angle of the maximum found on the pattern [rad]."""
+    """Angle of the maximum of the pattern [rad]."""
     side_lobe: float
     """Largest relative intensity away from every lobe [-]; NaN when there is none."""
 
@@ -60,7 +60,7 @@ class ChainCurves:
 @final
 @dataclass(frozen=True, eq=False)
 class StaticOptics:
-    """Everything the verb tells and draws."""
+    """All results that the verb reports and draws."""
 
     plan: OpticsPlan
     check: TiltLawCheck
@@ -82,7 +82,7 @@ class StaticOptics:
         """Plain values; every number says its unit in its name or beside it."""
         optics, chain = self.plan.optics, self.chain
         fits = zip(RANGES, self.check.printed, self.check.continuous, self.check.best, strict=True)
-        told: dict[str, Any] = plain(
+        fields: dict[str, Any] = plain(
             {
                 "array": {
                     "elements": optics.elements,
@@ -150,7 +150,7 @@ class StaticOptics:
                 ],
             }
         )
-        return told
+        return fields
 
     def words(self) -> list[str]:
         """A short table to read."""

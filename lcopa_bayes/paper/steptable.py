@@ -40,7 +40,7 @@ _FROM_POSTERIOR = {
 @final
 @dataclass(frozen=True)
 class Step:
-    """What a step of one size does through one model; times count from the step."""
+    """Response of one model to a step of one size; times count from the step."""
 
     rise: float
     """10 to 90 % of the steady value [time unit]; infinite when not reached within the record."""
@@ -99,7 +99,7 @@ class Row:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; infinite ones become None."""
-        told: dict[str, Any] = plain(
+        fields: dict[str, Any] = plain(
             {
                 "path": self.path,
                 "step": self.size,
@@ -110,12 +110,12 @@ class Row:
                 "posterior": self.posterior,
             }
         )
-        return told
+        return fields
 
 
 def step_table(
     study: Study,
-    found: Sequence[Identification],
+    identified: Sequence[Identification],
     *,
     posterior: Mapping[str, Any] | None = None,
     stated: Stated = PAPER,
@@ -126,7 +126,7 @@ def step_table(
     scaled to the size.
     """
     rows: list[Row] = []
-    for each in found:
+    for each in identified:
         data = each.data
         largest = max(data.records, key=lambda r: float(np.abs(r.blocks.drive.values).max()))
         size = float(np.abs(largest.blocks.drive.values).max())
@@ -157,16 +157,16 @@ def load_posterior(folder: Path, study: Study) -> Mapping[str, Any]:
     """`results.json` of the run folder of a fit of this study; InputError when it is not one."""
     path = folder / "results.json"
     try:
-        told: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        results: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise InputError(f"{path}: cannot be read ({error}); give the run folder that `fit` wrote") from None
-    if not isinstance(told, dict) or "step_metrics" not in told:
+    if not isinstance(results, dict) or "step_metrics" not in results:
         raise InputError(f"{path}: has no step metrics; give the run folder that `fit` wrote")
-    if told.get("study") != study.name:
+    if results.get("study") != study.name:
         raise InputError(
-            f"{path}: is of the study {told.get('study')!r}, not {study.name!r}; fit this study first"
+            f"{path}: is of the study {results.get('study')!r}, not {study.name!r}; fit this study first"
         )
-    return told
+    return results
 
 
 def _value(step: Step, metric: str) -> float:
@@ -192,12 +192,12 @@ def _printed(metric: str, stated: Stated) -> dict[str, float]:
 
 
 def _from_posterior(
-    told: Mapping[str, Any] | None, metric: str, path: str, response: str, size: float
+    results: Mapping[str, Any] | None, metric: str, path: str, response: str, size: float
 ) -> Mapping[str, Any] | None:
-    if told is None or metric not in _FROM_POSTERIOR:
+    if results is None or metric not in _FROM_POSTERIOR:
         return None
     name = _FROM_POSTERIOR[metric]
-    named = {row["name"]: row for row in told["step_metrics"]}
+    named = {row["name"]: row for row in results["step_metrics"]}
     row = named.get(f"{name}[{path}]", named.get(f"{name}[{response}]"))
     if row is None:
         return None

@@ -78,7 +78,7 @@ class Judged:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        told: dict[str, Any] = plain(
+        fields: dict[str, Any] = plain(
             {
                 "id": self.claim.id,
                 "verdict": self.verdict.kind.value,
@@ -89,19 +89,20 @@ class Judged:
                 "source": self.claim.source,
             }
         )
-        return told
+        return fields
 
 
 def earlier(folder: Path, verb: str, needs: Sequence[str]) -> Mapping[str, Any]:
-    """What `verb` wrote to a run folder; InputError when it cannot be read or lacks any of `needs`."""
+    """Results that `verb` wrote to a run folder; InputError when it cannot be read or lacks any of
+    `needs`."""
     path = folder / f"{verb}.json"
     try:
-        told: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        results: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(
             f"{path}: cannot be read ({error}); give the run folder that `{verb}` wrote"
         ) from None
-    absent = [key for key in needs if key not in told] if isinstance(told, dict) else list(needs)
+    absent = [key for key in needs if key not in results] if isinstance(results, dict) else list(needs)
     if absent:
         raise InputError(f"{path}: lacks {', '.join(absent)}; run `{verb}` again with --resume")
-    return told
+    return results

@@ -106,7 +106,7 @@ def delay_rounding(
     moved, *_ = np.linalg.lstsq(fixed, -change, rcond=None)
     sd, free_sd = _sd(fixed), _sd(free)[:-1]
     names = _names(len(path.orders))
-    left = change + fixed @ moved
+    residual = change + fixed @ moved
     return DelayRounding(
         blocks,
         delay,
@@ -115,7 +115,7 @@ def delay_rounding(
         float(np.sqrt(np.mean(change**2))),
         0.5 * float(change @ change),
         0.5 * float(further @ further),
-        0.5 * float(left @ left),
+        0.5 * float(residual @ residual),
         tuple(
             ParameterShift(name, float(by), float(by / s), float(by / f))
             for name, by, s, f in zip(names, moved, sd, free_sd, strict=True)
