@@ -41,11 +41,13 @@ class InversionError(ArithmeticError):
 
 
 class PoleSearchError(ArithmeticError):
-    """The poles `found` are not as many as the argument principle `counted`."""
+    """The poles `located` are not as many as the argument principle `counted`."""
 
-    def __init__(self, counted: int, found: tuple[complex, ...]) -> None:
-        self.counted, self.found = counted, found
-        super().__init__(f"{counted} pole(s) counted above the real axis but {len(found)} found: {found}")
+    def __init__(self, counted: int, located: tuple[complex, ...]) -> None:
+        self.counted, self.located = counted, located
+        super().__init__(
+            f"{counted} pole(s) counted above the real axis but {len(located)} located: {located}"
+        )
 
 
 @final
@@ -180,12 +182,12 @@ def _poles(compliance: Compliance) -> _Complex:
         step = each.sum(axis=-1) / np.where((slope := (order * each).sum(axis=-1)) == 0, 1, slope)
         w = w - step / np.maximum(1, 4 * np.abs(step))
     settled = (np.abs(step) < 1e-10) & (w.imag > 0) & (w.imag < ray) if w.size else np.zeros(0, dtype=bool)
-    found: list[complex] = []
+    located: list[complex] = []
     for candidate in w[settled].tolist():
-        if all(abs(candidate - other) > 1e-7 for other in found):
-            found.append(candidate)
-    if len(found) != counted:
-        raise PoleSearchError(counted, tuple(complex(np.exp(zero)) for zero in found))
-    if not all(isfinite(abs(np.exp(zero))) for zero in found):
+        if all(abs(candidate - other) > 1e-7 for other in located):
+            located.append(candidate)
+    if len(located) != counted:
+        raise PoleSearchError(counted, tuple(complex(np.exp(zero)) for zero in located))
+    if not all(isfinite(abs(np.exp(zero))) for zero in located):
         raise InputError(f"time scales beyond the range of floating point; got {compliance}")
-    return np.asarray(np.exp(np.array(found, dtype=complex)))
+    return np.asarray(np.exp(np.array(located, dtype=complex)))

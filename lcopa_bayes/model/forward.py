@@ -166,11 +166,11 @@ class ForwardModel:
     ) -> StepResponse:
         """Step response of an element, from `known` or added to it."""
         circle = self.circles[step]
-        found = known.get((element, step))
-        if found is None or found.coarse.shape[2] < circle.n:
+        response = known.get((element, step))
+        if response is None or response.coarse.shape[2] < circle.n:
             times, orders = dynamics.times[element], dynamics.orders[element]
-            found = known[element, step] = step_response(times, orders, circle, step, slopes=slopes)
-        return found.first(circle.n)
+            response = known[element, step] = step_response(times, orders, circle, step, slopes=slopes)
+        return response.first(circle.n)
 
     @cached_property
     def _alike(self) -> list[list[tuple[int, int, float]]]:
@@ -178,19 +178,19 @@ class ForwardModel:
 
         Steps of several heights are then simulated once, not once per record.
         """
-        found: list[list[tuple[int, int, float]]] = []
+        shared: list[list[tuple[int, int, float]]] = []
         seen: list[tuple[int, int]] = []
         for number, experiment in enumerate(self.experiments):
-            found.append([(number, axis, 1.0) for axis in range(len(experiment.drives))])
+            shared.append([(number, axis, 1.0) for axis in range(len(experiment.drives))])
             for axis, drive in enumerate(experiment.drives):
                 for first, first_axis in seen:
                     scale = drive.over(self.experiments[first].drives[first_axis])
                     if scale is not None and experiment.mesh.reads_like(self.experiments[first].mesh):
-                        found[number][axis] = (first, first_axis, scale)
+                        shared[number][axis] = (first, first_axis, scale)
                         break
                 else:
                     seen.append((number, axis))
-        return found
+        return shared
 
     def unit_slopes(self, dynamics: Dynamics) -> list[tuple[Array, list[Array]]]:
         """`unit_responses` with exact derivatives, per experiment.

@@ -209,17 +209,17 @@ _CUBIC = np.linalg.inv(np.vander(np.arange(4.0), increasing=True))
 def _weights(grid: Grid, times: Vector, exposure: float) -> csr_array:
     """Weights that read samples from block means through the running integral at the edges."""
     at = (times - grid.start) / grid.step
-    left, slopes = _through_integral(grid, at, derivative=True)
-    parts = [(np.arange(3) + left[:, None], slopes)]
+    first, slopes = _through_integral(grid, at, derivative=True)
+    parts = [(np.arange(3) + first[:, None], slopes)]
     if exposure > 0.0:
         width = exposure / grid.step
-        left, late = _through_integral(grid, at, derivative=False)
+        first, late = _through_integral(grid, at, derivative=False)
         start, early = _through_integral(grid, at - width, derivative=False)
         early[at < width] = 0.0  # at rest before the first block
-        between = start[:, None] + np.arange(int((left - start).max()) + 1)
-        whole = (between < left[:, None]).astype(float)
+        between = start[:, None] + np.arange(int((first - start).max()) + 1)
+        whole = (between < first[:, None]).astype(float)
         parts = [
-            (np.arange(3) + left[:, None], late / width),
+            (np.arange(3) + first[:, None], late / width),
             (np.arange(3) + start[:, None], -early / width),
             (np.minimum(between, grid.n - 1), whole / width),
         ]
@@ -233,10 +233,10 @@ def _through_integral(grid: Grid, at: Vector, *, derivative: bool) -> tuple[Inde
 
     Returns: the edge (positions,), and the weights of the three block means after it (positions, 3).
     """
-    left = np.clip(np.floor(at).astype(int) - 1, 0, grid.n - 3)
-    powers = np.vander(at - left, 4, increasing=True)
+    first = np.clip(np.floor(at).astype(int) - 1, 0, grid.n - 3)
+    powers = np.vander(at - first, 4, increasing=True)
     if derivative:
         powers = np.arange(4) * np.concatenate((np.zeros((at.size, 1)), powers[:, :-1]), axis=1)
     nodes = powers @ _CUBIC
     # sum_j nodes_j A_j, A_j = sum of the means before edge j: a mean counts at all edges after it
-    return left, np.cumsum(nodes[:, :0:-1], axis=1)[:, ::-1]
+    return first, np.cumsum(nodes[:, :0:-1], axis=1)[:, ::-1]

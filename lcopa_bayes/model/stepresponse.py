@@ -203,10 +203,10 @@ class StepResponse:
             scale, by_order = order * growth / (base * _POWER * width), log + 1.0 / order
         else:
             scale, by_order = growth, log
-        found = edge * scale
+        response = edge * scale
         if self._leading is not None:
-            found[self._leading] += edge[0] * scale * by_order
-        values[:, chosen] = np.where(after, found, 0.0)
+            response[self._leading] += edge[0] * scale * by_order
+        values[:, chosen] = np.where(after, response, 0.0)
 
 
 def _running(means: Array) -> Array:

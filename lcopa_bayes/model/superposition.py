@@ -167,11 +167,11 @@ class Superposition:
         for shift, jump in shifts:
             reached = x - shift
             if lattice.exposure == 0.0:
-                found = source.at(reached, kind)
+                reading = source.at(reached, kind)
             else:
                 before: Kind = "value" if kind == "slope" else "integral"
-                found = (source.at(reached, before) - source.at(reached - width, before)) / width
-            out += jump * found[: out.shape[0]]
+                reading = (source.at(reached, before) - source.at(reached - width, before)) / width
+            out += jump * reading[: out.shape[0]]
 
     def _convolved(self, response: StepResponse, phase: Phase) -> StepResponse:
         """Response to all changes of a phase as block means; its onsets are read as the blocks have them."""
@@ -234,5 +234,5 @@ class Superposition:
             readings = (late - early.take(whole.astype(int), slice(None), early.size)) / width
         if key[2] == "slope":
             readings = readings[:1]
-        self.kept[(*key, len(self.kept))] = found = _Read.of(origin, readings)
-        return found
+        self.kept[(*key, len(self.kept))] = reading = _Read.of(origin, readings)
+        return reading

@@ -173,7 +173,7 @@ def test_a_pole_search_without_luck_is_noticed(monkeypatch):
     with pytest.raises(PoleSearchError) as caught:
         Compliance((1.0,), (1.8,), 1.0).step_response(1.0)
     assert caught.value.counted == 2
-    assert caught.value.found == (pytest.approx(np.exp(1j * pi / 1.8)),)
+    assert caught.value.located == (pytest.approx(np.exp(1j * pi / 1.8)),)
 
 
 @pytest.mark.parametrize("order", [2.5, 3.7, 5.0])

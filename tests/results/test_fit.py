@@ -113,7 +113,7 @@ def test_the_same_study_gives_the_same_fit_and_resumes_to_it(fitted, tmp_path):
 def test_a_chain_of_another_study_is_not_taken_up(fitted, tmp_path):
     other = study(record(5), sampler=TINY | {"steps": 60})
     fit(other, folder=tmp_path)
-    with pytest.raises(InputError, match="made from other records, settings or seed"):
+    with pytest.raises(InputError, match="written with other records, settings or seed"):
         fit(replace(other, fit=(record(6),)), folder=tmp_path, resume=True)
 
 
