@@ -190,7 +190,7 @@ def _drive_problems(where: str, entry: object) -> list[str]:
 
 
 def _command(record: Mapping[str, Any], device: Device, rng: np.random.Generator) -> Command:
-    """Commands of all drive axes of a record in one."""
+    """Joint command of all drive axes of a record."""
     commands = [_axis_command(record.get(axis.name), record, rng) for axis in device.drive_axes]
     times = np.unique(np.concatenate([command.times for command in commands]))
     values = np.hstack([command.at(times) for command in commands])

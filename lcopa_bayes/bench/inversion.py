@@ -73,7 +73,9 @@ class Compliance:
         if not all(0 < value < inf for value in (*self.etas, *self.orders, self.stiffness)):
             problems.append(f"viscosities, orders and stiffness must be positive and finite; got {self}")
         if len(set(self.orders)) != len(self.orders):
-            problems.append(f"orders must be distinct: add the viscosities of equal ones; got {self.orders}")
+            problems.append(
+                f"orders must be distinct: add the viscosities of equal orders; got {self.orders}"
+            )
         if problems:
             raise InputError(problems)
 

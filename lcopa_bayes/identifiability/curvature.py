@@ -40,7 +40,7 @@ class Curvature:
     correlations: Matrix
     """Of the linearised estimates, (parameters, parameters) [-]; NaN where a variance is infinite."""
     overlap: Matrix
-    """Cosines between sensitivities, (parameters, parameters) [-]; 0 with one that is nil."""
+    """Cosines between sensitivities, (parameters, parameters) [-]; 0 for a sensitivity of zero."""
     collinearity: float
     """``1 / sqrt(smallest eigenvalue)`` of the cosines [-] (Brun et al. 2001, Water Resources Research 37):
     above 10 to 15 some sensitivity is nearly a combination of the others; infinite when it is one."""

@@ -1,4 +1,5 @@
-"""The printed parametrisation of a path, and its sensitivities from those of the normalised one."""
+"""The printed parametrisation of a path, and its sensitivities from those of the normalised
+parametrisation."""
 
 from __future__ import annotations
 

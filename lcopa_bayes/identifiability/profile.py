@@ -75,7 +75,7 @@ class Profile:
     ends: tuple[float, float]
     """Ends of the search, in `unit`."""
     moving: tuple[str, ...]
-    """Other parameters that move within that interval to compensate this one, farthest first."""
+    """Other parameters that move within that interval to compensate the change, farthest first."""
     top: Vector
     """Table values of the highest point, (rows,)."""
     freedom: Freedom

@@ -24,7 +24,7 @@ _CONSTANT = 1e-4
 _PROPORTIONAL = 1e-7
 """Unit columns closer than this are the same [-]."""
 _CLEAR = 6
-"""Points, the best conditioned ones, from which symmetries are named."""
+"""Best conditioned points, from which symmetries are named."""
 _MOVES = 1e-6
 """Share of the largest entry from which a parameter takes part in a null vector [-]."""
 _NOTHING = 1e-10
@@ -227,13 +227,13 @@ def exchanges(table: ParameterTable) -> tuple[Symmetry, ...]:
     out = []
     for element, slot in enumerate(table.layout.elements):
         for a, b in combinations(range(slot.terms if table.exchangeable[element] else 0), 2):
-            one, other = (
+            first, second = (
                 tuple(table.names[table.at(kind, element, term)] for kind in ("time", "order"))
                 for term in (a, b)
             )
             sentence = (
-                f"({', '.join(one)}) and ({', '.join(other)}) may change places; by keeping orders "
+                f"({', '.join(first)}) and ({', '.join(second)}) may change places; by keeping orders "
                 "decreasing each plant is counted once"
             )
-            out.append(Symmetry("exchange", (*one, *other), (), sentence))
+            out.append(Symmetry("exchange", (*first, *second), (), sentence))
     return tuple(out)

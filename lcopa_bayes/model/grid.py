@@ -182,7 +182,7 @@ class Mesh:
     def _aligned(cls, times: Vector, begin: float, step: float, lattice: Lattice, first: int) -> Mesh:
         slots = lattice.slots
         assert slots is not None
-        # blocks from the one that holds `begin` to the last sample's
+        # blocks from the block of `begin` to that of the last sample
         back = ceil((times[-1] - begin) / step - 0.5 + 1e-9)
         kept = slots - slots[-1] + back + 1  # a spare block on either side: every sample has neighbours
         grid = Grid(times[-1] - (back + 1.5) * step, step, back + 3)

@@ -33,7 +33,7 @@ class DirectorCurve:
     """Spatial mean, (m,) [rad]."""
 
     def mean_at(self, voltage: ArrayLike) -> Array:
-        """Mean tilt [rad] at each `voltage` [V], linear between the solved ones.
+        """Mean tilt [rad] at each `voltage` [V], linear between the solved voltages.
 
         InputError outside their range. The square-root rise at threshold costs up to 0.04 rad within one
         spacing of 10 mV of it; `director.equilibrium` has no such error.
@@ -143,7 +143,7 @@ class FitQuality:
 def fit_quality(curve: DirectorCurve, law: TiltLaw, lower: float, upper: float) -> FitQuality:
     """Compare `law` with `curve` at its solved voltages in ``[lower, upper]`` [V].
 
-    Raises InputError for a range beyond the solved one, or with fewer than three voltages in it.
+    Raises InputError for a range beyond the solved range, or with fewer than three voltages in it.
     """
     finite([lower, upper], name="range", lower=curve.voltage[0], upper=curve.voltage[-1], unit="V")
     inside = (curve.voltage >= lower) & (curve.voltage <= upper)

@@ -80,7 +80,7 @@ def uncoupled(stated: Stated, audit: Mapping[str, Any]) -> Verdict:
     pair = (
         f"; most alike are {' and '.join(alike[0]['pair'])}, cosine {alike[0]['cosine']:.3f}" if alike else ""
     )
-    said = "infinite (one is a combination of the others)" if index is None else f"{index:.3g}"
+    said = "infinite (one sensitivity is a combination of the others)" if index is None else f"{index:.3g}"
     how = (
         f"collinearity index of the sensitivities at the maximum of the likelihood {said}{pair}. The claim "
         f"holds below {COLLINEAR:g}."
@@ -100,7 +100,8 @@ def all_determined(stated: Stated, audit: Mapping[str, Any]) -> Verdict:
 
 
 def dominant_order(stated: Stated, audit: Mapping[str, Any]) -> Verdict:
-    """I5: by whether the profile of the largest order is bounded on both sides and holds the stated one."""
+    """I5: by whether the profile of the largest order is bounded on both sides and contains the stated
+    order."""
     names = ("order_1", "order_1_direct")
     row = next((row for row in audit["parameters"] if row["name"] in names), None)
     if row is None:

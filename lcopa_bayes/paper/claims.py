@@ -19,7 +19,7 @@ from lcopa_bayes.paper.verdict import Claim, Evidence, Judged
 CLAIMS: tuple[Claim, ...] = (
     Claim(
         "I1",
-        "Parameters map uniquely to the response; no two sets give the same one.",
+        "Parameters map uniquely to the response; no two sets give the same response.",
         "Section 4.3",
         from_audit(auditclaims.unique_map, "are there symmetries, or sets of parameters with one response?"),
     ),

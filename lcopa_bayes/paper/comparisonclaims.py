@@ -107,7 +107,7 @@ def same_steady_state(stated: Stated, compare: Mapping[str, Any]) -> Verdict:
         else Kind.UNDECIDED
     )
     how = (
-        f"the integer model tends to {whole['value']:.4g}, the fractional one to {free['value']:.4g} "
+        f"the integer model tends to {whole['value']:.4g}, the fractional model to {free['value']:.4g} "
         f"{free['unit']}: {100 * apart:+.2g} % apart ({100 * low:+.2g} to {100 * high:+.2g} % by their "
         f"{100 * free['level']:g} % intervals), stated within {100 * limit:g} %. Number: this distance."
     )

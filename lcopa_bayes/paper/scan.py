@@ -1,4 +1,4 @@
-"""The scan of Eqs. 62-64: every candidate of the intervals, then finer ones around the best."""
+"""The scan of Eqs. 62-64: every candidate of the intervals, then finer candidates around the best."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Table 1 of Ta et al. 2026 for identified models: step metrics beside the printed ones and a posterior's."""
+"""Table 1 of Ta et al. 2026 for identified models: step metrics beside those printed and those of a
+posterior."""
 
 from __future__ import annotations
 
@@ -98,7 +99,7 @@ class Row:
     """Value, lower and upper end (None is open), level and grade; None without a posterior."""
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values; infinite ones become None."""
+        """Plain values; infinite values become None."""
         fields: dict[str, Any] = plain(
             {
                 "path": self.path,

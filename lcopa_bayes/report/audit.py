@@ -112,7 +112,7 @@ def _verdicts(results: Mapping[str, Any]) -> Section:
             (str(row["name"]), str(row["reason"]), ", ".join(row["partners"]) or NONE)
             for row in results["parameters"]
         ),
-        "Partners are parameters whose changes can compensate a change of this one, the most exact first.",
+        "Partners are parameters that can compensate a change of this parameter, the most exact first.",
     )
     against = tuple(
         (str(row["name"]), str(row["verdict"]), "; ".join(row["disagreements"]))

@@ -19,7 +19,7 @@ from lcopa_bayes.report.theme import BAND, HELD_OUT, INK, NOISE, blank, grid, lo
 _PER_FIGURE = 18
 """Most quantities on one figure of ranks."""
 _MOST_ROWS = 40
-"""Replicas listed one by one."""
+"""Most replicas listed individually."""
 
 _NEEDS = (
     *("study", "verdict", "grade", "grade_reason", "seed", "asked", "replicas", "coverage", "simultaneous"),
@@ -73,7 +73,7 @@ def _coverage(results: Mapping[str, Any]) -> Section:
     )
     caption = (
         "Observed coverage with its simultaneous band against the stated level (dashed), over all replicas"
-        + (" and over the reliable ones." if reliable else "; none is graded reliable.")
+        + (" and over the reliable replicas." if reliable else "; none is graded reliable.")
     )
     return Section(
         "Coverage",

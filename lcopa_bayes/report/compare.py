@@ -156,7 +156,7 @@ def _priors(results: Mapping[str, Any]) -> Section:
         "The evidence depends on the width of the priors. Here gains, times and delays have priors half and "
         "twice as wide; orders keep theirs, which are the ends of their domain. Importance weights use the "
         "existing draws; a refit moves them to the new posterior and repeats the bridge sampling; undefined "
-        "are narrower priors that exclude values the data support: with one of these no preference is stated."
+        "are narrower priors that exclude values the data support: where these occur no preference is stated."
     )
     tables = (Table(columns, tuple(rows)),) if rows else ()
     return Section("Influence of the prior", (text,), (), tables)
@@ -264,7 +264,7 @@ def _figures(results: Mapping[str, Any], curves: Mapping[str, pd.DataFrame]) -> 
     """Figures of a comparison; `curves` by candidate."""
     drawings = [*_evidence(results), *_records(results, curves)]
     text = (
-        "Each model in its own colour throughout; black dots are samples that were fitted, red ones samples "
+        "Each model in its own colour throughout; black dots are fitted samples, red dots samples "
         "that no model was fitted to.",
     )
     return [Section("Candidates side by side", text, tuple(drawings))]
@@ -308,7 +308,7 @@ def _evidence(results: Mapping[str, Any]) -> list[Drawing]:
     panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     below = [row["name"] for row in rows if row["log_evidence"] - best < -_NEAR - 3]
     caption = (
-        "Log evidence against the number of terms: circles free orders, squares integer ones, bars two "
+        "Log evidence against the number of terms: circles free orders, squares integer orders, bars two "
         "standard errors; open triangles the same under priors half (down) and twice (up) as wide."
     )
     if below:
@@ -394,6 +394,6 @@ def _caption(rows: Sequence[Mapping[str, Any]], record: str, axis: str, *, held:
             if (entry["record"], entry["axis"]) == (record, axis):
                 errors.append(f"{row['name']} {figures(entry['rmse'])} {entry['unit']}")
     bands = f"the {POINTWISE} 90 % band" + (
-        "s with noise of all" if held else " with noise of the preferred one"
+        "s with noise of all" if held else " with noise of the preferred candidate"
     )
     return f"Medians of the candidates, {bands}, and residuals below. RMSE: {', '.join(errors)}."

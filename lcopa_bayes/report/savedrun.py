@@ -82,7 +82,8 @@ class SavedRun:
         return whole[(whole["record"] == record) & (whole["axis"] == axis)]
 
     def records(self, table: str) -> list[tuple[str, str]]:
-        """Record and axis pairs of a table: fitted ones first, then held-out ones, as they were saved."""
+        """Record and axis pairs of a table: fitted records first, then held-out records, in the order
+        saved."""
         pairs = self.tables[table][["record", "axis", "held_out"]].drop_duplicates()
         ordered = pairs.sort_values("held_out", kind="stable")
         return list(zip(ordered["record"], ordered["axis"], strict=True))

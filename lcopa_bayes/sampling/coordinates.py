@@ -63,7 +63,7 @@ class Chart:
     def charted(self, z: Matrix) -> tuple[Matrix, Vector]:
         """Chart of sampled coordinates (batch, dimension), and log |d chart / d coordinates|, (batch,).
 
-        Exchangeable terms are sorted first. Infinite where a coordinate is at one of its ends.
+        Exchangeable terms are sorted first. Infinite where a coordinate is at an end of its range.
         """
         z = self.terrain.sorted(z)
         y, log_volume = z.copy(), np.zeros(len(z))
@@ -90,7 +90,7 @@ class Chart:
         return z[finite], y[finite], log_volume[finite]
 
     def uncharted(self, y: Matrix) -> tuple[Matrix, Flags]:
-        """Sampled coordinates of charted ones, and which points of the chart have any, (batch,)."""
+        """Sampled coordinates of charted coordinates, and which points of the chart have any, (batch,)."""
         z = y.copy()
         width = (self.high - self.low)[self._bounded]
         z[:, self._bounded] = self.low[self._bounded] + width * expit(y[:, self._bounded])

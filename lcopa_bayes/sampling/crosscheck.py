@@ -185,7 +185,7 @@ class CrossCheck:
         )
 
     def limitations(self, grade: Grade) -> tuple[Limitation, ...]:
-        """None when the methods agree; else one that lowers draws of this grade by one level."""
+        """None when the methods agree; else a limitation that lowers draws of this grade by one level."""
         return () if self.agrees else (Limitation(_LOWER[grade.level], self.sentence, _REMEDY),)
 
     def as_json(self) -> dict[str, Any]:

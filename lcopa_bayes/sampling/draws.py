@@ -168,14 +168,14 @@ def _unconfirmed(parameters: tuple[str, ...]) -> tuple[Limitation, ...]:
 def weighted_draws(
     posterior: Posterior, weighted: Weighted, rng: np.random.Generator, *, target_ess: float
 ) -> Draws:
-    """Draws of every parameter from weighted ones, linear parameters drawn exactly, with their grade."""
+    """Draws of every parameter from weighted draws, linear parameters drawn exactly, with their grade."""
     return _resampled(posterior, weighted, weighted.batches(_PER_ENSEMBLE, rng), rng, target_ess)
 
 
 def _resampled(
     posterior: Posterior, weighted: Weighted, chosen: Index, rng: np.random.Generator, target_ess: float
 ) -> Draws:
-    """Draws at positions of weighted ones.
+    """Draws at positions of weighted draws.
 
     Parts of the weighted draws take the place of the ensembles of a sampler: being independent, they let
     R-hat and scatter show a mean that depends on a few draws. Effective sample sizes are those of the weights

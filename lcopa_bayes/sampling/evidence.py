@@ -51,13 +51,13 @@ class Evidence:
 
 
 def known_to(error: float) -> Level:
-    """Level of a sum of log densities by its Monte Carlo standard error [nat]; unusable without one."""
+    """Level of a sum of log densities by its Monte Carlo standard error [nat]; unusable without an error."""
     return "reliable" if error <= _RELIABLE else "tentative" if error <= _TENTATIVE else "unusable"
 
 
 def evidence_of(posterior: Posterior, run: Run, ess: float) -> Evidence | None:
     """Log evidence of a run: the mean weight of importance draws, with that of every batch; or `evidence` of
-    its ensembles, None for a single one. `ess` as there."""
+    its ensembles, None for a single ensemble. `ess` as there."""
     weighted = run.weighted
     if weighted is None:
         return evidence(posterior, run.kept()[0], ess, run.plan.seed)

@@ -56,7 +56,7 @@ class ImportancePlan:
     """How much work importance sampling may spend."""
 
     efforts: tuple[Effort, ...] = (Effort(4_000, 1_000, 6), Effort(8_000, 3_000, 6))
-    """Attempts, each continuing the previous attempt with more components, until one is good."""
+    """Attempts, each continuing the previous attempt with more components, until the draws are good."""
     starts: int = 6
     """Starts of the least-squares search."""
     wanted: float = 400.0

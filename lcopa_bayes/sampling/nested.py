@@ -35,7 +35,7 @@ _REDRAWN = 100
 _PROBES = np.linspace(0.05, 0.95, 19)
 """Probabilities at which the errors of the marginals are measured [-]."""
 _QUEUE = 128
-"""Most points moved at once: a batch of 32 costs twice as much per point, one of 512 a fourth less."""
+"""Most points moved at once: a batch of 32 costs twice as much per point, a batch of 512 a fourth less."""
 _LATE = 0.5
 """Most points moved at once, of the live points [-]: a fifth of these arrive too late to be used."""
 _CHUNK = 128
@@ -58,7 +58,7 @@ class NestedPlan:
 
     @classmethod
     def of(cls, dimension: int, *, seed: int, quick: bool = False) -> NestedPlan:
-        """A plan for a number of sampled parameters; a quick one has a quarter of the live points."""
+        """A plan for a number of sampled parameters; a quick plan has a quarter of the live points."""
         live = 100 + 50 * dimension
         return cls(8, live // 4 if quick else live, 20 * dimension, seed)
 
@@ -72,7 +72,7 @@ class Nested:
     values: Matrix
     """Canonical table values of equally weighted draws, (draws, rows), each in its row's unit."""
     ess: Vector
-    """Effective sample size of the marginal of each row, NaN of a fixed one, (rows,) [draws]."""
+    """Effective sample size of the marginal of each row, NaN of a fixed parameter, (rows,) [draws]."""
     log_evidence: float
     """Of all runs together [nat]."""
     log_evidence_sd: float

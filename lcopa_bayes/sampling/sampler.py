@@ -58,7 +58,7 @@ _ATTEMPTS, _LONGER = 2, 1.5
 _DELIVERED = 500
 """Fewest importance draws of a batch that are delivered."""
 _PER_WANTED = 4.0
-"""Delivered draws per effective one that is wanted [-] ..."""
+"""Delivered draws per effective draw wanted [-] ..."""
 _SURPLUS = 1.4
 """... and effective importance draws: 1.4 and 4 times as many are together worth 1.04 times as many."""
 

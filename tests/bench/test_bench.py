@@ -552,9 +552,9 @@ def test_campaign_tells_every_problem_and_writes_nothing(tmp_path, rng):
     told = "\n".join(caught.value.problems)
     for words in ("occurs 2 times", "'../up' cannot be", "did you mean 'x_on'", "same time unit"):
         assert words in told
-    with pytest.raises(InputError, match="no record is left"):
+    with pytest.raises(InputError, match="no record remains"):
         write_campaign(tmp_path / "new", [first], held_out=("x_on",))
-    with pytest.raises(InputError, match="no record is left"):
+    with pytest.raises(InputError, match="no record remains"):
         write_campaign(tmp_path / "new", [])
     assert not list(tmp_path.iterdir())
 

@@ -80,11 +80,11 @@ T = np.linspace(0.1, 3.0, 40)
         (lambda a, b: a * np.exp(-b * T), 2, []),
         (lambda a, b, c: a * b / c * np.exp(-T) + c * 0, 1, ["only the product a b c^-1 acts"]),
         (lambda a, b, c: np.exp(-(a + 2 * b) * T) * c, 2, ["only the sum a + 2 b acts"]),
-        (lambda a, b, c: a * T / (b + c * T), 2, ["a common factor on a, b, c changes nothing"]),
+        (lambda a, b, c: a * T / (b + c * T), 2, ["a common factor on a, b, c has no effect"]),
         (
             lambda a, b, c, d: a * T / (b * T**2 + c + d),
             2,
-            ["only the sum c + d acts", "a common factor on a, b, the sum c + d changes nothing"],
+            ["only the sum c + d acts", "a common factor on a, b, the sum c + d has no effect"],
         ),
         (
             lambda a, b, c: np.exp(-(a**2 + b) * T + 0 * c),

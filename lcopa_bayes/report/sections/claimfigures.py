@@ -1,4 +1,4 @@
-"""What the verdicts rest on, drawn: step response, crosstalk, delays, tilt, lobes, steering."""
+"""Figures of the evidence for the verdicts: step response, crosstalk, delays, tilt, lobes, steering."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def sections(stated: Stated = PAPER) -> list[Section]:
                     "claim_delay",
                     _delays(stated),
                     "Shift of the other parameters when the delay is held at the nearest camera period, for "
-                    f"the printed delay of {figures(costs[0].delay, 4)} ms and for the worst one, "
+                    f"the printed delay of {figures(costs[0].delay, 4)} ms and for the worst delay, "
                     f"{figures(costs[1].delay, 4)} ms.",
                 ),
             ),

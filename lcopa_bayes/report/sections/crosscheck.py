@@ -1,4 +1,4 @@
-"""The two methods side by side, where a run was checked by a second one."""
+"""Both methods side by side, where a run was checked by a second method."""
 
 from __future__ import annotations
 

@@ -125,12 +125,18 @@ def _fits(calculated: StaticOptics) -> Table:
     for k, name in enumerate(RANGES):
         laws = (calculated.check.printed, calculated.check.continuous, calculated.check.best)
         for law, fit in zip(("as printed", "continuous", "best of this form"), laws, strict=True):
-            one = fit[k]
-            relative = one.largest_relative_error
+            law_fit = fit[k]
+            relative = law_fit.largest_relative_error
             rows.append(
                 (
-                    *(name, figures(one.lower), figures(one.upper), law, figures(one.r_squared, 4)),
-                    figures(one.largest_error),
+                    *(
+                        name,
+                        figures(law_fit.lower),
+                        figures(law_fit.upper),
+                        law,
+                        figures(law_fit.r_squared, 4),
+                    ),
+                    figures(law_fit.largest_error),
                     NONE if not np.isfinite(relative) else f"{100 * relative:.3g} %",
                 )
             )

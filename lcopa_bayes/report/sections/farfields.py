@@ -25,7 +25,7 @@ def sections(calculated: StaticOptics) -> list[Section]:
         f"= {figures(optics.pitch_in_wavelengths)} wavelengths apart, wavelength "
         f"{figures(1e9 * optics.wavelength, 4)} nm."
     )
-    one = Section(
+    along_axis = Section(
         "Far field along one axis",
         (array, "Intensities are relative to the main lobe; elements in the figure are isotropic."),
         (
@@ -48,7 +48,7 @@ def sections(calculated: StaticOptics) -> list[Section]:
             ),
         ),
     )
-    return [one, both]
+    return [along_axis, both]
 
 
 def _decibel(values: Matrix) -> Matrix:

@@ -11,7 +11,7 @@ from lcopa_bayes.report.section import Column, Section, Table
 
 
 def section(run: SavedRun) -> Section:
-    """Free parameters with intervals and grades, those with several modes, and the fixed ones."""
+    """Free parameters with intervals and grades, parameters with several modes, and fixed parameters."""
     free, fixed = run.results["parameters"], run.results["fixed"]
     kind = ", ".join(dict.fromkeys(f"{percent(row['level'])} {row['interval']}" for row in free))
     tables = [

@@ -87,7 +87,7 @@ def _spectrum(panel: Axes, rows: pd.DataFrame, time_unit: str) -> None:
 
 
 def _shown(power: Vector) -> Index:
-    """The lowest frequencies, spread wide on a logarithmic axis, one by one, and extremes of the rest."""
+    """The lowest frequencies, spread wide on a logarithmic axis, singly, and extremes of the rest."""
     few = min(power.size, 200)
     return (
         np.concatenate((np.arange(few), few + extremes(power[few:]))) if few < power.size else np.arange(few)
