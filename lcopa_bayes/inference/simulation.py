@@ -1,0 +1,219 @@
+"""Responses of a batch of plants with effects, split into what the table's linear parameters scale.
+
+Where every response axis stays linear in its gains, a record is ``base + sum gain_ij column_ij``, and gains can
+be integrated out as without effects; otherwise the base holds the gains too. So it is with coefficients that
+only add a fixed shape in time. Each plant is simulated by itself (`plant.effects.simulator`); without an effect
+before the reading all share one call of the forward model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple, final
+
+import numpy as np
+
+from lcopa_bayes.arrays import Array, Flags, Matrix, Vector
+from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
+from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.plant.effects.declared import Declared
+from lcopa_bayes.plant.effects.effect import Effect, ParallelEffect, Scene, UnstableError
+from lcopa_bayes.plant.effects.passage import Moved, Plant, deflections
+from lcopa_bayes.plant.effects.simulator import Simulator
+from lcopa_bayes.plant.forward import ForwardModel
+
+
+class Simulated(NamedTuple):
+    """One record under a batch of plants."""
+
+    base: Array
+    """Response with all `columns` left out, (axes, batch, samples) [response unit]."""
+    columns: Mapping[int, Matrix]
+    """What a unit of a table row adds to its response axis, (batch, samples); none for what does not act."""
+    bounded: Flags
+    """Plants that have a bounded response, (batch,); the others are 0 throughout."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """The model of a table with the effects of a forward model."""
+
+    table: ParameterTable
+    model: ForwardModel
+
+    @property
+    def declared(self) -> Declared:
+        """The effects."""
+        assert self.model.effects is not None
+        return self.model.effects
+
+    @cached_property
+    def scaled(self) -> frozenset[int]:
+        """Rows that have a column: gains where responses are linear in them, coefficients that only add."""
+        rows = self.table.rows
+        gains = self.table.of_kind("gain") if self.declared.affine else []
+        return frozenset([*gains, *(k for k, row in enumerate(rows) if row.adds_to is not None)])
+
+    @cached_property
+    def coefficients(self) -> list[list[int]]:
+        """Table rows of the coefficients of each effect, those of one record after those of another."""
+        return self._rows(COEFFICIENTS)
+
+    @cached_property
+    def constants(self) -> list[list[int]]:
+        """Table rows of the internal constants of each effect."""
+        return self._rows(CONSTANTS)
+
+    def _rows(self, kinds: tuple[str, ...]) -> list[list[int]]:
+        rows = self.table.rows
+        out = []
+        for e in range(len(self.declared.kinds)):
+            mine = [k for k, row in enumerate(rows) if row.kind in kinds and row.place.first == e]
+            out.append(sorted(mine, key=lambda k: rows[k].place.second))
+        return out
+
+    def effects(self, values: Vector) -> tuple[Effect, ...]:
+        """The effects with the internal constants of table values, (rows,)."""
+        ranges = self.declared.ranges
+        return tuple(
+            kind.with_constants(ranges, values[rows].tolist())
+            for kind, rows in zip(self.declared.kinds, self.constants, strict=True)
+        )
+
+    def psi(self, values: Vector) -> Vector:
+        """Coefficients as a simulator of this model's records takes them; those of another record are 0."""
+        parts = []
+        for e, (kind, rows) in enumerate(zip(self.declared.kinds, self.coefficients, strict=True)):
+            if not kind.card.per_record:
+                parts.append(values[rows])
+                continue
+            count = self._counts[e]
+            for place in self.declared.fitted:
+                own = [] if place is None else rows[place * count : (place + 1) * count]
+                parts.append(values[own] if own else np.zeros(count))
+        return np.concatenate(parts) if parts else np.empty(0)
+
+    @cached_property
+    def _counts(self) -> list[int]:
+        """Coefficients of each effect, or of one record of it [-]."""
+        ranges = self.declared.ranges
+        instances = (
+            kind.with_constants(ranges, [one.low for one in kind.internal(ranges)])
+            for kind in self.declared.kinds
+        )
+        return [len(instance.coefficients(ranges)) for instance in instances]
+
+    def simulator(self, effects: tuple[Effect, ...]) -> Simulator:
+        """What simulates one plant with these effects."""
+        told = self.declared
+        return Simulator(self.model.plain, effects, told.ranges, told.epochs, told.times)
+
+    def plant(self, values: Vector) -> Plant:
+        """The plant of canonical table values, (rows,), without offsets."""
+        batch = values[None]
+        offsets = np.zeros((len(self.model.experiments), len(self.table.layout.responses)))
+        return Plant(self.table.gains(batch)[0], self.table.dynamics(batch), offsets)
+
+    def __call__(self, values: Matrix) -> list[Simulated]:
+        """Every record at canonical table values, (batch, rows)."""
+        told, batch, layout = self.declared, len(values), self.table.layout
+        shared = None
+        if not (told.bending or told.commanding):
+            shared = self.model.plain.unit_responses(self.table.dynamics(values))
+        sizes = [times.size for times in told.times]
+        bounded = np.ones(batch, dtype=bool)
+        out = [
+            Simulated(
+                np.zeros((len(layout.responses), batch, n)),
+                {k: np.zeros((batch, n)) for k in self.scaled if self._acts(k, r)},
+                bounded,
+            )
+            for r, n in enumerate(sizes)
+        ]
+        effects, simulator = None, None
+        for b, row in enumerate(values):
+            own = self.effects(row)
+            if simulator is None or own != effects:
+                effects, simulator = own, self.simulator(own)
+            units = None if shared is None else [each[:, b] for each in shared]
+            try:
+                self._one(simulator, row, units, b, out)
+            except UnstableError:
+                bounded[b] = False
+                for record in out:
+                    for each in (*record.base, *record.columns.values()):
+                        each[b] = 0.0
+        return out
+
+    def _acts(self, k: int, r: int) -> bool:
+        """Whether a scaled row acts on a record."""
+        row = self.table.rows[k]
+        if row.kind == "gain":
+            experiment = self.model.experiments[r]
+            drive = row.place.second
+            return experiment.drives[drive].moves or experiment.rest[drive] != 0.0
+        return self.declared.fitted[r] == row.place.second // self._counts[row.place.first]
+
+    def _one(
+        self, simulator: Simulator, row: Vector, units: list[Matrix] | None, b: int, out: list[Simulated]
+    ) -> None:
+        """Write one plant's responses."""
+        plant, still = self.plant(row), row.copy()
+        still[[k for k in self.scaled if self.table.rows[k].kind != "gain"]] = 0.0
+        psi = self.psi(still)
+        if units is None and not self.declared.bending:
+            driven = simulator.driven(simulator.scenes(plant, psi))
+            units = [each[:, 0] for each in driven.unit_responses(plant.dynamics)]
+        if not self.declared.affine:
+            for record, y in zip(out, self._read(simulator, plant, psi, units), strict=True):
+                record.base[:, b] = y.T
+        else:
+            zero = replace(plant, gains=np.zeros_like(plant.gains))
+            scenes = simulator.scenes(zero, psi)
+            rest = [Moved(scene, np.zeros((scene.times.size, len(plant.gains)))) for scene in scenes]
+            base = simulator.finished(rest, psi)
+            for record, y in zip(out, base, strict=True):
+                record.base[:, b] = y.T
+            for j in range(plant.gains.shape[1]):
+                gains = np.zeros_like(plant.gains)
+                gains[:, j] = 1.0
+                read = self._read(simulator, replace(plant, gains=gains), psi, units)
+                for record, y, nothing in zip(out, read, base, strict=True):
+                    for i in range(gains.shape[0]):
+                        k = self.table.at("gain", i, j)
+                        if k in record.columns:
+                            record.columns[k][b] = (y - nothing)[:, i]
+        self._added(simulator, plant, b, out)
+
+    def _read(
+        self, simulator: Simulator, plant: Plant, psi: Vector, units: list[Matrix] | None
+    ) -> list[Matrix]:
+        """Deflections of one plant as read, per record (samples, axes)."""
+        if units is None:
+            return simulator.finished(simulator.moved(plant, psi), psi)
+        scenes = simulator.scenes(plant, psi)
+        moved = [
+            Moved(scene, deflections(self.table.layout, scene, plant.gains, each))
+            for scene, each in zip(scenes, units, strict=True)
+        ]
+        return simulator.finished(moved, psi)
+
+    def _added(self, simulator: Simulator, plant: Plant, b: int, out: list[Simulated]) -> None:
+        """Columns of the coefficients that only add."""
+        for e, rows in enumerate(self.coefficients):
+            effect = simulator.effects[e]
+            if not (isinstance(effect, ParallelEffect) and effect.additive) or rows[0] not in self.scaled:
+                continue
+            count = self._counts[e]
+            for r, place in enumerate(self.declared.fitted):
+                if place is None:
+                    continue
+                scene: Scene = simulator.scene(r, plant)
+                for k in range(count):
+                    unit = np.zeros(count)
+                    unit[k] = 1.0
+                    at = rows[place * count + k]
+                    out[r].columns[at][b] = effect.added(scene, unit)[:, self.table.rows[at].response]
