@@ -20,6 +20,7 @@ from lcopa_bayes.inference.draws import Draws, gather
 from lcopa_bayes.inference.evidence import Evidence, evidence
 from lcopa_bayes.inference.nested import NestedPlan, nested
 from lcopa_bayes.inference.sampler import Run, SamplePlan, sample
+from lcopa_bayes.inference.weightedrun import weighted_run
 from lcopa_bayes.predict import Band, bands
 from lcopa_bayes.provenance import digest_of, fingerprint
 from lcopa_bayes.requirements import unmet
@@ -86,18 +87,25 @@ def fit(
         writable_folder(folder)
     problem = resolved(problem)
     plan = plan_of(problem, quick=quick)
-    run = sample(
-        problem.posterior,
-        plan,
-        jobs=jobs,
-        chain_file=folder / "chain.h5" if folder else None,
-        fingerprint=fingerprint(study, plan) + ("" if starts is None else digest_of(starts)),
-        resume=resume,
-        quiet=quiet,
-        starts=starts,
-    )
-    draws, check = gather(problem.posterior, run), None
-    weighed = evidence(problem.posterior, run.kept()[0], draws.ess, plan.seed)
+    expensive = problem.posterior.simulation is not None and study.sampler.method == "auto"
+    found = weighted_run(problem.posterior, plan, jobs=jobs, quick=quick) if expensive else None
+    check = None
+    weighed: Evidence | None
+    if found is not None:
+        run, draws, weighed = found.run, found.draws, found.evidence
+    else:
+        run = sample(
+            problem.posterior,
+            plan,
+            jobs=jobs,
+            chain_file=folder / "chain.h5" if folder else None,
+            fingerprint=fingerprint(study, plan) + ("" if starts is None else digest_of(starts)),
+            resume=resume,
+            quiet=quiet,
+            starts=starts,
+        )
+        draws = gather(problem.posterior, run)
+        weighed = evidence(problem.posterior, run.kept()[0], draws.ess, plan.seed)
     if cross_check:
         wanted = NestedPlan.of(problem.posterior.dimension, seed=plan.seed, quick=quick)
         check = CrossCheck.of(

@@ -13,6 +13,7 @@ from lcopa_bayes.inference.data import Observed, Samples
 from lcopa_bayes.inference.draws import Draws
 from lcopa_bayes.inference.noise import GaussianNoise, Noise
 from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.inference.simulation import Simulation
 from lcopa_bayes.plant.forward import ForwardModel
 
 LEVELS = (0.5, 0.9)
@@ -27,6 +28,8 @@ _CELLS = 2_000_000
 """Draws times samples behind the bands of one axis of one record."""
 _FEWEST = 200
 """Draws behind a band at least."""
+_WITH_EFFECTS = 1000
+"""Draws behind a band at most where the plant has effects, which take a simulation each."""
 _SWEEPS = 20
 """Sweeps after which a Gibbs chain of a level has forgotten its start [-]: 1e-6 of it is left at nu = 1."""
 
@@ -72,7 +75,13 @@ class Band:
 
 
 def responses(table: ParameterTable, model: ForwardModel, values: Matrix) -> list[Array]:
-    """Plant responses without offsets, per experiment (axes, batch, samples) [response unit]."""
+    """Plant responses without offsets, per experiment (axes, batch, samples) [response unit].
+
+    With effects NaN for plants without a bounded response; what differs from record to record is 0 on records
+    that were not fitted.
+    """
+    if model.effects is not None:
+        return Simulation(table, model).responses(values)
     gains, layout, out = table.gains(values), table.layout, []
     unit_responses = model.unit_responses(table.dynamics(values))
     for experiment, units in zip(model.experiments, unit_responses, strict=True):
@@ -98,13 +107,18 @@ def bands(
     `model` simulates the records of `samples` at their sample times. An offset per record is not
     known for a held-out record: it is taken from the samples before the drive can have acted, else
     from the record itself (integrated out given its samples), and the band says which and from how many.
+    Effects that differ from record to record count as noise on a held-out record, as large as on the others.
     """
     out = []
     for r, record in enumerate(samples):
-        one = ForwardModel(model.layout, (model.experiments[r],))
-        values = draws.thinned(max(_FEWEST, _CELLS // record.times.size))
+        one = model.only(r)
+        most = max(_FEWEST, _CELLS // record.times.size)
+        values = draws.thinned(most if model.effects is None else min(most, _WITH_EFFECTS))
         parts = np.array_split(values, max(1, values.shape[0] * record.times.size // _CELLS * 4))
         plant = np.concatenate([responses(draws.table, one, part)[0] for part in parts], axis=1)
+        disturbed = plant
+        if held_out and one.effects is not None and one.effects.per_record:
+            disturbed = Simulation(draws.table, one).disturbed(values, rng)[0]
         for axis, observed in enumerate(record.axes):
             if observed.values.size == 0:
                 continue
@@ -115,6 +129,8 @@ def bands(
             )
             response = response + offset[:, None]
             noisy = response + noise.draw(parameters, observed.gaps, rng)
+            if disturbed is not plant:
+                noisy += (disturbed - plant)[axis][:, observed.index]
             response_axis = record.record.response_axes[axis]
             out.append(
                 Band(

@@ -147,13 +147,17 @@ class SamplerSettings:
     """Effective sample size [-] at which sampling stops."""
     thin: int | None = None
     """Steps per kept draw [-]; None: chosen from the autocorrelation time."""
+    method: Literal["auto", "ensembles"] = "auto"
+    """Ensembles from the prior; or, where the plant has effects, importance sampling around the optima and
+    ensembles only where its weights fail."""
 
     def __post_init__(self) -> None:
         least = {"ensembles": 2, "walkers": 4, "steps": 1, "target_ess": 1, "thin": 1}
         chosen = {key: getattr(self, key) for key in least}
         optional = ("walkers", "steps", "thin")
         stated = [key for key in least if not (key in optional and chosen[key] is None)]
-        refuse_if([problem for key in stated for problem in whole_number(key, chosen[key], least[key])])
+        problems = one_of("method", self.method, ("auto", "ensembles"))
+        refuse_if([*problems, *(p for key in stated for p in whole_number(key, chosen[key], least[key]))])
 
 
 @final
@@ -172,7 +176,7 @@ class EffectsSettings:
     """Time to half of a step response, delay excluded [time unit]; None: derived from the fit records."""
 
     def __post_init__(self) -> None:
-        problems = []
+        problems: list[str] = []
         for key, value in (("add", self.add), ("use", self.use)):
             if not isinstance(value, tuple):
                 problems.append(f"`{key}` must be a list of texts; got {value!r}")

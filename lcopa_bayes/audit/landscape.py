@@ -200,7 +200,7 @@ class Landscape:
         """The noise parameters that maximise the likelihood of the residual of `values`."""
         posterior, table, out = self.posterior, self.posterior.table, values.copy()
         canonical = table.canonical(values[None])
-        units = posterior.model.unit_responses(table.dynamics(canonical))
+        units = posterior.responses(canonical)
         for axis in range(len(table.layout.responses)):
             rows = [table.at(name, axis) for name in posterior.noise.names]
             moving = [k for k in rows if table.rows[k].free and k != held]

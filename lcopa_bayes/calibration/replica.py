@@ -241,7 +241,7 @@ class Replication:
         parameters = [draws.flat[:, k] for k, row in enumerate(table.rows) if row.free]
         steps = [
             curves.gains[:, i, j] * curves.normalised[unit][:, k]
-            for i, row in enumerate(table.layout.unit_of)
+            for i, row in enumerate(curves.curve_of)
             for j, unit in enumerate(row)
             for k in at
         ]

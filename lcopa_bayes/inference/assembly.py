@@ -98,7 +98,8 @@ def table_of(
         model=study.model,
         noise=noise_of(kinds, study.noise.kind),
         priors=named,
-        effects=effect_rows(kinds, ranges, records, layout, study.time_unit) if ranges else (),
+        effects=declared(study, kinds, ranges, ()) if ranges else None,
+        effect_rows=effect_rows(kinds, ranges, records, layout, study.time_unit) if ranges else (),
         noise_effect=scatter[0] if scatter else "",
         problems=[*problems, *foreign.values()],
     )

@@ -1,10 +1,10 @@
 """Effects that a study declares: their kinds, their scales from the fit records, and their parameters.
 
-An effect's formula counts deflections in the largest one and drives in the largest one. Both come from the fit
-records, not from a fit, so that a coefficient has a meaning before anything is fitted; a study may state them.
-Default priors: normal(0, scale) of a coefficient, half-normal of one that is never negative, with the scale the
-effect gives it; of an internal constant log-uniform, or uniform over less than a factor of 4, from end to end
-of what the loop tries.
+An effect's formula counts deflections in the largest one and drives in the largest one. Both come from the
+fit records, not from a fit, so that a coefficient has a meaning before anything is fitted; a study may state
+them. Default priors: normal(0, scale) of a coefficient, half-normal of one that is never negative, with the
+scale the effect gives it; of an internal constant log-uniform, or uniform over less than a factor of 4, from
+end to end of what the loop tries.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ def used_kinds(study: Study, layout: Layout) -> tuple[tuple[type[Effect], ...], 
                 "already; leave one of them out"
             )
     if len(scatter) > 1:
-        names = ", ".join(kind.card.name for kind in scatter)
-        problems.append(f"[effects] use: {names} each replace the noise; use one of them")
+        each = ", ".join(kind.card.name for kind in scatter)
+        problems.append(f"[effects] use: {each} each replace the noise; use one of them")
     names = [axis.name for axis in layout.responses]
     problems += [
         f"[effects] deflection: no response axis is named {axis!r}{nearest(axis, names)}"
@@ -237,6 +237,4 @@ def unused(key: str, study: Study) -> str | None:
         return None
     if name not in known:
         return None
-    return (
-        f"[priors] {key}: the effect {name!r} is not used; add it to [effects] use or leave this prior out"
-    )
+    return f"[priors] {key}: the effect {name!r} is not used; add it to [effects] use or leave this prior out"

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from lcopa_bayes.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.effected import Effected
 from lcopa_bayes.inference.simulation import Simulation

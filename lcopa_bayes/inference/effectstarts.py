@@ -8,7 +8,6 @@ from typing import Protocol
 import numpy as np
 
 from lcopa_bayes.arrays import Matrix, Vector
-from lcopa_bayes.inference.effectslopes import effect_slopes
 from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.posterior import Posterior
@@ -41,7 +40,7 @@ def effect_starts(posterior: Posterior, alone: Sequence[Placed], rng: np.random.
     rows = posterior.table.rows
     plant = [k for k, row in enumerate(rows) if row.kind not in (*COEFFICIENTS, *CONSTANTS)]
     free = [k for k, row in enumerate(rows) if row.kind in CONSTANTS and row.free]
-    out = []
+    out: list[Vector] = []
     for optimum in alone[:_PLANTS]:
         start = np.array([row.value for row in rows])
         start[plant] = optimum.values

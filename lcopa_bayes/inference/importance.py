@@ -24,7 +24,7 @@ from scipy.special import logsumexp
 from lcopa_bayes.arrays import Index, Matrix, Vector
 from lcopa_bayes.inference.chart import Chart
 from lcopa_bayes.inference.draws import Draws
-from lcopa_bayes.inference.evidence import charted_density
+from lcopa_bayes.inference.evidence import Mapped, charted_density
 from lcopa_bayes.inference.grade import Quality, between
 from lcopa_bayes.inference.optimum import Optimum, find_optima
 from lcopa_bayes.inference.posterior import Posterior
@@ -81,6 +81,8 @@ class Importance:
     """Sampled coordinates of every draw, exchangeable terms by decreasing order, (draws, dimension)."""
     log_density: Vector
     """Log posterior density, as `Posterior.log_density`, (draws,) [nat]; -inf where there is none."""
+    raw: Vector
+    """Log of density over proposal, (draws,) [nat]."""
     log_weights: Vector
     """Normalised and Pareto-smoothed, (draws,) [nat]; -inf where the density is 0."""
     pareto_k: float
@@ -114,14 +116,17 @@ class Importance:
 
 
 def first_look(
-    posterior: Posterior, rng: np.random.Generator, plan: ImportancePlan = ImportancePlan()
+    posterior: Posterior,
+    rng: np.random.Generator,
+    plan: ImportancePlan = ImportancePlan(),
+    mapped: Mapped = map,
 ) -> Importance | None:
     """Optima of a posterior from several starts, and importance sampling around them.
 
     None where no start led to an optimum of positive density.
     """
     optima = find_optima(posterior, rng, starts=plan.starts)
-    return importance(posterior, optima, rng, plan) if optima else None
+    return importance(posterior, optima, rng, plan, mapped) if optima else None
 
 
 def importance(
@@ -129,8 +134,9 @@ def importance(
     optima: Sequence[Optimum],
     rng: np.random.Generator,
     plan: ImportancePlan = ImportancePlan(),
+    mapped: Mapped = map,
 ) -> Importance:
-    """Importance sampling around given optima, one or more.
+    """Importance sampling around given optima, one or more; `mapped` spreads the density over processes.
 
     FloatingPointError where the density is NaN.
     """
@@ -143,7 +149,7 @@ def importance(
             core = split(core, rng)
         for _ in range(effort.rounds):
             y = proposal.draw(effort.learning, rng)
-            seen = seen.joined(proposal, y, charted_density(posterior, chart, y))
+            seen = seen.joined(proposal, y, charted_density(posterior, chart, y, mapped))
             log_weights = seen.log_weights()
             if np.isneginf(log_weights).all():
                 break
@@ -152,7 +158,7 @@ def importance(
             if k <= _LIGHT and effective(own) > LEAST_EFFICIENCY * effort.learning:
                 break
         y = proposal.draw(effort.draws, rng)
-        density = charted_density(posterior, chart, y)
+        density = charted_density(posterior, chart, y, mapped)
         found = _weighed(posterior, chart, y, density, density - proposal.log_density(y))
         if found.good(plan.wanted):
             break
@@ -168,10 +174,10 @@ def _weighed(posterior: Posterior, chart: Chart, y: Matrix, charted: Vector, raw
     density[exists] = charted[exists] + chart.charted(z[exists])[1] - posterior.table.log_permutations
     log_weights, k = tail_smoothed(raw)
     if np.isneginf(raw).all():
-        return Importance(z, density, log_weights, k, 0.0, -np.inf, np.inf, 0, 0)
+        return Importance(z, density, raw, log_weights, k, 0.0, -np.inf, np.inf, 0, 0)
     mean = float(logsumexp(raw) - np.log(raw.size))
     error = float(np.std(np.exp(raw - mean)) / np.sqrt(raw.size))
-    return Importance(z, density, log_weights, k, effective(log_weights), mean, error, 0, 0)
+    return Importance(z, density, raw, log_weights, k, effective(log_weights), mean, error, 0, 0)
 
 
 def tail_smoothed(log_weights: Vector) -> tuple[Vector, float]:

@@ -16,6 +16,7 @@ from lcopa_bayes.inference.kinds import COEFFICIENTS, KINDS
 from lcopa_bayes.inference.noise import NOISES
 from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.priors import Prior
+from lcopa_bayes.plant.effects.declared import Declared
 from lcopa_bayes.plant.forward import Dynamics
 from lcopa_bayes.plant.layout import Layout
 from lcopa_bayes.problems import InputError, nearest
@@ -36,6 +37,8 @@ class ParameterTable:
     rows: tuple[Parameter, ...]
     resolution: float = 0.0
     """Shortest time constant of a term of order above 1 under default priors [time unit]."""
+    effects: Declared | None = None
+    """Effects whose parameters are among the rows, over no record; None without any."""
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -204,14 +207,15 @@ def parameter_table(
     model: ModelSettings,
     noise: str,
     priors: Mapping[str, PriorSettings],
-    effects: Sequence[Parameter] = (),
+    effects: Declared | None = None,
+    effect_rows: Sequence[Parameter] = (),
     noise_effect: str = "",
     problems: Sequence[str] = (),
 ) -> ParameterTable:
     """Table of a study; InputError when a prior names no parameter or has no mass in its domain.
 
-    `effects` are the parameters of its effects, `noise_effect` the name of an effect that gives the noise its
-    shape; `problems` found before join those found here.
+    `effect_rows` are the parameters of its `effects`, `noise_effect` the name of an effect that gives the
+    noise its shape; `problems` found before join those found here.
     """
     rows: list[Parameter] = []
 
@@ -244,13 +248,13 @@ def parameter_table(
             add(name, (i, 0), layout.response_name(i), unit, prior)
             if noise_effect and KINDS[name].noise == "shape":
                 rows[-1] = replace(rows[-1], name=f"{noise_effect}.{rows[-1].name}")
-    rows += effects
+    rows += effect_rows
     names = [row.name for row in rows]
     if len(set(names)) < len(names):
         twice = ", ".join(sorted({name for name in names if names.count(name) > 1}))
         raise InputError(f"{twice}: axes and records together name two parameters alike; rename a record")
     rows = _fix_orders(rows, layout, model)
-    return ParameterTable(layout, tuple(_with_priors(rows, priors, problems)), scales.resolution)
+    return ParameterTable(layout, tuple(_with_priors(rows, priors, problems)), scales.resolution, effects)
 
 
 def _fix_orders(rows: list[Parameter], layout: Layout, model: ModelSettings) -> list[Parameter]:
@@ -263,9 +267,7 @@ def _fix_orders(rows: list[Parameter], layout: Layout, model: ModelSettings) -> 
             f"have {', '.join(str(slot.terms) for slot in layout.elements)} term(s); give one order per term"
         )
     return [
-        replace(row, prior=None, value=float(model.orders[row.place.second]))
-        if row.kind == "order"
-        else row
+        replace(row, prior=None, value=float(model.orders[row.place.second])) if row.kind == "order" else row
         for row in rows
     ]
 

@@ -286,9 +286,11 @@ class Posterior:
     def without_effects(self) -> Posterior:
         """The same of the plant alone; the noise stays."""
         rows = tuple(row for row in self.table.rows if row.kind not in (*COEFFICIENTS, *CONSTANTS))
-        return replace(self, table=replace(self.table, rows=rows), model=self.model.plain)
+        table = replace(self.table, rows=rows, effects=None)
+        return replace(self, table=table, model=self.model.plain)
 
 
 def bounded(units: Sequence[Units]) -> Flags:
     """Plants with a bounded response, (batch,), of responses with effects."""
-    return np.all([one.bounded for one in units if isinstance(one, Simulated)], axis=0)
+    out: Flags = np.all([one.bounded for one in units if isinstance(one, Simulated)], axis=0)
+    return out

@@ -1,9 +1,9 @@
 """Responses of a batch of plants with effects, split into what the table's linear parameters scale.
 
-Where every response axis stays linear in its gains, a record is ``base + sum gain_ij column_ij``, and gains can
-be integrated out as without effects; otherwise the base holds the gains too. So it is with coefficients that
-only add a fixed shape in time. Each plant is simulated by itself (`plant.effects.simulator`); without an effect
-before the reading all share one call of the forward model.
+Where every response axis stays linear in its gains, a record is ``base + sum gain_ij column_ij``, and gains
+can be integrated out as without effects; otherwise the base holds the gains too. So it is with coefficients
+that only add a fixed shape in time. Each plant is simulated by itself (`plant.effects.simulator`); without an
+effect before the reading all share one call of the forward model.
 """
 
 from __future__ import annotations
@@ -147,6 +147,32 @@ class Simulation:
                     for each in (*record.base, *record.columns.values()):
                         each[b] = 0.0
         return out
+
+    def responses(self, values: Matrix) -> list[Array]:
+        """Responses without offsets, per record (axes, batch, samples) [response unit]; NaN where there is no
+        bounded one."""
+        out = []
+        for record in self(values):
+            total = record.base.copy()
+            for k, column in record.columns.items():
+                total[self.table.rows[k].response] += values[:, k, None] * column
+            total[:, ~record.bounded] = np.nan
+            out.append(total)
+        return out
+
+    def disturbed(self, values: Matrix, rng: np.random.Generator) -> list[Array]:
+        """`responses` of one other record, whose own coefficients are unknown.
+
+        They are drawn as large as those of the fit records: normal about 0, of their root mean square.
+        """
+        told, out = self.declared, values.copy()
+        for kind, rows, count in zip(told.kinds, self.coefficients, self._counts, strict=True):
+            if kind.card.per_record:
+                fitted = values[:, rows].reshape(len(values), -1, count)
+                size = np.sqrt(np.mean(fitted**2, axis=1))
+                out[:, rows[:count]] = size * rng.standard_normal(size.shape)
+        own = replace(self.model, effects=replace(told, fitted=(0,) * len(told.fitted)))
+        return Simulation(self.table, own).responses(out)
 
     def _acts(self, k: int, r: int) -> bool:
         """Whether a scaled row acts on a record."""

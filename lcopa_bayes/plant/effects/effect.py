@@ -183,9 +183,10 @@ class Effect(ABC):
             if isinstance(values[0], bool):
                 out.append(Constant(field.name, "-", 0.0, 0.0, "choice"))
                 continue
-            ends = (min(values), max(values)) if field.default is MISSING else (field.default,) * 2
+            low, high = (min(values), max(values)) if field.default is MISSING else (field.default,) * 2
             kind: Literal["constant", "fraction"] = "fraction" if field.name in cls.fractions else "constant"
-            out.append(Constant(field.name, cls.units.get(field.name, "-"), *map(float, ends), kind))
+            unit = cls.units.get(field.name, "-")
+            out.append(Constant(field.name, unit, float(low), float(high), kind))
         return tuple(out)
 
     @classmethod
