@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import lcopa_bayes
+from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.optics.cell import Field
 from lcopa_bayes.paper.intervals import Scan
-from lcopa_bayes.problems import InputError
 from lcopa_bayes.verbs import papers, questions, runs
 from lcopa_bayes.verbs.outcome import Told
 

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 
-from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import Command, on_off, step
 from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.data.settings import EffectsSettings, ModelSettings, NoiseSettings, PriorSettings, SamplerSettings
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
-from lcopa_bayes.inference.draws import Draws
-from lcopa_bayes.inference.grade import Quality
 from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.priors import Prior
-from lcopa_bayes.record import Axis, Record
-from lcopa_bayes.settings import ModelSettings, NoiseSettings, PriorSettings, SamplerSettings
-from lcopa_bayes.study import Study
+from lcopa_bayes.sampling.convergence import Quality
+from lcopa_bayes.sampling.draws import Draws
 
 U, Y = Axis("u", "V"), Axis("y", "rad")
 TRUTH = {"gain": 2.0, "time_1": 1.5, "order_1": 0.8, "delay": 0.73, "offset": 0.3, "sigma": 0.02}
@@ -164,3 +167,56 @@ class Toy:
         inside = total > -np.inf
         total[inside] += heat * self.log_likelihood(coordinates[inside])
         return total
+
+
+def same_quantiles(a: Draws, b: Draws) -> bool:
+    """Whether the shares of `a` below quantiles of `b` are as they should be, within Monte Carlo error."""
+    p = np.array([0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98])
+    error = np.sqrt(p * (1 - p) * (1 / min(a.ess, len(a.flat)) + 1 / min(b.ess, len(b.flat))))
+    free = [k for k, row in enumerate(a.table.rows) if row.free]
+    shares = [np.mean(a.flat[:, k, None] < np.quantile(b.flat[:, k], p), axis=0) for k in free]
+    return bool((np.abs(np.array(shares) - p) < 4.5 * error).all())
+
+
+def check_page(path: Path) -> str:
+    """The page stands alone: no script, nothing fetched, no duplicate ids."""
+    page = path.read_text(encoding="utf-8")
+    assert "<script" not in page
+    assert not re.search(r'(?:src|href)="(?!#|data:)', page)
+    ids = re.findall(r'\bid="([^"]+)"', page)
+    assert len(ids) == len(set(ids))
+    return page
+
+
+def with_effect(
+    base: Study, use: Sequence[str], truth: Mapping[str, float], *, seed: int = 3
+) -> tuple[Study, Vector]:
+    """The study with its responses made anew by a plant with effects, and its table values.
+
+    `truth` is by name of a parameter or by its kind; white noise of its ``sigma``. What the effects count
+    deflections in is stated, so that it does not follow the noise.
+    """
+    made = problem_of(replace(base, effects=EffectsSettings(use=tuple(use))))
+    posterior, ranges = made.posterior, made.ranges
+    assert posterior.simulation is not None
+    assert ranges is not None
+    values = np.array(
+        [truth.get(row.name, truth.get(row.kind, row.value)) for row in posterior.table.rows], dtype=float
+    )
+    assert np.isfinite(values).all()
+    rng, records = np.random.default_rng(seed), []
+    for r, (each, clean) in enumerate(
+        zip(base.fit, posterior.simulation.responses(values[None]), strict=True)
+    ):
+        response, rows = each.response.copy(), np.isfinite(each.response).any(axis=1)
+        for axis in range(response.shape[1]):
+            level = posterior.table.offset(values[None], axis, r)[0]
+            noise = truth["sigma"] * rng.standard_normal(int(rows.sum()))
+            response[rows, axis] = clean[axis, 0] + level + noise
+        records.append(replace(each, response=response))
+    stated = EffectsSettings(
+        use=tuple(use),
+        deflection=dict(zip(ranges.names, ranges.response.tolist(), strict=True)),
+        speed=ranges.speed,
+    )
+    return replace(base, fit=tuple(records), effects=stated), values

@@ -11,24 +11,24 @@ from typing import Any, final
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.arrays import Matrix
-from lcopa_bayes.audit.bayes import Known, beliefs, known_best, prior_draws, prior_spread
+from lcopa_bayes.audit.contraction import Known, beliefs, known_best, prior_draws, prior_spread
+from lcopa_bayes.audit.curvature import Curvature, curvature
 from lcopa_bayes.audit.delays import Delays, delays
-from lcopa_bayes.audit.landscape import Landscape, Peak
-from lcopa_bayes.audit.local import Curvature, curvature
 from lcopa_bayes.audit.printedform import printed_structure
 from lcopa_bayes.audit.profile import Profile
-from lcopa_bayes.audit.profilewalk import profile
+from lcopa_bayes.audit.profilepath import profile
 from lcopa_bayes.audit.radial import Radial, radial
 from lcopa_bayes.audit.sensitivities import sensitivities
-from lcopa_bayes.audit.structure import Structure, exchanges, structure
+from lcopa_bayes.audit.symmetries import Structure, exchanges, structure
 from lcopa_bayes.audit.tolerance import Tolerance
 from lcopa_bayes.audit.verdict import Finding, judged
-from lcopa_bayes.estimate import plain
-from lcopa_bayes.fit import Fit
+from lcopa_bayes.core.arrays import Matrix
+from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.inference.likelihood import Landscape, Peak
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.parameter import Parameter
-from lcopa_bayes.resonance import unresolved
+from lcopa_bayes.results.fit import Fit
+from lcopa_bayes.results.resonance import unresolved
 
 _POINTS = 24
 """Prior draws at which symmetries are looked for, besides likely ones."""

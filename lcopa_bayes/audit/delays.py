@@ -9,13 +9,13 @@ from typing import Any, final
 import numpy as np
 from scipy.stats import norm
 
-from lcopa_bayes.arrays import Vector
-from lcopa_bayes.audit.landscape import Landscape
-from lcopa_bayes.audit.local import curvature
-from lcopa_bayes.estimate import LEVEL, plain
+from lcopa_bayes.audit.curvature import curvature
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.estimate import LEVEL, plain
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.inference.likelihood import Landscape
 from lcopa_bayes.inference.parameters import ParameterTable
-from lcopa_bayes.study import Study
 
 
 @final

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.audit.sensitivities import Sensitivities
-from lcopa_bayes.audit.structure import Structure, structure
-from lcopa_bayes.stated import PAPER, Stated
+from lcopa_bayes.audit.symmetries import Structure, structure
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.data.literature import PAPER, Stated
 
 SPRINGS = 4
 """Springs of the element, of which Eq. 16 adds up the stiffnesses."""

@@ -10,8 +10,8 @@ from typing import Any, final
 import numpy as np
 from scipy.stats import chi2, t
 
-from lcopa_bayes.arrays import Vector
-from lcopa_bayes.estimate import LEVEL, plain
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.estimate import LEVEL, plain
 from lcopa_bayes.inference.posterior import Posterior
 
 LEVELS = (0.68, LEVEL, 0.95)

@@ -8,9 +8,9 @@ from typing import Any, final
 import numpy as np
 from scipy.optimize import least_squares
 
-from lcopa_bayes.arrays import Matrix, Vector
-from lcopa_bayes.audit.landscape import Landscape, Peak
-from lcopa_bayes.estimate import plain
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.inference.likelihood import Landscape, Peak
 
 _MOVED = 0.2
 """Share of the radius from which a parameter counts as moved [-]."""

@@ -7,8 +7,8 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Matrix, Vector
-from lcopa_bayes.audit.landscape import Landscape
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.inference.likelihood import Landscape
 from lcopa_bayes.inference.noise import Student
 from lcopa_bayes.inference.posterior import Posterior
 

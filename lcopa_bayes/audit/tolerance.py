@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import final
 
-from lcopa_bayes.inference.defaults import Scales
+from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.parameter import Parameter
 
 FACTOR = 2.0

@@ -7,12 +7,12 @@ from typing import Any, Literal, final
 
 import numpy as np
 
-from lcopa_bayes.audit.bayes import Belief
-from lcopa_bayes.audit.local import Curvature
+from lcopa_bayes.audit.contraction import Belief
+from lcopa_bayes.audit.curvature import Curvature
 from lcopa_bayes.audit.profile import Profile
-from lcopa_bayes.audit.structure import Structure
+from lcopa_bayes.audit.symmetries import Structure
 from lcopa_bayes.audit.tolerance import Tolerance
-from lcopa_bayes.estimate import LEVEL, plain
+from lcopa_bayes.core.estimate import LEVEL, plain
 
 Verdict = Literal[
     "identified",

@@ -9,8 +9,8 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lcopa_bayes.arrays import Array, Matrix, Vector, frozen
-from lcopa_bayes.problems import InputError
+from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
+from lcopa_bayes.core.errors import InputError
 
 
 @final

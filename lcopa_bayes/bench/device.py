@@ -10,13 +10,13 @@ from typing import Protocol, final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lcopa_bayes.arrays import Array, Matrix, frozen
 from lcopa_bayes.bench.command import Command
 from lcopa_bayes.bench.inversion import Compliance
 from lcopa_bayes.bench.superposition import superposed
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.record import Axis
-from lcopa_bayes.stated import PAPER, StatedPath
+from lcopa_bayes.core.arrays import Array, Matrix, frozen
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.literature import PAPER, StatedPath
+from lcopa_bayes.data.record import Axis
 
 ACCURACY = 1e-9
 """Error of a response [-], of the steady deflection per unit drive and per unit jump."""

@@ -16,8 +16,8 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lcopa_bayes.arrays import Array, Vector, frozen
-from lcopa_bayes.problems import InputError
+from lcopa_bayes.core.arrays import Array, Vector, frozen
+from lcopa_bayes.core.errors import InputError
 
 _Complex = NDArray[np.complex128]
 

@@ -7,8 +7,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.bench.inversion import Compliance
+from lcopa_bayes.core.arrays import Matrix, Vector
 
 Balance: TypeAlias = Callable[[Vector, Vector, Vector, int], Vector]
 """(force, deflection, its rate, each (axes,); number of the step) -> force that acts, (axes,)."""

@@ -9,7 +9,7 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.bench.command import Command, quiet, two_axis
-from lcopa_bayes.bench.drivekinds import joined
+from lcopa_bayes.bench.driveeffects import joined
 
 LARGEST = pi / 2
 """Largest drive of either axis [rad]."""

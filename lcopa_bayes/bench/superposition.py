@@ -9,7 +9,7 @@ import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial, chebyshev
 from scipy.interpolate import PPoly
 
-from lcopa_bayes.arrays import Array, Vector
+from lcopa_bayes.core.arrays import Array, Vector
 
 Response: TypeAlias = Callable[[Array], Array]
 """A causal function of time [ms], zero up to time 0, elementwise."""

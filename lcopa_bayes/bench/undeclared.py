@@ -10,14 +10,14 @@ from typing import ClassVar, Literal, final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Matrix
-from lcopa_bayes.bench import drivekinds, outsiders, plantkinds, readkinds
+from lcopa_bayes.bench import driveeffects, planteffects, readingeffects, unnamedeffects
 from lcopa_bayes.bench.acquisition import Bench, truth
 from lcopa_bayes.bench.device import Device, TransferPath
-from lcopa_bayes.bench.hidden import STEPS, Hidden, HiddenDevice, Shot
+from lcopa_bayes.bench.hiddeneffects import STEPS, Hidden, HiddenDevice, Shot
 from lcopa_bayes.bench.schedules import LARGEST, Schedule, plain_schedules, rich_schedules
-from lcopa_bayes.problems import InputError, nearest
-from lcopa_bayes.record import Axis, Record
+from lcopa_bayes.core.arrays import Matrix
+from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.data.record import Axis, Record
 
 NOISE = 1.8e-4
 """Standard deviation of the noise of a sample [rad], Ta et al. 2026, Figs. 13 to 16."""
@@ -37,9 +37,9 @@ def _makers(*modules: ModuleType) -> dict[str, Maker]:
     return found
 
 
-NAMED: dict[str, Maker] = _makers(drivekinds, plantkinds, readkinds)
+NAMED: dict[str, Maker] = _makers(driveeffects, planteffects, readingeffects)
 """Effects that a catalogue may name."""
-OUTSIDE: dict[str, Maker] = _makers(outsiders)
+OUTSIDE: dict[str, Maker] = _makers(unnamedeffects)
 """Effects that none names."""
 
 

@@ -8,8 +8,8 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Matrix, Vector
 from lcopa_bayes.bench.command import Command
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.design.limits import Limits
 
 PLAIN = "step"

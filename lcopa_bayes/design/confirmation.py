@@ -10,14 +10,14 @@ from typing import Any, final
 import numpy as np
 from scipy.stats import chi2
 
-from lcopa_bayes.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.bench.acquisition import Bench as VirtualBench
 from lcopa_bayes.bench.acquisition import truth
-from lcopa_bayes.crew import crew
+from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
+from lcopa_bayes.core.estimate import LEVEL, plain
+from lcopa_bayes.core.parallel import crew
 from lcopa_bayes.design.design import LINEAR, Design
 from lcopa_bayes.design.information import Bench
 from lcopa_bayes.design.refit import Trial, device_of
-from lcopa_bayes.estimate import LEVEL, plain
 
 REPLICAS = 12
 """Records simulated and fitted per drive."""

@@ -8,18 +8,18 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Flags, Matrix, Vector
-from lcopa_bayes.audit.bayes import prior_draws, prior_spread
-from lcopa_bayes.audit.landscape import Landscape
-from lcopa_bayes.audit.structure import Structure, structure
+from lcopa_bayes.audit.contraction import prior_draws, prior_spread
+from lcopa_bayes.audit.symmetries import Structure, structure
+from lcopa_bayes.core.arrays import Flags, Matrix, Vector
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.design.candidates import PLAIN, candidates
 from lcopa_bayes.design.information import Bench
 from lcopa_bayes.design.limits import Limits, bench_times, limits_of
 from lcopa_bayes.design.precision import Promise, median, promises, ratios, reached, within
-from lcopa_bayes.estimate import Estimate
-from lcopa_bayes.fit import Fit
 from lcopa_bayes.inference.assembly import Problem
-from lcopa_bayes.problems import InputError
+from lcopa_bayes.inference.likelihood import Landscape
+from lcopa_bayes.results.fit import Fit
 
 DRAWS = 24
 """Draws of the posterior that are averaged over."""

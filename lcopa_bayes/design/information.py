@@ -10,15 +10,15 @@ from typing import NamedTuple, final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Array, Matrix, Vector
 from lcopa_bayes.bench.command import Command
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.data.drive import Drive
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.noise import GaussianNoise, Student
-from lcopa_bayes.operational.series import Circle
-from lcopa_bayes.operational.stepresponse import StepResponse, step_response
-from lcopa_bayes.plant.drive import Drive
-from lcopa_bayes.plant.grid import Mesh
-from lcopa_bayes.plant.superposition import Superposition, blocks_of, phases
+from lcopa_bayes.model.grid import Mesh
+from lcopa_bayes.model.powerseries import Circle
+from lcopa_bayes.model.stepresponse import StepResponse, step_response
+from lcopa_bayes.model.superposition import Superposition, blocks_of, phases
 
 _NOTHING = 1e-11
 """Share of a slope that is not constant below which a resting response makes up for all of it [-]."""
@@ -42,7 +42,7 @@ class Bench:
     Slopes are in the logarithm of time constants and in the plain value of every other parameter, made
     white by the study's noise; the record's resting response is unknown where the study's is, and is
     projected out. Costs, per set of values, a step response and its slopes, and per drive their
-    superposition: all in O(samples log samples). Accuracy: as `operational.stepresponse`.
+    superposition: all in O(samples log samples). Accuracy: as `model.stepresponse`.
     """
 
     problem: Problem

@@ -8,11 +8,11 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Vector
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.literature import PAPER
 from lcopa_bayes.inference.assembly import Problem
-from lcopa_bayes.inference.data import sampling_period
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.stated import PAPER
+from lcopa_bayes.inference.observations import sampling_period
 
 MOST_SAMPLES = 100_000
 """Samples of the longest bench time tried: 10 s at 10 kHz."""

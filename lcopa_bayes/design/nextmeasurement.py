@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.design.design import design
-from lcopa_bayes.estimate import plain
-from lcopa_bayes.fit import Fit
-from lcopa_bayes.problems import InputError
+from lcopa_bayes.results.fit import Fit
 
 _DRAWS = 8
 """Draws averaged over: enough to rank drives."""

@@ -8,7 +8,7 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Array, Flags, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.design.candidates import Candidate
 from lcopa_bayes.design.information import Bench
 from lcopa_bayes.design.limits import Limits

@@ -8,14 +8,14 @@ from typing import final
 import numpy as np
 from scipy.optimize import least_squares
 
-from lcopa_bayes.arrays import Flags, Vector
 from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.core.arrays import Flags, Vector
+from lcopa_bayes.data.record import Record
+from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.design.information import Bench
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.leastsquares import LeastSquares, apart
 from lcopa_bayes.inference.parameters import ParameterTable
-from lcopa_bayes.record import Record
-from lcopa_bayes.settings import PriorSettings
 
 _SAME = 1e-9
 """Orders closer than this are one term [-]."""

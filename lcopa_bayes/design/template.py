@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from lcopa_bayes.bench.command import Command
+from lcopa_bayes.core.files import write_text
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.design.limits import Limits
-from lcopa_bayes.files import write_text
-from lcopa_bayes.study import Study
 
 
 def write_template(study: Study, limits: Limits, command: Command, time: float, path: Path) -> Path:

@@ -1,1 +1,1 @@
-"""From parameters, priors and noise to a posterior, its sampler, and graded draws."""
+"""From parameters, priors and noise to a posterior and its optima."""

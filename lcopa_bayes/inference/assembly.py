@@ -6,25 +6,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import final
 
-from lcopa_bayes.inference.data import Samples
-from lcopa_bayes.inference.declared import (
-    declared,
-    effect_rows,
-    noise_of,
-    record_ranges,
-    unused,
-    used_kinds,
-)
-from lcopa_bayes.inference.defaults import Scales
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.record import Record
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.inference.declared import declared, effect_rows, noise_of, record_ranges, unused, used_kinds
+from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.noise import NOISES
+from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.parameters import ParameterTable, parameter_table
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.plant.effects.effect import Effect, Ranges, ScatterEffect
-from lcopa_bayes.plant.forward import ForwardModel, forward_model
-from lcopa_bayes.plant.layout import Layout
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.record import Record
-from lcopa_bayes.study import Study
+from lcopa_bayes.model.effects.effect import Effect, Ranges, ScatterEffect
+from lcopa_bayes.model.forward import ForwardModel, forward_model
+from lcopa_bayes.model.layout import Layout
 
 
 @final

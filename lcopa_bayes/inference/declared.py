@@ -14,19 +14,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lcopa_bayes.arrays import Vector
-from lcopa_bayes.inference.data import Samples
-from lcopa_bayes.inference.defaults import Scales
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.data.record import Record
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.inference.defaultpriors import Scales
+from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.priors import Prior
-from lcopa_bayes.plant.effects.catalogue import catalogue
-from lcopa_bayes.plant.effects.declared import Declared
-from lcopa_bayes.plant.effects.effect import Coefficient, Constant, Effect, Ranges, ScatterEffect
-from lcopa_bayes.plant.effects.scales import own_drives
-from lcopa_bayes.plant.layout import Layout
-from lcopa_bayes.problems import InputError, nearest
-from lcopa_bayes.record import Record
-from lcopa_bayes.study import Study
+from lcopa_bayes.model.effects.catalogue import catalogue
+from lcopa_bayes.model.effects.declared import Declared
+from lcopa_bayes.model.effects.effect import Coefficient, Constant, Effect, Ranges, ScatterEffect
+from lcopa_bayes.model.effects.scales import own_drives
+from lcopa_bayes.model.layout import Layout
 
 _REACHED = 0.995
 """Quantile of the deflections of a record that counts as its largest [-]: a few outliers are none."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from lcopa_bayes.arrays import Array, Matrix, Vector
-from lcopa_bayes.inference.effected import Effected
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.inference.effects import Effected
 from lcopa_bayes.inference.simulation import Simulation
-from lcopa_bayes.plant.effects.effect import Effect
+from lcopa_bayes.model.effects.effect import Effect
 
 _STEP = 1e-4
 """Step of a constant, over its value or, where it lies between 0 and 1, over 1 [-]."""
@@ -16,8 +16,8 @@ _STEP = 1e-4
 def effect_slopes(simulation: Simulation, values: Vector, *, exact: bool = True) -> list[Array]:
     """Per record (samples, axes, rows), in the table's units, at canonical values (rows,).
 
-    Coefficients by differences through the simulator (`plant.effects.slopes`), constants by central ones over
-    1e-4. The plant's rows as there; unless `exact` those of the plant alone, fifty times cheaper and good
+    Coefficients by differences through the simulator (`model.effects.jacobian`), constants by central ones
+    over 1e-4. The plant's rows as there; unless `exact` those of the plant alone, fifty times cheaper and good
     enough to descend with. Raises UnstableError where there is no bounded response.
     """
     made, psi = _effected(simulation, values), simulation.psi(values)

@@ -7,11 +7,11 @@ from typing import Protocol
 
 import numpy as np
 
-from lcopa_bayes.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.plant.effects.effect import UnstableError
+from lcopa_bayes.model.effects.effect import UnstableError
 
 _PLANTS = 3
 """Optima of the plant alone from which effects are started [-]."""

@@ -8,7 +8,7 @@ from math import inf
 from types import MappingProxyType
 from typing import Literal, final
 
-from lcopa_bayes.arrays import Flags, Vector
+from lcopa_bayes.core.arrays import Flags, Vector
 
 
 @final

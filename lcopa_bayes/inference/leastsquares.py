@@ -11,11 +11,11 @@ from typing import final
 import numpy as np
 from scipy.optimize import least_squares
 
-from lcopa_bayes.arrays import Matrix, Vector
-from lcopa_bayes.inference.data import Observed
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.inference.effectslopes import effect_slopes
 from lcopa_bayes.inference.noise import GaussianNoise, White
 from lcopa_bayes.inference.noisefit import NoiseFit
+from lcopa_bayes.inference.observations import Observed
 from lcopa_bayes.inference.posterior import Posterior, bounded
 
 _EDGE = 1e-6

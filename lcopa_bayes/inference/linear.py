@@ -7,7 +7,7 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
 
 
 @final

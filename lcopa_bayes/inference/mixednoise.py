@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 from scipy.linalg.lapack import dpttrf, dpttrs
 
-from lcopa_bayes.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.noisemodel import (
     SLIGHT,
     GaussianNoise,
@@ -18,7 +18,7 @@ from lcopa_bayes.inference.noisemodel import (
 from lcopa_bayes.inference.priors import Prior
 
 if TYPE_CHECKING:
-    from lcopa_bayes.inference.defaults import Scales
+    from lcopa_bayes.inference.defaultpriors import Scales
 
 
 @final

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import gammaln
 from scipy.stats import t as student_t
 
-from lcopa_bayes.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.mixednoise import WhiteAR1
 from lcopa_bayes.inference.noisemodel import SLIGHT, products, root_mean_square
 from lcopa_bayes.inference.noisemodel import GaussianNoise as GaussianNoise
@@ -17,7 +17,7 @@ from lcopa_bayes.inference.noisemodel import Noise as Noise
 from lcopa_bayes.inference.priors import Prior
 
 if TYPE_CHECKING:
-    from lcopa_bayes.inference.defaults import Scales
+    from lcopa_bayes.inference.defaultpriors import Scales
 
 
 @final

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from lcopa_bayes.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.priors import Prior
 
 if TYPE_CHECKING:
-    from lcopa_bayes.inference.defaults import Scales
+    from lcopa_bayes.inference.defaultpriors import Scales
 
 LOG_2PI = float(np.log(2 * np.pi))
 SLIGHT = 0.1

@@ -8,11 +8,11 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.inference.effectstarts import effect_starts
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.plant.effects.effect import UnstableError
+from lcopa_bayes.model.effects.effect import UnstableError
 
 _SCREENED = 1024
 """Prior draws whose misfit is looked at."""

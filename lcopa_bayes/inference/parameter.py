@@ -10,7 +10,7 @@ from typing import NamedTuple, final
 import numpy as np
 from scipy.special import logit
 
-from lcopa_bayes.arrays import Vector
+from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.inference.kinds import KINDS, Kind
 from lcopa_bayes.inference.priors import Prior
 

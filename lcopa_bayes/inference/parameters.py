@@ -10,17 +10,17 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Array, Flags, Index, Matrix, Vector
-from lcopa_bayes.inference.defaults import Scales
+from lcopa_bayes.core.arrays import Array, Flags, Index, Matrix, Vector
+from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.data.settings import ModelSettings, PriorSettings
+from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.kinds import COEFFICIENTS, KINDS
 from lcopa_bayes.inference.noise import NOISES
 from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.priors import Prior
-from lcopa_bayes.plant.effects.declared import Declared
-from lcopa_bayes.plant.forward import Dynamics
-from lcopa_bayes.plant.layout import Layout
-from lcopa_bayes.problems import InputError, nearest
-from lcopa_bayes.settings import ModelSettings, PriorSettings
+from lcopa_bayes.model.effects.declared import Declared
+from lcopa_bayes.model.forward import Dynamics
+from lcopa_bayes.model.layout import Layout
 
 _ORDERED_DRAWS = 200_000
 """Prior draws that measure how much mass an unexchangeable prior has where orders decrease."""

@@ -10,15 +10,15 @@ from typing import TypeAlias, final
 import numpy as np
 from scipy.special import expit, log_expit, logit
 
-from lcopa_bayes.arrays import Array, Flags, Matrix, Vector
-from lcopa_bayes.inference.data import Observed, Samples
+from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.linear import NormalEquations
 from lcopa_bayes.inference.noise import GaussianNoise, Noise
+from lcopa_bayes.inference.observations import Observed, Samples
 from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.simulation import Simulated, Simulation
-from lcopa_bayes.plant.forward import ForwardModel
+from lcopa_bayes.model.forward import ForwardModel
 
 _LOG_2PI = float(np.log(2 * np.pi))
 Units: TypeAlias = "Array | Simulated"

@@ -12,7 +12,7 @@ from typing import Any, final
 import numpy as np
 from scipy import stats
 
-from lcopa_bayes.arrays import Array, Vector
+from lcopa_bayes.core.arrays import Array, Vector
 
 
 def _uniform(x: Vector, p: Mapping[str, float]) -> Vector:

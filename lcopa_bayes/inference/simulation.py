@@ -2,7 +2,7 @@
 
 Where every response axis stays linear in its gains, a record is ``base + sum gain_ij column_ij``, and gains
 can be integrated out as without effects; otherwise the base holds the gains too. So it is with coefficients
-that only add a fixed shape in time. Each plant is simulated by itself (`plant.effects.simulator`); without an
+that only add a fixed shape in time. Each plant is simulated by itself (`model.effects.simulator`); without an
 effect before the reading all share one call of the forward model.
 """
 
@@ -15,14 +15,14 @@ from typing import NamedTuple, final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Array, Flags, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.parameters import ParameterTable
-from lcopa_bayes.plant.effects.declared import Declared
-from lcopa_bayes.plant.effects.effect import Effect, ParallelEffect, Scene, UnstableError
-from lcopa_bayes.plant.effects.passage import Moved, Plant, deflections
-from lcopa_bayes.plant.effects.simulator import Simulator
-from lcopa_bayes.plant.forward import ForwardModel
+from lcopa_bayes.model.effects.declared import Declared
+from lcopa_bayes.model.effects.effect import Effect, ParallelEffect, Scene, UnstableError
+from lcopa_bayes.model.effects.passage import Moved, Plant, deflections
+from lcopa_bayes.model.effects.simulator import Simulator
+from lcopa_bayes.model.forward import ForwardModel
 
 
 class Simulated(NamedTuple):

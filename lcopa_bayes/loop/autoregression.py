@@ -10,7 +10,7 @@ from typing import final
 import numpy as np
 from scipy.signal import lfilter, lfiltic
 
-from lcopa_bayes.arrays import Array, Matrix, Vector, frozen
+from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
 
 _UNIT_GAP = 1e-2
 """Gaps this close to one sampling period are one [sampling periods]."""

@@ -8,12 +8,12 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Vector
+from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.loop.autoregression import Autoregression, unbroken
 from lcopa_bayes.loop.basemodel import BaseModel
-from lcopa_bayes.loop.quiet import AxisNoise, axis_noise, joint_noise, quiet_pieces
-from lcopa_bayes.loop.regression import Optimum, Regression
+from lcopa_bayes.loop.gaussnewton import Optimum, Regression
+from lcopa_bayes.loop.noisesamples import AxisNoise, axis_noise, joint_noise, quiet_pieces
 from lcopa_bayes.loop.starts import screened
 from lcopa_bayes.loop.whitening import Whitening, parts
 

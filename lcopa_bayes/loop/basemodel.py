@@ -8,7 +8,7 @@ from typing import Protocol, final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Flags, Matrix, Vector
+from lcopa_bayes.core.arrays import Flags, Matrix, Vector
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.noise import White
 from lcopa_bayes.inference.posterior import Posterior

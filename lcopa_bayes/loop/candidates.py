@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from lcopa_bayes.loop.confirm import Refit, refit, under_one_noise
 from lcopa_bayes.loop.constants import tuned
-from lcopa_bayes.loop.instances import descended, movable, rough
+from lcopa_bayes.loop.descents import descended, movable, rough
+from lcopa_bayes.loop.refits import Refit, refit, under_one_noise
 from lcopa_bayes.loop.scores import State
 from lcopa_bayes.loop.signature import Signature
 from lcopa_bayes.loop.trace import SEEN, Trace, Traced

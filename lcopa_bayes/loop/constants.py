@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from lcopa_bayes.arrays import Vector
-from lcopa_bayes.loop.extended import ExtendedModel
-from lcopa_bayes.loop.regression import Optimum, Regression
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.loop.extendedmodel import ExtendedModel
+from lcopa_bayes.loop.gaussnewton import Optimum, Regression
 from lcopa_bayes.loop.scoreevidence import Projection
 from lcopa_bayes.loop.signature import Signature, signature_of
 from lcopa_bayes.loop.trace import LEVEL, Trace, Traced
 from lcopa_bayes.loop.whitening import Whitening
-from lcopa_bayes.plant.effects.effect import Effect
+from lcopa_bayes.model.effects.effect import Effect
 
 _ROUNDS = 6
 _STEPS = 4

@@ -8,7 +8,7 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Array, Index, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.loop.scores import State
 
 

@@ -9,24 +9,24 @@ from typing import Any, final
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.estimate import LEVEL
+from lcopa_bayes.core.estimate import LEVEL
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem
-from lcopa_bayes.inference.grade import Grade
+from lcopa_bayes.loop.bandwidening import Widening
 from lcopa_bayes.loop.basefit import BaseFit
 from lcopa_bayes.loop.density import LoopDensity
 from lcopa_bayes.loop.draws import LoopDraws, sample_loop, unit_of
-from lcopa_bayes.loop.outlying import NAME as OUTLIERS
-from lcopa_bayes.loop.outlying import Outlying, outlying
+from lcopa_bayes.loop.heldouteffects import missed, unseen_share
+from lcopa_bayes.loop.outliers import NAME as OUTLIERS
+from lcopa_bayes.loop.outliers import Outlying, outlying
 from lcopa_bayes.loop.rounds import CLEAR, SINGLE, Round, search
 from lcopa_bayes.loop.scores import Score, State, fit_scores, held_out_scores, left_out_scores
 from lcopa_bayes.loop.terms import fitted_base
 from lcopa_bayes.loop.trace import Trace
-from lcopa_bayes.loop.unseen import missed, unseen_share
 from lcopa_bayes.loop.verdict import ALONE, EXPLAINED, Found, Verdict, beside, decide
-from lcopa_bayes.loop.widening import Widening
-from lcopa_bayes.plant.effects.catalogue import catalogue
-from lcopa_bayes.plant.effects.effect import Effect
-from lcopa_bayes.study import Study
+from lcopa_bayes.model.effects.catalogue import catalogue
+from lcopa_bayes.model.effects.effect import Effect
+from lcopa_bayes.sampling.convergence import Grade
 
 Z90 = 1.6448536269514722
 """Half width of a central 90 % interval of a normal distribution [sd]."""

@@ -10,7 +10,7 @@ from typing import final
 import numpy as np
 from scipy.optimize import minimize
 
-from lcopa_bayes.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.loop.autoregression import Autoregression
 
 _LARGEST_ORDER = 8

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.special import logsumexp
 from scipy.stats import multivariate_t
 
-from lcopa_bayes.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.loop.autoregression import Autoregression
 from lcopa_bayes.loop.noisepieces import Mode, NoisePieces
 

@@ -9,16 +9,16 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.data.record import Record
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem
-from lcopa_bayes.inference.data import Samples
-from lcopa_bayes.inference.effected import Effected, carried
+from lcopa_bayes.inference.effects import Effected, carried
+from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.loop.autoregression import Autoregression
-from lcopa_bayes.loop.extended import ExtendedModel
-from lcopa_bayes.loop.quiet import quiet_samples
+from lcopa_bayes.loop.extendedmodel import ExtendedModel
+from lcopa_bayes.loop.noisesamples import quiet_samples
 from lcopa_bayes.loop.whitening import parts, stacked
-from lcopa_bayes.record import Record
-from lcopa_bayes.study import Study
 
 
 @final

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias, final
 import emcee
 import numpy as np
 
-from lcopa_bayes.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Matrix, Vector
 
 Proposal: TypeAlias = Callable[[Matrix, np.random.RandomState], tuple[Matrix, Vector]]
 """Walkers (batch, k) -> proposed ones, and log of the ratio of the proposals' densities, back over forth."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import final
@@ -10,14 +10,13 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.loop.candidates import refitted
-from lcopa_bayes.loop.confirm import SIGNIFICANT, Refit, log_bayes_factor, refit, under_one_noise
-from lcopa_bayes.loop.groups import group
-from lcopa_bayes.loop.regression import Regression
+from lcopa_bayes.loop.gaussnewton import Regression
+from lcopa_bayes.loop.refits import SIGNIFICANT, Refit, log_bayes_factor, refit, under_one_noise
 from lcopa_bayes.loop.scores import State
-from lcopa_bayes.loop.signature import Signature, pair_evidence
+from lcopa_bayes.loop.signature import Signature, expected_margin, pair_evidence
 from lcopa_bayes.loop.trace import Trace, Traced, trace
 from lcopa_bayes.loop.verdict import MARGIN
-from lcopa_bayes.plant.effects.effect import Effect
+from lcopa_bayes.model.effects.effect import Effect
 
 MOST = 3
 """Effects that are added at most [-]."""
@@ -194,3 +193,32 @@ def _paired(start: State, state: State, seen: Trace) -> Refit | None:
 
 def _best(one: Traced) -> Signature:
     return one.signatures[one.best]
+
+
+def group(
+    chosen: Refit, refits: Sequence[Refit], seen: Trace, signatures: Mapping[str, Signature]
+) -> tuple[str, ...]:
+    """Names that these records cannot tell from the chosen one.
+
+    A rival that was refitted belongs to the group when it lost by less than 3 nat; one that was not, when the
+    margin expected at the fitted size, which the angle between projected signatures sets, is below 3 nat.
+    Where noise was fitted jointly that margin would count the effect as noise, and only refits say.
+    """
+    name = chosen.added[0]
+    own = signatures[name]
+    amplitude = chosen.optimum.x[chosen.places(name)]
+    out = [name]
+    fitted = {one.added[0]: one for one in refits}
+    for one in seen.traced:
+        if one.name == name or one.card.place == "generic" or not one.signatures:
+            continue
+        if one.name in fitted:
+            if chosen.log_bayes_factor - fitted[one.name].log_bayes_factor < MARGIN:
+                out.append(one.name)
+            continue
+        if chosen.whitening.dependence:
+            continue
+        margin = min(expected_margin(own, amplitude, rival, seen.scale) for rival in one.signatures)
+        if margin < MARGIN:
+            out.append(one.name)
+    return tuple(out)

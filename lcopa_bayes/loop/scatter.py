@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import logsumexp
 
-from lcopa_bayes.arrays import Vector
+from lcopa_bayes.core.arrays import Vector
 
 _SHARES = (1e-3, 5e-3, 3e-2)
 """Shares of outliers tried [-]."""

@@ -14,7 +14,7 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
 
 _RANK = 1e-9
 """Singular values below this share of the largest are zero [-]."""

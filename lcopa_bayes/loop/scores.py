@@ -9,15 +9,15 @@ from typing import Any, final
 import numpy as np
 from scipy.stats import norm
 
-from lcopa_bayes.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.loop.autoregression import Autoregression
-from lcopa_bayes.loop.extended import ExtendedModel
-from lcopa_bayes.loop.leftout import groups, shifts
+from lcopa_bayes.loop.bandwidening import Widening
+from lcopa_bayes.loop.crossvalidation import groups, shifts
+from lcopa_bayes.loop.extendedmodel import ExtendedModel
+from lcopa_bayes.loop.gaussnewton import Optimum
 from lcopa_bayes.loop.prediction import FLAT, LevelPrior, levelled, predicted
-from lcopa_bayes.loop.regression import Optimum
 from lcopa_bayes.loop.whitening import Whitening
-from lcopa_bayes.loop.widening import Widening
 
 LEVEL = 0.9
 """Probability inside the bands [-]."""

@@ -8,11 +8,11 @@ from typing import final
 import numpy as np
 from scipy.special import log_ndtr
 
-from lcopa_bayes.arrays import Matrix, Vector
-from lcopa_bayes.loop.extended import ExtendedModel
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.loop.extendedmodel import ExtendedModel
 from lcopa_bayes.loop.scoreevidence import Projection, log_bayes_factors, survival
 from lcopa_bayes.loop.whitening import Whitening
-from lcopa_bayes.plant.effects.effect import Effect
+from lcopa_bayes.model.effects.effect import Effect
 
 _LEAST_POWER = 1e-10
 """Power of a direction of a signature at one prior sd below which it is nothing [-]."""

@@ -8,15 +8,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 
-from lcopa_bayes.arrays import Vector
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.data.record import Record
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.loop.basefit import BaseFit
 from lcopa_bayes.loop.basemodel import BaseModel
-from lcopa_bayes.loop.regression import Regression
+from lcopa_bayes.loop.gaussnewton import Regression
 from lcopa_bayes.loop.verdict import MARGIN
 from lcopa_bayes.loop.whitening import Whitening
-from lcopa_bayes.record import Record
-from lcopa_bayes.study import Study
 
 _EVALUATIONS = 60
 _STEPS = 8

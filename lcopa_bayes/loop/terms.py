@@ -9,26 +9,26 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lcopa_bayes.arrays import Vector
-from lcopa_bayes.checks import refuse_if
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.checks import refuse_if
+from lcopa_bayes.data.requirements import unmet_apart_from_rest
+from lcopa_bayes.data.rest import not_at_rest
+from lcopa_bayes.data.settings import PriorSettings
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
-from lcopa_bayes.inference.discretisation import FACTORS, largest_shift, narrowed
-from lcopa_bayes.inference.nesting import lifted
+from lcopa_bayes.inference.nestedmodels import lifted
 from lcopa_bayes.loop.basefit import BaseFit, base_fit
 from lcopa_bayes.loop.basemodel import BaseModel
-from lcopa_bayes.loop.confirm import log_bayes_factor
-from lcopa_bayes.loop.extended import ExtendedModel
+from lcopa_bayes.loop.extendedmodel import ExtendedModel
+from lcopa_bayes.loop.gaussnewton import Regression
 from lcopa_bayes.loop.prediction import taken
-from lcopa_bayes.loop.regression import Regression
+from lcopa_bayes.loop.refits import log_bayes_factor
 from lcopa_bayes.loop.rounds import leading
 from lcopa_bayes.loop.scores import State
 from lcopa_bayes.loop.startlevel import Mended, started
 from lcopa_bayes.loop.trace import trace
-from lcopa_bayes.plant.effects.effect import Effect
-from lcopa_bayes.requirements import unmet_apart_from_rest
-from lcopa_bayes.rest import not_at_rest
-from lcopa_bayes.settings import PriorSettings
-from lcopa_bayes.study import Study
+from lcopa_bayes.model.effects.effect import Effect
+from lcopa_bayes.results.discretisation import FACTORS, largest_shift, narrowed
 
 _MOST = 3
 _GAIN = 10.0

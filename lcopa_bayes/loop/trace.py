@@ -11,13 +11,13 @@ import numpy as np
 from scipy.special import logsumexp
 from scipy.stats import binom
 
-from lcopa_bayes.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.loop.scatter import scatter_evidence
 from lcopa_bayes.loop.scoreevidence import Projection
 from lcopa_bayes.loop.scores import State
 from lcopa_bayes.loop.signature import Scale, Signature, signature_of
 from lcopa_bayes.loop.whitening import Whitening
-from lcopa_bayes.plant.effects.effect import Card, Effect, ScatterEffect
+from lcopa_bayes.model.effects.effect import Card, Effect, ScatterEffect
 
 LEAST = 3.0
 """Log Bayes factor that an effect needs at least [nat]."""

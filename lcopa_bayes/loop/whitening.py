@@ -9,8 +9,8 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Array, Index, Matrix, Vector
-from lcopa_bayes.inference.data import Samples
+from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
+from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.loop.autoregression import Autoregression, unbroken
 from lcopa_bayes.loop.noiseposterior import NoisePosterior
 

@@ -9,11 +9,10 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lcopa_bayes.arrays import Array
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.stated import PAPER, StatedOptics
-
-from .checks import finite, unless_positive
+from lcopa_bayes.core.arrays import Array
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.literature import PAPER, StatedOptics
+from lcopa_bayes.optics.checks import finite, unless_positive
 
 _ROUNDING = 4 * float(np.finfo(float).eps)
 """A direction cosine beyond 1 by no more than this [-] is end-fire seen through rounding."""

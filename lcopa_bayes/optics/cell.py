@@ -14,10 +14,9 @@ from enum import Enum
 from math import isfinite, pi, sqrt
 from typing import final
 
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.stated import PAPER, StatedOptics
-
-from .checks import unless_positive
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.literature import PAPER, StatedOptics
+from lcopa_bayes.optics.checks import unless_positive
 
 
 class Field(Enum):

@@ -9,12 +9,11 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lcopa_bayes.arrays import Array
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.stated import PAPER, Stated, StatedOptics
-
-from .array import LinearArray, paper_array
-from .checks import finite, unless_positive
+from lcopa_bayes.core.arrays import Array
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.literature import PAPER, Stated, StatedOptics
+from lcopa_bayes.optics.array import LinearArray, paper_array
+from lcopa_bayes.optics.checks import finite, unless_positive
 
 
 @final

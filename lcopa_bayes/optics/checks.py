@@ -7,8 +7,8 @@ from math import inf, isfinite
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lcopa_bayes.arrays import Array
-from lcopa_bayes.problems import InputError
+from lcopa_bayes.core.arrays import Array
+from lcopa_bayes.core.errors import InputError
 
 
 def unless_positive(name: str, value: float, unit: str) -> list[str]:

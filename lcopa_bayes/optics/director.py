@@ -8,12 +8,11 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Vector, frozen
-from lcopa_bayes.problems import InputError
-
-from .cell import Cell, Field
-from .checks import finite
-from .freeenergy import Expansion, expand, newton_step
+from lcopa_bayes.core.arrays import Vector, frozen
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.optics.cell import Cell, Field
+from lcopa_bayes.optics.checks import finite
+from lcopa_bayes.optics.freeenergy import Expansion, expand, newton_step
 
 CELLS = 800
 """Default number of grid cells [-]; keeps the mean tilt of the paper's cell within 1.1e-5 rad up to 5 V."""

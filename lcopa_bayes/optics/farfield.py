@@ -14,12 +14,11 @@ from typing import TypeAlias, final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lcopa_bayes.arrays import Array, Matrix, Vector, frozen
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.stated import PAPER, StatedOptics
-
-from .array import LinearArray, PlanarArray, paper_array
-from .checks import finite
+from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.literature import PAPER, StatedOptics
+from lcopa_bayes.optics.array import LinearArray, PlanarArray, paper_array
+from lcopa_bayes.optics.checks import finite
 
 ComplexArray: TypeAlias = NDArray[np.complex128]
 

@@ -17,11 +17,10 @@ import numpy as np
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
-from lcopa_bayes.arrays import Vector
-from lcopa_bayes.problems import InputError
-
-from .cell import Cell, Field
-from .checks import finite
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.optics.cell import Cell, Field
+from lcopa_bayes.optics.checks import finite
 
 
 @final

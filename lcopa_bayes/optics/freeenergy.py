@@ -12,9 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
 
-from lcopa_bayes.arrays import Matrix, Vector
-
-from .cell import Cell, Field
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.optics.cell import Cell, Field
 
 
 class Expansion(NamedTuple):

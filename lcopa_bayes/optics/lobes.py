@@ -11,12 +11,11 @@ from numpy.typing import ArrayLike
 from scipy.optimize import brentq, minimize_scalar
 from scipy.special import spherical_jn
 
-from lcopa_bayes.arrays import Vector, frozen
-from lcopa_bayes.stated import PAPER, StatedOptics
-
-from .array import LinearArray, PlanarArray, paper_array
-from .checks import finite
-from .farfield import element_factor, intensity
+from lcopa_bayes.core.arrays import Vector, frozen
+from lcopa_bayes.data.literature import PAPER, StatedOptics
+from lcopa_bayes.optics.array import LinearArray, PlanarArray, paper_array
+from lcopa_bayes.optics.checks import finite
+from lcopa_bayes.optics.farfield import element_factor, intensity
 
 _PER_LOBE = 16
 """Samples per lobe width ``lambda / (N d)`` [-] in a search; refinement follows."""

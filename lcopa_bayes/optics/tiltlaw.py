@@ -9,13 +9,12 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lcopa_bayes.arrays import Array, Matrix, Vector, frozen
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.stated import PAPER, StatedOptics
-
-from .cell import Cell, Field, paper_cell
-from .checks import finite
-from .director import CELLS, equilibrium
+from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.literature import PAPER, StatedOptics
+from lcopa_bayes.optics.cell import Cell, Field, paper_cell
+from lcopa_bayes.optics.checks import finite
+from lcopa_bayes.optics.director import CELLS, equilibrium
 
 
 @final

@@ -6,10 +6,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from lcopa_bayes.paper.earlier import earlier
+from lcopa_bayes.data.literature import Stated
 from lcopa_bayes.paper.posteriorclaims import needs_audit
-from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict
-from lcopa_bayes.stated import Stated
+from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict, earlier
 
 COLLINEAR = 10.0
 """Collinearity index from which sensitivities count as coupled [-] (Brun et al. 2001)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from lcopa_bayes.data.literature import PAPER, Stated
 from lcopa_bayes.paper import (
     auditclaims,
     comparisonclaims,
@@ -14,7 +15,6 @@ from lcopa_bayes.paper.auditclaims import from_audit
 from lcopa_bayes.paper.comparisonclaims import from_comparison, jointly
 from lcopa_bayes.paper.posteriorclaims import uncompared
 from lcopa_bayes.paper.verdict import Claim, Evidence, Judged
-from lcopa_bayes.stated import PAPER, Stated
 
 CLAIMS: tuple[Claim, ...] = (
     Claim(

@@ -7,11 +7,10 @@ from math import hypot, log
 from pathlib import Path
 from typing import Any
 
-from lcopa_bayes.paper.earlier import earlier
+from lcopa_bayes.data.literature import Stated
 from lcopa_bayes.paper.posteriorclaims import needs_comparison
 from lcopa_bayes.paper.printedmodel import integer_rival
-from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict
-from lcopa_bayes.stated import Stated
+from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict, earlier
 
 STRONG = log(20)
 """Difference of log evidence from which a term is needed [nat] (Kass and Raftery 1995)."""

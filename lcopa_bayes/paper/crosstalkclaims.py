@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from itertools import permutations
 from math import floor, log10
 
+from lcopa_bayes.data.literature import Stated
 from lcopa_bayes.paper.printedmodel import RECORD_LENGTH, PrintedModel
 from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict
-from lcopa_bayes.stated import Stated
 
 PRINTED_DIGITS = 3
 """Significant digits of the crosstalk gains as printed, 0.00115 and 0.00185 [-]."""

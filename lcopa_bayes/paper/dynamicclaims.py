@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from lcopa_bayes.data.literature import Stated
 from lcopa_bayes.paper.printedmodel import RECORD_LENGTH, SETTLING_BANDS, PrintedModel, integer_rival
 from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict
-from lcopa_bayes.stated import Stated
 
 TIME_ROUNDING = 0.5
 """Table 1 prints whole milliseconds: half of the last digit [ms]."""

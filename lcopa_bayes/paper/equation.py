@@ -18,13 +18,13 @@ from typing import final
 import numpy as np
 from scipy.special import gamma
 
-from lcopa_bayes.arrays import Array, Matrix, Vector
-from lcopa_bayes.operational.blockpulse import integration_weights, lower_toeplitz
-from lcopa_bayes.operational.series import Circle, Spectrum
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.model.blockpulses import integration_weights, lower_toeplitz
+from lcopa_bayes.model.element import PaperForm
+from lcopa_bayes.model.grid import Mesh
+from lcopa_bayes.model.powerseries import Circle, Spectrum
 from lcopa_bayes.paper.paths import Blocks, PathRecord
-from lcopa_bayes.plant.drive import Drive
-from lcopa_bayes.plant.element import PaperForm
-from lcopa_bayes.plant.grid import Mesh
 
 
 class Convention(Enum):

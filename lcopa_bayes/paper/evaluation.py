@@ -16,9 +16,9 @@ from typing import final
 import numpy as np
 from tqdm import tqdm
 
-from lcopa_bayes.arrays import Array, Index, Matrix, Vector
-from lcopa_bayes.operational.blockpulse import integration_weights, lower_toeplitz
-from lcopa_bayes.operational.series import Circle, Spectrum
+from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
+from lcopa_bayes.model.blockpulses import integration_weights, lower_toeplitz
+from lcopa_bayes.model.powerseries import Circle, Spectrum
 from lcopa_bayes.paper.equation import (
     Convention,
     differenced_integrals,

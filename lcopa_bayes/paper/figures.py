@@ -12,14 +12,14 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Vector
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.literature import PAPER, Stated
+from lcopa_bayes.data.record import Record
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.paper.equation import PathModel, response_to
 from lcopa_bayes.paper.identify import Identification, Identified
 from lcopa_bayes.paper.paths import resting_level
-from lcopa_bayes.plant.drive import Drive
-from lcopa_bayes.record import Record
-from lcopa_bayes.stated import PAPER, Stated
-from lcopa_bayes.study import Study
 
 KINDS = ("fractional", "integer", "fractional, output error", "integer, output error")
 """Models that are shown: the paper's scan with free and with integer orders, and the output-error fits."""

@@ -12,14 +12,14 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from lcopa_bayes.estimate import plain
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.paper.equation import Convention, PathModel, equation_rmse, least_squares, output_rmse
 from lcopa_bayes.paper.intervals import Interval, Scan
 from lcopa_bayes.paper.outputerror import output_error_fit
 from lcopa_bayes.paper.paths import PathData, path_data
 from lcopa_bayes.paper.scan import Scanned, scan
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.study import Study
 
 
 @final

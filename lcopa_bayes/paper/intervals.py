@@ -10,8 +10,8 @@ from typing import NamedTuple, final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Array, Matrix, Vector
-from lcopa_bayes.problems import InputError
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.errors import InputError
 
 _ROUND = 9
 """Decimals to which orders are compared."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-from lcopa_bayes.operational.wavelets import FormCost, PrintedEquation, form_costs
+from lcopa_bayes.data.literature import PAPER, Stated
+from lcopa_bayes.model.wavelets import FormCost, PrintedEquation, form_costs
 from lcopa_bayes.paper.printedmodel import RECORD_LENGTH
 from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict
 from lcopa_bayes.paper.wholeblocks import DelayRounding, delay_rounding
-from lcopa_bayes.stated import PAPER, Stated
 
 SAME_ANSWER = 1e-9
 """Relative difference of two responses below which they are the same answer [-]; rounding gives 1e-14."""

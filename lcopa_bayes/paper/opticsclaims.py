@@ -7,13 +7,13 @@ from math import pi
 
 import numpy as np
 
+from lcopa_bayes.data.literature import PAPER, Stated, StatedOptics
 from lcopa_bayes.optics.array import LinearArray, paper_array
 from lcopa_bayes.optics.cell import Field
 from lcopa_bayes.optics.chain import geometry_check, linearisation_row
 from lcopa_bayes.optics.lobes import strongest_grating_lobe
 from lcopa_bayes.optics.tiltlaw import TiltLawCheck, tilt_law_check
 from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict
-from lcopa_bayes.stated import PAPER, Stated, StatedOptics
 
 PHYSICAL_JUMP = 0.5
 """Part of the law's jump that the solved tilt must show over 2 mV about the knee to be physical [-]."""

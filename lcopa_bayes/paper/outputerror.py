@@ -7,16 +7,16 @@ from typing import Literal
 
 import numpy as np
 
-from lcopa_bayes.arrays import Vector
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.data.settings import ModelSettings, NoiseSettings
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.model.element import Element, to_paper
 from lcopa_bayes.paper.equation import PathModel, output_rmse
 from lcopa_bayes.paper.paths import PathData
-from lcopa_bayes.plant.element import Element, to_paper
-from lcopa_bayes.settings import ModelSettings, NoiseSettings
-from lcopa_bayes.study import Study
 
 
 def output_error_fit(

@@ -7,13 +7,13 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Array, Vector
-from lcopa_bayes.plant.drive import Drive
-from lcopa_bayes.plant.grid import Grid
-from lcopa_bayes.plant.layout import Layout
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.record import Record
-from lcopa_bayes.study import Study
+from lcopa_bayes.core.arrays import Array, Vector
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.record import Record
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.model.grid import Grid
+from lcopa_bayes.model.layout import Layout
 
 MOST_BLOCKS = 1024
 """A record with more samples is identified on this many block means: the algebra is quadratic in them."""

@@ -8,21 +8,21 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Vector
 from lcopa_bayes.bench.acquisition import Bench, truth
 from lcopa_bayes.bench.command import step
 from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.data.literature import PAPER, Stated, StatedPath
+from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.data.settings import ModelSettings
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.paper.equation import PathModel, output_rmse
 from lcopa_bayes.paper.identify import integer_orders
 from lcopa_bayes.paper.intervals import Interval, Scan
 from lcopa_bayes.paper.outputerror import output_error_fit
 from lcopa_bayes.paper.paths import path_data
 from lcopa_bayes.paper.scan import scan
-from lcopa_bayes.record import Axis, Record
-from lcopa_bayes.settings import ModelSettings
-from lcopa_bayes.stated import PAPER, Stated, StatedPath
-from lcopa_bayes.stepmetrics import settling
-from lcopa_bayes.study import Study
+from lcopa_bayes.results.steps import settling
 
 RECORD_LENGTH = 25.0
 """Length of the paper's records [ms]: the axes of Figs. 13 to 17 end between 20 and 25 ms."""

@@ -8,8 +8,8 @@ from typing import Any, final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Matrix, Vector
-from lcopa_bayes.estimate import plain
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.optics.chain import linearisation_error, linearised_angle, paper_chain
 from lcopa_bayes.optics.checks import finite
 from lcopa_bayes.optics.director import Profile, equilibrium

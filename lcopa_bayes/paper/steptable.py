@@ -11,15 +11,15 @@ from typing import Any, final
 
 import numpy as np
 
-from lcopa_bayes.estimate import plain
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.literature import PAPER, Stated
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.paper.equation import PathModel, response_to
 from lcopa_bayes.paper.figures import KINDS, model_of, paper_figure
 from lcopa_bayes.paper.identify import Identification
-from lcopa_bayes.plant.drive import Drive
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.stated import PAPER, Stated
-from lcopa_bayes.stepmetrics import crossing, settling
-from lcopa_bayes.study import Study
+from lcopa_bayes.results.steps import crossing, settling
 
 METRICS = ("rise", "settling 2 %", "settling 5 %", "steady", "at end", "peak", "overshoot", "RMSE")
 """Rows of the table for each path."""

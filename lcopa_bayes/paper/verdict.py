@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from pathlib import Path
 from typing import Any, final
 
-from lcopa_bayes.estimate import plain
-from lcopa_bayes.stated import Stated
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.data.literature import Stated
 
 
 class Kind(Enum):
@@ -87,3 +90,18 @@ class Judged:
             }
         )
         return told
+
+
+def earlier(folder: Path, verb: str, needs: Sequence[str]) -> Mapping[str, Any]:
+    """What `verb` wrote to a run folder; InputError when it cannot be read or lacks any of `needs`."""
+    path = folder / f"{verb}.json"
+    try:
+        told: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: cannot be read ({error}); give the run folder that `{verb}` wrote"
+        ) from None
+    absent = [key for key in needs if key not in told] if isinstance(told, dict) else list(needs)
+    if absent:
+        raise InputError(f"{path}: lacks {', '.join(absent)}; run `{verb}` again with --resume")
+    return told

@@ -14,16 +14,16 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.arrays import Matrix, Vector
-from lcopa_bayes.plant.drive import Drive
-from lcopa_bayes.plant.element import PaperForm, from_paper
-from lcopa_bayes.plant.forward import Dynamics, Experiment, ForwardModel
-from lcopa_bayes.plant.grid import Mesh
-from lcopa_bayes.plant.layout import Layout
-from lcopa_bayes.problems import InputError
-from lcopa_bayes.record import Axis
-from lcopa_bayes.settings import ModelSettings
-from lcopa_bayes.stated import PAPER, StatedPath
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.literature import PAPER, StatedPath
+from lcopa_bayes.data.record import Axis
+from lcopa_bayes.data.settings import ModelSettings
+from lcopa_bayes.model.element import PaperForm, from_paper
+from lcopa_bayes.model.forward import Dynamics, Experiment, ForwardModel
+from lcopa_bayes.model.grid import Mesh
+from lcopa_bayes.model.layout import Layout
 
 _FINE = 4000
 """Blocks of the response itself, so many that only the rounding of the delay shows [-]."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lcopa_bayes.arrays import Index, Vector
+from lcopa_bayes.core.arrays import Index, Vector
 
 MOST = 600
 """Points of a curve that are drawn; a figure is about 500 points wide."""

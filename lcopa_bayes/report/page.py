@@ -11,26 +11,26 @@ from typing import final
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from lcopa_bayes.files import writable_folder, write_text
-from lcopa_bayes.report.canvas import inlined, look
-from lcopa_bayes.report.saved import SavedRun, load_run
+from lcopa_bayes.core.files import writable_folder, write_text
+from lcopa_bayes.report.savedrun import SavedRun, load_run
 from lcopa_bayes.report.section import Drawing, Section
 from lcopa_bayes.report.sections import (
     crosscheck,
-    data,
     evidence,
-    origin,
     pairs,
     parameters,
     priors,
+    provenance,
+    records,
     residuals,
     sensitivity,
     steps,
     traces,
 )
+from lcopa_bayes.report.theme import inlined, look
 
 _SECTIONS = (
-    data.section,
+    records.section,
     residuals.section,
     parameters.section,
     pairs.section,
@@ -40,7 +40,7 @@ _SECTIONS = (
     sensitivity.section,
     evidence.section,
     crosscheck.section,
-    origin.section,
+    provenance.section,
 )
 """What a report shows, in this order; a later stage adds its own section here."""
 _ADVICE = {

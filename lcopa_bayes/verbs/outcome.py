@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
-from lcopa_bayes.cores import cores
-from lcopa_bayes.study import Study
-from lcopa_bayes.studyfile import load_study
+from lcopa_bayes.core.parallel import cores
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.data.studyfile import load_study
 
 
 @final

@@ -4,28 +4,36 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from lcopa_bayes.audit.audit import audit
-from lcopa_bayes.comparison.candidatefile import load_candidates
-from lcopa_bayes.comparison.candidates import candidates_of
-from lcopa_bayes.comparison.compare import compare
-from lcopa_bayes.design.design import checked
+from lcopa_bayes.compare.candidates import candidates_of
+from lcopa_bayes.compare.compare import compare
+from lcopa_bayes.core.files import writable_folder
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.data.studyfile import load_candidates
+from lcopa_bayes.design.confirmation import REPLICAS, confirmed
+from lcopa_bayes.design.design import DRAWS, checked, design
 from lcopa_bayes.design.nextmeasurement import next_measurement
-from lcopa_bayes.files import writable_folder
-from lcopa_bayes.fit import Fit, fit
+from lcopa_bayes.design.summary import as_json
+from lcopa_bayes.design.template import write_template
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.loop.loop import loop
-from lcopa_bayes.loop.told import drawn, words
-from lcopa_bayes.loop.told import results as loop_results
-from lcopa_bayes.planning import DESIGN_PAGE, plan_next
-from lcopa_bayes.provenance import provenance
+from lcopa_bayes.loop.summary import drawn, words
+from lcopa_bayes.loop.summary import results as loop_results
 from lcopa_bayes.report import write_report
-from lcopa_bayes.report.auditpage import write_audit
-from lcopa_bayes.report.comparisonpage import write_comparison
-from lcopa_bayes.report.looppage import write_loop
-from lcopa_bayes.runfolder import save_fit, save_json
-from lcopa_bayes.study import Study
+from lcopa_bayes.report.audit import write_audit
+from lcopa_bayes.report.compare import write_comparison
+from lcopa_bayes.report.design import NAME as DESIGN_PAGE
+from lcopa_bayes.report.design import write_design
+from lcopa_bayes.report.loop import write_loop
+from lcopa_bayes.results.fit import Fit, fit
+from lcopa_bayes.results.provenance import provenance
+from lcopa_bayes.results.runfolder import save_fit, save_json
 from lcopa_bayes.verbs.outcome import Told, place_of, study_of, with_report
+
+_QUICK = 4
+"""How many times fewer draws a quick design takes."""
 
 
 def audit_study(options: argparse.Namespace, command: list[str]) -> Told:
@@ -89,3 +97,29 @@ def loop_study(options: argparse.Namespace, command: list[str]) -> Told:
     save_json(drawn(found), folder / "loop_curves.json")
     save_json(values, folder / "loop.json")
     return with_report(values, write_loop(folder), *words(values))
+
+
+def plan_next(
+    fit: Fit, folder: Path, *, jobs: int = 1, quick: bool = False, **options: Any
+) -> tuple[dict[str, Any], list[str]]:
+    """Write `design.json`, `design.html` and `design/next.csv`; returns the values and lines for a reader.
+
+    `options` are those of `design.design`; when `quick`, fewer draws and replicas are taken. Without a
+    winner there is no `next.csv`.
+    """
+    made = design(fit, draws=DRAWS // _QUICK if quick else DRAWS, **options)
+    trials = confirmed(made, jobs=jobs, replicas=REPLICAS // 2 if quick else REPLICAS)
+    values = as_json(made) | trials | {"template": None}
+    if values["winner"] is not None:
+        path = writable_folder(folder / "design") / "next.csv"
+        write_template(fit.study, made.limits, made.winner.candidate.command, made.time, path)
+        values["template"] = f"{path.parent.name}/{path.name}"
+    save_json(values, folder / "design.json")
+    write_design(folder)
+    words = [f"{'parameter':16}{'best drive':28}{'relative sd':>12}  bench time for 10 %"]
+    for row in values["parameters"]:
+        spread = row["relative_sd"] and row["relative_sd"]["value"]
+        number = "-" if spread is None else f"{spread:.3g}"
+        told = row["reason"] or row["time_words"]
+        words.append(f"{row['name']:16}{row['best_drive'] or '-':28}{number:>12}  {told}")
+    return values, [*words, values["verdict"], values["confirmed"]["sentence"]]

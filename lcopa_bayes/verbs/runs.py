@@ -9,25 +9,25 @@ from pathlib import Path
 import numpy as np
 
 from lcopa_bayes.bench.campaign import write_campaign
-from lcopa_bayes.bench.plan import load_plan
-from lcopa_bayes.calibration.calibrate import calibrate
-from lcopa_bayes.calibration.summary import results as calibration_results
-from lcopa_bayes.calibration.summary import tables
-from lcopa_bayes.calibration.truths import Stated
-from lcopa_bayes.checks import refuse_if
-from lcopa_bayes.cores import cores
-from lcopa_bayes.files import writable_folder
-from lcopa_bayes.fit import fit
-from lcopa_bayes.provenance import provenance
+from lcopa_bayes.bench.campaignfile import load_plan
+from lcopa_bayes.calibrate.calibrate import calibrate
+from lcopa_bayes.calibrate.summary import results as calibration_results
+from lcopa_bayes.calibrate.summary import tables
+from lcopa_bayes.calibrate.truths import Stated
+from lcopa_bayes.core.checks import refuse_if
+from lcopa_bayes.core.files import writable_folder
+from lcopa_bayes.core.parallel import cores
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.report import write_report
-from lcopa_bayes.report.auditpage import write_audit
-from lcopa_bayes.report.calibrationpage import is_calibration, write_calibration
-from lcopa_bayes.report.comparisonpage import write_comparison
-from lcopa_bayes.report.designpage import write_design
-from lcopa_bayes.report.looppage import write_loop
-from lcopa_bayes.rival import integer_rival
-from lcopa_bayes.runfolder import save_fit, save_json, save_table
-from lcopa_bayes.study import Study
+from lcopa_bayes.report.audit import write_audit
+from lcopa_bayes.report.calibrate import is_calibration, write_calibration
+from lcopa_bayes.report.compare import write_comparison
+from lcopa_bayes.report.design import write_design
+from lcopa_bayes.report.loop import write_loop
+from lcopa_bayes.results.fit import fit
+from lcopa_bayes.results.integerrival import integer_rival
+from lcopa_bayes.results.provenance import provenance
+from lcopa_bayes.results.runfolder import save_fit, save_json, save_table
 from lcopa_bayes.verbs.outcome import Told, place_of, study_of, with_report
 
 _PAGES = {

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from lcopa_bayes.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Matrix, Vector
 
 WANTED = 20.0
 """Ratio of effective draws per CPU second that the project asks for [-]."""

@@ -24,15 +24,15 @@ from arviz_stats.base import array_stats
 from comparison import Piece, compared, table
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.arrays import Matrix, Vector
-from lcopa_bayes.fit import plan_of
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.inference.assembly import problem_of
-from lcopa_bayes.inference.evidence import evidence
-from lcopa_bayes.inference.nested import NestedPlan, nested
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.inference.sampler import SamplePlan, sample, sampled_qualities
-from lcopa_bayes.inference.unitcube import UnitCube
-from lcopa_bayes.studyfile import load_study
+from lcopa_bayes.results.fit import plan_of
+from lcopa_bayes.sampling.evidence import evidence
+from lcopa_bayes.sampling.nested import NestedPlan, nested
+from lcopa_bayes.sampling.sampler import SamplePlan, sample, sampled_qualities
+from lcopa_bayes.sampling.unitcube import UnitCube
 
 STUDY = Path(__file__).parents[1] / "paper-step-x"
 SHARES = (("order_2", ">", 1.3), ("order_1", ">", 1.9), ("order_3", "<", 0.1))

@@ -23,12 +23,12 @@ from scoresheet import bounds, matrix, sheet
 from tqdm import tqdm
 
 from lcopa_bayes.bench.undeclared import NAMED, OUTSIDE
-from lcopa_bayes.files import writable_folder, write_text
+from lcopa_bayes.core.files import writable_folder, write_text
 from lcopa_bayes.loop import candidates, rounds, trace, verdict
-from lcopa_bayes.report.canvas import look
+from lcopa_bayes.report.formatting import figures
 from lcopa_bayes.report.page import Verdict, write_page
 from lcopa_bayes.report.section import Column, Section, Table
-from lcopa_bayes.report.wording import figures
+from lcopa_bayes.report.theme import look
 
 HERE = Path(__file__).parent
 FIRST_TEST_SEED = 1000

@@ -6,6 +6,8 @@ from math import pi
 
 import numpy as np
 
+from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.literature import PAPER, Stated
 from lcopa_bayes.optics.array import LinearArray, paper_array
 from lcopa_bayes.optics.chain import geometry_check, linearisation_error
 from lcopa_bayes.optics.lobes import strongest_grating_lobe
@@ -15,11 +17,9 @@ from lcopa_bayes.paper.equation import response_to
 from lcopa_bayes.paper.numericsclaims import delay_costs
 from lcopa_bayes.paper.opticsclaims import FAR_WEAKER, tilt_checks
 from lcopa_bayes.paper.printedmodel import RECORD_LENGTH, SETTLING_BANDS, PrintedModel, integer_rival
-from lcopa_bayes.plant.drive import Drive
-from lcopa_bayes.report.canvas import BAND, CYCLE, HELD_OUT, NOISE, STEADY, blank, svg_of
+from lcopa_bayes.report.formatting import figures
 from lcopa_bayes.report.section import Drawing, Section
-from lcopa_bayes.report.wording import figures
-from lcopa_bayes.stated import PAPER, Stated
+from lcopa_bayes.report.theme import BAND, CYCLE, HELD_OUT, NOISE, STEADY, blank, svg_of
 
 _SHOWN = 100.0
 """Time of the long panel [ms]."""

@@ -9,10 +9,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from lcopa_bayes.report.canvas import BAND, HELD_OUT, grid, label, log_ticks, svg_of
-from lcopa_bayes.report.saved import SavedRun
+from lcopa_bayes.report.formatting import NONE, figures, interval, to_spread
+from lcopa_bayes.report.savedrun import SavedRun
 from lcopa_bayes.report.section import Column, Drawing, Section, Table
-from lcopa_bayes.report.wording import NONE, figures, interval, to_spread
+from lcopa_bayes.report.theme import BAND, HELD_OUT, grid, label, log_ticks, svg_of
 
 _TITLE = "Second method"
 _PER_FIGURE = 12

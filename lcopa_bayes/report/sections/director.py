@@ -6,9 +6,9 @@ import numpy as np
 
 from lcopa_bayes.optics.tiltlaw import RANGES, continuous_law, printed_law
 from lcopa_bayes.paper.staticoptics import StaticOptics
-from lcopa_bayes.report.canvas import CYCLE, HELD_OUT, STEADY, blank, svg_of
+from lcopa_bayes.report.formatting import NONE, figures
 from lcopa_bayes.report.section import Column, Drawing, Section, Table
-from lcopa_bayes.report.wording import NONE, figures
+from lcopa_bayes.report.theme import CYCLE, HELD_OUT, STEADY, blank, svg_of
 
 
 def sections(made: StaticOptics) -> list[Section]:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from lcopa_bayes.arrays import Matrix
+from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.paper.staticoptics import StaticOptics
-from lcopa_bayes.report.canvas import HELD_OUT, blank, grid, svg_of
 from lcopa_bayes.report.decimation import extremes
+from lcopa_bayes.report.formatting import figures
 from lcopa_bayes.report.section import Column, Drawing, Section, Table
-from lcopa_bayes.report.wording import figures
+from lcopa_bayes.report.theme import HELD_OUT, blank, grid, svg_of
 
 _FLOOR = -50.0
 """Lowest intensity shown [dB]."""

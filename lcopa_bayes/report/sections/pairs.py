@@ -6,9 +6,9 @@ import corner
 import numpy as np
 from matplotlib.figure import Figure
 
-from lcopa_bayes.report.canvas import BAND, log_ticks, plain, svg_of
-from lcopa_bayes.report.saved import SavedRun
+from lcopa_bayes.report.savedrun import SavedRun
 from lcopa_bayes.report.section import Drawing, Section
+from lcopa_bayes.report.theme import BAND, log_ticks, plain, svg_of
 
 _MOST = 10
 """Parameters on one corner plot."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from lcopa_bayes.report.saved import SavedRun
+from lcopa_bayes.report.formatting import figures, interval, percent, to_spread
+from lcopa_bayes.report.savedrun import SavedRun
 from lcopa_bayes.report.section import Column, Section, Table
-from lcopa_bayes.report.wording import figures, interval, percent, to_spread
 
 
 def section(run: SavedRun) -> Section:

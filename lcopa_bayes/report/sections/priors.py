@@ -9,10 +9,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from lcopa_bayes.inference import defaults
-from lcopa_bayes.report.canvas import BAND, HELD_OUT, grid, label, log_ticks, svg_of
-from lcopa_bayes.report.saved import SavedRun
+from lcopa_bayes.inference import defaultpriors
+from lcopa_bayes.report.savedrun import SavedRun
 from lcopa_bayes.report.section import Column, Drawing, Section, Table
+from lcopa_bayes.report.theme import BAND, HELD_OUT, grid, label, log_ticks, svg_of
 
 _PER_FIGURE = 12
 """Parameters on one figure."""
@@ -41,7 +41,7 @@ def section(run: SavedRun) -> Section:
         ),
         drawings,
         (_table(run),),
-        inspect.cleandoc(defaults.__doc__ or ""),
+        inspect.cleandoc(defaultpriors.__doc__ or ""),
     )
 
 

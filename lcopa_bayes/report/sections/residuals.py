@@ -8,13 +8,13 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from lcopa_bayes.arrays import Index, Vector
-from lcopa_bayes.report.canvas import BAND, HELD_OUT, INK, NOISE, SEEN, blank, label, plain, svg_of
+from lcopa_bayes.core.arrays import Index, Vector
 from lcopa_bayes.report.decimation import extremes, said
-from lcopa_bayes.report.saved import SavedRun
+from lcopa_bayes.report.formatting import figures, probability
+from lcopa_bayes.report.savedrun import SavedRun
 from lcopa_bayes.report.section import Drawing, Section
-from lcopa_bayes.report.wording import figures, probability
-from lcopa_bayes.residuals import WHITE_P
+from lcopa_bayes.report.theme import BAND, HELD_OUT, INK, NOISE, SEEN, blank, label, plain, svg_of
+from lcopa_bayes.results.residuals import WHITE_P
 
 _ORDINATE_BAND = (-log(0.975), -log(0.025))
 """2.5 and 97.5 % quantiles of the unit exponential law of a periodogram ordinate over its mean [-]."""

@@ -8,12 +8,12 @@ from typing import Any
 import pandas as pd
 from matplotlib.axes import Axes
 
-from lcopa_bayes.predict import KIND
-from lcopa_bayes.report.canvas import BAND, STEADY, grid, plain, svg_of
 from lcopa_bayes.report.decimation import extremes
-from lcopa_bayes.report.saved import SavedRun
+from lcopa_bayes.report.formatting import NOT_REACHED, OPEN, figures, interval, to_spread
+from lcopa_bayes.report.savedrun import SavedRun
 from lcopa_bayes.report.section import Column, Drawing, Section, Table
-from lcopa_bayes.report.wording import NOT_REACHED, OPEN, figures, interval, to_spread
+from lcopa_bayes.report.theme import BAND, STEADY, grid, plain, svg_of
+from lcopa_bayes.results.prediction import KIND
 
 _PER_FIGURE = 6
 """Paths on one figure."""

@@ -7,9 +7,9 @@ from itertools import cycle
 
 import numpy as np
 
-from lcopa_bayes.report.canvas import CYCLE, grid, label, log_ticks, svg_of
-from lcopa_bayes.report.saved import SavedRun
+from lcopa_bayes.report.savedrun import SavedRun
 from lcopa_bayes.report.section import Drawing, Section
+from lcopa_bayes.report.theme import CYCLE, grid, label, log_ticks, svg_of
 
 _PER_FIGURE = 12
 """Parameters on one figure."""

@@ -1,0 +1,234 @@
+"""Symmetries: ways to move parameters that change no sample, from the rank of sensitivities."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any, Literal, final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.inference.parameters import ParameterTable
+
+Kind = Literal["no effect", "sum", "product", "scale", "exchange", "combination"]
+
+TOLERANCES = (1e-9, 1e-10, 1e-11)
+"""Singular values, relative to the largest, below which a direction counts as blind [-]; a symmetry is
+called one only when all of them give the same rank: those of true ones are below 1e-12, while those of
+directions that are merely stiff spread over all decades."""
+_CONSTANT = 1e-4
+"""Entries of a null vector that differ less between points count as the same [-]."""
+_PROPORTIONAL = 1e-7
+"""Unit columns closer than this are the same [-]."""
+_CLEAR = 6
+"""Points, the best conditioned ones, from which symmetries are named."""
+_MOVES = 1e-6
+"""Share of the largest entry from which a parameter takes part in a null vector [-]."""
+_NOTHING = 1e-10
+"""Relative change of the responses below which a parameter does nothing [-]."""
+
+
+@final
+@dataclass(frozen=True)
+class Symmetry:
+    """Parameters that can make up for each other exactly."""
+
+    kind: Kind
+    parameters: tuple[str, ...]
+    powers: tuple[float, ...]
+    """Relative changes that leave the responses as they are (scale), or how each enters what acts
+    (sum, product) [-]; empty where these depend on the values."""
+    sentence: str
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        told: dict[str, Any] = plain(
+            {
+                "kind": self.kind,
+                "parameters": self.parameters,
+                "powers": self.powers,
+                "sentence": self.sentence,
+            }
+        )
+        return told
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """What the model and the drives leave open before any noise."""
+
+    symmetries: tuple[Symmetry, ...]
+    parameters: int
+    """Number of parameters looked at."""
+    rank: int
+    """Largest rank of the sensitivities over all points."""
+    certain: bool
+    """Whether all tolerances give that rank."""
+    singular: Vector
+    """Singular values of the best conditioned point, relative to the largest, decreasing [-]."""
+
+    @property
+    def blind(self) -> frozenset[str]:
+        """Names that take part in a continuous symmetry."""
+        return frozenset(
+            name for found in self.symmetries if found.kind != "exchange" for name in found.parameters
+        )
+
+    def partners(self, name: str) -> tuple[str, ...]:
+        """The other parameters of the continuous symmetries of one."""
+        found = [s.parameters for s in self.symmetries if s.kind != "exchange" and name in s.parameters]
+        return tuple(dict.fromkeys(other for group in found for other in group if other != name))
+
+
+def structure(
+    names: Sequence[str],
+    slopes: Sequence[Matrix],
+    values: Sequence[Vector],
+    *,
+    tolerances: tuple[float, float, float] = TOLERANCES,
+) -> Structure:
+    """Symmetries of a model from its sensitivities at several points.
+
+    Parameters: `slopes`, per point, derivatives of all samples in the logarithm of each parameter's size
+    (samples, parameters); `values`, per point, the parameters (parameters,), none zero. A direction is
+    blind when it is so at every point: full rank at one point proves that there is none nearby. All of the
+    `tolerances` [-] must agree on the rank.
+    """
+    names = tuple(names)
+    largest = [max(float(np.linalg.norm(m, axis=0).max()), 1e-300) for m in slopes]
+    reach = [np.linalg.norm(m, axis=0) / top for m, top in zip(slopes, largest, strict=True)]
+    acting = [p for p in range(len(names)) if any(one[p] > _NOTHING for one in reach)]
+    found = [
+        Symmetry("no effect", (names[p],), (1.0,), f"{names[p]} changes no sample: nothing excites it")
+        for p in range(len(names))
+        if p not in acting
+    ]
+    points = [m[:, acting] for m, one in zip(slopes, reach, strict=True) if one[acting].min(initial=1) > 0]
+    at = [v[acting] for v, one in zip(values, reach, strict=True) if one[acting].min(initial=1) > 0]
+    kept = [names[p] for p in acting]
+    if not points or not kept:
+        return Structure(tuple(found), len(names), 0, True, np.empty(0))
+    spectra = [_spectrum(m) for m in points]
+    ranks = {t: max(int(np.sum(s > t)) for s in spectra) for t in tolerances}
+    rank = ranks[tolerances[1]]
+    certain = len(set(ranks.values())) == 1
+    if rank < len(kept) and certain:
+        clear = np.argsort([-s[rank - 1] for s in spectra], kind="stable")[:_CLEAR]
+        columns, labels, members, grouped = _merged([points[p] for p in clear], [at[p] for p in clear], kept)
+        found += [*grouped, *_directions(columns, labels, members)]
+    best = max(spectra, key=lambda s: float(s[rank - 1]))
+    return Structure(tuple(found), len(names), rank, certain, best)
+
+
+def _spectrum(matrix: Matrix) -> Vector:
+    """Singular values of unit columns, relative to the largest."""
+    singular = np.linalg.svd(matrix / np.linalg.norm(matrix, axis=0), compute_uv=False)
+    return np.asarray(singular / singular[0])
+
+
+def _merged(
+    points: Sequence[Matrix], values: Sequence[Vector], names: Sequence[str]
+) -> tuple[list[Matrix], list[str], list[tuple[str, ...]], list[Symmetry]]:
+    """Columns with those that are proportional at every point made one; their labels and members; what was
+    found."""
+    unit = [m / np.linalg.norm(m, axis=0) for m in points]
+    groups: list[list[int]] = []
+    for p in range(len(names)):
+        own = (g for g in groups if all(_same(m[:, g[0]], m[:, p]) for m in unit))
+        group = next(own, None)
+        groups.append([p]) if group is None else group.append(p)
+    found, labels, columns = [], [], [np.empty((m.shape[0], len(groups))) for m in points]
+    for g, group in enumerate(groups):
+        members = tuple(names[p] for p in group)
+        labels.append(members[0])
+        for column, m in zip(columns, points, strict=True):
+            column[:, g] = m[:, group[0]]
+        if len(group) == 1:
+            continue
+        shares = np.array([m[:, group[0]] @ m[:, group] / (m[:, group[0]] @ m[:, group[0]]) for m in points])
+        sizes = np.array([v[group] / v[group[0]] for v in values])
+        if _constant(shares):
+            powers = _round(shares.mean(axis=0))
+            told = " ".join(f"{n}^{p:g}" if p != 1 else n for n, p in zip(members, powers, strict=True))
+            found.append(Symmetry("product", members, powers, f"only the product {told} acts"))
+            labels[-1] = f"the product {told}"
+        elif _constant(shares / sizes):
+            weights = _round((shares / sizes).mean(axis=0))
+            parts = (n if w == 1 else f"{w:g} {n}" for n, w in zip(members, weights, strict=True))
+            told = " + ".join(parts).replace("+ -", "- ")
+            found.append(Symmetry("sum", members, weights, f"only the sum {told} acts"))
+            labels[-1] = f"the sum {told}"
+            for column, m in zip(columns, points, strict=True):
+                column[:, g] = m[:, group].sum(axis=1)
+        else:
+            told = ", ".join(members)
+            found.append(Symmetry("combination", members, (), f"only one combination of {told} acts"))
+    return columns, labels, [tuple(names[p] for p in group) for group in groups], found
+
+
+def _directions(
+    columns: Sequence[Matrix], labels: Sequence[str], members: Sequence[tuple[str, ...]]
+) -> list[Symmetry]:
+    """Blind directions that are left, each group counting as one parameter."""
+    kernels = [_kernel(m) for m in columns]
+    width = min(kernel.shape[1] for kernel in kernels)
+    kernels = [kernel for kernel in kernels if kernel.shape[1] == width]
+    if not width:
+        return []
+    reach = np.max([np.abs(kernel).max(axis=1) for kernel in kernels], axis=0)
+    taking = [p for p in range(len(labels)) if reach[p] > _MOVES * reach.max()]
+    told, parameters = [labels[p] for p in taking], tuple(n for p in taking for n in members[p])
+    if width == 1:
+        vectors = np.array([k[taking, 0] / k[taking[0], 0] for k in kernels])
+        if _constant(vectors):
+            powers = _round(vectors.mean(axis=0))
+            parts = (n if w == 1 else f"{n} (to the power {w:g})" for n, w in zip(told, powers, strict=True))
+            sentence = f"a common factor on {', '.join(parts)} changes nothing"
+            return [Symmetry("scale", parameters, powers if len(parameters) == len(told) else (), sentence)]
+    many = f"{width} ways" if width > 1 else "one way"
+    sentence = f"{many} to move {', '.join(told)} together without any effect"
+    return [Symmetry("combination", parameters, (), sentence)]
+
+
+def _kernel(matrix: Matrix) -> Matrix:
+    """Null space in relative changes, (parameters, dimension)."""
+    norms = np.linalg.norm(matrix, axis=0)
+    _, singular, rows = np.linalg.svd(matrix / norms, full_matrices=True)
+    rank = int(np.sum(singular > TOLERANCES[1] * singular[0]))
+    return np.asarray(rows[rank:].T / norms[:, None])
+
+
+def _same(a: Vector, b: Vector) -> bool:
+    """Whether two unit columns are the same but for their sign."""
+    return bool(min(np.linalg.norm(a - b), np.linalg.norm(a + b)) < _PROPORTIONAL)
+
+
+def _constant(rows: Matrix) -> bool:
+    """Whether all points have the same entries."""
+    return bool(np.all(np.ptp(rows, axis=0) <= _CONSTANT * np.abs(rows).max(axis=0)))
+
+
+def _round(entries: Vector) -> tuple[float, ...]:
+    """Entries to the digits that are sure."""
+    return tuple(float(f"{entry:.4g}") + 0.0 for entry in entries)
+
+
+def exchanges(table: ParameterTable) -> tuple[Symmetry, ...]:
+    """Pairs of terms of an element that have equal priors: the denominator is their sum in any order."""
+    out = []
+    for element, slot in enumerate(table.layout.elements):
+        for a, b in combinations(range(slot.terms if table.exchangeable[element] else 0), 2):
+            one, other = (
+                tuple(table.names[table.at(kind, element, term)] for kind in ("time", "order"))
+                for term in (a, b)
+            )
+            sentence = (
+                f"({', '.join(one)}) and ({', '.join(other)}) may change places; by keeping orders "
+                "decreasing each plant is counted once"
+            )
+            out.append(Symmetry("exchange", (*one, *other), (), sentence))
+    return tuple(out)

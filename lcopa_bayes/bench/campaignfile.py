@@ -1,0 +1,210 @@
+"""Campaign files: what the virtual bench is to measure, written down as TOML.
+
+    [campaign]
+    name = "paper-step"
+    seed = 7
+    [bench]                      # defaults: the paper's bench
+    noise_sd = 1.8e-4
+    [[path]]                     # defaults: the paper's four paths
+    response = "x"
+    drive = "x"
+    gain = 0.1
+    delay = 3.0
+    etas = [16.0, 12.5]
+    orders = [1.8, 0.9]
+    stiffness = 5.57
+    [[record]]
+    name = "x_on"
+    duration = 25.0
+    x = { step = 1.5708 }        # or { on_off = 1.5, hold = 5 }, { staircase = [1, 2], hold = 5 },
+                                 # { prbs = [0, 1.5], hold = 1 }; each with `at` and `rest`
+    held_out = false
+
+Times are milliseconds, angles radians. A table ``[undeclared]`` with `effects`, `drives`, `correlation` and
+`noise_sd` stands for bench, paths and records: see `undeclared.UndeclaredPlan`.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, ClassVar, final
+
+import numpy as np
+
+from lcopa_bayes.bench.acquisition import PAPER_BENCH, Bench, simulate
+from lcopa_bayes.bench.command import Command, on_off, prbs, quiet, staircase, step
+from lcopa_bayes.bench.device import PAPER_DEVICE, Device, TransferPath
+from lcopa_bayes.bench.undeclared import UndeclaredPlan
+from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.data.record import Axis, Record
+
+_TABLES = {"campaign", "bench", "path", "record", "undeclared"}
+_MEASURED = ("bench", "path", "record")
+_KINDS = {"step", "on_off", "staircase", "prbs"}
+_COMMAND_KEYS = _KINDS | {"at", "rest", "hold"}
+_PATH_KEYS = {"response", "drive"} | {field.name for field in fields(TransferPath)}
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A campaign that can be run."""
+
+    name: str
+    seed: int
+    device: Device
+    bench: Bench
+    records: tuple[Mapping[str, Any], ...]
+
+    settings: ClassVar[str] = ""
+    """What the study file says beside the records."""
+
+    @property
+    def held_out(self) -> tuple[str, ...]:
+        """Names of the records not for fitting."""
+        return tuple(record["name"] for record in self.records if record.get("held_out", False))
+
+    def run(self, rng: np.random.Generator) -> tuple[Record, ...]:
+        """Measure every record, in the order of the file."""
+        return tuple(
+            simulate(
+                self.device,
+                self.bench,
+                _command(record, self.device, rng),
+                duration=float(record["duration"]),
+                name=record["name"],
+                rng=rng,
+            )
+            for record in self.records
+        )
+
+
+def load_plan(path: Path) -> Plan | UndeclaredPlan:
+    """Read a campaign file; InputError with everything wrong in it."""
+    try:
+        told = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: is not valid TOML: {error}") from None
+    problems = [f"{path}: unknown table [{key}]{nearest(key, _TABLES)}" for key in told if key not in _TABLES]
+    heading = told.get("campaign", {})
+    problems += _unknown(path, "[campaign]", heading, {"name", "seed"})
+    if "undeclared" in told and not problems:
+        return _undeclared(path, told)
+    bench_keys = {field.name for field in fields(Bench)}
+    problems += _unknown(path, "[bench]", told.get("bench", {}), bench_keys)
+    for number, entry in enumerate(told.get("path", []), start=1):
+        problems += _unknown(path, f"[[path]] {number}", entry, _PATH_KEYS)
+        problems += _missing(path, f"[[path]] {number}", entry, _PATH_KEYS)
+    records = told.get("record", [])
+    if not records:
+        problems.append(f"{path}: has no [[record]]; add one with `name`, `duration` and a drive")
+    if problems:
+        raise InputError(problems)
+    device = _device(path, told.get("path", []))
+    known = {"name", "duration", "held_out"} | {axis.name for axis in device.drive_axes}
+    for number, entry in enumerate(records, start=1):
+        problems += _unknown(path, f"[[record]] {number}", entry, known)
+        problems += _missing(path, f"[[record]] {number}", entry, {"name", "duration"})
+        for axis in device.drive_axes:
+            problems += _drive_problems(f"{path}: [[record]] {number}, {axis.name}", entry.get(axis.name))
+    if problems:
+        raise InputError(problems)
+    settings = {name: getattr(PAPER_BENCH, name) for name in bench_keys} | told.get("bench", {})
+    sd = settings["noise_sd"]
+    bench = Bench(**settings | {"noise_sd": tuple(sd) if isinstance(sd, list) else sd})
+    return Plan(heading.get("name", path.stem), int(heading.get("seed", 0)), device, bench, tuple(records))
+
+
+def _undeclared(path: Path, told: Mapping[str, Any]) -> UndeclaredPlan:
+    """A campaign with hidden effects."""
+    heading, table = told.get("campaign", {}), told["undeclared"]
+    known = {field.name for field in fields(UndeclaredPlan)} - {"name", "seed"}
+    problems = _unknown(path, "[undeclared]", table, known)
+    problems += [f"{path}: [{k}] is not used beside [undeclared]; remove it" for k in told if k in _MEASURED]
+    if problems:
+        raise InputError(problems)
+    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table.items()}
+    try:
+        return UndeclaredPlan(heading.get("name", path.stem), int(heading.get("seed", 0)), **values)
+    except InputError as error:
+        raise InputError([f"{path}: {problem}" for problem in error.problems]) from None
+
+
+def _unknown(path: Path, where: str, table: Mapping[str, Any], known: set[str]) -> list[str]:
+    return [f"{path}: {where}: unknown key {key!r}{nearest(key, known)}" for key in table if key not in known]
+
+
+def _missing(path: Path, where: str, table: Mapping[str, Any], needed: set[str]) -> list[str]:
+    return [f"{path}: {where}: has no `{key}`; add it" for key in sorted(needed) if key not in table]
+
+
+def _device(path: Path, entries: list[Mapping[str, Any]]) -> Device:
+    """The device of the ``[[path]]`` tables, or the paper's; a path not listed does nothing."""
+    if not entries:
+        return PAPER_DEVICE
+    drives = list(dict.fromkeys(entry["drive"] for entry in entries))
+    responses = list(dict.fromkeys(entry["response"] for entry in entries))
+    dead = TransferPath(0.0, 0.0, (1.0,), (1.0,), 1.0)
+    table = [[dead for _ in drives] for _ in responses]
+    for entry in entries:
+        values = {key: entry[key] for key in _PATH_KEYS - {"response", "drive"}}
+        values |= {"etas": tuple(entry["etas"]), "orders": tuple(entry["orders"])}
+        try:
+            made = TransferPath(**values)
+        except InputError as error:
+            raise InputError([f"{path}: [[path]] {problem}" for problem in error.problems]) from None
+        table[responses.index(entry["response"])][drives.index(entry["drive"])] = made
+    return Device(
+        tuple(tuple(row) for row in table),
+        tuple(Axis(name, "rad") for name in drives),
+        tuple(Axis(name, "rad") for name in responses),
+        tuple(0.0 for _ in responses),
+    )
+
+
+def _drive_problems(where: str, told: object) -> list[str]:
+    if told is None:
+        return []
+    if not isinstance(told, dict):
+        return [f"{where}: must be a table such as {{ step = 1.5 }}; got {told!r}"]
+    problems = [
+        f"{where}: unknown key {key!r}{nearest(key, _COMMAND_KEYS)}"
+        for key in told
+        if key not in _COMMAND_KEYS
+    ]
+    kinds = [key for key in told if key in _KINDS]
+    if len(kinds) != 1:
+        problems.append(f"{where}: name exactly one of {', '.join(sorted(_KINDS))}; got {kinds}")
+    elif kinds[0] != "step" and "hold" not in told:
+        problems.append(f"{where}: {kinds[0]} needs `hold`, the time of each level [ms]")
+    return problems
+
+
+def _command(record: Mapping[str, Any], device: Device, rng: np.random.Generator) -> Command:
+    """Commands of all drive axes of a record in one."""
+    commands = [_axis_command(record.get(axis.name), record, rng) for axis in device.drive_axes]
+    times = np.unique(np.concatenate([command.times for command in commands]))
+    values = np.hstack([command.at(times) for command in commands])
+    return Command(times, values, np.hstack([command.rest for command in commands]))
+
+
+def _axis_command(
+    told: Mapping[str, Any] | None, record: Mapping[str, Any], rng: np.random.Generator
+) -> Command:
+    if told is None:
+        return quiet()
+    at, rest = told.get("at", 0.0), told.get("rest", 0.0)
+    if "step" in told:
+        return step(told["step"], at=at, rest=rest)
+    if "on_off" in told:
+        return on_off(told["on_off"], hold=told["hold"], at=at, rest=rest)
+    if "staircase" in told:
+        return staircase(told["staircase"], hold=told["hold"], start=at, rest=rest)
+    low, high = told["prbs"]
+    duration = float(record["duration"]) - at
+    return prbs(low, high, hold=told["hold"], duration=duration, rng=rng, start=at, rest=rest)

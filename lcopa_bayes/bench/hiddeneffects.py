@@ -1,0 +1,201 @@
+"""Devices with something hidden in them that no declared model has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import final
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
+
+from lcopa_bayes.bench.command import Command
+from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.bench.inversion import Compliance
+from lcopa_bayes.bench.marching import Balance, marched, step_means
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.data.record import Axis
+
+STEPS = 4
+"""Steps of a march per camera period; halving them moves a response by less than 1e-5 of its range."""
+_FINE = 8
+"""Points per camera period on which a lag of the sensor is integrated."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """What a hidden effect may know about the record being taken."""
+
+    epoch: float
+    """Place in the campaign, -1/2 to 1/2 [-]."""
+    drive: Vector
+    """Largest drive of each axis in the campaign [drive unit]."""
+    deflection: Vector
+    """Deflection under it [response unit]."""
+    delay: float
+    """Of the direct paths [ms]."""
+    steady: Matrix
+    """Deflection per unit of drive held for ever, (responses, drives)."""
+    chance: np.random.Generator
+    """For what differs from record to record."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Hidden:
+    """An effect by the places where it acts; None where it does not."""
+
+    name: str
+    numbers: Mapping[str, float]
+    """Sizes and internal constants."""
+    disturbance: bool = False
+    """Whether it is no part of the plant, so that the truth is without it."""
+    commands: Callable[[Command, Shot], Command] | None = None
+    stretch: Callable[[Shot], float] | None = None
+    """Factor on every time constant."""
+    balance: Callable[[Shot, float], Balance] | None = None
+    """From the shot and the step [ms]: force that acts on the direct paths."""
+    lag: float = 0.0
+    """Time constant of the sensor [ms]."""
+    exposure: float = 0.0
+    """[ms]."""
+    seen: Callable[[Matrix, Vector, Command, Shot], Matrix] | None = None
+    """(deflections, times, command that acts, shot) -> deflections."""
+    noise: Callable[[Matrix, np.random.Generator], Matrix] | None = field(default=None)
+    """From noise to noise, (n, axes)."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class HiddenDevice:
+    """A device with hidden effects; answers commands as `Device` does."""
+
+    device: Device
+    effects: tuple[Hidden, ...]
+    shot: Shot
+    steps: int = STEPS
+
+    @property
+    def drive_axes(self) -> tuple[Axis, ...]:
+        """Axes of the drive."""
+        return self.device.drive_axes
+
+    @property
+    def response_axes(self) -> tuple[Axis, ...]:
+        """Axes of the response."""
+        return self.device.response_axes
+
+    @property
+    def time_unit(self) -> str:
+        """Unit of every time."""
+        return self.device.time_unit
+
+    def response(self, command: Command, time: ArrayLike, *, exposure: float = 0.0) -> Matrix:
+        """Responses at `time` [ms], (n, n_responses); the first axis pairs with the first drive, and so on.
+
+        Accuracy: that of `Device.response` unless forces are changed; then see `marched`.
+        """
+        times, shot = np.asarray(time, dtype=float), self.shot
+        offsets = np.array(self.device.offsets)
+        for effect in self.effects:
+            if effect.commands is not None:
+                command = effect.commands(command, shot)
+        factors = [effect.stretch(shot) for effect in self.effects if effect.stretch is not None]
+        device = stretched(self.device, float(np.prod(factors)))
+        exposure += sum(effect.exposure for effect in self.effects)
+        lags = [effect.lag for effect in self.effects if effect.lag > 0]
+        at = times if not lags else _fine(times)
+        y = device.response(command, at, exposure=exposure) - offsets
+        balances = [effect.balance for effect in self.effects if effect.balance is not None]
+        if balances:
+            period = float(np.min(np.diff(times)))
+            direct, crossed = _parted(device)
+            y = crossed.response(command, at) - offsets
+            y += bent(direct, command, at, period / self.steps, balances, shot)
+        for lag in lags:
+            y = _lagging(at, y, lag)
+        if lags:
+            y = y[np.searchsorted(at, times - 1e-9)]
+        for effect in self.effects:
+            if effect.seen is not None:
+                y = effect.seen(y, times, command, shot)
+        return np.asarray(y + offsets)
+
+
+def stretched(device: Device, factor: float) -> Device:
+    """The device with every time constant multiplied."""
+    if factor == 1.0:
+        return device
+
+    def slower(path: TransferPath) -> TransferPath:
+        etas = tuple(eta * factor**order for eta, order in zip(path.etas, path.orders, strict=True))
+        return replace(path, etas=etas)
+
+    return replace(device, paths=tuple(tuple(map(slower, row)) for row in device.paths))
+
+
+def _parted(device: Device) -> tuple[list[TransferPath], Device]:
+    """Direct paths, and the device without them."""
+    direct = [row[i] for i, row in enumerate(device.paths)]
+    rows = tuple(
+        tuple(replace(path, gain=0.0) if i == j else path for j, path in enumerate(row))
+        for i, row in enumerate(device.paths)
+    )
+    return direct, replace(device, paths=rows)
+
+
+def bent(
+    paths: Sequence[TransferPath],
+    command: Command,
+    times: Vector,
+    step: float,
+    balances: Sequence[Callable[[Shot, float], Balance]],
+    shot: Shot,
+) -> Matrix:
+    """Deflections of direct paths under changed forces at `times`, (n, axes); see `marched`."""
+    first = min([*(command.times + min(path.delay for path in paths)), float(times[-1])])
+    start = times[0] + step * np.floor((first - times[0]) / step - 1.0)
+    edges = start + step * np.arange(int(np.ceil((times[-1] - start) / step + 1e-6)) + 3)
+    gains = np.array([path.steady for path in paths])
+    moved = command.values - command.rest
+    means = [step_means(edges, command.times + path.delay, moved[:, i]) for i, path in enumerate(paths)]
+    rest = gains * command.rest
+    made = [make(shot, step) for make in balances]
+
+    def balance(f: Vector, y: Vector, rate: Vector, number: int) -> Vector:
+        for one in made:
+            f = one(f, y, rate, number)
+        return f
+
+    level = rest
+    for _ in range(400):  # at rest the force that acts holds the deflection
+        level = 0.5 * (level + balance(rest, level, np.zeros_like(level), -1))
+    elements = tuple(
+        Compliance(tuple(eta / path.stiffness for eta in path.etas), path.orders, 1.0) for path in paths
+    )
+    force = rest[:, None] + gains[:, None] * np.stack(means)
+    y = marched(elements, force, balance, level, step)
+    nodes = np.concatenate((edges[:1], edges[1:]))
+    table = CubicSpline(nodes, np.concatenate((level[:, None], y), axis=1), axis=1)
+    out = np.where(times[:, None] <= start, level, table(np.maximum(times, start)).T)
+    return np.asarray(out)
+
+
+def _fine(times: Vector) -> Vector:
+    """The times with `_FINE` points per interval."""
+    part = np.arange(_FINE) / _FINE
+    inner = times[:-1, None] + np.diff(times)[:, None] * part
+    return np.append(inner.ravel(), times[-1])
+
+
+def _lagging(at: Vector, y: Matrix, lag: float) -> Matrix:
+    """First-order lag of a signal that is linear between `at` and has always had its first value."""
+    out = np.empty_like(y)
+    out[0] = y[0]
+    for k, gap in enumerate(np.diff(at)):
+        fade = np.exp(-gap / lag)
+        slope = (y[k + 1] - y[k]) / gap
+        out[k + 1] = y[k + 1] - lag * slope + (out[k] - y[k] + lag * slope) * fade
+    return out

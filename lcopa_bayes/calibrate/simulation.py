@@ -1,0 +1,101 @@
+"""A study's records measured again on the virtual bench, at a given truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lcopa_bayes.bench.command import Command
+from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.data.record import Record
+from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.results.prediction import responses
+
+
+def command_of(record: Record) -> Command:
+    """The drive of a record: a value holds from its row to the next, and the plant rests before the first."""
+    changed = np.flatnonzero((record.drive[1:] != record.drive[:-1]).any(axis=1)) + 1
+    return Command(record.time[changed], record.drive[changed], record.drive[0])
+
+
+def device_of(table: ParameterTable, truth: Vector, record: int, *, time_unit: str) -> Device:
+    """The plant with the table values `truth`, (rows,), and the offsets it has on a fit record."""
+    layout, values = table.layout, truth[None]
+    gains, dynamics = table.gains(values)[0], table.dynamics(values)
+    paths = tuple(
+        tuple(
+            _path(
+                float(gains[i, j]),
+                float(dynamics.delays[0, layout.delay_of[i][j]]),
+                dynamics.times[layout.element_of[i][j]][0],
+                dynamics.orders[layout.element_of[i][j]][0],
+            )
+            for j in range(len(layout.drives))
+        )
+        for i in range(len(layout.responses))
+    )
+    offsets = tuple(float(table.offset(values, i, record)[0]) for i in range(len(layout.responses)))
+    return Device(paths, layout.drives, layout.responses, offsets, time_unit)
+
+
+def _path(gain: float, delay: float, times: Vector, orders: Vector) -> TransferPath:
+    """Path of stiffness 1; terms of one order act as one whose viscosity is their sum."""
+    etas: dict[float, float] = {}
+    for time, order in zip(times.tolist(), orders.tolist(), strict=True):
+        etas[order] = etas.get(order, 0.0) + time**order
+    return TransferPath(gain, delay, tuple(etas.values()), tuple(etas), 1.0)
+
+
+def exact_responses(problem: Problem, truth: Vector) -> list[Matrix]:
+    """Responses of every fit record at its sample times without noise, (samples, axes) [response unit].
+
+    Accuracy: that of `Device.response`; what the bench cannot do so accurately raises its error.
+    """
+    study, posterior = problem.study, problem.posterior
+    return [
+        device_of(posterior.table, truth, r, time_unit=study.time_unit).response(
+            command_of(samples.record), samples.times, exposure=study.model.exposure
+        )
+        for r, samples in enumerate(posterior.samples)
+    ]
+
+
+def measured(
+    problem: Problem, truth: Vector, exact: Sequence[Matrix], rng: np.random.Generator
+) -> tuple[Record, ...]:
+    """The fit records with the `exact` responses and noise of the study's noise model at the truth.
+
+    Drives, times and missing cells are those of the study.
+    """
+    posterior, values = problem.posterior, truth[None]
+    out = []
+    for samples, clean in zip(posterior.samples, exact, strict=True):
+        record = samples.record
+        rows = np.searchsorted(record.time, samples.times)
+        response = np.full(record.response.shape, np.nan)
+        for axis, observed in enumerate(samples.axes):
+            noise = posterior.noise.draw(posterior.noise_parameters(values, axis), observed.gaps, rng)[0]
+            response[rows[observed.index], axis] = clean[observed.index, axis] + noise
+        axes = (record.drive_axes, record.response_axes)
+        out.append(Record(record.name, record.time, record.drive, response, *axes, record.time_unit))
+    return tuple(out)
+
+
+def model_gap(problem: Problem, truth: Vector, exact: Sequence[Matrix]) -> float:
+    """Root sum of squares, over all samples, of forward model minus bench at the truth [noise scale].
+
+    It bounds how many posterior standard deviations the discretisation of the model can shift anything.
+    """
+    posterior, values = problem.posterior, truth[None]
+    modelled = responses(posterior.table, posterior.model, values)
+    total = 0.0
+    for r, (samples, clean) in enumerate(zip(posterior.samples, exact, strict=True)):
+        for axis, observed in enumerate(samples.axes):
+            offset = posterior.table.offset(values, axis, r)
+            gap = modelled[r][axis][0][observed.index] + offset - clean[observed.index, axis]
+            parameters = posterior.noise_parameters(values, axis)
+            total += float(np.sum(posterior.noise.standard(gap[None], parameters, observed.gaps) ** 2))
+    return float(np.sqrt(total))

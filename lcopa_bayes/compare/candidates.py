@@ -1,0 +1,235 @@
+"""Candidates: models of the same records, each a study derived from one."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import final
+
+from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.data.candidatesettings import CandidateSettings
+from lcopa_bayes.data.settings import ModelSettings, PriorSettings
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.inference.defaultpriors import Scales
+from lcopa_bayes.inference.parameters import parameter_table
+from lcopa_bayes.model.layout import Layout
+
+STUDY = "study"
+"""Name of the candidate that is the study as it stands."""
+KNOWN = (STUDY, "fractional-1", "fractional-2", "fractional-3", "first-order", "second-order", "integer-kept")
+"""Candidates any study has."""
+VARIANTS: Mapping[str, str] = {
+    "separate": "an element of its own for every path",
+    "delays": "a delay of its own for every path",
+    "no-cross": "no cross paths",
+}
+"""What may follow the name of a known candidate, after a hyphen."""
+_MOST = 3
+"""Most terms of the candidates a study has without asking."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A model to compare."""
+
+    name: str
+    study: Study
+    about: str
+    """In words."""
+    notes: tuple[str, ...] = ()
+    improper: tuple[str, ...] = ()
+    """Parameters whose prior was said to be improper."""
+
+    @property
+    def integer(self) -> bool:
+        """Whether every order is fixed at an integer."""
+        orders = self.study.model.orders
+        return orders != "free" and all(float(order).is_integer() for order in orders)
+
+    @property
+    def terms(self) -> int:
+        """Viscous terms of the richest element [-]."""
+        terms = self.study.model.terms
+        return max(terms.values()) if isinstance(terms, Mapping) else terms
+
+
+def known_settings(name: str, study: Study) -> CandidateSettings:
+    """Settings of a candidate any study has, by its name; InputError for any other name."""
+    base, variants = name, []
+    while (found := re.fullmatch(rf"(.+)-({'|'.join(VARIANTS)})", base)) is not None:
+        base = found[1]
+        variants.append(found[2])
+    most = _most_terms(study.model)
+    told: dict[str, object] = {}
+    fractional = re.fullmatch(r"fractional-([1-6])", base)
+    if fractional:
+        told["terms"] = int(fractional[1])
+    elif base == "first-order":
+        told["orders"] = (1.0,)
+    elif base == "second-order":
+        told["orders"] = (2.0, 1.0)
+    elif base == "integer-kept":
+        told["orders"] = (2.0, *[1.0] * (most - 1)) if most > 1 else (1.0,)
+    elif base != STUDY:
+        raise InputError(
+            f"no candidate {name!r}{nearest(base, KNOWN)}; any of them may end in "
+            f"{', '.join('-' + key for key in VARIANTS)}; or describe it under [[candidates]]"
+        )
+    told |= {"share": "none"} if "separate" in variants else {}
+    told |= {"delay": "path"} if "delays" in variants else {}
+    return CandidateSettings(name, cross="no-cross" not in variants, **told)  # type: ignore[arg-type]
+
+
+def derived(study: Study, settings: CandidateSettings) -> Candidate:
+    """A candidate of a study; InputError when its settings do not fit the study's axes."""
+    model = settings.model(study.model)
+    notes: list[str] = []
+    fixed: dict[str, PriorSettings] = {}
+    if not settings.cross:
+        model, fixed = _uncrossed(study, settings.name, model)
+    made = replace(study, model=model, noise=settings.noise_settings(study.noise), priors={})
+    names = _names(made)
+    priors = dict(study.priors)
+    if model.orders != "free":
+        priors = {name: prior for name, prior in priors.items() if not name.startswith("order_")}
+    dropped = sorted(set(study.priors) - set(names)) if settings.name != STUDY else []
+    if dropped:
+        notes.append(f"has no {', '.join(dropped)}: the study's priors of these do not apply")
+        priors = {name: prior for name, prior in priors.items() if name in names}
+    for name in settings.improper:
+        if name not in names:
+            raise InputError(f"candidate {settings.name!r}: no parameter {name!r}{nearest(name, names)}")
+        priors.pop(name, None)
+        notes.append(
+            f"the prior of {name} is improper, so the evidence is undefined; the other scores are under the "
+            "default prior in its place"
+        )
+    made = replace(made, priors=priors | dict(settings.priors) | fixed)
+    return Candidate(
+        settings.name, made, _about(study, model, settings.cross), tuple(notes), settings.improper
+    )
+
+
+def candidates_of(
+    study: Study, extra: Sequence[CandidateSettings] = (), pick: Sequence[str] | None = None
+) -> tuple[Candidate, ...]:
+    """The candidates to compare: those picked by name, or a short list and all of `extra`.
+
+    InputError for a name that is unknown, and when fewer than two different models are left.
+    """
+    own = {one.name: one for one in (*study.candidates, *extra)}
+    wanted = pick if pick is not None else (study.compare.pick or (*_short_list(study), *own))
+    problems: list[str] = []
+    made: list[Candidate] = []
+    for name in dict.fromkeys(wanted):
+        try:
+            made.append(derived(study, own[name] if name in own else known_settings(name, study)))
+        except InputError as error:
+            problems += [f"candidate {name!r}: {p}" if name not in p else p for p in error.problems]
+    if problems:
+        raise InputError(problems)
+    distinct: list[Candidate] = []
+    for one in made:
+        alike = [other for other in distinct if _same(one, other)]
+        if not alike:
+            distinct.append(one)
+    if len(distinct) < 2:
+        raise InputError(
+            f"{study.name}: {len(distinct)} candidate left to compare; name two different models or more, "
+            f"such as {', '.join(KNOWN)}"
+        )
+    return tuple(distinct)
+
+
+def _short_list(study: Study) -> list[str]:
+    """A few candidates that ask how many terms, and whether fractional ones."""
+    model, most = study.model, _most_terms(study.model)
+    plain = model.orders == "free" and not isinstance(model.terms, Mapping) and most <= _MOST
+    own = [] if plain else [STUDY]
+    upto = 2 if own else min(max(most, 2), _MOST)
+    fractional = [f"fractional-{terms}" for terms in range(1, upto + 1)]
+    return [*own, *fractional, *(["first-order"] if most <= 2 and not own else []), "second-order"]
+
+
+def _most_terms(model: ModelSettings) -> int:
+    return max(model.terms.values()) if isinstance(model.terms, Mapping) else model.terms
+
+
+def _same(one: Candidate, other: Candidate) -> bool:
+    """Whether two candidates are one model."""
+    return (one.study.model, one.study.noise, dict(one.study.priors), one.improper) == (
+        other.study.model,
+        other.study.noise,
+        dict(other.study.priors),
+        other.improper,
+    )
+
+
+def _names(study: Study) -> tuple[str, ...]:
+    """Names of the parameters a study without priors of its own has."""
+    layout = Layout.of(study.drive_axes, study.response_axes, study.model)
+    return parameter_table(
+        layout,
+        Scales.of(study.fit),
+        [record.name for record in study.fit],
+        time_unit=study.time_unit,
+        model=study.model,
+        noise=study.noise.kind,
+        priors={},
+    ).names
+
+
+def _uncrossed(
+    study: Study, name: str, model: ModelSettings
+) -> tuple[ModelSettings, dict[str, PriorSettings]]:
+    """The model without cross paths, and what holds their gains at zero and the rest out of the way."""
+    axes = len(study.drive_axes), len(study.response_axes)
+    if axes[0] != axes[1] or axes[0] < 2:
+        raise InputError(
+            f"candidate {name!r}: without cross paths makes sense for as many drives as responses, two or "
+            f"more; this study has {axes[0]} and {axes[1]}"
+        )
+    if model.share == "paper":  # the direct paths' element is then the only one
+        model = replace(model, share="all", terms=_direct_terms(model))
+    layout = Layout.of(study.drive_axes, study.response_axes, model)
+    direct = {(layout.own_response(j), j) for j in range(axes[1])}
+    used = {layout.element_of[i][j] for i, j in direct if i is not None}
+    delays = {layout.delay_of[i][j] for i, j in direct if i is not None}
+    held: dict[str, float] = {}
+    for i in range(axes[1]):
+        for j in range(axes[0]):
+            if (i, j) not in direct:
+                held[f"gain_{layout.path_name(i, j)}"] = 0.0
+    for e, slot in enumerate(layout.elements):
+        for k in range(slot.terms if e not in used else 0):  # of no effect: any value does
+            held |= {f"time_{k + 1}_{slot.name}": 1.0, f"order_{k + 1}_{slot.name}": 1.0}
+    for d, slot_name in enumerate(layout.delays):
+        if d not in delays:
+            held[f"delay_{slot_name}"] = 0.0
+    return model, {key: PriorSettings(key, fixed=value) for key, value in held.items()}
+
+
+def _direct_terms(model: ModelSettings) -> int:
+    if isinstance(model.terms, Mapping):
+        return model.terms.get("direct", max(model.terms.values()))
+    return model.terms
+
+
+def _about(study: Study, model: ModelSettings, cross: bool) -> str:
+    if isinstance(model.terms, Mapping):
+        terms = ", ".join(f"{name} {count}" for name, count in model.terms.items()) + " terms"
+    else:
+        terms = f"{model.terms} term{'s' if model.terms > 1 else ''}"
+    orders = (
+        "free orders"
+        if model.orders == "free"
+        else f"orders {', '.join(f'{order:g}' for order in model.orders)}"
+    )
+    shared = {"paper": "direct and cross elements", "all": "one element", "none": "an element per path"}
+    delays = {"shared": "one delay", "element": "a delay per element", "path": "a delay per path"}
+    if len(study.drive_axes) == len(study.response_axes) == 1:
+        return f"{terms}, {orders}"
+    parts = [terms, orders, shared[model.share], delays[model.delay], *([] if cross else ["no cross paths"])]
+    return ", ".join(parts)

@@ -1,0 +1,1 @@
+"""What every room rests on: errors, arrays, files, checks, estimates, processes."""

@@ -1,0 +1,94 @@
+"""A number with its unit, interval, effective sample size and grade: the only form in which one leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Vector
+
+LEVEL = 0.9
+"""Probability inside the intervals that are reported [-]."""
+EQUAL_TAILED = "equal-tailed credible"
+"""The kind of interval reported: as much probability below it as above."""
+
+
+@final
+@dataclass(frozen=True)
+class Estimate:
+    """Posterior median and interval of one quantity."""
+
+    name: str
+    value: float
+    """Median, in `unit`; infinite when more than half of the draws never reach it."""
+    unit: str
+    lower: float
+    """Lower end, in `unit`; infinite when open."""
+    upper: float
+    """Upper end, in `unit`; infinite when open."""
+    ess: float
+    """Effective sample size behind it [draws]."""
+    grade: str
+    mean: float = np.nan
+    """Mean, in `unit`; NaN when a draw is infinite."""
+    sd: float = np.nan
+    """Standard deviation, in `unit`; NaN when a draw is infinite."""
+    level: float = LEVEL
+    """Probability inside the interval [-]."""
+    interval: str = EQUAL_TAILED
+    note: str = ""
+
+    @classmethod
+    def of(cls, name: str, unit: str, draws: Vector, *, ess: float, grade: str, note: str = "") -> Estimate:
+        """From draws; infinite draws (never reached) may make a side open, NaN draws raise ValueError."""
+        if np.isnan(draws).any():
+            raise ValueError(f"{name}: {np.isnan(draws).sum()} of {draws.size} draws are NaN")
+        finite = bool(np.isfinite(draws).all())
+        tail = (1 - LEVEL) / 2
+        lower, middle, upper = (_quantile(draws, q) for q in (tail, 0.5, 1 - tail))
+        mean, sd = (float(draws.mean()), float(draws.std(ddof=1))) if finite else (np.nan, np.nan)
+        return cls(name, middle, unit, lower, upper, ess, grade, mean, sd, note=note)
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values; what is infinite or undefined is None."""
+        out: dict[str, Any] = {
+            "name": self.name,
+            "value": self.value,
+            "unit": self.unit,
+            "mean": self.mean,
+            "sd": self.sd,
+            "lower": self.lower,
+            "upper": self.upper,
+            "level": self.level,
+            "interval": self.interval,
+            "ess": self.ess,
+            "grade": self.grade,
+        }
+        told: dict[str, Any] = plain(out | ({"note": self.note} if self.note else {}))
+        return told
+
+
+def _quantile(draws: Vector, probability: float) -> float:
+    """Quantile that does not interpolate between a finite and an infinite draw."""
+    method = "linear" if np.isfinite(draws).all() else "higher"
+    return float(np.quantile(draws, probability, method=method))  # type: ignore[call-overload]
+
+
+def plain(value: Any) -> Any:
+    """Nested dicts and lists of plain JSON values; numbers that are not finite become None."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, int | np.integer):
+        return int(value)
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    return value

@@ -1,0 +1,1 @@
+"""Records, drives and studies, read and checked."""

@@ -1,0 +1,104 @@
+"""A record file as cells of text, so that every bad cell can be quoted with its place."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NoReturn, final
+
+import pandas as pd
+
+from lcopa_bayes.core.errors import InputError, nearest
+
+SUFFIXES = (".csv", ".parquet")
+"""Kinds of record files."""
+FORM = "time_<unit>, drive_<axis>_<unit> or response_<axis>_<unit>"
+"""How columns are named."""
+_MOST = 5
+"""Problems told per column, so that one shifted column does not bury the others."""
+
+
+@final
+@dataclass(frozen=True)
+class CellTable:
+    """A file as text, so that every bad cell can be quoted; `rows` are line (CSV) or row numbers."""
+
+    path: Path
+    names: list[str]
+    rows: list[int]
+    columns: list[Sequence[str]]
+    problems: list[str]
+
+    def place(self, column: int, row: int | None = None) -> str:
+        """Where a column or one of its cells stands, in the words of the user's file."""
+        count = "line" if self.path.suffix.lower() == ".csv" else "row"
+        middle = "" if row is None else f", {count} {self.rows[row]}"
+        return f"{self.path}{middle}, column {self.names[column]!r}"
+
+    def tell(self, problems: Sequence[str], place: str) -> None:
+        """Add the first problems of a kind and the number of the others."""
+        self.problems.extend(problems[:_MOST])
+        if len(problems) > _MOST:
+            self.problems.append(f"{place}: and {len(problems) - _MOST} more like these")
+
+
+def refuse(path: Path, why: str) -> NoReturn:
+    """Raise InputError about a file."""
+    raise InputError(f"{path}: {why}")
+
+
+def _csv_cells(path: Path) -> CellTable:
+    rows, cells, ragged = [], [], []
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        reader = csv.reader(file, skipinitialspace=True, strict=True)
+        try:
+            names = [name.strip() for name in next((row for row in reader if row), [])]
+            for row in reader:
+                if len(row) == len(names):
+                    rows.append(reader.line_num)
+                    cells.append(row)
+                elif len(row) > 1 or "".join(row).strip():  # an empty line is no row
+                    what = f"has {len(row)} cell(s) where the header has {len(names)}"
+                    ragged.append(f"{path}, line {reader.line_num}: {what}; write every cell, even if empty")
+        except UnicodeDecodeError:
+            refuse(path, "is not UTF-8 text; save it as comma-separated UTF-8")
+        except csv.Error as error:
+            refuse(path, f"line {reader.line_num} is not comma-separated text ({error})")
+    if not names:
+        refuse(path, f"is empty; expected a header of columns {FORM}")
+    if len(names) == 1 and any(separator in names[0] for separator in ";\t"):
+        refuse(path, "line 1: the columns are not separated by commas; separate them by commas")
+    table = CellTable(path, names, rows, [*zip(*cells, strict=True)] if cells else [()] * len(names), [])
+    table.tell(ragged, str(path))
+    return table
+
+
+def _parquet_cells(path: Path) -> CellTable:
+    frame = pd.read_parquet(path)
+
+    def text(value: object) -> str:
+        gone = value is None or value is pd.NA or (isinstance(value, float) and math.isnan(value))
+        return "" if gone else str(value)  # str of a float is exact
+
+    columns: list[Sequence[str]] = [
+        [text(v) for v in frame.iloc[:, j].tolist()] for j in range(frame.shape[1])
+    ]
+    return CellTable(path, [str(c) for c in frame.columns], [*range(1, len(frame) + 1)], columns, [])
+
+
+def read_cells(path: Path) -> CellTable:
+    """The file as text; InputError when there is none or it cannot be read."""
+    try:
+        if not path.exists():
+            beside = (file.name for file in path.parent.glob("*") if file.suffix.lower() in SUFFIXES)
+            refuse(path, f"no such file{nearest(path.name, beside)}")
+        if path.suffix.lower() not in SUFFIXES or not path.is_file():
+            refuse(path, f"is not a record; expected a file ending in {' or '.join(SUFFIXES)}")
+        return _csv_cells(path) if path.suffix.lower() == ".csv" else _parquet_cells(path)
+    except InputError:
+        raise
+    except (OSError, ValueError, NotImplementedError) as error:
+        refuse(path, f"cannot be read ({error})")

@@ -1,0 +1,196 @@
+"""Records: time, drive and response of one experiment, and the tables that hold them.
+
+A table is CSV or Parquet, one row per sample. A column is named ``role_axis_unit``: the role is all
+before the first underscore, the unit all after the last one and the axis everything between, so
+``drive_left_heater_pct`` is axis ``left_heater`` in ``pct``. The time column is ``time_<unit>``.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import final
+
+import numpy as np
+import pandas as pd
+
+from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
+from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.core.files import write_whole
+from lcopa_bayes.data.cells import FORM, SUFFIXES, CellTable, read_cells, refuse
+
+TIME_UNITS = {"s": 0, "ms": -3, "us": -6}
+"""Each time unit as a power of ten of a second."""
+_ROLES = ("time", "drive", "response")
+
+
+def in_time_unit(time: Array | float, given: str, wanted: str) -> Array:
+    """`time` [given] in the unit `wanted`; one correctly rounded multiplication or division."""
+    power = TIME_UNITS[given] - TIME_UNITS[wanted]
+    with np.errstate(over="ignore"):  # an infinite time is refused by `Record`
+        return np.asarray(time * 10.0**power if power >= 0 else time / 10.0**-power)
+
+
+@final
+@dataclass(frozen=True)
+class Axis:
+    """One column of drive or response: a free name, which may hold underscores, and a free unit."""
+
+    name: str
+    unit: str
+
+    def __post_init__(self) -> None:
+        for word in (self.name, self.unit):
+            if not word or word != word.strip() or not word.isprintable():
+                raise InputError(f"axis {self.name!r} in {self.unit!r}: both must be printable words")
+        if "_" in self.unit:
+            raise InputError(f"axis {self.name!r}: the unit {self.unit!r} must not hold an underscore")
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Record:
+    """One experiment, sampled uniformly or not; arrays are finite, checked and read-only.
+
+    Raises InputError unless times increase strictly, there are two rows or more, one response sample
+    or more, axes with distinct names in each role, and arrays that fit them.
+    """
+
+    name: str
+    """Stem of the file."""
+    time: Vector
+    """(n,) sample times [time_unit]."""
+    drive: Matrix
+    """(n, n_drives) in the units of `drive_axes`; a value holds from its row to the next."""
+    response: Matrix
+    """(n, n_responses) in the units of `response_axes`; NaN is a sample that was not taken."""
+    drive_axes: tuple[Axis, ...]
+    response_axes: tuple[Axis, ...]
+    time_unit: str
+    """One of `TIME_UNITS`."""
+
+    def __post_init__(self) -> None:
+        for key, ndim in (("time", 1), ("drive", 2), ("response", 2)):
+            try:
+                array = frozen(getattr(self, key), name=key, ndim=ndim, missing=key == "response")
+            except ValueError as error:
+                raise InputError(f"record {self.name!r}: {error}") from error
+            object.__setattr__(self, key, array)
+        names = [[axis.name for axis in axes] for axes in (self.drive_axes, self.response_axes)]
+        got, fitting = (self.drive.shape, self.response.shape), tuple((self.time.size, len(k)) for k in names)
+        wrong = (
+            (self.time_unit not in TIME_UNITS, f"time unit {self.time_unit!r}; known: {[*TIME_UNITS]}"),
+            (self.time.size < 2, "needs two or more rows"),
+            ((self.time[1:] <= self.time[:-1]).any(), f"times must increase strictly [{self.time_unit}]"),
+            (np.isnan(self.response).all(), "needs one or more response samples"),
+            (any(len({*k}) < max(1, len(k)) for k in names), "needs axes with distinct names in each role"),
+            (got != fitting, f"drive and response have shapes {got}; their axes and times need {fitting}"),
+        )
+        if any(is_so for is_so, _ in wrong):
+            raise InputError([f"record {self.name!r}: {what}" for is_so, what in wrong if is_so])
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Rebuild rather than restore, so that a copy in another process is locked too."""
+        arrays = (self.time, self.drive, self.response)
+        return Record, (self.name, *arrays, self.drive_axes, self.response_axes, self.time_unit)
+
+
+def _roles(table: CellTable) -> tuple[str, dict[str, dict[int, Axis]]]:
+    """Time unit, and the axis of every usable column by role; what is wrong joins `table.problems`."""
+    found: dict[str, dict[int, Axis]] = {role: {} for role in _ROLES}
+    for index, name in enumerate(table.names):
+        role, _, rest = name.partition("_")
+        axis, _, unit = ("time", "", rest) if role == "time" else rest.rpartition("_")
+        if role not in _ROLES:
+            problem = f"the role {role!r} is not known, columns are {FORM}{nearest(role, _ROLES)}"
+        elif role == "time" and unit not in TIME_UNITS:
+            problem = f"the time unit {unit!r} is not known{nearest(unit, TIME_UNITS)}"
+        elif not (axis.strip() and unit.strip() and name.isprintable()):
+            problem = f"expected {role}_<axis>_<unit>, as in {role}_x_rad"
+        elif any(axis == other.name for other in found[role].values()):
+            problem = f"the {role} of axis {axis!r}, or the time, has a column already; keep one"
+        else:
+            found[role][index] = Axis(axis.strip(), unit.strip())
+            continue
+        table.problems.append(f"{table.place(index)} (column {index + 1} of {len(table.names)}): {problem}")
+    for role in _ROLES:
+        if not any(name.partition("_")[0] == role for name in table.names):
+            table.problems.append(f"{table.path}: has no {role} column; columns are {FORM}")
+    return next((axis.unit for axis in found["time"].values()), "s"), found
+
+
+def _numbers(table: CellTable, column: int, *, missing: bool) -> Vector:
+    """(n,) numbers of a column; a bad cell is NaN here and joins `table.problems`."""
+    out, bad = np.full(len(table.rows), np.nan), []
+    for row, cell in enumerate(table.columns[column]):
+        text = cell.strip()
+        try:
+            value = float(text) if text and "_" not in text else math.nan  # float() takes 1_000
+        except ValueError:
+            value = math.inf
+        if math.isfinite(value):
+            out[row] = value
+        elif not (missing and text.lower() in ("", "nan")):
+            what = f"{text!r} is not a finite number" if text else "the cell is empty"
+            needed = "a number, or nothing for a missing sample" if missing else "a number in every row"
+            bad.append(f"{table.place(column, row)}: {what}; expected {needed}")
+    table.tell(bad, table.place(column))
+    return out
+
+
+def load_record(path: Path, time_unit: str | None = None) -> Record:
+    """Read a record from CSV or Parquet; times come out in `time_unit`, by default the unit of the file.
+
+    Raises InputError with everything wrong in the file: place (file, line and column; in Parquet the
+    row, counted from 1), what was found and what was expected, at most five per column and kind.
+    Accuracy: numbers are read exactly; a converted time is off by half a unit in the last place.
+    """
+    if time_unit is not None and time_unit not in TIME_UNITS:
+        raise InputError(f"unknown time unit {time_unit!r}{nearest(time_unit, TIME_UNITS)}")
+    table = read_cells(Path(path))
+    n_rows = len(table.rows) if not table.problems else 2  # rows of another length are told already
+    given, axes = _roles(table)
+    values = {role: [_numbers(table, j, missing=role == "response") for j in axes[role]] for role in _ROLES}
+    for column, time in zip(axes["time"], values["time"], strict=True):
+        late = [int(i) for i in np.flatnonzero(time[1:] <= time[:-1])]
+        rule = "does not come after the time of the row before,"
+        told = [f"{table.place(column, i + 1)}: {time[i + 1]} {rule} {time[i]}; sort the rows" for i in late]
+        table.tell(told, table.place(column))
+    if n_rows < 2:
+        table.problems.append(f"{path}: has {n_rows} row(s) of data; a record needs two or more")
+    if not table.problems and np.isnan(values["response"]).all():
+        table.problems.append(f"{path}: no response column holds a sample; a record needs one or more")
+    if table.problems:
+        raise InputError(table.problems)
+    wanted = time_unit or given
+    time = in_time_unit(values["time"][0], given, wanted)
+    drive, response = np.column_stack(values["drive"]), np.column_stack(values["response"])
+    both = tuple(axes["drive"].values()), tuple(axes["response"].values())
+    return Record(table.path.stem, time, drive, response, *both, wanted)
+
+
+def save_record(record: Record, path: Path) -> None:
+    """Write a record as CSV or Parquet, by suffix; every number reads back exactly, NaN is an empty cell.
+
+    The file appears whole or not at all. Raises InputError when it cannot be written there.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        refuse(path, f"expected a name ending in {' or '.join(SUFFIXES)}")
+    columns = {f"time_{record.time_unit}": record.time}
+    columns |= {f"drive_{a.name}_{a.unit}": v for a, v in zip(record.drive_axes, record.drive.T, strict=True)}
+    responses = zip(record.response_axes, record.response.T, strict=True)
+    columns |= {f"response_{axis.name}_{axis.unit}": values for axis, values in responses}
+
+    def write(beside: Path) -> None:
+        if path.suffix.lower() != ".csv":
+            return pd.DataFrame(columns).to_parquet(beside, index=False)
+        with beside.open("w", encoding="utf-8", newline="") as file:
+            rows = zip(*(values.tolist() for values in columns.values()), strict=True)
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(columns)
+            writer.writerows(["" if math.isnan(v) else repr(v) for v in row] for row in rows)
+
+    write_whole(path, write)

@@ -1,0 +1,193 @@
+"""A posterior's model with effects: responses, signatures and Jacobians in the table's values.
+
+    made = effected(problem.posterior, values, [OddCurvature(), Vibration(frequency=0.1)])
+    made.responses(values, psi)    # list per record, (samples, axes); at made.vanishing the base model's
+    made.signature(values)         # list per record, (samples, axes, psi): derivative at psi = 0
+    made.jacobian(values, psi)     # list per record, (samples, axes, rows of the table)
+    made.coefficients              # name, unit, prior scale, sign, effect and record of every psi
+
+An effect instance holds its internal constants; ``CubicStiffness.grid(made.ranges)`` lists those worth
+trying and `lcopa_bayes.model.effects.catalogue` the classes by name. For records held out,
+``made.over(model, samples, epochs)`` is the same with other records, and `carried` moves psi over.
+Samples an axis misses are filled too: choose with ``samples[r].axes[a].index``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.inference.observations import Samples
+from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.model.effects.effect import Coefficient, Effect, Ranges
+from lcopa_bayes.model.effects.jacobian import coefficient_slopes, plant_slopes
+from lcopa_bayes.model.effects.passage import Plant
+from lcopa_bayes.model.effects.scales import ranges_of
+from lcopa_bayes.model.effects.simulator import Simulator
+from lcopa_bayes.model.forward import ForwardModel
+
+
+@final
+@dataclass(frozen=True)
+class Placed:
+    """One entry of psi."""
+
+    name: str
+    """``<effect>.<coefficient>``, with ``[<record>]`` when it belongs to one."""
+    coefficient: Coefficient
+    effect: int
+    """Position of its effect."""
+    record: int | None
+    """Position of its record; None when it acts on all."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Effected:
+    """Base model plus effects over a set of records."""
+
+    table: ParameterTable
+    simulator: Simulator
+    records: tuple[str, ...]
+    offsets: tuple[int, ...] | None
+    """Position in the table's records of each record; None: offsets are left out (held-out records)."""
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """The effects."""
+        return self.simulator.effects
+
+    @property
+    def ranges(self) -> Ranges:
+        """Scales of the base fit."""
+        return self.simulator.ranges
+
+    @property
+    def vanishing(self) -> Vector:
+        """psi at which every effect vanishes."""
+        return np.zeros(self.simulator.size)
+
+    @cached_property
+    def coefficients(self) -> tuple[Placed, ...]:
+        """What every entry of psi is."""
+        out = []
+        for e, effect in enumerate(self.effects):
+            told = effect.coefficients(self.ranges)
+            if effect.card.per_record:
+                out += [
+                    Placed(f"{effect.name}.{one.name}[{record}]", one, e, r)
+                    for r, record in enumerate(self.records)
+                    for one in told
+                ]
+            else:
+                out += [Placed(f"{effect.name}.{one.name}", one, e, None) for one in told]
+        return tuple(out)
+
+    def with_effects(self, effects: Sequence[Effect]) -> Effected:
+        """The same records and scales with other effects."""
+        return replace(self, simulator=replace(self.simulator, effects=tuple(effects)))
+
+    def over(self, model: ForwardModel, samples: Sequence[Samples], epochs: Vector) -> Effected:
+        """The same plant and effects over records held out; their offsets are left out."""
+        times = tuple(one.times for one in samples)
+        simulator = replace(self.simulator, model=model, times=times, epochs=epochs)
+        return replace(
+            self, simulator=simulator, records=tuple(one.record.name for one in samples), offsets=None
+        )
+
+    def plant(self, values: Vector) -> Plant:
+        """The plant of the table's values, (rows,)."""
+        return plant_of(self.table, values, self.offsets, len(self.records))
+
+    def responses(self, values: Vector, psi: Vector) -> list[Matrix]:
+        """Responses at the sample times, per record (samples, axes) [response unit].
+
+        Raises UnstableError where an effect leaves no bounded response.
+        """
+        return self.simulator.responses(self.plant(values), psi)
+
+    def signature(self, values: Vector, psi: Vector | None = None) -> list[Matrix]:
+        """Derivative in psi (default: where it vanishes), per record (samples, axes, size of psi)."""
+        at = self.vanishing if psi is None else psi
+        return coefficient_slopes(self.simulator, self.plant(values), at)
+
+    def jacobian(self, values: Vector, psi: Vector | None = None) -> list[Matrix]:
+        """Derivative in the table's values, per record (samples, axes, rows); 0 for noise parameters.
+
+        Exact without effects; see `model.effects.jacobian.plant_slopes` for what is differenced.
+        """
+        at, table = self.vanishing if psi is None else psi, self.table
+        slopes = plant_slopes(self.simulator, self.plant(values), at)
+        out = []
+        for r, slope in enumerate(slopes):
+            made = np.zeros((*slope.gains.shape[:2], len(table.rows)))
+            for k, row in enumerate(table.rows):
+                first, second = row.place
+                if row.kind == "gain":
+                    made[..., k] = slope.gains[..., first, second]
+                elif row.kind == "time":
+                    made[..., k] = slope.times[first][..., second]
+                elif row.kind == "order":
+                    made[..., k] = slope.orders[first][..., second]
+                elif row.kind == "delay":
+                    made[..., k] = slope.delays[..., first]
+                elif row.kind == "offset" and self.offsets is not None and second in (-1, self.offsets[r]):
+                    made[:, first, k] = 1.0
+            out.append(made)
+        return out
+
+
+def plant_of(table: ParameterTable, values: Vector, offsets: Sequence[int] | None, records: int) -> Plant:
+    """The plant of a table's values, (rows,)."""
+    batch = table.canonical(values[None])
+    axes = range(len(table.layout.responses))
+    shifts = np.zeros((records, len(axes)))
+    if offsets is not None:
+        shifts = np.array([[table.offset(batch, i, r)[0] for i in axes] for r in offsets])
+    return Plant(table.gains(batch)[0], table.dynamics(batch), shifts)
+
+
+def effected(
+    posterior: Posterior, values: Vector, effects: Sequence[Effect] = (), epochs: Vector | None = None
+) -> Effected:
+    """The fit records of a posterior with effects; scales are taken from the base fit `values`.
+
+    `epochs` [-]: place of each record in the campaign, by default `epochs_of` their names.
+    """
+    names = tuple(one.record.name for one in posterior.samples)
+    n, fit = len(names), tuple(range(len(names)))
+    at = epochs_of(names)[0] if epochs is None else epochs
+    times = tuple(one.times for one in posterior.samples)
+    ranges = ranges_of(posterior.model, plant_of(posterior.table, values, fit, n), times)
+    simulator = Simulator(posterior.model, tuple(effects), ranges, at, times)
+    return Effected(posterior.table, simulator, names, fit)
+
+
+def epochs_of(fit: Sequence[str], held_out: Sequence[str] = ()) -> tuple[Vector, Vector]:
+    """Places of the records to fit and of those held out in the campaign, -1/2 to 1/2 [-].
+
+    By the number that ends their names when every name has one, all differ and what precedes is the same;
+    otherwise records to fit come first, in their order.
+    """
+    names = [*fit, *held_out]
+    parts = [re.fullmatch(r"(.*?)(\d+)", name) for name in names]
+    numbers = [int(part[2]) for part in parts if part]
+    stems = {part[1] for part in parts if part}
+    order = np.arange(len(names), dtype=float)
+    if len(set(numbers)) == len(names) and len(stems) == 1:
+        order = np.argsort(np.argsort(numbers)).astype(float)
+    places = order / max(len(names) - 1, 1) - (0.5 if len(names) > 1 else 0.0)
+    return places[: len(fit)], places[len(fit) :]
+
+
+def carried(psi: Vector, source: Effected, target: Effected) -> Vector:
+    """psi for the same effects over other records; coefficients of one record vanish."""
+    shared = {one.name: value for one, value in zip(source.coefficients, psi, strict=True)}
+    return np.array([shared.get(one.name, 0.0) if one.record is None else 0.0 for one in target.coefficients])

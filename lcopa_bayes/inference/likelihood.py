@@ -1,0 +1,231 @@
+"""The likelihood alone, maximised over all parameters but one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import final
+
+import numpy as np
+from scipy.optimize import least_squares, minimize
+from scipy.special import expit, logit
+
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.inference.leastsquares import LeastSquares, apart
+from lcopa_bayes.inference.posterior import Posterior
+
+_TAIL = 1e-9
+"""Prior mass beyond either end of a search where a prior has no end of its own [-]."""
+_FAR = 100.0
+"""Standard deviations of such a prior that are searched where it is not on a logarithmic scale [-]."""
+_EDGE = 1e-6
+"""Distance kept from the ends of a search, relative to its width [-]."""
+_AT_END = 1e-3
+"""Closer to an end than this share of the search counts as at its bound [-]."""
+_STIFFNESS = 1e3
+"""Weight of a residual row that keeps orders decreasing [-]: a force of 1 moves them by 1e-6."""
+_EVALUATIONS = 60
+_ROUNDS = 12
+_GAINED = 1e-3
+"""Rounds between plant and noise end when the log likelihood gains less [nat]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Peak:
+    """A maximum of the likelihood, perhaps with one parameter held."""
+
+    values: Vector
+    """Table values, (rows,); orders may increase by 1e-6 where terms merge."""
+    log_likelihood: float
+    """[nat]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Landscape:
+    """Log likelihood of all free parameters, none integrated out; of the priors only the support counts.
+
+    Coordinates are those on which a parameter is sampled: logarithms of time constants and noise scales,
+    logits of correlations, plain values of the rest.
+    """
+
+    posterior: Posterior
+
+    @cached_property
+    def free(self) -> tuple[int, ...]:
+        """Table positions of the free parameters."""
+        return tuple(k for k, row in enumerate(self.posterior.table.rows) if row.free)
+
+    @cached_property
+    def least(self) -> LeastSquares:
+        """Whitened residuals and their exact derivatives."""
+        return LeastSquares(self.posterior)
+
+    def coordinate(self, k: int, value: float) -> float:
+        """Coordinate of one parameter's value."""
+        row = self.posterior.table.rows[k]
+        return float(np.log(value) if row.log_scale else logit(value) if row.logit_scale else value)
+
+    def value(self, k: int, coordinate: float) -> float:
+        """Value of one parameter's coordinate."""
+        row = self.posterior.table.rows[k]
+        return float(
+            np.exp(coordinate) if row.log_scale else expit(coordinate) if row.logit_scale else coordinate
+        )
+
+    def column(self, k: int, values: Matrix) -> Vector:
+        """Coordinates of one parameter of many table values, (batch,)."""
+        row, x = self.posterior.table.rows[k], values[:, k]
+        return np.asarray(np.log(x) if row.log_scale else logit(x) if row.logit_scale else x)
+
+    def search(self, k: int) -> tuple[float, float]:
+        """Ends of the search of one parameter in its coordinate: its domain, or for a prior without ends of
+        its own 100 standard deviations, on logarithmic scales the decades with all but 2e-9 of its mass."""
+        row = self.posterior.table.rows[k]
+        assert row.prior is not None
+        low, high = row.domain
+        tails = row.prior.frozen.ppf((_TAIL, 1 - _TAIL))
+        if not (row.log_scale or row.logit_scale):
+            mean, sd = row.prior.frozen.mean(), row.prior.frozen.std()
+            tails = (mean - _FAR * sd, mean + _FAR * sd) if np.isfinite(sd) else tails
+        closed = row.log_scale or row.logit_scale  # zero and one are infinitely far away
+        if not np.isfinite(low) or (closed and low <= 0.0):
+            low = max(low, float(tails[0]))
+        if not np.isfinite(high) or (row.logit_scale and high >= 1.0):
+            high = min(high, float(tails[1]))
+        a, b = self.coordinate(k, low), self.coordinate(k, high)
+        edge = _EDGE * (b - a)
+        return a + edge, b - edge
+
+    def log_likelihood(self, values: Matrix) -> Vector:
+        """Of canonical table values (batch, rows), (batch,) [nat]."""
+        return self.posterior.joint_log_likelihood(values)
+
+    def climb(self, start: Vector, *, held: int | None = None, most: int = _EVALUATIONS) -> Peak:
+        """A local maximum from table values; the parameter `held` keeps the value it starts with.
+
+        Plant and noise parameters are maximised in turn until nothing is gained.
+        """
+        noise_moves = any(k not in self.least.columns and k != held for k in self.free)
+        values, best = start, -np.inf
+        for _ in range(_ROUNDS if noise_moves else 1):
+            values = self._plant(values, held, most)
+            if noise_moves:
+                values = self._noise(values, held)
+            reached = float(self.log_likelihood(self.posterior.table.canonical(values[None]))[0])
+            gained, best = reached - best, max(best, reached)
+            if gained < _GAINED:
+                break
+        return Peak(values, best)
+
+    def at_bound(self, values: Vector, *, but: int | None = None) -> tuple[str, ...]:
+        """Names of the free parameters that stand at an end of their search."""
+        out = []
+        for k in self.free:
+            low, high = self.search(k)
+            x = self.coordinate(k, values[k]) if k != but else 0.5 * (low + high)
+            if min(x - low, high - x) < _AT_END * (high - low):
+                out.append(self.posterior.table.names[k])
+        return tuple(out)
+
+    def _plant(self, values: Vector, held: int | None, most: int) -> Vector:
+        """Least squares in the plant's parameters at the noise parameters of `values`."""
+        least, table = self.least, self.posterior.table
+        moving = [p for p, k in enumerate(least.columns) if k != held]
+        if not moving:
+            return values
+        ends = np.array([self.search(least.columns[p]) for p in moving]).T
+        whole = least.coordinates(values)
+
+        def both(x: Vector) -> tuple[Vector, Matrix]:
+            at = whole.copy()
+            at[moving] = x
+            return self.rows(at, values, moving)
+
+        found = least_squares(
+            *apart(both, np.clip(whole[moving], *ends)),  # a start only
+            bounds=(ends[0], ends[1]),
+            x_scale="jac",
+            max_nfev=most,
+            ftol=1e-7,
+            xtol=1e-7,
+            gtol=1e-7,
+        )
+        whole[moving] = found.x
+        raw = least.values(whole, values)
+        # a held time or order stays that of its own term: merged terms must not change places
+        own = held is not None and table.rows[held].kind in ("time", "order")
+        return raw if own else np.asarray(table.canonical(raw[None])[0])
+
+    def rows(self, x: Vector, template: Vector, moving: Sequence[int]) -> tuple[Vector, Matrix]:
+        """Whitened residual without priors, with rows that keep orders decreasing."""
+        least, table = self.least, self.posterior.table
+        residual, jacobian = least.residual(x, template)
+        residual, jacobian = residual[: self.posterior.size], jacobian[: self.posterior.size]
+        if "nu" in self.posterior.noise.names:  # as in expectation maximisation of Student noise
+            weight = np.sqrt(self._student_weights(residual, template))
+            residual, jacobian = residual * weight, jacobian * weight[:, None]
+        values = least.values(x, template)
+        walls, slopes = [], []
+        for element, slot in enumerate(table.layout.elements):
+            orders = [table.at("order", element, term) for term in range(slot.terms)]
+            for upper, lower in pairwise(orders):
+                excess, row = values[lower] - values[upper], np.zeros(len(least.columns))
+                for k, sign in ((upper, -1.0), (lower, 1.0)):
+                    if excess > 0 and k in least.columns:
+                        scale = values[k] if table.rows[k].log_scale else 1.0
+                        row[least.columns.index(k)] = sign * _STIFFNESS * scale
+                walls.append(_STIFFNESS * max(excess, 0.0))
+                slopes.append(row)
+        if walls:
+            residual = np.concatenate([residual, walls])
+            jacobian = np.concatenate([jacobian, slopes])
+        return residual, jacobian[:, moving]
+
+    def _student_weights(self, standard: Vector, values: Vector) -> Vector:
+        """``(nu + 1) / (nu + z^2)`` of standardised residuals."""
+        out, start, table = np.empty(standard.size), 0, self.posterior.table
+        for samples in self.posterior.samples:
+            for axis, observed in enumerate(samples.axes):
+                part = slice(start, start + observed.values.size)
+                nu = values[table.at("nu", axis)]
+                out[part] = (nu + 1) / (nu + standard[part] ** 2)
+                start = part.stop
+        return out
+
+    def _noise(self, values: Vector, held: int | None) -> Vector:
+        """The noise parameters that maximise the likelihood of the residual of `values`."""
+        posterior, table, out = self.posterior, self.posterior.table, values.copy()
+        canonical = table.canonical(values[None])
+        units = posterior.responses(canonical)
+        for axis in range(len(table.layout.responses)):
+            rows = [table.at(name, axis) for name in posterior.noise.names]
+            moving = [k for k in rows if table.rows[k].free and k != held]
+            if not moving:
+                continue
+            left = [
+                (
+                    posterior.residual(axis, r, samples.axes[axis], canonical, units[r]),
+                    samples.axes[axis].gaps,
+                )
+                for r, samples in enumerate(posterior.samples)
+            ]
+
+            def cost(x: Vector, rows: list[int] = rows, moving: list[int] = moving, left=left) -> float:  # type: ignore[no-untyped-def]
+                at = out.copy()
+                for k, coordinate in zip(moving, x, strict=True):
+                    at[k] = self.value(k, coordinate)
+                told = [posterior.noise.pointwise(part, at[None, rows], gaps) for part, gaps in left]
+                return -float(sum(density.sum() for density in told))
+
+            ends = [self.search(k) for k in moving]
+            start = [
+                float(np.clip(self.coordinate(k, out[k]), *e)) for k, e in zip(moving, ends, strict=True)
+            ]
+            found = minimize(cost, start, method="L-BFGS-B", bounds=ends, options={"ftol": 1e-12})
+            for k, coordinate in zip(moving, found.x, strict=True):
+                out[k] = self.value(k, float(coordinate))
+        return out

@@ -1,0 +1,86 @@
+"""Observed samples of a set of records, arranged for the likelihood."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Index, Matrix, Vector
+from lcopa_bayes.data.record import Record
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """Samples of one response axis in one record."""
+
+    index: Index
+    """Position of each sample among the record's sample times."""
+    values: Vector
+    """[response unit]."""
+    gaps: Vector
+    """Time since the previous sample, in sampling periods; 1 for the first."""
+
+    @cached_property
+    def chosen(self) -> Index | slice:
+        """`index`, as a slice where it is one: taking a slice copies nothing."""
+        if not self.index.size:
+            return self.index
+        first, last = int(self.index[0]), int(self.index[-1]) + 1
+        return slice(first, last) if last - first == self.index.size else self.index
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """All samples of one record."""
+
+    record: Record
+    times: Vector
+    """Times at which any axis was sampled [time unit]."""
+    axes: tuple[Observed, ...]
+    """One per response axis."""
+
+    @classmethod
+    def of(cls, record: Record, period: float) -> Samples:
+        """Samples of a record; gaps are counted in `period` [time unit]."""
+        taken = ~np.isnan(record.response)
+        rows = np.flatnonzero(taken.any(axis=1))
+        times = record.time[rows]
+        axes = []
+        for axis in range(record.response.shape[1]):
+            index = np.flatnonzero(taken[rows, axis])
+            at = times[index]
+            gaps = np.concatenate(([1.0], np.diff(at) / period))[: at.size]
+            axes.append(Observed(index, record.response[rows[index], axis], gaps))
+        return cls(record, times, tuple(axes))
+
+    @cached_property
+    def first_change(self) -> float:
+        """Time of the first drive change, infinite when there is none [time unit]."""
+        drive = self.record.drive
+        moved = np.flatnonzero((drive != drive[0]).any(axis=1))
+        return float(self.record.time[moved[0]]) if moved.size else np.inf
+
+    def quiet(self, axis: int) -> Observed:
+        """Samples of an axis taken before any drive change can have acted, that at the change included."""
+        observed = self.axes[axis]
+        n = int(np.searchsorted(self.times[observed.index], self.first_change, side="right"))
+        return Observed(observed.index[:n], observed.values[:n], observed.gaps[:n])
+
+    def matrix(self) -> Matrix:
+        """Responses at `times`, (samples, axes), NaN where missing [response unit]."""
+        out = np.full((self.times.size, len(self.axes)), np.nan)
+        for axis, observed in enumerate(self.axes):
+            out[observed.index, axis] = observed.values
+        return out
+
+
+def sampling_period(records: Sequence[Record]) -> float:
+    """Median time between samples over the records [time unit]; the unit in which noise correlates."""
+    steps = [np.diff(record.time[~np.isnan(record.response).all(axis=1)]) for record in records]
+    return float(np.median(np.concatenate(steps)))

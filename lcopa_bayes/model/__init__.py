@@ -1,0 +1,1 @@
+"""The plant: elements, delayed drives, block-pulse algebra, responses and their derivatives."""

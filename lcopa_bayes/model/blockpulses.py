@@ -1,0 +1,113 @@
+"""Fractional integration of block pulses: weights, their derivative in the order, dense matrices."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from scipy.linalg import toeplitz
+from scipy.special import digamma, gamma
+
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
+
+_DIRECT = 16
+"""Second differences are taken directly below this index and from their series above it, where
+direct subtraction would cancel all but ``2 log10(p)`` digits."""
+_SERIES_TERMS = 6
+"""Terms of the series: the first one left out is below 1e-16 of the leading one (``0.01 * 16**-12``)."""
+
+
+@lru_cache(maxsize=64)
+def _tail_basis(n: int) -> tuple[Vector, Matrix]:
+    """``log m`` and the powers ``m**(-2k)``, k = 0.., for m = _DIRECT .. n-1."""
+    m = np.arange(_DIRECT, n, dtype=float)
+    return np.log(m), m ** (-2.0 * np.arange(_SERIES_TERMS)[:, None])
+
+
+def _series_coefficients(q: Vector) -> Matrix:
+    """``2 binomial(q, 2k)``, k = 1.., (batch, terms)."""
+    j = np.arange(2 * _SERIES_TERMS)
+    return np.asarray(2 * np.cumprod((q[:, None] - j) / (j + 1), axis=1)[:, 1::2], dtype=float)
+
+
+def _series_coefficient_slopes(q: Vector) -> Matrix:
+    """Derivatives of `_series_coefficients` in q; same shape."""
+    value, slope, slopes = np.ones_like(q), np.zeros_like(q), []
+    for j in range(2 * _SERIES_TERMS):
+        slope = (slope * (q - j) + value) / (j + 1)
+        value = value * (q - j) / (j + 1)
+        slopes.append(2 * slope)
+    return np.stack(slopes[1::2], axis=-1)
+
+
+def integration_weights(orders: Vector, n: int, step: float) -> Matrix:
+    r"""First column of the block-pulse matrix of :math:`I^a`, for a batch of orders.
+
+    ``w[0] = step^a / Gamma(a+2)``, ``w[p] = w[0] ((p+1)^(a+1) - 2 p^(a+1) + (p-1)^(a+1))``
+    (Ta et al. 2026, Eqs. 44, 45).
+
+    Parameters: orders (batch,) [-], >= 0; n blocks of width `step` [time unit].
+    Returns: (batch, n) [time unit^order]. Accuracy: 1e-13 of ``w[0] max(1, n^(a-1))``.
+    """
+    q = orders + 1
+    out = np.empty((orders.size, n))
+    out[:, 0] = 1.0
+    head = min(n, _DIRECT)
+    powers = np.arange(head + 1, dtype=float) ** q[:, None]
+    out[:, 1:head] = powers[:, 2:] - 2 * powers[:, 1:-1] + powers[:, :-2]
+    if n > _DIRECT:
+        log_m, basis = _tail_basis(n)
+        tail = np.multiply((q - 2)[:, None], log_m, out=out[:, _DIRECT:])
+        np.exp(tail, out=tail)
+        tail *= _series_coefficients(q) @ basis
+    out *= (step**orders / gamma(orders + 2))[:, None]
+    return out
+
+
+def integration_weights_slope(orders: Vector, n: int, step: float) -> Matrix:
+    """Derivative of `integration_weights` in the order; same shapes, [time unit^order].
+
+    Accuracy: 1e-12 of ``w[0] max(1, n^(a-1)) max(1, |log step|)``.
+    """
+    q = orders + 1
+    out = np.empty((orders.size, n))
+    out[:, 0] = 0.0
+    head = min(n, _DIRECT)
+    p = np.arange(head + 1, dtype=float)
+    log_p = np.log(np.maximum(p, 1.0))  # p = 0 contributes 0 to p^q log p for q > 0
+    powers = p ** q[:, None] * log_p
+    out[:, 1:head] = powers[:, 2:] - 2 * powers[:, 1:-1] + powers[:, :-2]
+    if n > _DIRECT:
+        log_m, basis = _tail_basis(n)
+        values, slopes = _series_coefficients(q), _series_coefficient_slopes(q)
+        growth = np.exp((q - 2)[:, None] * log_m)
+        out[:, _DIRECT:] = growth * (log_m * (values @ basis) + slopes @ basis)
+    scale = (step**orders / gamma(orders + 2))[:, None]
+    weights = integration_weights(orders, n, step)
+    return np.asarray(out * scale + weights * (np.log(step) - digamma(orders + 2))[:, None])
+
+
+def integration_matrix(order: float, n: int, step: float) -> Matrix:
+    r"""Block-pulse matrix of the fractional integral (Ta et al. 2026, Eqs. 44, 45, transposed).
+
+    ``P @ f`` approximates the block means of :math:`I^a f` on n blocks of width `step`.
+
+    Parameters: order [-] >= 0, n > 0, step [time unit] > 0; otherwise ValueError.
+    Returns: (n, n), lower triangular Toeplitz, [time unit^order]; the identity at order 0.
+    Accuracy: exact for constants. ``P(a) @ P(b) = P(a+b)`` holds only to O(step).
+    """
+    if not (order >= 0 and n > 0 and step > 0):
+        raise ValueError(f"need order >= 0, n > 0, step > 0; got {order}, {n}, {step}")
+    return lower_toeplitz(integration_weights(np.array([order]), n, step)[0])
+
+
+def lower_toeplitz(column: Array) -> Matrix:
+    """Lower triangular Toeplitz matrix with this first column."""
+    return toeplitz(column, np.zeros_like(column))
+
+
+def shift_matrix(blocks: int, n: int) -> Matrix:
+    """Delay by whole blocks (Ta et al. 2026, Eq. 53, transposed): ``(E @ f)[i] = f[i - blocks]``."""
+    if blocks < 0:
+        raise ValueError(f"a delay of {blocks} blocks looks into the future; need blocks >= 0")
+    return np.eye(n, k=-blocks)

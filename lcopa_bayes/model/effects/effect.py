@@ -1,0 +1,301 @@
+"""What every effect is: a card, coefficients with a scale, and one abstract class per place.
+
+An effect is a frozen dataclass. Its fields are its internal constants (a frequency, a frame length);
+`grid` lists the instances worth trying on a set of records. Its coefficients psi are what is estimated;
+at psi = 0 every effect vanishes and the plant is the linear one, exactly. The order of the stages is
+
+    commands -> DriveEffect -> delay, gain -> ElementEffect, ForceEffect -> SensorEffect (on the grid)
+             -> read at the samples -> ParallelEffect (adds) -> ReadoutEffect -> offset -> noise
+
+Deflection always means the response without its offset, so that it is 0 at zero drive.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields
+from types import MappingProxyType
+from typing import Any, ClassVar, Literal, Self, final
+
+from lcopa_bayes.core.arrays import Index, Matrix, Vector
+from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.model.grid import Grid
+from lcopa_bayes.model.layout import Layout
+
+
+class UnstableError(ArithmeticError):
+    """The plant with its effects has no bounded response; carries the `effects`, `record` and `why`."""
+
+    def __init__(self, effects: tuple[str, ...], record: str, why: str) -> None:
+        self.effects, self.record, self.why = effects, record, why
+        super().__init__(f"record {record!r} with {', '.join(effects) or 'no effect'}: {why}")
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return UnstableError, (self.effects, self.record, self.why)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Ranges:
+    """Scales that make coefficients comparable between devices; frozen once, at the base fit."""
+
+    drive: Vector
+    """Largest magnitude of any drive of the same unit [drive unit]."""
+    response: Vector
+    """Largest deflection of each response axis in the base model, alike for axes of one unit in proportion to
+    what their drives hold [response unit]."""
+    period: float
+    """Median distance of samples [time unit]."""
+    span: float
+    """Length of the longest record [time unit]."""
+    speed: float
+    """Time from 0 to half of the final deflection after a step, delay excluded [time unit]."""
+    direct: Index
+    """Drive that each response axis belongs to [-]."""
+    names: tuple[str, ...]
+    """Names of the response axes."""
+
+    @property
+    def axes(self) -> int:
+        """Number of response axes."""
+        return self.response.size
+
+    @property
+    def column(self) -> Matrix:
+        """`response` as a column, (axes, 1)."""
+        return self.response[:, None]
+
+
+@final
+@dataclass(frozen=True)
+class Coefficient:
+    """One number that an effect estimates; it vanishes at 0."""
+
+    name: str
+    unit: str
+    """"-", "time" or "response": the latter two are units of the records."""
+    scale: float
+    """Standard deviation of its prior, normal or, when `one_signed`, half-normal [`unit`]."""
+    one_signed: bool = False
+    """Whether only values of 0 or more make sense."""
+    axis: int | None = None
+    """Response axis it acts on; None when it acts on several."""
+
+
+@final
+@dataclass(frozen=True)
+class Constant:
+    """One internal constant of an effect and where its default prior reaches."""
+
+    name: str
+    unit: str
+    """"-", "time", "response" or "1/time"."""
+    low: float
+    """Smallest value that is tried [`unit`]."""
+    high: float
+    """Largest value that is tried; equal to `low` where it is fixed unless a study gives a prior [`unit`]."""
+    kind: Literal["constant", "fraction", "choice"]
+    """Positive, of any magnitude; a share from 0 to 1; or no (0) and yes (1)."""
+
+
+@final
+@dataclass(frozen=True)
+class Card:
+    """What a reader needs to know about an effect."""
+
+    name: str
+    place: str
+    """drive, plant, output, noise or generic."""
+    formula: str
+    source: str
+    reveals: str
+    """Excitation that shows it."""
+    mistaken_for: str
+    """What it looks like under a plain step."""
+    per_record: bool = False
+    """Whether each record has coefficients of its own."""
+    disturbance: bool = False
+    """Whether it belongs to the noise model and not to the plant."""
+    resting: bool = False
+    """Whether it goes on where nothing moves."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One record as the effects see it."""
+
+    layout: Layout
+    ranges: Ranges
+    record: int
+    """Position among the simulated records [-]."""
+    epoch: float
+    """Place in the campaign, -1/2 for the first record, 1/2 for the last [-]."""
+    times: Vector
+    """Sample times [time unit]."""
+    grid: Grid
+    drives: tuple[Drive, ...]
+    """Commands as recorded, deviations from rest."""
+    rest: Vector
+    """Drive before the first command [drive unit]."""
+    gains: Matrix
+    """(responses, drives) [response unit per drive unit]."""
+    delays: Matrix
+    """(responses, drives) [time unit]."""
+
+    def direct(self, axis: int) -> tuple[Drive, float, float, float]:
+        """Own drive of a response axis, its rest, gain and delay."""
+        j = int(self.ranges.direct[axis])
+        return self.drives[j], float(self.rest[j]), float(self.gains[axis, j]), float(self.delays[axis, j])
+
+
+class Effect(ABC):
+    """An addition to the linear plant; concrete effects subclass one of the classes below."""
+
+    card: ClassVar[Card]
+    per_command: ClassVar[bool] = False
+    """Whether it is computed command by command, which takes long on records of thousands."""
+    linear: ClassVar[bool] = False
+    """Whether what it adds, where it acts, is proportional to its coefficients: one difference is then
+    enough for a slope."""
+    affine: ClassVar[bool] = True
+    """Whether every response axis stays linear in the gains of its own paths."""
+    additive: ClassVar[bool] = False
+    """Whether what it adds depends on time alone, not on the plant or its drive."""
+    units: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    """Units of the internal constants that have one."""
+    fractions: ClassVar[frozenset[str]] = frozenset()
+    """Internal constants that lie between 0 and 1."""
+
+    @classmethod
+    def grid(cls, ranges: Ranges) -> tuple[Self, ...]:
+        """Instances with the internal constants worth trying; one when there are none to try."""
+        return (cls(),)
+
+    @classmethod
+    def internal(cls, ranges: Ranges) -> tuple[Constant, ...]:
+        """Internal constants, in the order of the fields; they reach from end to end of `grid`, and what has
+        a default value is fixed there."""
+        listed, out = cls.grid(ranges), []
+        for field in fields(cls):  # type: ignore[arg-type]
+            values = [getattr(one, field.name) for one in listed]
+            if isinstance(values[0], bool):
+                out.append(Constant(field.name, "-", 0.0, 0.0, "choice"))
+                continue
+            low, high = (min(values), max(values)) if field.default is MISSING else (field.default,) * 2
+            kind: Literal["constant", "fraction"] = "fraction" if field.name in cls.fractions else "constant"
+            unit = cls.units.get(field.name, "-")
+            out.append(Constant(field.name, unit, float(low), float(high), kind))
+        return tuple(out)
+
+    @classmethod
+    def with_constants(cls, ranges: Ranges, values: Sequence[float]) -> Self:
+        """The instance with internal constants as numbers, in the order of `internal`."""
+        told = cls.internal(ranges)
+        return cls(*(bool(v) if one.kind == "choice" else v for one, v in zip(told, values, strict=True)))
+
+    @abstractmethod
+    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
+        """Coefficients, of one record when the card says `per_record`."""
+
+    @classmethod
+    def applies(cls, layout: Layout) -> bool:
+        """Whether a plant of this layout can have the effect."""
+        return True
+
+    @property
+    def name(self) -> str:
+        """Name of the effect."""
+        return self.card.name
+
+    @property
+    def constants(self) -> dict[str, Any]:
+        """Internal constants by name."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+
+
+class DriveEffect(Effect):
+    """Changes the commands of one drive axis."""
+
+    @abstractmethod
+    def commands(
+        self, drive: Drive, rest: float, axis: int, scene: Scene, psi: Vector
+    ) -> tuple[Drive, float]:
+        """Commands as they act: deviations from the resting drive, and that rest [drive unit]."""
+
+
+class ElementEffect(Effect):
+    """Changes the time constants from record to record."""
+
+    @abstractmethod
+    def stretch(self, scene: Scene, psi: Vector) -> float:
+        """Factor on all time constants [-]."""
+
+
+class ForceEffect(Effect):
+    """Changes the balance of forces in the direct paths: ``y + viscous(y) = v(f, y)`` instead of ``= f``."""
+
+    affine = False
+
+    @abstractmethod
+    def force(self, f: Matrix, y: Matrix, rate: Matrix, scene: Scene, psi: Vector) -> Matrix:
+        """Effective force v on each direct path, (axes, blocks) [response unit].
+
+        Parameters: f, the force so far (gain times delayed drive); y, deflection of the direct path;
+        rate, its derivative [response unit per time unit]; all (axes, blocks). Pointwise in time.
+        """
+
+
+class SensorEffect(Effect):
+    """A linear filter between the deflection and the reading."""
+
+    @abstractmethod
+    def filtered(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
+        """Deviation from rest after the filter, (axes, blocks), from that before it; 0 before the first."""
+
+
+class ParallelEffect(Effect):
+    """A response of its own beside that of the paths, proportional to its coefficients."""
+
+    linear = True
+
+    @abstractmethod
+    def added(self, scene: Scene, psi: Vector) -> Matrix:
+        """What it adds at the sample times, (samples, axes) [response unit]."""
+
+
+class ReadoutEffect(Effect):
+    """Acts on the deflection at the sample times."""
+
+    affine = False
+
+    @abstractmethod
+    def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
+        """Deflection as read, (samples, axes) [response unit], from the one before."""
+
+
+class ScatterEffect(Effect):
+    """Changes the distribution of the noise and not the mean: its signature is 0."""
+
+    noise: ClassVar[str]
+    """Noise model that takes the place of the study's; the parameters it has beside a scale are those of the
+    effect."""
+
+
+def single(name: str, scale: float, unit: str = "-", *, one_signed: bool = False) -> tuple[Coefficient, ...]:
+    """One coefficient."""
+    return (Coefficient(name, unit, scale, one_signed),)
+
+
+def per_axis(
+    ranges: Ranges, names: Sequence[str], part: float, *, one_signed: bool = False
+) -> tuple[Coefficient, ...]:
+    """Coefficients [response unit] for every axis in turn; their scale is a `part` of its deflection."""
+    return tuple(
+        Coefficient(
+            f"{name}_{axis}" if ranges.axes > 1 else name, "response", part * float(size), one_signed, number
+        )
+        for number, (axis, size) in enumerate(zip(ranges.names, ranges.response, strict=True))
+        for name in names
+    )

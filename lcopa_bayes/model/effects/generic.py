@@ -1,0 +1,122 @@
+"""Classes without a mechanism, so that no name is forced on what no named effect explains."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.model.effects.effect import Card, Coefficient, ParallelEffect, Ranges, Scene, per_axis
+from lcopa_bayes.model.effects.parallel import falling, relaxing
+from lcopa_bayes.model.effects.superposition import jumps_of, summed
+
+_LAGS = 6
+_WAVES = 8
+_POWERS = (2, 3)
+_PARTS = (0.3, 1.0, 3.0)
+"""Lags of the non-linear class, in response times [-]."""
+
+
+@final
+@dataclass(frozen=True)
+class UnmodelledLinear(ParallelEffect):
+    """Any further linear response of an axis to its own drive."""
+
+    card: ClassVar[Card] = Card(
+        name="unmodelled_linear",
+        place="generic",
+        formula="y += K sum_k c_k u / (1 + T_k s), T_k from an eighth of the response time to the span",
+        source="relaxation spectrum",
+        reveals="any drive",
+        mistaken_for="a named linear effect",
+    )
+
+    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
+        """c_k [-] per axis."""
+        return tuple(
+            Coefficient(f"c{k + 1}_{axis}" if ranges.axes > 1 else f"c{k + 1}", "-", 0.03)
+            for axis in ranges.names
+            for k in range(_LAGS)
+        )
+
+    def added(self, scene: Scene, psi: Vector) -> Matrix:
+        """One exponential per change and lag."""
+        out = np.zeros((scene.times.size, scene.ranges.axes))
+        lags = np.geomspace(scene.ranges.speed / 8, scene.ranges.span, _LAGS)
+        for axis, mine in enumerate(psi.reshape(-1, _LAGS)):
+            drive, rest, gain, delay = scene.direct(axis)
+            for c, lag in zip(mine, lags, strict=True):
+                if c != 0.0:
+                    moved = summed(scene.times, drive, delay, jumps_of(drive), relaxing(float(lag)))
+                    out[:, axis] += c * gain * (rest + moved)
+        return out
+
+
+@final
+@dataclass(frozen=True)
+class UnmodelledSmooth(ParallelEffect):
+    """Any slow addition to a record, whatever the drive does."""
+
+    additive = True
+    card: ClassVar[Card] = Card(
+        name="unmodelled_smooth",
+        place="generic",
+        formula="y += sum_k c_k cos(pi k (t - start) / length), k = 1..8, per record and axis",
+        source="cosine series",
+        reveals="any record; repeats tell it from what the drive causes",
+        mistaken_for="everything slow",
+        per_record=True,
+        disturbance=True,
+    )
+
+    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
+        """c_k [response unit] per axis."""
+        return per_axis(ranges, tuple(f"c{k + 1}" for k in range(_WAVES)), 0.005)
+
+    def added(self, scene: Scene, psi: Vector) -> Matrix:
+        """Linear in the coefficients."""
+        length = max(float(scene.times[-1] - scene.times[0]), scene.ranges.period)
+        phase = np.pi * (scene.times - scene.times[0]) / length
+        waves = np.cos(np.outer(phase, np.arange(1, _WAVES + 1)))
+        return np.asarray(waves @ psi.reshape(-1, _WAVES).T)
+
+
+@final
+@dataclass(frozen=True)
+class UnmodelledNonlinear(ParallelEffect):
+    """A further response to powers of the drive, and to its falls."""
+
+    card: ClassVar[Card] = Card(
+        name="unmodelled_nonlinear",
+        place="generic",
+        formula="y += K umax sum_pk c_pk (u/umax)^p / (1 + T_k s), p = 2, 3, and falls of u alone, "
+        "T_k 0.3 to 3 response times",
+        source="Hammerstein series",
+        reveals="amplitude series, on/off, sign reversal",
+        mistaken_for="a named non-linear effect",
+    )
+
+    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
+        """c [-], shared by the axes."""
+        names = [f"{kind}_{k + 1}" for kind in ("even", "odd", "fall") for k in range(len(_PARTS))]
+        return tuple(Coefficient(name, "-", 0.03) for name in names)
+
+    def added(self, scene: Scene, psi: Vector) -> Matrix:
+        """One exponential per change, kind and lag."""
+        out = np.zeros((scene.times.size, scene.ranges.axes))
+        kinds = psi.reshape(len(_POWERS) + 1, len(_PARTS))
+        for axis in range(scene.ranges.axes):
+            drive, rest, gain, delay = scene.direct(axis)
+            size = scene.ranges.drive[scene.ranges.direct[axis]]
+            levels = (rest + np.concatenate(([0.0], drive.values))) / size
+            inputs = [(float(levels[0]) ** p, np.diff(levels**p)) for p in _POWERS]
+            inputs.append((0.0, np.where(falling(drive, rest), np.diff(levels), 0.0)))
+            for (level, jumps), mine in zip(inputs, kinds, strict=True):
+                for c, part in zip(mine, _PARTS, strict=True):
+                    if c != 0.0:
+                        lag = relaxing(part * scene.ranges.speed)
+                        moved = summed(scene.times, drive, delay, jumps, lag)
+                        out[:, axis] += c * gain * size * (level + moved)
+        return out

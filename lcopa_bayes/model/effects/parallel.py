@@ -1,0 +1,212 @@
+"""Responses beside those of the paths, each in closed form for a drive that is constant between changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import ClassVar, Self, final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.model.effects.effect import Card, Coefficient, ParallelEffect, Ranges, Scene, single
+from lcopa_bayes.model.effects.superposition import jumps_of, summed
+from lcopa_bayes.model.layout import Layout
+
+
+def relaxing(time: float) -> Callable[[Array], Array]:
+    """``1 - exp(-t / time)``."""
+    return lambda t: np.asarray(-np.expm1(-t / time))
+
+
+def falling(drive: Drive, rest: float) -> Array:
+    """Whether each change leads to a smaller magnitude."""
+    levels = np.abs(rest + np.concatenate(([0.0], drive.values)))
+    return np.asarray(levels[1:] < levels[:-1])
+
+
+@final
+@dataclass(frozen=True)
+class IonCreep(ParallelEffect):
+    """A slow further deflection under a held drive."""
+
+    time: float
+    """Ti [time unit]."""
+
+    units = MappingProxyType({"time": "time"})
+    card: ClassVar[Card] = Card(
+        name="ion_creep",
+        place="plant",
+        formula="y += k K u / (1 + Ti s), K the gain of the path",
+        source="ionic double layers, 0.5 to 2 %",
+        reveals="long holds",
+        mistaken_for="fractional tail of a low order (84 % of it)",
+    )
+
+    @classmethod
+    def grid(cls, ranges: Ranges) -> tuple[Self, ...]:
+        """From a quarter of the longest record to ten times it."""
+        return tuple(cls(float(time)) for time in np.geomspace(0.25 * ranges.span, 10 * ranges.span, 4))
+
+    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
+        """k [-]."""
+        return single("k", 0.03)
+
+    def added(self, scene: Scene, psi: Vector) -> Matrix:
+        """One exponential per change."""
+        columns = []
+        for axis in range(scene.ranges.axes):
+            drive, rest, gain, delay = scene.direct(axis)
+            moved = summed(scene.times, drive, delay, jumps_of(drive), relaxing(self.time))
+            columns.append(psi[0] * gain * (rest + moved))
+        return np.stack(columns, axis=1)
+
+
+@final
+@dataclass(frozen=True)
+class Backflow(ParallelEffect):
+    """A transient kick after changes to smaller (or larger) magnitude."""
+
+    time: float
+    """Tb [time unit]."""
+    rising: bool
+    """Whether it follows rising instead of falling changes."""
+
+    units = MappingProxyType({"time": "time"})
+    card: ClassVar[Card] = Card(
+        name="backflow",
+        place="plant",
+        formula="y += k K du s Tb / (1 + Tb s)^3 on falling (or rising) changes",
+        source="Ruan and Sambles; Appl. Phys. Lett. 75:3491 and 80:3721 (bounce on rise, overshoot)",
+        reveals="on/off",
+        mistaken_for="ringing of an order above 1",
+    )
+
+    @classmethod
+    def grid(cls, ranges: Ranges) -> tuple[Self, ...]:
+        """From a tenth of the response time to the whole, on either change."""
+        times = np.geomspace(0.1 * ranges.speed, ranges.speed, 6)
+        return tuple(cls(float(time), rising) for rising in (False, True) for time in times)
+
+    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
+        """k [-]."""
+        return single("k", 0.1)
+
+    def added(self, scene: Scene, psi: Vector) -> Matrix:
+        """``(x^2 / 2) e^(-x)``, x = t / Tb, per change."""
+        columns = []
+        for axis in range(scene.ranges.axes):
+            drive, rest, gain, delay = scene.direct(axis)
+            chosen = np.where(falling(drive, rest) != self.rising, jumps_of(drive), 0.0)
+            kick = summed(scene.times, drive, delay, chosen, self.kick)
+            columns.append(psi[0] * gain * kick)
+        return np.stack(columns, axis=1)
+
+    def kick(self, t: Array) -> Array:
+        """Response to a unit change."""
+        x = t / self.time
+        return np.asarray(0.5 * x**2 * np.exp(-x))
+
+
+@final
+@dataclass(frozen=True)
+class ExtraMode(ParallelEffect):
+    """A lightly damped resonance beside the main response."""
+
+    frequency: float
+    """[cycles per time unit]."""
+    damping: float
+    """zeta [-], below 1."""
+
+    units = MappingProxyType({"frequency": "1/time"})
+    fractions = frozenset({"damping"})
+    card: ClassVar[Card] = Card(
+        name="extra_mode",
+        place="plant",
+        formula="y += k K u / (1 + 2 zeta s / w + s^2 / w^2), w = 2 pi frequency",
+        source="mechanical or elastic resonance",
+        reveals="steps, pseudo-random drive",
+        mistaken_for="ringing of an order above 1",
+    )
+
+    @classmethod
+    def grid(cls, ranges: Ranges) -> tuple[Self, ...]:
+        """From two cycles per record to a twelfth of the sampling rate, lightly and well damped."""
+        low, high = 2 / ranges.span, 1 / (12 * ranges.period)
+        count = max(2, int(np.ceil(12 * np.log2(max(high / low, 2.0)) / 2)))
+        return tuple(
+            cls(float(f), damping) for damping in (0.03, 0.15) for f in np.geomspace(low, high, count)
+        )
+
+    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
+        """k [-]."""
+        return single("k", 0.05)
+
+    def added(self, scene: Scene, psi: Vector) -> Matrix:
+        """One damped oscillation per change."""
+        columns = []
+        for axis in range(scene.ranges.axes):
+            drive, rest, gain, delay = scene.direct(axis)
+            moved = summed(scene.times, drive, delay, jumps_of(drive), self.step)
+            columns.append(psi[0] * gain * (rest + moved))
+        return np.stack(columns, axis=1)
+
+    def step(self, t: Array) -> Array:
+        """Response to a unit step."""
+        w, root = 2 * np.pi * self.frequency, np.sqrt(1 - self.damping**2)
+        phase = w * root * t
+        wave = np.cos(phase) + self.damping / root * np.sin(phase)
+        return np.asarray(1 - np.exp(-self.damping * w * t) * wave)
+
+
+@final
+@dataclass(frozen=True)
+class MissingCrossPath(ParallelEffect):
+    """A path from one axis to another with dynamics that the model's cross paths do not have."""
+
+    time: float
+    """T [time unit]."""
+
+    units = MappingProxyType({"time": "time"})
+    card: ClassVar[Card] = Card(
+        name="missing_cross_path",
+        place="plant",
+        formula="y_i += k_ij (ymax_i / umax_j) u_j / (1 + T s) for every drive j of another axis",
+        source="elastic or thermal coupling of the axes",
+        reveals="single-axis records read on both axes",
+        mistaken_for="cross gains; axis_rotation",
+    )
+
+    @classmethod
+    def applies(cls, layout: Layout) -> bool:
+        """Only with two drives or more."""
+        return len(layout.drives) > 1
+
+    @classmethod
+    def grid(cls, ranges: Ranges) -> tuple[Self, ...]:
+        """From a third of the response time to ten times it."""
+        return tuple(cls(float(time)) for time in np.geomspace(0.3 * ranges.speed, 10 * ranges.speed, 5))
+
+    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
+        """k_ij [-] by response axis and drive."""
+        return tuple(
+            Coefficient(f"k_{name}_{j + 1}", "-", 0.03)
+            for name, own in zip(ranges.names, ranges.direct, strict=True)
+            for j in range(ranges.drive.size)
+            if j != own
+        )
+
+    def added(self, scene: Scene, psi: Vector) -> Matrix:
+        """One exponential per change."""
+        out = np.zeros((scene.times.size, scene.ranges.axes))
+        pairs = ((i, j) for i in range(scene.ranges.axes) for j in range(scene.ranges.drive.size))
+        other = ((i, j) for i, j in pairs if j != scene.ranges.direct[i])
+        for k, (i, j) in zip(psi, other, strict=True):
+            drive, unit = scene.drives[j], scene.ranges.response[i] / scene.ranges.drive[j]
+            moved = summed(
+                scene.times, drive, float(scene.delays[i, j]), jumps_of(drive), relaxing(self.time)
+            )
+            out[:, i] += k * unit * (scene.rest[j] + moved)
+        return out

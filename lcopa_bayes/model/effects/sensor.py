@@ -1,0 +1,101 @@
+"""Linear filters between the deflection and the reading."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, final
+
+import numpy as np
+from scipy.signal import lfilter
+
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.model.effects.effect import Card, Coefficient, Ranges, Scene, SensorEffect, single
+
+_CUBIC = np.linalg.inv(np.vander(np.array([-1.0, 0.0, 1.0, 2.0]), increasing=True))
+"""Coefficients of the Lagrange polynomials on the blocks -1, 0, 1, 2, one per column."""
+_SERIES = 24
+"""Terms of the moments' series, good to 1e-16 up to an exponent of 2."""
+
+
+@final
+@dataclass(frozen=True)
+class SensorLag(SensorEffect):
+    """First-order lag of sensor or read-out."""
+
+    card: ClassVar[Card] = Card(
+        name="sensor_lag",
+        place="output",
+        formula="y -> y / (1 + Ts s)",
+        source="amplifier or read-out, 0.05 to 0.5 ms",
+        reveals="pseudo-random drive; a test of the sensor with a fast source",
+        mistaken_for="delay and order together (97 % of it)",
+    )
+
+    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
+        """Ts [time unit]."""
+        return single("Ts", 2 * ranges.period, "time", one_signed=True)
+
+    def filtered(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
+        """Exact for cubics through four blocks. Ts below 0 has no meaning: NaN."""
+        if psi[0] == 0.0:
+            return y
+        if psi[0] < 0.0:
+            return np.full(y.shape, np.nan)
+        rate = scene.grid.step / float(psi[0])
+        weights = _moments(rate) @ _CUBIC
+        padded = np.pad(y, ((0, 0), (2, 1)))
+        padded[:, -1] = 2 * y[:, -1] - y[:, -2] if y.shape[1] > 1 else y[:, -1]
+        n = y.shape[1]
+        fed = sum(weights[k] * padded[:, k : k + n] for k in range(4))
+        return np.asarray(lfilter([1.0], [1.0, -np.exp(-rate)], fed, axis=1))
+
+
+def _moments(rate: float) -> Vector:
+    """``int_0^1 rate e^(-rate (1 - s)) s^k ds`` for k = 0..3."""
+    if rate < 2.0:  # the recurrence below would cancel
+        powers = np.arange(4.0)
+        term, total = np.ones(4), np.zeros(4)
+        for j in range(_SERIES):  # int (1-s)^j s^k = j! k! / (j+k+1)!
+            term = 1.0 / (powers + 1.0) if j == 0 else term * -rate / (powers + 1.0 + j)
+            total += term
+        return rate * total
+    moments = [1.0 - np.exp(-rate)]
+    for k in range(1, 4):
+        moments.append(1.0 - k / rate * moments[-1])
+    return np.array(moments)
+
+
+@final
+@dataclass(frozen=True)
+class Exposure(SensorEffect):
+    """Camera samples that are means over the exposure before them."""
+
+    card: ClassVar[Card] = Card(
+        name="exposure",
+        place="output",
+        formula="y -> (1 - e^(-Te s)) / (Te s) y",
+        source="exposure of the camera, up to its period",
+        reveals="pseudo-random drive near the sampling limit",
+        mistaken_for="delay of Te/2, to second order",
+    )
+
+    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
+        """Te [time unit]."""
+        return single("Te", ranges.period, "time", one_signed=True)
+
+    def filtered(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
+        """Gauss quadrature with one node more than the exposure has blocks, at least four."""
+        blocks = float(psi[0]) / scene.grid.step
+        nodes, weights = np.polynomial.legendre.leggauss(4 + int(abs(blocks)))
+        late = blocks * (1 + nodes) / 2
+        return np.asarray(sum(w / 2 * _shifted(y, shift) for w, shift in zip(weights, late, strict=True)))
+
+
+def _shifted(y: Matrix, blocks: float) -> Matrix:
+    """``y`` at `blocks` blocks before, by cubics through four blocks; 0 before the first."""
+    whole = int(np.floor(blocks)) + 1
+    weights = (whole - blocks) ** np.arange(4.0) @ _CUBIC
+    n, reach = y.shape[1], abs(whole) + 2
+    padded = np.concatenate((np.zeros((y.shape[0], reach)), y, np.repeat(y[:, -1:], reach, axis=1)), axis=1)
+    first = reach - whole - 1
+    return np.asarray(sum(weights[k] * padded[:, first + k : first + k + n] for k in range(4)))

@@ -1,0 +1,193 @@
+"""Simulation of all records of a set at once: the linear plant with effects at their places."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.model.effects.effect import (
+    DriveEffect,
+    Effect,
+    ElementEffect,
+    ForceEffect,
+    ParallelEffect,
+    Ranges,
+    ReadoutEffect,
+    Scene,
+    SensorEffect,
+)
+from lcopa_bayes.model.effects.passage import Moved, Plant, linear, passed
+from lcopa_bayes.model.forward import ForwardModel, StepResponses
+
+UPSTREAM = (DriveEffect, ElementEffect, ForceEffect, SensorEffect)
+"""Places before the reading."""
+_KEPT = 3
+"""Simulations kept, so that what acts after the plant is evaluated without simulating it again."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Simulator:
+    """Responses of every experiment of `model` with `effects`.
+
+    psi holds the coefficients effect by effect, those of a `per_record` effect record by record.
+    """
+
+    model: ForwardModel
+    effects: tuple[Effect, ...]
+    ranges: Ranges
+    epochs: Vector
+    """Place of each record in the campaign, (records,), -1/2 to 1/2 [-]."""
+    times: tuple[Vector, ...]
+    """Sample times of each record [time unit]."""
+    step_responses: OrderedDict[bytes, StepResponses] = field(default_factory=OrderedDict)
+    """Step responses of the latest plants; shared with simulators of other effects, for most
+    simulations differ in the commands alone."""
+
+    @cached_property
+    def _kept(self) -> OrderedDict[bytes, list[Moved]]:
+        return OrderedDict()
+
+    @cached_property
+    def _slices(self) -> list[slice]:
+        """Part of psi of each effect."""
+        records, first, out = len(self.model.experiments), 0, []
+        for effect in self.effects:
+            count = len(effect.coefficients(self.ranges)) * (records if effect.card.per_record else 1)
+            out.append(slice(first, first + count))
+            first += count
+        return out
+
+    @property
+    def size(self) -> int:
+        """Number of coefficients."""
+        return self._slices[-1].stop if self.effects else 0
+
+    def part(self, psi: Vector, effect: int, record: int) -> Vector:
+        """Coefficients of an effect that act on a record."""
+        mine = psi[self._slices[effect]]
+        if not self.effects[effect].card.per_record:
+            return mine
+        count = mine.size // len(self.model.experiments)
+        return mine[record * count : (record + 1) * count]
+
+    def responses(self, plant: Plant, psi: Vector) -> list[Matrix]:
+        """Responses at the sample times, per record (samples, axes) [response unit].
+
+        Raises UnstableError. Accuracy: second order in the block width, as the forward model; the
+        forward model's to rounding at psi = 0.
+        """
+        if psi.shape != (self.size,):
+            raise ValueError(f"psi must have shape {(self.size,)}; got {psi.shape}")
+        moved = self.moved(plant, psi)
+        return [y + plant.offsets[r] for r, y in enumerate(self.finished(moved, psi))]
+
+    def finished(self, moved: Sequence[Moved], psi: Vector) -> list[Matrix]:
+        """Deflections as read, per record, from those before parallel and readout effects."""
+        out = []
+        for r, (scene, deflection) in enumerate(moved):
+            y = deflection
+            for kind in (ParallelEffect, ReadoutEffect):
+                for e, effect in enumerate(self.effects):
+                    if isinstance(effect, kind):
+                        mine = self.part(psi, e, r)
+                        if isinstance(effect, ParallelEffect):
+                            y = y + effect.added(scene, mine)
+                        elif isinstance(effect, ReadoutEffect):
+                            y = effect.seen(y, scene, mine)
+            out.append(y)
+        return out
+
+    def moved(self, plant: Plant, psi: Vector) -> list[Moved]:
+        """Every record up to its reading; the latest few are kept.
+
+        Effects whose coefficients are all 0 are left out, and what only changes commands is simulated by
+        the forward model itself.
+        """
+        parts = [psi[self._slices[e]] for e, f in enumerate(self.effects) if isinstance(f, UPSTREAM)]
+        key = plant.key + b"".join(part.tobytes() for part in parts)
+        if key in self._kept:
+            self._kept.move_to_end(key)
+        else:
+            acting = self._bending(psi)
+            scenes = self.scenes(plant, psi)
+            model = self.driven(scenes)
+            made = (
+                passed(model, scenes, plant, [self._acting(acting, psi, r) for r in range(len(scenes))])
+                if any(acting)
+                else linear(model, scenes, plant, self._known(plant))
+            )
+            self._kept[key] = made
+            while len(self._kept) > _KEPT:
+                self._kept.popitem(last=False)
+        return self._kept[key]
+
+    def _known(self, plant: Plant) -> StepResponses:
+        """Step responses of a plant's elements."""
+        own = self.step_responses.setdefault(plant.elements, {})
+        self.step_responses.move_to_end(plant.elements)
+        while len(self.step_responses) > _KEPT:
+            self.step_responses.popitem(last=False)
+        return own
+
+    def _bending(self, psi: Vector) -> list[bool]:
+        """Of each effect, whether it acts between commands and reading."""
+        return [
+            isinstance(effect, (ElementEffect, ForceEffect, SensorEffect)) and bool(psi[part].any())
+            for effect, part in zip(self.effects, self._slices, strict=True)
+        ]
+
+    def bends(self, psi: Vector) -> bool:
+        """Whether anything acts between commands and reading, so that the forward model does not hold."""
+        return any(self._bending(psi))
+
+    def _acting(self, acting: Sequence[bool], psi: Vector, record: int) -> list[tuple[Effect, Vector]]:
+        """Effects that act before the reading, with their coefficients on a record."""
+        return [(self.effects[e], self.part(psi, e, record)) for e, acts in enumerate(acting) if acts]
+
+    def scenes(self, plant: Plant, psi: Vector) -> list[Scene]:
+        """Every record with the commands as they act."""
+        out = []
+        for record in range(len(self.model.experiments)):
+            scene = self.scene(record, plant)
+            for e, effect in enumerate(self.effects):
+                own = self.part(psi, e, record)
+                if isinstance(effect, DriveEffect) and own.any():
+                    pairs = [
+                        effect.commands(drive, float(scene.rest[j]), j, scene, own)
+                        for j, drive in enumerate(scene.drives)
+                    ]
+                    drives, rest = tuple(drive for drive, _ in pairs), np.array([at for _, at in pairs])
+                    scene = replace(scene, drives=drives, rest=rest)
+            out.append(scene)
+        return out
+
+    def driven(self, scenes: Sequence[Scene]) -> ForwardModel:
+        """The forward model under the commands of the scenes."""
+        pairs = list(zip(self.model.experiments, scenes, strict=True))
+        if all(experiment.drives is scene.drives for experiment, scene in pairs):
+            return self.model
+        changed = (replace(each, drives=scene.drives, rest=scene.rest) for each, scene in pairs)
+        return replace(self.model, experiments=tuple(changed))
+
+    def scene(self, record: int, plant: Plant) -> Scene:
+        """A record as commanded."""
+        experiment, layout = self.model.experiments[record], self.model.layout
+        return Scene(
+            layout,
+            self.ranges,
+            record,
+            float(self.epochs[record]),
+            self.times[record],
+            experiment.mesh.grid,
+            experiment.drives,
+            experiment.rest,
+            plant.gains,
+            plant.dynamics.delays[0][np.array(layout.delay_of)],
+        )

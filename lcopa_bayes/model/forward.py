@@ -1,0 +1,261 @@
+"""The forward model: from a batch of plants to the responses of every record, with exact derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.record import Record
+from lcopa_bayes.model.grid import Mesh
+from lcopa_bayes.model.layout import Layout
+from lcopa_bayes.model.powerseries import Circle
+from lcopa_bayes.model.stepresponse import StepResponse, step_response
+from lcopa_bayes.model.superposition import Phase, Superposition, blocks_of, phases
+
+if TYPE_CHECKING:
+    from lcopa_bayes.model.effects.declared import Declared
+
+_CELLS = 3 << 13
+"""Plants times blocks times viscous terms evaluated at once. Larger temporaries go back to the operating
+system after every operation and come back as page faults: 64 plants took 1.6 times as long."""
+_ABREAST = 8
+"""Portions are multiples of this: transforms of so many series run in one vector register."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Dynamics:
+    """What shapes unit responses, for a batch of plants."""
+
+    times: tuple[Matrix, ...]
+    """Time constants [time unit] of each element, (batch, terms)."""
+    orders: tuple[Matrix, ...]
+    """Orders [-] of each element, (batch, terms), not increasing along a row."""
+    delays: Matrix
+    """Delays [time unit], (batch, delay slots)."""
+
+    @property
+    def batch(self) -> int:
+        """Number of plants."""
+        return int(self.delays.shape[0])
+
+    def __getitem__(self, plants: slice) -> Dynamics:
+        """Some of the plants."""
+        times, orders = (tuple(each[plants] for each in part) for part in (self.times, self.orders))
+        return Dynamics(times, orders, self.delays[plants])
+
+
+StepResponses = dict[tuple[int, float], StepResponse]
+"""Step responses by element and block width."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """A record prepared for simulation: all that does not depend on parameters."""
+
+    name: str
+    mesh: Mesh
+    drives: tuple[Drive, ...]
+    rest: Vector
+    """Drive before the first change, one per drive axis [drive unit]."""
+
+    @classmethod
+    def of(
+        cls,
+        record: Record,
+        times: Vector,
+        *,
+        blocks: int | None = None,
+        exposure: float = 0.0,
+        refinement: int = 1,
+    ) -> Experiment:
+        """For reading `record` at `times` [time unit]; see `Mesh.of_samples` for the options."""
+        drives = tuple(Drive.of_rows(record.time, column) for column in record.drive.T)
+        begin = min((drive.times[0] for drive in drives if drive.moves), default=times[0])
+        mesh = Mesh.of_samples(times, float(begin), blocks=blocks, exposure=exposure, refinement=refinement)
+        return cls(record.name, mesh, drives, record.drive[0])
+
+    @cached_property
+    def circle(self) -> Circle:
+        """Where this record's series are evaluated."""
+        return Circle(self.mesh.grid.n)
+
+    @cached_property
+    def edges(self) -> Vector:
+        """Block edges [time unit]."""
+        return self.mesh.grid.edges
+
+    @cached_property
+    def phases(self) -> tuple[tuple[Phase, ...], ...]:
+        """Changes of every drive by phase; none for a drive that never moves."""
+        return tuple(phases(drive, self.mesh.lattice.step) if drive.moves else () for drive in self.drives)
+
+    @cached_property
+    def blocks(self) -> int:
+        """Blocks of the step responses that simulate the record."""
+        begin = min((float(drive.times[0]) for drive in self.drives if drive.moves), default=np.inf)
+        return blocks_of(self.mesh.lattice, begin) if begin < np.inf else 0
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class ForwardModel:
+    """Unit responses of every experiment: the operational matrices as a function of the dynamics."""
+
+    layout: Layout
+    experiments: tuple[Experiment, ...]
+    effects: Declared | None = None
+    """Effects of the plant; unit responses are those of the plant without."""
+
+    def only(self, *records: int) -> ForwardModel:
+        """The same model of some of the records."""
+        own = None if self.effects is None else self.effects.only(records)
+        return ForwardModel(self.layout, tuple(self.experiments[r] for r in records), own)
+
+    def joined(self, other: ForwardModel) -> ForwardModel:
+        """The same model of the records of both."""
+        own = None
+        if self.effects is not None and other.effects is not None:
+            own = self.effects.joined(other.effects)
+        return ForwardModel(self.layout, (*self.experiments, *other.experiments), own)
+
+    @property
+    def plain(self) -> ForwardModel:
+        """The same model without effects."""
+        return self if self.effects is None else replace(self, effects=None)
+
+    def unit_responses(self, dynamics: Dynamics, known: StepResponses | None = None) -> list[Array]:
+        """Deviation from rest per unit gain, for each experiment (units, batch, samples) [drive unit].
+
+        The response of axis i is ``offset_i + sum_j gain_ij (rest_j + unit_ij)``. Second order in the
+        block width; see `model.stepresponse`. `known` are step responses of these very dynamics, a
+        batch of one, under other commands; those that lack are added.
+        """
+        shapes = [(len(self.layout.units), dynamics.batch, e.mesh.reading.samples) for e in self.experiments]
+        out = [np.zeros(shape) for shape in shapes]
+        for plants in self._portions(dynamics.batch):
+            own = {} if known is None else known
+            self._respond(dynamics[plants], [read[:, plants] for read in out], own)
+        return out
+
+    def _portions(self, batch: int) -> Iterator[slice]:
+        """Slices of a batch that are small enough to be fast."""
+        blocks = max((circle.n for circle in self.circles.values()), default=1)
+        terms = max(element.terms for element in self.layout.elements)
+        size = max(_ABREAST, _CELLS // (blocks * terms) // _ABREAST * _ABREAST)
+        return (slice(first, first + size) for first in range(0, batch, size))
+
+    @cached_property
+    def circles(self) -> dict[float, Circle]:
+        """Where the step responses of each block width are evaluated: long enough for every record."""
+        longest: dict[float, int] = {}
+        for experiment in self.experiments:
+            step = experiment.mesh.lattice.step
+            longest[step] = max(longest.get(step, 0), experiment.blocks)
+        return {step: Circle(blocks) for step, blocks in longest.items() if blocks}
+
+    def _respond(self, dynamics: Dynamics, out: list[Array], known: StepResponses) -> None:
+        """Write the unit responses of a few plants into `out`."""
+        read: dict[tuple[int, int, int, int], Array] = {}
+        superposed = {step: Superposition(circle) for step, circle in self.circles.items()}
+        for number, (experiment, target) in enumerate(zip(self.experiments, out, strict=True)):
+            lattice, first = experiment.mesh.lattice, experiment.mesh.reading.first
+            for index, (element, delay, axis) in enumerate(self.layout.units):
+                if not experiment.phases[axis]:
+                    continue
+                place, place_axis, scale = self._alike[number][axis]
+                same = (element, delay, place, place_axis)
+                if same in read:
+                    np.multiply(scale, read[same], out=target[index])
+                    continue
+                response = self._step_response(dynamics, element, lattice.step, known)
+                late = dynamics.delays[:, delay]
+                target[index][:, first:] = superposed[lattice.step](
+                    response, experiment.phases[axis], lattice, late, (element, delay)
+                )[0]
+                if scale == 1.0:
+                    read[same] = target[index]
+
+    def _step_response(
+        self, dynamics: Dynamics, element: int, step: float, known: StepResponses, *, slopes: bool = False
+    ) -> StepResponse:
+        """Step response of an element, from `known` or added to it."""
+        circle = self.circles[step]
+        found = known.get((element, step))
+        if found is None or found.coarse.shape[2] < circle.n:
+            times, orders = dynamics.times[element], dynamics.orders[element]
+            found = known[element, step] = step_response(times, orders, circle, step, slopes=slopes)
+        return found.first(circle.n)
+
+    @cached_property
+    def _alike(self) -> list[list[tuple[int, int, float]]]:
+        """First experiment and axis with a proportional drive read in the same way, and the factor.
+
+        Steps of several heights are then simulated once, not once per record.
+        """
+        found: list[list[tuple[int, int, float]]] = []
+        seen: list[tuple[int, int]] = []
+        for number, experiment in enumerate(self.experiments):
+            found.append([(number, axis, 1.0) for axis in range(len(experiment.drives))])
+            for axis, drive in enumerate(experiment.drives):
+                for first, first_axis in seen:
+                    scale = drive.over(self.experiments[first].drives[first_axis])
+                    if scale is not None and experiment.mesh.reads_like(self.experiments[first].mesh):
+                        found[number][axis] = (first, first_axis, scale)
+                        break
+                else:
+                    seen.append((number, axis))
+        return found
+
+    def unit_slopes(self, dynamics: Dynamics) -> list[tuple[Array, list[Array]]]:
+        """`unit_responses` with exact derivatives, per experiment.
+
+        The second entry holds one array per unit, (2 terms + 1, batch, samples): derivatives in the
+        logarithms of the time constants, the orders, and the delay [per time unit].
+        """
+        known: StepResponses = {}
+        superposed = {step: Superposition(circle) for step, circle in self.circles.items()}
+        out = []
+        for experiment in self.experiments:
+            lattice, reading = experiment.mesh.lattice, experiment.mesh.reading
+            value = np.zeros((len(self.layout.units), dynamics.batch, reading.samples))
+            slopes = []
+            for index, (element, delay, axis) in enumerate(self.layout.units):
+                terms = dynamics.times[element].shape[1]
+                slopes.append(np.zeros((2 * terms + 1, dynamics.batch, reading.samples)))
+                if not experiment.phases[axis]:
+                    continue
+                response = self._step_response(dynamics, element, lattice.step, known, slopes=True)
+                superpose, changes = superposed[lattice.step], experiment.phases[axis]
+                late, key = dynamics.delays[:, delay], (element, delay)
+                rows = superpose(response, changes, lattice, late, key)
+                value[index][:, reading.first :] = rows[0]
+                slopes[index][:-1, :, reading.first :] = rows[1:]
+                by_block = superpose(response, changes, lattice, late, key, "slope")
+                slopes[index][-1:, :, reading.first :] = -by_block / lattice.step
+            out.append((value, slopes))
+        return out
+
+
+def forward_model(
+    layout: Layout,
+    records: Sequence[Record],
+    times: Sequence[Vector],
+    *,
+    blocks: int | None = None,
+    exposure: float = 0.0,
+    refinement: int = 1,
+) -> ForwardModel:
+    """Forward model of `records`, each read at its own `times` [time unit]."""
+    experiments = (
+        Experiment.of(record, at, blocks=blocks, exposure=exposure, refinement=refinement)
+        for record, at in zip(records, times, strict=True)
+    )
+    return ForwardModel(layout, tuple(experiments))

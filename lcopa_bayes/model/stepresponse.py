@@ -1,0 +1,257 @@
+"""Unit step responses of elements from their onset on, and their values at any time after it.
+
+A block-pulse solution is exact to second order where the response is smooth. At its onset it rises like
+t^order_1: there, and only there, a block is too wide. So blocks begin at the onset itself, and the first of
+them are solved again on blocks four, sixteen and 64 times as narrow, which cost little because they are few.
+Below two and a half of the narrowest blocks the leading power of the onset takes over.
+
+Measured against high-precision inversions of the Laplace transform for orders 0.3 to 2 and blocks of 0.03 of
+the time constant: 1e-4 of the step or better right after the onset for orders above 0.5, where the same
+blocks laid over the onset and read by a parabola are off by several percent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
+from lcopa_bayes.model.powerseries import Circle, Spectrum
+from lcopa_bayes.model.transfer import transfer, transfer_slopes
+
+Kind = Literal["integral", "value", "slope"]
+"""What is read: the running integral from the onset [blocks], the value, or the derivative [per block]."""
+
+_RATIO = 4
+"""Blocks of a level in one block of the next coarser level."""
+_LEVELS = 3
+"""Levels finer than the blocks of the whole response."""
+_NEAR = 8
+"""Blocks after the onset that are read from finer levels."""
+_FINE = _RATIO * _NEAR + 4
+"""Blocks of a finer level: what the coarser one hands over, and the neighbours that reading needs."""
+_POWER = 2.5
+"""Blocks of the finest level below which the response is taken as its leading power of time."""
+_SIDE = 2
+"""Blocks on either side of the one that is read."""
+
+
+def _tap_polynomials() -> Matrix:
+    """Integral from the left edge of a block to theta within it, per mean of the blocks around it.
+
+    Row l holds the coefficients, in rising powers of theta, that belong to the mean of block l - _SIDE: the
+    polynomial through the running integral at the six edges around.
+    """
+    edges = np.arange(-_SIDE, _SIDE + 2, dtype=float)
+    rows = []
+    for block in range(-_SIDE, _SIDE + 1):
+        area = np.where(edges > block, 1.0, 0.0) - (1.0 if block < 0 else 0.0)
+        rows.append(np.linalg.solve(np.vander(edges, increasing=True), area))
+    return np.array(rows)
+
+
+_INTEGRAL = _tap_polynomials()
+_VALUE = _INTEGRAL[:, 1:] * np.arange(1, _INTEGRAL.shape[1])
+_SLOPE = _VALUE[:, 1:] * np.arange(1, _VALUE.shape[1])
+_TAPS: dict[Kind, Matrix] = {"integral": _INTEGRAL, "value": _VALUE, "slope": _SLOPE}
+
+
+def taps(theta: Array, kind: Kind) -> Array:
+    """Weights of the five block means around the block that holds a position, (5, *theta.shape).
+
+    `theta` is the distance from the block's left edge in blocks.
+    """
+    coefficients = _TAPS[kind]
+    out = np.empty((coefficients.shape[0], *theta.shape))
+    for row, polynomial in zip(out, coefficients, strict=True):
+        row[...] = polynomial[-1]
+        for coefficient in polynomial[-2::-1]:
+            row *= theta
+            row += coefficient
+    return out
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class StepResponse:
+    """Unit step responses of a batch of elements and, as further rows, their derivatives.
+
+    Times are counted in blocks from the onset. Rows: the response; with derivatives also one row per
+    logarithm of a time constant and one per order.
+    """
+
+    coarse: Array
+    """Block means over the whole response, (rows, batch, n)."""
+    fine: Array
+    """Block means after the onset on ever narrower blocks, (rows, levels, batch, _FINE); no levels where the
+    onset is read from the coarse blocks."""
+    orders: Vector
+    """Leading order of each element, (batch,) [-]."""
+
+    @property
+    def _leading(self) -> int | None:
+        """Row of the derivative in the leading order."""
+        rows = self.coarse.shape[0]
+        return None if rows == 1 else 1 + (rows - 1) // 2
+
+    @cached_property
+    def _sums(self) -> Array:
+        """Running integral at the left edges of the coarse blocks, (rows, batch, n) [blocks]."""
+        return _running(self.coarse)
+
+    @cached_property
+    def _fine_sums(self) -> Array:
+        """The same for the finer levels [blocks of the level]."""
+        return _running(self.fine)
+
+    def on_lattice(self, theta: Vector, kind: Kind = "value") -> Array:
+        """Readings at ``k + theta``, k = 0 .. n - 3, (rows, batch, n - 2).
+
+        Parameters: theta (batch,) in [0, 1) [blocks], one for each element.
+        """
+        n = self.coarse.shape[2] - _SIDE
+        weights = taps(theta, kind)
+        out = np.zeros((*self.coarse.shape[:2], n))
+        inner = out[:, :, _SIDE:]
+        for weight, shift in zip(weights, range(2 * _SIDE + 1), strict=True):
+            inner += weight[:, None] * self.coarse[:, :, shift : shift + n - _SIDE]
+        if kind == "integral":
+            inner += self._sums[:, :, _SIDE:n]
+        first = min(_NEAR, n)
+        near = theta[:, None] + np.arange(first)
+        out[:, :, :first] = self._near(near, kind)
+        return out
+
+    def at(self, x: Matrix, kind: Kind = "value") -> Array:
+        """Readings at positions `x`, (batch, samples) [blocks from the onset] -> (rows, batch, samples).
+
+        Zero before the onset. Positions go up to n - 3.
+        """
+        block = np.clip(np.floor(x).astype(int), _SIDE, self.coarse.shape[2] - _SIDE - 1)
+        weights = taps(x - block, kind)
+        out = np.zeros((self.coarse.shape[0], *x.shape))
+        elements = np.arange(x.shape[0])[:, None]
+        for weight, shift in zip(weights, range(-_SIDE, _SIDE + 1), strict=True):
+            out += weight * self.coarse[:, elements, block + shift]
+        if kind == "integral":
+            out += self._sums[:, elements, block]
+        after = x > 0.0
+        out *= after
+        if self.fine.shape[1] == 0:
+            return out
+        near = (after & (x < _NEAR)).nonzero()
+        out[:, near[0], near[1]] = self._read_fine(near[0], x[near], kind)
+        return out
+
+    def first(self, n: int) -> StepResponse:
+        """The first `n` blocks."""
+        if n == self.coarse.shape[2]:
+            return self
+        return StepResponse(self.coarse[:, :, :n], self.fine, self.orders)
+
+    def beyond(self, means: Array) -> StepResponse:
+        """Other responses of these elements, as block means alone, (rows, batch, n)."""
+        return StepResponse(means, self.fine[:, :0], self.orders)
+
+    def _near(self, x: Matrix, kind: Kind) -> Array:
+        """Readings at positions below _NEAR, (rows, batch, positions)."""
+        elements = np.repeat(np.arange(x.shape[0]), x.shape[1])
+        return self._read_fine(elements, x.ravel(), kind).reshape(-1, *x.shape)
+
+    def _read_fine(self, element: Index, x: Vector, kind: Kind) -> Array:
+        """Readings of single elements at positions below _NEAR, (rows, positions)."""
+        level = np.clip(np.floor(np.log(_NEAR / np.maximum(x, 1e-9)) / np.log(_RATIO)), 0, _LEVELS - 1)
+        level = level.astype(int)
+        width = _RATIO ** -(level + 1.0)
+        position = x / width
+        power = position < _POWER
+        place = np.where(power, _POWER, position)
+        block = np.minimum(np.floor(place).astype(int), _FINE - _SIDE - 1)
+        weights = taps(place - block, kind)
+        values = np.zeros((self.fine.shape[0], x.size))
+        for weight, shift in zip(weights, range(-_SIDE, _SIDE + 1), strict=True):
+            values += weight * self.fine[:, level, element, block + shift]
+        if kind == "integral":
+            values = (values + self._fine_sums[:, level, element, block]) * width
+        elif kind == "slope":
+            values /= width
+        self._lead(values, power, element, position, kind)
+        return values
+
+    def _lead(self, values: Array, power: Array, element: Index, position: Vector, kind: Kind) -> None:
+        """Overwrite readings closest to the onset by the leading power of time; zero before the onset."""
+        chosen = np.flatnonzero(power)
+        if not chosen.size:
+            return
+        element, position = element[chosen], position[chosen]
+        after = position > 0.0
+        base = np.where(after, position, _POWER) / _POWER
+        block = int(_POWER)
+        weights = taps(np.array([_POWER - block]), "value")[:, 0]
+        means = self.fine[:, -1, element, block - _SIDE : block + _SIDE + 1]
+        edge = np.einsum("rpl,l->rp", means, weights)
+        order = self.orders[element]
+        width = float(_RATIO) ** -_LEVELS
+        log, growth = np.log(base), base**order
+        if kind == "integral":
+            scale = growth * base * _POWER * width / (order + 1.0)
+            by_order = log - 1.0 / (order + 1.0)
+        elif kind == "slope":
+            scale, by_order = order * growth / (base * _POWER * width), log + 1.0 / order
+        else:
+            scale, by_order = growth, log
+        found = edge * scale
+        if self._leading is not None:
+            found[self._leading] += edge[0] * scale * by_order
+        values[:, chosen] = np.where(after, found, 0.0)
+
+
+def _running(means: Array) -> Array:
+    out = np.zeros_like(means)
+    np.cumsum(means[..., :-1], axis=-1, out=out[..., 1:])
+    return out
+
+
+_FINE_CIRCLE = Circle(_FINE)
+
+
+def step_response(
+    times: Matrix, orders: Matrix, circle: Circle, step: float, *, slopes: bool = False
+) -> StepResponse:
+    """Step responses of ``1 / (1 + sum_i (T_i s)^order_i)`` on `circle.n` blocks of width `step`.
+
+    Parameters: times [time unit] and orders [-], (batch, terms), orders not increasing along a row; step
+    [time unit]; with `slopes` the derivatives in every log time constant and order are rows too.
+    Accuracy: second order in `step` away from the onset; see the module for the onset itself. What the
+    blocks are too wide for, `transfer` says.
+    """
+    scale = float(_RATIO) ** np.arange(1, _LEVELS + 1)
+    coarse = _means(times / step, orders, circle, slopes=slopes)
+    fine = _means(times / step * scale[:, None, None], orders, _FINE_CIRCLE, slopes=slopes)
+    for level in range(_LEVELS - 2, -1, -1):
+        _hand_over(fine[:, level + 1], fine[:, level])
+    _hand_over(fine[:, 0], coarse)
+    return StepResponse(coarse, fine, orders[:, 0])
+
+
+def _hand_over(narrow: Array, wide: Array) -> None:
+    """Replace the first block means by those of the narrower blocks in them."""
+    count = min(_NEAR, wide.shape[-1])
+    parts = narrow[..., : _RATIO * count].reshape(*narrow.shape[:-1], count, _RATIO)
+    wide[..., :count] = parts.mean(axis=-1)
+
+
+def _means(times: Array, orders: Matrix, circle: Circle, *, slopes: bool) -> Array:
+    """Block means of the step responses, (rows, ..., n); times in blocks."""
+    if not slopes:
+        return _stepped(transfer(times, orders, circle, 1.0), circle)[None]
+    value, parts = transfer_slopes(times, orders, circle, 1.0)
+    return np.stack([_stepped(row, circle) for row in (value, *parts.log_times, *parts.orders)])
+
+
+def _stepped(spectrum: Spectrum, circle: Circle) -> Array:
+    """Response to a unit step from the first block on."""
+    return circle.coefficients(spectrum / circle.difference)

@@ -1,0 +1,238 @@
+"""A record's response to a unit of drive: step responses superposed at the delayed changes of the drive."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from math import ceil
+from typing import final
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from lcopa_bayes.core.arrays import Array, Index, Vector
+from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.model.grid import Lattice
+from lcopa_bayes.model.powerseries import Circle, Spectrum
+from lcopa_bayes.model.stepresponse import Kind, StepResponse
+
+SPARE = 5
+"""Blocks beyond the last sample: what reading needs on either side, and one for rounding."""
+_SAME_PHASE = 1e-7
+"""Changes whose distance deviates from whole blocks by less than this share a phase [blocks]."""
+_ROUNDED = 1e-4
+"""The same where there are too many phases: time stamps may have been rounded [blocks]."""
+_PHASES = 24
+"""Phases of a drive that are kept apart; more changes off the lattice than this are shared out between the
+two blocks around them, as block means of the drive would be."""
+_ADDED = 10
+"""Changes of one phase that are added one by one; more are convolved on the circle."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Phase:
+    """Changes of a drive that are whole blocks apart."""
+
+    time: float
+    """First of them [time unit]."""
+    blocks: Index
+    """Whole blocks from there to each, increasing."""
+    jumps: Vector
+    """Change of the drive at each [drive unit]."""
+
+
+def phases(drive: Drive, step: float) -> tuple[Phase, ...]:
+    """The changes of a drive by phase on blocks of width `step` [time unit]."""
+    jumps = np.diff(drive.values, prepend=0.0)
+    place = (drive.times - drive.times[0]) / step
+    for tolerance in (_SAME_PHASE, _ROUNDED):
+        groups = _alike(place, tolerance)
+        if groups is not None:
+            return tuple(
+                Phase(
+                    float(drive.times[members[0]]),
+                    np.round(place[members] - place[members[0]]).astype(int),
+                    jumps[members],
+                )
+                for members in groups
+            )
+    below = np.floor(place).astype(int)
+    share = place - below
+    at, where = np.unique(np.concatenate((below, below + 1)), return_inverse=True)
+    weights = np.concatenate(((1 - share) * jumps, share * jumps))
+    shared = np.asarray(np.bincount(where, weights=weights), dtype=float)
+    return (Phase(float(drive.times[0]), at, shared),)
+
+
+def _alike(place: Vector, tolerance: float) -> list[Index] | None:
+    """Positions by phase; None when there are more than _PHASES."""
+    beyond = place - np.round(place)
+    groups: list[Index] = []
+    rest = np.arange(place.size)
+    while rest.size and len(groups) < _PHASES:
+        apart = np.abs(beyond[rest] - beyond[rest[0]])
+        same = np.minimum(apart, 1.0 - apart) < tolerance
+        groups.append(rest[same])
+        rest = rest[~same]
+    return None if rest.size else groups
+
+
+def blocks_of(lattice: Lattice, begin: float) -> int:
+    """Blocks that a step response needs from `begin` [time unit] to the last sample."""
+    return ceil((float(lattice.times[-1]) - begin) / lattice.step) + SPARE if lattice.times.size else SPARE
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Read:
+    """A step response on the lattice of a record."""
+
+    origin: Vector
+    """Position of the first sample, (batch,) [blocks after the onset]."""
+    padded: Array
+    """As many zeros, then readings at ``origin - floor(origin) + k``, (rows, batch, 2 n)."""
+
+    @classmethod
+    def of(cls, origin: Vector, readings: Array) -> _Read:
+        """Readings from the onset on, (rows, batch, n)."""
+        padded = np.zeros((*readings.shape[:2], 2 * readings.shape[2]))
+        padded[:, :, readings.shape[2] :] = readings
+        return cls(origin, padded)
+
+    @property
+    def size(self) -> int:
+        """Readings from the onset on."""
+        return int(self.padded.shape[2]) // 2
+
+    def take(self, start: Index, slots: Index | slice, length: int) -> Array:
+        """Readings at ``start + slot``, (rows, batch, slots); zero before the onset.
+
+        Parameters: start (batch,); slots increasing from 0, the last of them length - 1.
+        """
+        windows = sliding_window_view(self.padded, length, axis=2)
+        first = np.clip(start + self.size, 0, windows.shape[2] - 1)
+        return np.asarray(windows[:, np.arange(start.size), first][:, :, slots])
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Superposition:
+    """Responses of elements to drives, for one batch of plants; what records share is read once."""
+
+    circle: Circle
+    """Of the step responses' blocks."""
+    kept: dict[tuple[object, ...], _Read] = field(default_factory=dict)
+
+    def __call__(
+        self,
+        response: StepResponse,
+        changes: Sequence[Phase],
+        lattice: Lattice,
+        delays: Vector,
+        key: tuple[int, int],
+        kind: Kind = "value",
+    ) -> Array:
+        """Readings of `response` under the delayed changes, (rows, batch, samples) [drive unit].
+
+        Parameters: delays (batch,) [time unit]; key: element and delay slot, the same for the same
+        `response` and `delays`; kind "slope" reads the derivative per block instead.
+        """
+        shape = (*response.coarse.shape[:2], lattice.times.size)
+        out = np.zeros(shape if kind == "value" else (1, *shape[1:]))
+        if not lattice.times.size:
+            return out
+        for phase in changes:
+            if lattice.slots is None:
+                self._add_anywhere(out, response, phase, lattice, delays, kind)
+            else:
+                self._add_on_lattice(out, response, phase, lattice, delays, key, kind)
+        return out
+
+    def _add_anywhere(
+        self,
+        out: Array,
+        response: StepResponse,
+        phase: Phase,
+        lattice: Lattice,
+        delays: Vector,
+        kind: Kind,
+    ) -> None:
+        """Add the response to one phase at sample times of any spacing."""
+        x = (lattice.times - phase.time - delays[:, None]) / lattice.step
+        width = lattice.exposure / lattice.step
+        many = phase.blocks.size > _ADDED
+        source = self._convolved(response, phase) if many else response
+        shifts = [(0, 1.0)] if many else list(zip(phase.blocks, phase.jumps, strict=True))
+        for shift, jump in shifts:
+            reached = x - shift
+            if lattice.exposure == 0.0:
+                found = source.at(reached, kind)
+            else:
+                before: Kind = "value" if kind == "slope" else "integral"
+                found = (source.at(reached, before) - source.at(reached - width, before)) / width
+            out += jump * found[: out.shape[0]]
+
+    def _convolved(self, response: StepResponse, phase: Phase) -> StepResponse:
+        """Response to all changes of a phase as block means; its onsets are read as the blocks have them."""
+        total = self.circle.coefficients(self.circle.spectrum(response.coarse) * self._train(phase))
+        return response.beyond(total)
+
+    def _train(self, phase: Phase) -> Spectrum:
+        """Spectrum of the jumps of a phase."""
+        train = np.zeros(self.circle.n)
+        inside = phase.blocks < self.circle.n
+        train[phase.blocks[inside]] = phase.jumps[inside]
+        return self.circle.spectrum(train)
+
+    def _add_on_lattice(
+        self,
+        out: Array,
+        response: StepResponse,
+        phase: Phase,
+        lattice: Lattice,
+        delays: Vector,
+        key: tuple[int, int],
+        kind: Kind,
+    ) -> None:
+        """Add the response to one phase at equidistant sample times."""
+        origin = (lattice.times[0] - phase.time - delays) / lattice.step
+        read = self._read(response, origin, lattice, (*key, kind))
+        # a reading of another record or phase may be a whole number of blocks away
+        start = np.floor(read.origin).astype(int) + round(float(origin[0] - read.origin[0]))
+        assert lattice.slots is not None
+        length = int(lattice.slots[-1]) + 1
+        if phase.blocks.size > _ADDED:
+            missing = ((0, 0), (0, 0), (0, self.circle.n - read.size))
+            spectrum = self.circle.spectrum(np.pad(read.padded[:, :, read.size :], missing))
+            total = self.circle.coefficients(spectrum * self._train(phase))
+            out += _Read.of(read.origin, total).take(start, lattice.chosen, length)
+            return
+        for shift, jump in zip(phase.blocks, phase.jumps, strict=True):
+            out += jump * read.take(start - shift, lattice.chosen, length)
+
+    def _read(
+        self, response: StepResponse, origin: Vector, lattice: Lattice, key: tuple[object, ...]
+    ) -> _Read:
+        """The step response at the phase that the samples have after the onset."""
+        key = (*key, lattice.step, lattice.exposure)
+        for other, read in self.kept.items():
+            if other[:-1] == key:
+                apart = float(origin[0] - read.origin[0])
+                if abs(apart - round(apart)) < _SAME_PHASE:
+                    return read
+        theta = origin - np.floor(origin)
+        width = lattice.exposure / lattice.step
+        if lattice.exposure == 0.0:
+            readings = response.on_lattice(theta, key[2])  # type: ignore[arg-type]
+        else:
+            before: Kind = "value" if key[2] == "slope" else "integral"
+            late = response.on_lattice(theta, before)
+            opened = theta - width
+            whole = np.floor(opened)
+            early = _Read.of(opened, response.on_lattice(opened - whole, before))
+            readings = (late - early.take(whole.astype(int), slice(None), early.size)) / width
+        if key[2] == "slope":
+            readings = readings[:1]
+        self.kept[(*key, len(self.kept))] = found = _Read.of(origin, readings)
+        return found

@@ -1,1 +1,0 @@
-"""Block pulses and the triangular Toeplitz algebra of their fractional integrals."""

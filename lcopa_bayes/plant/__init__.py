@@ -1,1 +1,0 @@
-"""The plant: elements, delayed drives, and the responses of records with their derivatives."""

@@ -1,0 +1,354 @@
+"""The page of an audit, drawn from `audit.json` and the draws of its run folder alone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.report.formatting import NONE, figures, interval, percent
+from lcopa_bayes.report.page import Verdict, write_page
+from lcopa_bayes.report.savedrun import SavedRun, load_run
+from lcopa_bayes.report.section import Column, Drawing, Section, Table
+from lcopa_bayes.report.theme import (
+    BAND,
+    CYCLE,
+    HELD_OUT,
+    INK,
+    blank,
+    grid,
+    label,
+    log_ticks,
+    look,
+    plain,
+    svg_of,
+)
+
+_PER_FIGURE = 12
+_TOP = 6.0
+"""Largest fall that is drawn [nat]."""
+_AT_90 = 2.706
+"""Fall at the ends of a 90 % interval [nat]."""
+_PAIRS = 6
+_DOTS = 1500
+
+
+NAME = "audit.html"
+"""Name of the page inside the run folder."""
+_NEEDS = (
+    *(
+        "study",
+        "verdict",
+        "grade",
+        "grade_reason",
+        "limitations",
+        "parameters",
+        "symmetries",
+        "structure",
+        "printed_form",
+        "spectrum",
+    ),
+    *("local", "radial", "functions", "delays", "next_measurement"),
+)
+
+
+def write_audit(folder: Path) -> Path:
+    """`audit.html` with verdicts, profiles, spectrum and pairs; returns its path.
+
+    InputError when the folder holds no audit or it cannot be used.
+    """
+    path = folder / "audit.json"
+    try:
+        told: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); run `audit` to write it") from None
+    absent = [key for key in _NEEDS if key not in told]
+    if absent:
+        raise InputError(f"{path}: lacks {', '.join(absent)}; run `audit` again with --resume")
+    run = load_run(folder)
+    with look():
+        sections = [*_tables(told), *_figures(told, run)]
+    verdict = Verdict(str(told["grade"]), str(told["verdict"]), str(told["grade_reason"]))
+    return write_page(folder, f"{told['study']}: identifiability", sections, verdict, NAME)
+
+
+def _tables(told: Mapping[str, Any]) -> list[Section]:
+    """Everything of an audit that is words and numbers."""
+    return [_verdicts(told), _next(told), _symmetries(told), _functions(told), _delays(told)]
+
+
+def _verdicts(told: Mapping[str, Any]) -> Section:
+    columns = (
+        *(Column("name", "code"), Column("unit"), Column("verdict"), Column("profile, 90 %", "interval")),
+        *(Column("contraction", "number"), Column("relative sd", "number")),
+    )
+    rows = []
+    for row in told["parameters"]:
+        lower, upper = row["profile"]["lower"], row["profile"]["upper"]
+        spread = None if lower is None or upper is None else (upper - lower) / 3.29
+        rows.append(
+            (
+                *(str(row["name"]), str(row["unit"]), str(row["verdict"]), interval(lower, upper, spread)),
+                *(figures(row["contraction"], 2), figures(row["relative_sd"], 2)),
+            )
+        )
+    caption = (
+        "The profile interval is that of the likelihood alone, within the support of the priors. Contraction "
+        "is 1 - posterior over prior variance on the sampled scale; relative sd is the Cramer-Rao bound "
+        "at the maximum, a dash where the Fisher matrix is singular or the parameter belongs to the noise. "
+        "Verdicts hold given this model. Identified: the data bound both ends of the interval, within a "
+        "factor of 2 (6 dB, an octave), an order within 0.5 (45 degrees of phase), a delay within one "
+        "sampling period or a factor of 2, an offset within half the range of the response. Weakly "
+        "identified: bounded, but not as narrowly. Unresolved: a resonance faster than the samples resolve."
+    )
+    why = Table(
+        (Column("name", "code"), Column("why", "prose"), Column("partners", "prose")),
+        tuple(
+            (str(row["name"]), str(row["reason"]), ", ".join(row["partners"]) or NONE)
+            for row in told["parameters"]
+        ),
+        "Partners are parameters that can make up for this one, the most exact first.",
+    )
+    against = tuple(
+        (str(row["name"]), str(row["verdict"]), "; ".join(row["disagreements"]))
+        for row in told["parameters"]
+        if row["disagreements"]
+    )
+    contrary = Table(
+        (Column("name", "code"), Column("verdict"), Column("what speaks against it, or limits it", "prose")),
+        against,
+        "Where the four methods disagree; a verdict follows the symmetries and the profile.",
+    )
+    tables = (Table(columns, tuple(rows), caption), why, *((contrary,) if against else ()))
+    return Section("Verdicts", (), (), tables)
+
+
+def _next(told: Mapping[str, Any]) -> Section:
+    advice = told["next_measurement"]
+    limits = told["limitations"]
+    if advice is None and limits:
+        text = tuple(
+            f"{_sentence(one['reason'])} To do: {one['remedy'] or 'see the report'}." for one in limits
+        )
+        return Section(
+            "What to measure next",
+            (
+                "Given this model every parameter is identified, but the checks of the model speak against "
+                "it: first mend the model, then ask again.",
+                *text,
+            ),
+        )
+    if advice is None:
+        return Section(
+            "What to measure next",
+            ("Given this model every parameter is identified: its parameters need no further record.",),
+        )
+    text = (_sentence(advice["reason"]),)
+    if not advice["parameters"]:
+        return Section("What to measure next", text)
+    columns = (
+        *(Column("name", "code"), Column("best drive"), Column("relative sd", "number")),
+        *(Column("after a plain step", "number"), Column("why none", "prose")),
+    )
+    rows = tuple(
+        (
+            *(row["name"], row["drive"] or NONE, *(_promised(row, key) for key in ("", "_step"))),
+            row["reason"] or NONE,
+        )
+        for row in advice["parameters"]
+    )
+    caption = (
+        f"Parameters that are not identified and what one more record of {advice['time']:g} "
+        f"{advice['time_unit']} promises for each by the drive that is best for it: median Cramer-Rao bounds "
+        "over draws of the posterior; above 1 it is still not determined. The verb design tries "
+        "other times and confirms by simulation."
+    )
+    return Section("What to measure next", text, (), (Table(columns, rows, caption),))
+
+
+def _sentence(clause: str) -> str:
+    """A clause as a sentence."""
+    return f"{clause[0].upper()}{clause[1:]}."
+
+
+def _promised(row: Mapping[str, Any], which: str) -> str:
+    """Expected relative standard deviation after the best drive or after the plain step."""
+    found = row.get(f"expected_relative_sd{which}")
+    return NONE if found is None else figures(found["value"], 2)
+
+
+def _symmetries(told: Mapping[str, Any]) -> Section:
+    text, printed = [], told["printed_form"]
+    found = [f"{one['kind']}: {one['sentence']}." for one in told["symmetries"]]
+    text += found or ["The model has no symmetry with these drives: every parameter acts on its own."]
+    if not told["structure"]["certain"]:
+        text.append(
+            "The rank of the sensitivities changes with the tolerance: what is a symmetry and what is "
+            "merely too weak to compute cannot be told apart, and no parameter is called structurally "
+            "unidentifiable."
+        )
+    if printed is not None:
+        text.append(
+            f"In the printed parametrisation (Ta et al. 2026, Eqs. 16, 21, 28) only {printed['rank']} of "
+            f"{printed['parameters']} numbers act: "
+            + "; ".join(one["sentence"] for one in printed["symmetries"])
+            + "."
+        )
+    if told["radial"] is not None:
+        moved, fall = told["radial"]["moved"], told["radial"]["fall"]
+        text.append(
+            f"Radial test: {figures(told['radial']['reached'], 2)} prior standard deviations away from the "
+            f"maximum twice the log likelihood has fallen by {figures(fall, 2)}; "
+            f"{', '.join(moved) or 'no parameter'} moved."
+        )
+    return Section("Symmetries", tuple(text))
+
+
+def _functions(told: Mapping[str, Any]) -> Section:
+    columns = (
+        *(Column("function", "code"), Column("unit"), Column("median", "number")),
+        *(Column("90 % interval", "interval"), Column("width / median", "number"), Column("verdict")),
+        Column("grade", "grade"),
+    )
+    rows = tuple(
+        (
+            *(row["name"], row["unit"], figures(row["value"])),
+            interval(row["lower"], row["upper"], _spread(row)),
+            *(percent(row["relative_width"]), row["verdict"], row["grade"]),
+        )
+        for row in told["functions"]
+    )
+    caption = "Functions of the parameters, the most precisely known first; equal-tailed credible intervals."
+    return Section("What is known best", (), (), (Table(columns, rows, caption),))
+
+
+def _spread(row: Mapping[str, Any]) -> float | None:
+    ends = (row["lower"], row["upper"])
+    return None if None in ends else (ends[1] - ends[0]) / 3.29
+
+
+def _delays(told: Mapping[str, Any]) -> Section:
+    found = told["delays"]
+    sentence = str(found["sentence"])
+    text = (f"{sentence[0].upper()}{sentence[1:]}.",)
+    rows: Sequence[Mapping[str, Any]] = found["separations"]
+    if not rows:
+        return Section("Delays of the paths", text)
+    unit = found["paths"][0]["unit"]
+    columns = (Column("pair", "code"), Column(f"told apart from [{unit}]", "number"))
+    cells = tuple((" / ".join(row["pair"]), figures(row["smallest_difference"], 2)) for row in rows)
+    caption = "Smallest difference a 90 % interval keeps apart from 0, linearised; a dash: none."
+    return Section("Delays of the paths", text, (), (Table(columns, cells, caption),))
+
+
+def _figures(told: Mapping[str, Any], run: SavedRun) -> list[Section]:
+    """Every figure of an audit."""
+    return [_profiles(told, run), _spectrum(told), _pairs(told, run)]
+
+
+def _profiles(told: Mapping[str, Any], run: SavedRun) -> Section:
+    rows = told["parameters"]
+    caption = (
+        "Line: fall of twice the log likelihood along the profile, its 90 % level dashed, an open side where "
+        "the line stays below to the end. Filled: marginal posterior on the scale of the axis."
+    )
+    pages = [rows[k : k + _PER_FIGURE] for k in range(0, len(rows), _PER_FIGURE)]
+    drawings = tuple(
+        Drawing(f"profiles_{number:02d}", _profile_page(page, run), caption)
+        for number, page in enumerate(pages, start=1)
+    )
+    return Section("Profiles and marginals", drawings=drawings)
+
+
+def _profile_page(rows: Sequence[Mapping[str, Any]], run: SavedRun) -> str:
+    figure, panels = grid(len(rows), columns=3, height=1.7)
+    for panel, row in zip(panels, rows, strict=True):
+        name, curve = row["name"], row["profile"]
+        x, fall = np.array(curve["values"], dtype=float), np.array(curve["fall"], dtype=float)
+        draws, log = run.draws[name].ravel(), run.is_log(name)
+        if log:
+            panel.set_xscale("log")
+        inside = x[fall <= _TOP]
+        low, high = min(inside.min(), draws.min()), max(inside.max(), draws.max())
+        panel.plot(x, np.minimum(fall, 2 * _TOP), color=INK, marker=".", markersize=2.5, linewidth=1.0)
+        panel.axhline(_AT_90, color=HELD_OUT, linewidth=0.8, linestyle="--")
+        edges = np.geomspace(low, high, 41) if log else np.linspace(low, high, 41)
+        counts, _ = np.histogram(draws, edges)
+        panel.stairs(counts / max(counts.max(), 1) * 0.8 * _TOP, edges, fill=True, color=BAND, alpha=0.35)
+        margin = 0.03
+        if log:
+            panel.set_xlim(low * (low / high) ** margin, high * (high / low) ** margin)
+            log_ticks(panel.xaxis, low, high)
+        else:
+            panel.set_xlim(low - margin * (high - low), high + margin * (high - low))
+            panel.locator_params(axis="x", nbins=4)
+        panel.set_ylim(0.0, _TOP)
+        panel.set_xlabel(label(name, run.units[name]))
+        panel.set_title(row["verdict"], fontsize=7.5, loc="left")
+    return svg_of(figure)
+
+
+def _spectrum(told: Mapping[str, Any]) -> Section:
+    rows = told["spectrum"]
+    if not rows:
+        return Section("Sloppy spectrum", ("Only noise parameters are free.",))
+    figure = blank(0.9 + 0.24 * len(rows))
+    panel = figure.subplots()
+    floor = max(row["eigenvalue"] for row in rows) * 1e-16
+    for place, row in enumerate(rows):
+        value = max(row["eigenvalue"], floor)  # what is drawn; the table of numbers is in audit.json
+        panel.plot([value], [place], "o", color=BAND if row["eigenvalue"] >= 1 else HELD_OUT, markersize=4)
+        told_parts = ", ".join(f"{weight:+.2f} {name}" for name, weight in list(row["direction"].items())[:4])
+        panel.annotate(
+            plain(told_parts), (1.01, place), xycoords=("axes fraction", "data"), va="center", fontsize=7
+        )
+    panel.axvline(1.0, color=INK, linewidth=0.8, linestyle=":")
+    panel.set_xscale("log")
+    panel.invert_yaxis()
+    panel.set_yticks(range(len(rows)), [str(place + 1) for place in range(len(rows))])
+    panel.set_xlabel("precision of the data over that of the prior [-]")
+    panel.set_ylabel("direction")
+    caption = (
+        "Eigenvalues of the Fisher information at the maximum, in prior standard deviations; left of 1 the "
+        "prior knows more than the data. Beside each, the parameters it moves."
+    )
+    return Section("Sloppy spectrum", drawings=(Drawing("sloppy_spectrum", svg_of(figure), caption),))
+
+
+def _pairs(told: Mapping[str, Any], run: SavedRun) -> Section:
+    pairs: dict[frozenset[str], tuple[str, str]] = {}
+    for row in told["parameters"]:
+        if row["verdict"] != "identified":
+            for partner in row["partners"][:2]:
+                pairs.setdefault(frozenset((row["name"], partner)), (row["name"], partner))
+    shown = list(pairs.values())[:_PAIRS]
+    if not shown:
+        return Section("Degenerate pairs", ("No parameter needs a partner to explain it.",))
+    figure, panels = grid(len(shown), columns=3, height=2.1)
+    for panel, (a, b) in zip(panels, shown, strict=True):
+        _pair(panel, run, a, b)
+    left = len(pairs) - len(shown)
+    caption = "Draws of parameters that are not identified against those that make up for them." + (
+        f" {left} more pairs are not drawn." if left else ""
+    )
+    return Section("Degenerate pairs", drawings=(Drawing("degenerate_pairs", svg_of(figure), caption),))
+
+
+def _pair(panel: Axes, run: SavedRun, a: str, b: str) -> None:
+    x, y = (run.draws[name].ravel() for name in (a, b))
+    step = max(1, x.size // _DOTS)
+    panel.plot(x[::step], y[::step], ".", color=CYCLE[0], markersize=1.5, alpha=0.5, rasterized=False)
+    for name, axis, values, scale in (
+        (a, panel.xaxis, x, panel.set_xscale),
+        (b, panel.yaxis, y, panel.set_yscale),
+    ):
+        if run.spans_decades(name):
+            scale("log")
+            log_ticks(axis, float(values.min()), float(values.max()))
+    panel.set_xlabel(label(a, run.units[a]))
+    panel.set_ylabel(label(b, run.units[b]))

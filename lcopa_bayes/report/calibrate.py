@@ -1,0 +1,286 @@
+"""The page of a calibration, drawn from its `results.json` alone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.report.formatting import figures, percent, probability
+from lcopa_bayes.report.page import Verdict, write_page
+from lcopa_bayes.report.section import Column, Drawing, Section, Table
+from lcopa_bayes.report.theme import BAND, HELD_OUT, INK, NOISE, blank, grid, look, plain, svg_of
+
+_PER_FIGURE = 18
+"""Most quantities on one figure of ranks."""
+_MOST_ROWS = 40
+"""Replicas listed one by one."""
+
+_NEEDS = (
+    *("study", "verdict", "grade", "grade_reason", "seed", "asked", "replicas", "coverage", "simultaneous"),
+    *("p_value", "p_value_of", "ranks", "rank_bins", "rank_corridor", "reliable", "grades", "not_reliable"),
+    *("failures", "truths", "model_gap", "seconds", "sampler", "engine", "discretisation"),
+)
+
+
+def is_calibration(folder: Path) -> bool:
+    """Whether a run folder is that of a calibration."""
+    try:
+        return "rank_corridor" in json.loads((folder / "results.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError, TypeError):
+        return False
+
+
+def write_calibration(folder: Path) -> Path:
+    """`report.html` with coverage, ranks and grades; returns its path. InputError when keys are missing."""
+    told: Mapping[str, Any] = json.loads((folder / "results.json").read_text(encoding="utf-8"))
+    absent = [key for key in _NEEDS if key not in told]
+    if absent:
+        raise InputError(
+            f"{folder / 'results.json'}: lacks {', '.join(absent)}; run `calibrate` again with --resume"
+        )
+    with look():
+        sections = _sections(told)
+    verdict = Verdict(told["grade"], told["verdict"], told["grade_reason"])
+    return write_page(folder, f"{told['study']}: calibration", sections, verdict)
+
+
+def _sections(told: Mapping[str, Any]) -> list[Section]:
+    """Sections of a calibration's `results.json`."""
+    return [_coverage(told), _ranks(told), _differences(told), _replicas(told)]
+
+
+def _coverage(told: Mapping[str, Any]) -> Section:
+    rows, reliable = told["coverage"], told["reliable"]
+    others = {(row["parameter"], row["level"]): row for row in (reliable or {"coverage": ()})["coverage"]}
+    table = Table(
+        (
+            *(Column("quantity", "code"), Column("stated", "number"), Column("observed", "number")),
+            *(Column("band", "number"), Column("p-value", "number"), Column("within")),
+            Column("observed in reliable replicas", "number"),
+        ),
+        tuple(_row(row, others.get((row["parameter"], row["level"]))) for row in rows),
+        f"Share of replicas whose equal-tailed interval holds the truth, over {told['replicas']} replicas. "
+        f"The band is {rows[0]['band']}'s at a confidence of {100 * rows[0]['confidence']:.2f} %: if every "
+        f"interval covers as stated, all {len(rows)} rows are within theirs together with a probability of "
+        f"{percent(told['simultaneous'])} or more. P-values are exact binomial, one row at a time.",
+    )
+    caption = (
+        "Observed coverage with its simultaneous band against the stated level (dashed), over all replicas"
+        + (" and over the reliable ones." if reliable else "; none is graded reliable.")
+    )
+    return Section(
+        "Coverage",
+        ("A step response counts at several times after the step, each path by itself.",),
+        (Drawing("calibration_coverage", _dots(told), caption),),
+        (table,),
+    )
+
+
+def _row(row: Mapping[str, Any], reliable: Mapping[str, Any] | None) -> tuple[str, ...]:
+    return (
+        str(row["parameter"]),
+        percent(row["level"]),
+        _percent(row["observed"]),
+        f"{_percent(row['lower'])} to {_percent(row['upper'])}",
+        figures(row["p_value"], 2),
+        "yes" if row["within"] else "NO",
+        "–" if reliable is None else _percent(reliable["observed"]),  # noqa: RUF001
+    )
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %"
+
+
+def _dots(told: Mapping[str, Any]) -> str:
+    """One row per quantity, one panel per level."""
+    names = list(dict.fromkeys(row["parameter"] for row in told["coverage"]))
+    levels = sorted({row["level"] for row in told["coverage"]})
+    figure = blank(0.9 + 0.27 * len(names))
+    panels = figure.subplots(1, len(levels), sharey=True, squeeze=False)[0]
+    groups = [(told, BAND, f"all {told['replicas']}")]
+    if told["reliable"]:
+        groups.append((told["reliable"], HELD_OUT, f"{told['reliable']['replicas']} reliable"))
+    for panel, level in zip(panels, levels, strict=True):
+        panel.axvline(level, color=NOISE, lw=0.9, ls=(0, (4, 3)))
+        for number, (group, colour, name) in enumerate(groups):
+            rows = [row for row in group["coverage"] if row["level"] == level]
+            at = np.arange(len(rows)) + 0.24 * (number - (len(groups) - 1) / 2)
+            seen = np.array([row["observed"] for row in rows])
+            ends = np.array([[row["lower"], row["upper"]] for row in rows]).T
+            panel.errorbar(seen, at, xerr=np.abs(ends - seen), fmt="o", ms=3, lw=1, color=colour, label=name)
+        panel.set_title(f"{percent(level)} intervals", loc="left")
+        panel.set_xlabel("coverage [-]")
+    panels[0].set_yticks(range(len(names)), [plain(name) for name in names])
+    panels[0].set_ylim(len(names) - 0.5, -0.5)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
+    return svg_of(figure)
+
+
+def _ranks(told: Mapping[str, Any]) -> Section:
+    bins, among = told["rank_bins"], len(told["ranks"][0]["counts"]) - 1
+    caption = (
+        f"Ranks of the truth among {among} posterior draws, {told['replicas']} replicas in {bins['bins']} "
+        "bins. Grey: where all bins of a histogram of uniform ranks lie with a probability of "
+        f"{percent(told['simultaneous'])} or more."
+    )
+    text = (
+        "Ranks heaped in the middle mean intervals that are too wide, heaped at both ends too narrow, at "
+        "one end biased. Of truths from the prior they are uniform if the whole procedure is exact; of a "
+        "truth that is the same in every replica they need not be.",
+        f"Overall {probability(told['p_value'])}: {told['p_value_of']}.",
+    )
+    return Section("Ranks", text, _pages(told, "calibration_ranks", caption, 1.35, _histogram))
+
+
+def _differences(told: Mapping[str, Any]) -> Section:
+    caption = (
+        "Share of ranks below a value minus what uniform ranks have there, over all replicas. Grey: corridor "
+        "in which the whole curve of uniform ranks lies with a probability of "
+        f"{percent(told['simultaneous'])}. The p-value is that of this test, one quantity at a time."
+    )
+    return Section("ECDF differences", (), _pages(told, "calibration_ecdf", caption, 1.35, _difference))
+
+
+def _pages(
+    told: Mapping[str, Any],
+    stem: str,
+    caption: str,
+    height: float,
+    draw: Callable[[Axes, Mapping[str, Any], Mapping[str, Any]], None],
+) -> tuple[Drawing, ...]:
+    """Figures of up to `_PER_FIGURE` panels, one per quantity."""
+    out = []
+    pages = -(-len(told["ranks"]) // _PER_FIGURE)
+    for number, part in enumerate(np.array_split(np.arange(len(told["ranks"])), pages), start=1):
+        rows = [told["ranks"][k] for k in part]
+        figure, panels = grid(len(rows), columns=3, height=height)
+        for panel, row in zip(panels, rows, strict=True):
+            draw(panel, row, told)
+            panel.set_title(plain(row["parameter"]), loc="left", fontsize=7.5)
+        for panel in panels[-3:]:
+            panel.set_xlabel("rank [-]")
+        out.append(Drawing(f"{stem}_{number:02d}", svg_of(figure), caption))
+    return tuple(out)
+
+
+def _histogram(panel: Axes, row: Mapping[str, Any], told: Mapping[str, Any]) -> None:
+    counts, band = np.array(row["counts"]), told["rank_bins"]
+    edges = np.linspace(0, counts.size, band["bins"] + 1)
+    panel.axhspan(band["lower"], band["upper"], color=NOISE, alpha=0.3, lw=0)
+    panel.axhline(told["replicas"] / band["bins"], color=NOISE, lw=0.8)
+    panel.stairs(counts.reshape(band["bins"], -1).sum(axis=1), edges, fill=True, color=BAND, alpha=0.75)
+    panel.set_xlim(0, counts.size)
+    panel.set_ylabel("replicas")
+
+
+def _difference(panel: Axes, row: Mapping[str, Any], told: Mapping[str, Any]) -> None:
+    counts, corridor = np.array(row["counts"]), told["rank_corridor"]
+    at = np.arange(1, counts.size)
+    expected = at / counts.size
+    lower, upper = (np.array(corridor[end]) / told["replicas"] - expected for end in ("lower", "upper"))
+    panel.fill_between(at, lower, upper, color=NOISE, alpha=0.3, lw=0, step="post")
+    panel.axhline(0.0, color=NOISE, lw=0.6)
+    panel.step(at, np.cumsum(counts)[:-1] / told["replicas"] - expected, where="post", color=BAND)
+    panel.set_xlim(0, counts.size)
+    panel.text(
+        0.98,
+        0.96,
+        f"p = {figures(row['p_value'], 2)}",
+        ha="right",
+        va="top",
+        fontsize=7,
+        color=INK,
+        transform=panel.transAxes,
+    )
+
+
+def _replicas(told: Mapping[str, Any]) -> Section:
+    gap, seconds, counted = told["model_gap"], told["seconds"], told["grades"]
+    engine, width = told["engine"], told["discretisation"]
+    rows = (
+        ("replicas asked for", str(told["asked"])),
+        *((f"graded {name}" if name != "failed" else "failed", str(n)) for name, n in counted.items()),
+        ("truths", _origin(told["truths"])),
+        ("draws by importance sampling", f"{engine['importance']}"),
+        ("draws by ensembles", f"{engine['sampling']}"),
+        ("Pareto k of importance weights, median", _number(engine["median_k"])),
+        ("Pareto k of importance weights, largest", _number(engine["largest_k"])),
+        ("seed", str(told["seed"])),
+        ("processor time of a replica, median [s]", figures(seconds["median"])),
+        ("processor time of a replica, largest [s]", figures(seconds["largest"])),
+        ("processor time in all [s]", figures(seconds["total"])),
+        ("forward model from bench at the truth, median [noise sd]", figures(gap["median"])),
+        ("forward model from bench at the truth, 90 % quantile [noise sd]", figures(gap["quantile_90"])),
+        ("forward model from bench at the truth, largest [noise sd]", figures(gap["largest"])),
+        ("shift by the width of the blocks is negligible", f"{width['negligible']} replicas"),
+        ("shift by the width of the blocks, median [posterior sd]", figures(width["median"], 2)),
+        ("shift by the width of the blocks, largest [posterior sd]", figures(width["largest"], 2)),
+        *((name.replace("_", " "), str(value)) for name, value in told["sampler"].items()),
+    )
+    lists = [Table((Column("replicas"), Column("value", "number")), rows)]
+    if told["not_reliable"]:
+        lists.append(
+            Table(
+                (
+                    Column("replica", "number"),
+                    Column("seed", "code"),
+                    Column("grade", "grade"),
+                    Column("reason", "prose"),
+                ),
+                tuple(
+                    (str(row["replica"]), str(row["seed"]), row["grade"], row["reason"])
+                    for row in told["not_reliable"][:_MOST_ROWS]
+                ),
+                _further(len(told["not_reliable"])),
+            )
+        )
+    if told["failures"]:
+        lists.append(
+            Table(
+                (Column("failed replica", "number"), Column("seed", "code"), Column("error", "prose")),
+                tuple(
+                    (str(row["replica"]), str(row["seed"]), row["error"])
+                    for row in told["failures"][:_MOST_ROWS]
+                ),
+                _further(len(told["failures"])),
+            )
+        )
+    text = (
+        "No replica is left out of what is said above but those that failed. The distance of the forward "
+        "model from the bench, root sum of squares over all samples, bounds by how many posterior standard "
+        "deviations discretisation alone can shift a result. Draws come from importance sampling around the "
+        f"optima where the Pareto k of the weights is at most {figures(engine['largest_good_k'])} and enough "
+        "draws are effective, else from ensembles of walkers.",
+    )
+    return Section("Replicas", text, tables=tuple(lists))
+
+
+def _origin(source: Mapping[str, Any]) -> str:
+    """Where truths come from, in words."""
+    stated = ", ".join(
+        f"{name} = {value:g}"
+        if isinstance(value, float | int)
+        else f"{name} from {value[0]:g} to {value[1]:g}"
+        for name, value in (source["stated"] or {}).items()
+    )
+    return {
+        "prior": "drawn from the prior of the study",
+        "posterior": f"drawn from the posterior in {source['folder']} (grade {source['grade']})",
+        "stated": f"stated: {stated}",
+        "stated and prior": f"stated: {stated}; the others drawn from the prior",
+    }[source["from"]]
+
+
+def _number(value: float | None) -> str:
+    return "none" if value is None else figures(value, 2)
+
+
+def _further(count: int) -> str:
+    return f"And {count - _MOST_ROWS} more in results.json." if count > _MOST_ROWS else ""

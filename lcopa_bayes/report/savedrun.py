@@ -1,0 +1,180 @@
+"""A run folder as the report reads it; everything the report needs is checked here."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from lcopa_bayes.core.arrays import Matrix
+from lcopa_bayes.core.errors import InputError
+
+_BAND = ("05", "25", "50", "75", "95")
+_WORDS = ("record", "axis", "unit", "name", "path", "prior", "from")
+_FLAGS = ("held_out", "log_scale", "integrated_out")
+_TABLES: Mapping[str, tuple[str, ...]] = {
+    "bands": (
+        *("record", "axis", "unit", "held_out", "time", "observed"),
+        *(f"{kind}_{q}" for kind in ("plant", "noisy") for q in _BAND),
+    ),
+    "drives": ("record", "axis", "unit", "time", "drive"),
+    "residuals": ("record", "axis", "unit", "held_out", "time", "residual"),
+    "autocorrelation": ("record", "axis", "lag", "autocorrelation", "white_band_95"),
+    "spectrum": ("record", "axis", "frequency", "power_over_white"),
+    "step_response": (
+        *("path", "unit", "time"),
+        *(f"response_{q}" for q in _BAND),
+        *("steady_05", "steady_50", "steady_95"),
+    ),
+    "priors": ("name", "unit", "prior", "from", "integrated_out"),
+    "prior_density": ("name", "log_scale", "x", "density"),
+}
+"""Tables the report draws and the columns it needs of each."""
+_CHECK_TABLES: Mapping[str, tuple[str, ...]] = {
+    "cross_check_density": ("name", "log_scale", "left", "right", "ensembles", "nested"),
+}
+"""The same of a run that was checked by a second method."""
+_RESULTS = (
+    *("study", "verdict", "grade", "grade_reason", "time_unit", "parameters", "fixed", "held_out"),
+    *("fit_scores", "step_metrics", "residual_tests", "sampler"),
+    *("ridges", "sensitivity", "cross_check"),
+)
+_PROVENANCE = ("command", "seed", "inputs_sha256", "python", "versions")
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class SavedRun:
+    """What a run left in its folder."""
+
+    results: Mapping[str, Any]
+    provenance: Mapping[str, Any]
+    tables: Mapping[str, pd.DataFrame]
+    draws: Mapping[str, Matrix]
+    """Draws of each free parameter, (ensembles, draws), in the parameter's unit."""
+
+    @property
+    def time_unit(self) -> str:
+        """Unit of all times."""
+        return str(self.results["time_unit"])
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Unit of each free parameter."""
+        return {row["name"]: row["unit"] for row in self.results["parameters"]}
+
+    def part(self, table: str, record: str, axis: str) -> pd.DataFrame:
+        """Rows of one axis of one record."""
+        whole = self.tables[table]
+        return whole[(whole["record"] == record) & (whole["axis"] == axis)]
+
+    def records(self, table: str) -> list[tuple[str, str]]:
+        """Record and axis pairs of a table: fitted ones first, then held-out ones, as they were saved."""
+        pairs = self.tables[table][["record", "axis", "held_out"]].drop_duplicates()
+        ordered = pairs.sort_values("held_out", kind="stable")
+        return list(zip(ordered["record"], ordered["axis"], strict=True))
+
+    def spans_decades(self, name: str) -> bool:
+        """Whether a parameter sampled on a logarithmic scale has draws over more than a factor of ten."""
+        low, high = np.quantile(self.draws[name], [0.0025, 0.9975])
+        return bool(self.is_log(name) and low > 0 and high > 10 * low)
+
+    def is_log(self, name: str) -> bool:
+        """Whether a parameter is sampled on a logarithmic scale."""
+        density = self.tables["prior_density"]
+        return bool(density.loc[density["name"] == name, "log_scale"].any())
+
+
+def load_run(folder: Path) -> SavedRun:
+    """Read a run folder; InputError names every file that is missing or cannot be used."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: there is no such run folder; give the folder `fit` wrote")
+    problems: list[str] = []
+    results = _json(folder / "results.json", _RESULTS, problems)
+    provenance = _json(folder / "provenance.json", _PROVENANCE, problems)
+    wanted = {**_TABLES, **(_CHECK_TABLES if results.get("cross_check") else {})}
+    tables = {
+        name: _table(folder / "tables" / f"{name}.csv", needs, problems) for name, needs in wanted.items()
+    }
+    draws = _draws(folder / "posterior.nc", problems)
+    if not problems:
+        absent = [row["name"] for row in results["parameters"] if row["name"] not in draws]
+        problems += [
+            f"{folder / 'posterior.nc'}: no draws of {name!r}, which results.json tells of; "
+            "both must come from the same run, so run `fit` again"
+            for name in absent
+        ]
+    if problems:
+        raise InputError(problems)
+    return SavedRun(results, provenance, tables, draws)
+
+
+def _missing(path: Path) -> str:
+    return f"{path}: this file of the run folder is missing; run `fit` again to write it"
+
+
+def _json(path: Path, needs: tuple[str, ...], problems: list[str]) -> dict[str, Any]:
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        problems.append(_missing(path))
+        return {}
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        problems.append(f"{path}: cannot be read as JSON ({error}); run `fit` again to write it")
+        return {}
+    if not isinstance(told, dict):
+        problems.append(f"{path}: expected a JSON object; run `fit` again to write it")
+        return {}
+    problems += [
+        f"{path}: the key {key!r} is missing; run `fit` again with this version of lcopa-bayes"
+        for key in needs
+        if key not in told
+    ]
+    return told
+
+
+def _table(path: Path, needs: tuple[str, ...], problems: list[str]) -> pd.DataFrame:
+    """A CSV table whose names stay names even when they look like numbers; empty when it has no rows."""
+    empty = pd.DataFrame(columns=list(needs))
+    try:
+        text = path.read_text(encoding="utf-8")
+        if not text.strip():
+            return empty
+        words = dict.fromkeys(_WORDS, str)
+        absent = {name: ["", "nan"] for name in needs if name not in (*_WORDS, *_FLAGS)}
+        table = pd.read_csv(io.StringIO(text), dtype=words, keep_default_na=False, na_values=absent)
+    except FileNotFoundError:
+        problems.append(_missing(path))
+        return empty
+    except (OSError, ValueError) as error:
+        problems.append(f"{path}: cannot be read as a table ({error}); run `fit` again to write it")
+        return empty
+    problems += [
+        f"{path}: the column {name!r} is missing; run `fit` again with this version of lcopa-bayes"
+        for name in needs
+        if name not in table
+    ]
+    return table
+
+
+def _draws(path: Path, problems: list[str]) -> dict[str, Matrix]:
+    if not path.exists():
+        problems.append(_missing(path))
+        return {}
+    try:
+        with xr.open_dataset(path, group="posterior", engine="h5netcdf") as posterior:
+            return {
+                str(values.attrs.get("parameter", name)): values.transpose("chain", "draw").to_numpy()
+                for name, values in posterior.data_vars.items()
+                if values.dims in (("chain", "draw"), ("draw", "chain"))
+            }
+    except (OSError, ValueError, KeyError) as error:
+        problems.append(f"{path}: cannot be read as draws ({error}); run `fit` again to write it")
+        return {}

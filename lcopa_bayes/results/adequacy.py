@@ -1,0 +1,177 @@
+"""Whether the model is adequate to its records: what else the intervals rest on than the sampling.
+
+A grade by the sampling says how well a posterior is known, not whether its model is right. Checks of the
+model against the records it was fitted to are limitations of every number: a residual that the noise model
+does not explain, bands that hold too many or too few samples, a residual far above the scatter at rest, noise
+whose parameters stand at the end of their priors, and a resonance that the samples do not resolve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from math import exp, inf, isfinite, log, sqrt
+from typing import final
+
+import numpy as np
+from scipy.stats import binom
+
+from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.results.prediction import LEVELS, Band
+from lcopa_bayes.results.residuals import WHITE_P, Residual
+from lcopa_bayes.results.resonance import resonances
+from lcopa_bayes.sampling.convergence import Limitation
+from lcopa_bayes.sampling.crosscheck import holm
+from lcopa_bayes.sampling.draws import Draws
+
+REST = 2.0
+"""Residual over the largest scatter that samples at rest allow, from which a model lacks something [-]: the
+default priors let noise in motion be twice that at rest."""
+MEMORY = 0.1
+"""Share of the record over which noise may be correlated [-]: with less than ten independent stretches it
+cannot be told from a response that the plant lacks."""
+_END = 0.9
+"""Noise parameters with half of their draws beyond this share of a bounded prior stand at its end [-]."""
+_REPLICAS = 400
+"""Noise that is drawn to learn how coverage scatters."""
+_CELLS = 4_000_000
+_ADD = "add terms to the model, or let `loop` trace what it lacks"
+
+
+def limitations(
+    problem: Problem,
+    draws: Draws,
+    shown: Sequence[Band],
+    left: Sequence[Residual],
+    rng: np.random.Generator,
+) -> tuple[Limitation, ...]:
+    """Limitations of the numbers of a fit, from its bands and residuals of the records that were fitted."""
+    fitted = [band for band in shown if not band.held_out]
+    return (
+        *_unexplained(
+            [one for one in left if not one.held_out], [_coverage(problem, draws, b, rng) for b in fitted]
+        ),
+        *_above_rest(problem, fitted),
+        *_ends(problem, draws),
+        *resonances(draws, problem.scales.period, problem.study.time_unit),
+    )
+
+
+@final
+@dataclass(frozen=True)
+class Coverage:
+    """Samples of one axis of one record inside the 90 % band."""
+
+    record: str
+    axis: str
+    share: float
+    """[-]."""
+    p: float
+    """Two-sided p-value under the noise model [-]."""
+
+
+def _coverage(problem: Problem, draws: Draws, band: Band, rng: np.random.Generator) -> Coverage:
+    """Coverage of a band beside that of noise about the median response.
+
+    Coverage of correlated noise scatters as that of fewer independent samples: as many as give the variance
+    between replicas.
+    """
+    noise, axes = problem.posterior.noise, [axis.name for axis in draws.table.layout.responses]
+    size = band.time.size
+    values = draws.thinned(max(50, min(_REPLICAS, _CELLS // size)))
+    places = [draws.table.at(name, axes.index(band.axis)) for name in noise.names]
+    gaps = np.concatenate(([1.0], np.diff(band.time) / problem.scales.period))
+    low, high = band.noisy[0] - band.plant[2], band.noisy[4] - band.plant[2]
+    replicas = noise.draw(values[:, places], gaps, rng)
+    shares = np.mean((replicas >= low) & (replicas <= high), axis=1)
+    due, spread = float(shares.mean()), float(shares.var())
+    independent = size if spread == 0 else max(1, min(size, round(due * (1 - due) / spread)))
+    share = band.coverage(LEVELS[1])
+    law = binom(independent, due)
+    above, below = law.sf(np.ceil(share * independent) - 1), law.cdf(np.floor(share * independent))
+    return Coverage(band.record, band.axis, share, float(min(1.0, 2 * min(above, below))))
+
+
+def _unexplained(left: Sequence[Residual], covered: Sequence[Coverage]) -> Iterator[Limitation]:
+    """Residuals that are not white and bands that do not hold what is due, corrected for all that are
+    tried."""
+    adjusted = holm([one.p_white for one in left] + [one.p for one in covered])
+    white, hold = adjusted[: len(left)], adjusted[len(left) :]
+    count = f"corrected for {len(adjusted)} tests" if len(adjusted) > 1 else "one test"
+    if white and min(white) < WHITE_P:
+        worst = left[int(np.argmin(white))]
+        yield Limitation(
+            "tentative",
+            "intervals hold only if what the noise model does not explain is harmless: the residual of "
+            f"{worst.record}, axis {worst.axis}, is not white ({_p(min(white))}, {count})",
+            _ADD,
+        )
+    if hold and min(hold) < WHITE_P:
+        off = covered[int(np.argmin(hold))]
+        wide = off.share > LEVELS[1]
+        noise = "wider" if wide else "narrower"
+        yield Limitation(
+            "tentative",
+            f"intervals hold only if the noise is right, which is {noise} than the residual: bands hold "
+            f"{100 * off.share:.0f} % of {off.record}, axis {off.axis}, where {100 * LEVELS[1]:.0f} % are "
+            f"due ({_p(min(hold))}, {count})",
+            "choose another [noise] kind, " + _ADD,
+        )
+
+
+def _p(p: float) -> str:
+    return f"p = {p:.1g}" if p > 0 else "p < 1e-300"
+
+
+def _above_rest(problem: Problem, fitted: Sequence[Band]) -> Iterator[Limitation]:
+    """The axis whose residual is largest over the scatter at rest, where that is too large."""
+    begins = {one.record.name: one.first_change for one in problem.posterior.samples}
+    worst, told = REST, None
+    for axis, declared in enumerate(problem.posterior.table.layout.responses):
+        quiet = problem.scales.quiet(axis)
+        if quiet is None:
+            continue
+        most = float(np.hypot(quiet.sigma * exp(2 * quiet.log_sd), quiet.correlated))
+        for band in fitted:
+            moving = band.time > begins[band.record]
+            if band.axis != declared.name or not moving.any():
+                continue
+            rms = sqrt(float(np.mean((band.observed - band.plant[2])[moving] ** 2)))
+            if rms > worst * most:
+                worst, told = rms / most, (band, rms, most)
+    if told is not None:
+        band, rms, most = told
+        yield Limitation(
+            "tentative",
+            "intervals hold only if noise grew with the first change of the drive: the residual of "
+            f"{band.record}, axis {band.axis}, is {rms:.3g} {band.unit}, at rest noise is at most "
+            f"{most:.3g} {band.unit}",
+            _ADD,
+        )
+
+
+def _ends(problem: Problem, draws: Draws) -> Iterator[Limitation]:
+    """Noise parameters at the end of their priors, and noise that is correlated over much of the record."""
+    samples = problem.scales.span / problem.scales.period
+    for row in draws.table.rows:
+        if not (row.free and row.noise):
+            continue
+        column, (low, high) = draws.column(row.name), row.domain
+        if row.kind == "rho":
+            memory = -1 / log(float(np.median(column)))
+            longest = -1 / log(high) if high < 1 else inf
+            if memory > min(MEMORY * samples, _END * longest):
+                yield Limitation(
+                    "tentative",
+                    f"intervals hold only if noise is correlated over {memory:.3g} samples of "
+                    f"{samples:.0f} ({row.name} = {np.median(column):.4g}): noise that slow stands for what "
+                    "the plant lacks",
+                    _ADD,
+                )
+        elif isfinite(high) and np.median(column) > low + _END * (high - low):
+            yield Limitation(
+                "tentative",
+                f"intervals hold only if {row.name} may not exceed {high:.3g} {row.unit}, the end of its "
+                "prior where it stands",
+                _ADD,
+            )

@@ -1,0 +1,194 @@
+"""How far the width of the blocks moves a posterior, and narrower blocks where that is too far.
+
+Two measures. Before sampling, at the best least-squares optimum: with W the whitening of the noise, J the
+whitened Jacobian and d the change of the whitened response on narrower blocks, the optimum moves by
+``(J' J + prior)^-1 J' d`` to first order. After sampling, at draws of the posterior, whatever its shape:
+draws weighted by the ratio of the likelihoods on narrow and on used blocks have the mean that sampling on
+narrow blocks would have had.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.leastsquares import LeastSquares
+from lcopa_bayes.inference.optimum import Optimum, find_optima
+from lcopa_bayes.sampling.convergence import Limitation
+from lcopa_bayes.sampling.draws import Draws
+
+LARGEST = 0.1
+"""Largest shift of a parameter by the width of the blocks that leaves a grade as it is [posterior sd]."""
+UNUSABLE = 1.0
+"""Shift at which numbers are not usable [posterior sd]."""
+_NOTHING = 0.02
+"""Shift that is not worth its digits [posterior sd]."""
+FACTORS = (2, 4)
+"""How many times narrower the blocks are on which shifts are measured."""
+_REST = 16 / 15
+"""What is left from blocks four times narrower to none, by the second order of the scheme."""
+_FINEST = 16
+"""Most by which blocks are narrowed [-]."""
+_MOST_CELLS = 1 << 15
+"""Blocks of all records together beyond which they are not narrowed: a fit takes as many times longer."""
+_STARTS = 2
+"""Starts of the search for the optimum."""
+_DRAWS = 400
+"""Draws behind the measurement after sampling."""
+
+
+@final
+@dataclass(frozen=True)
+class Discretisation:
+    """Shift of the posterior means by the width of the blocks."""
+
+    parameter: str
+    """The one that moves most."""
+    shift: float
+    """How far and to which side, on blocks without width [posterior sd]."""
+    error: float
+    """Standard error of `shift` from the number of draws [posterior sd]."""
+    refinement: int
+    """How many times narrower than the study's settings ask the blocks already are."""
+
+    blocks: int
+    """Blocks of all fit records together [-]."""
+
+    @property
+    def negligible(self) -> bool:
+        """Whether no parameter moves by more than `LARGEST`, a small error of measurement aside: a large one,
+        as of draws of which few have weight on narrow blocks, excuses nothing."""
+        return abs(self.shift) - min(2 * self.error, LARGEST) <= LARGEST
+
+    @property
+    def sentence(self) -> str:
+        """What was measured, a sentence without its full stop."""
+        if abs(self.shift) + 2 * self.error < _NOTHING:
+            return (
+                f"The width of the {self.blocks} blocks moves no posterior mean by more than {_NOTHING:g} sd"
+            )
+        return (
+            f"The width of the {self.blocks} blocks moves the posterior mean of {self.parameter} by "
+            f"{abs(self.shift):.2f} ± {self.error:.2f} sd, that of every other parameter by less"
+        )
+
+    @property
+    def limitations(self) -> tuple[Limitation, ...]:
+        """None where the shift is negligible."""
+        if self.negligible:
+            return ()
+        return (
+            Limitation(
+                "tentative" if abs(self.shift) < UNUSABLE else "unusable",
+                f"the width of the blocks moves {self.parameter} by {abs(self.shift):.2g} posterior sd",
+                "set [model] blocks to a larger number, or leave out the samples of the fastest onset",
+            ),
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "parameter": self.parameter,
+            "shift_sd": self.shift,
+            "shift_error_sd": self.error,
+            "refinement": self.refinement,
+            "blocks": self.blocks,
+            "negligible": self.negligible,
+        }
+
+
+def resolved(problem: Problem, optima: Sequence[Optimum] | None = None) -> Problem:
+    """The problem on blocks so narrow that the optimum moves by at most `LARGEST` sd on narrower ones.
+
+    The same problem gives the same blocks; see `narrowed`. `optima` are its own, best first, where they are
+    known already.
+    """
+    rng = np.random.default_rng([problem.study.seed, 6])
+    with threadpool_limits(1):  # matrices are small: more threads only wait for each other
+        if optima is None:
+            optima = find_optima(problem.posterior, rng, starts=_STARTS)
+        if not optima:
+            return problem
+        best = optima[0].values
+        return narrowed(problem, lambda each: optimum_shift(each, best))
+
+
+def narrowed(problem: Problem, shift: Callable[[Problem], float]) -> Problem:
+    """The problem on blocks halved while the `shift` measured on them is larger than `LARGEST` sd.
+
+    Not beyond `_FINEST` or `_MOST_CELLS`, where the measurement after sampling says what is left.
+    """
+    while shift(problem) > LARGEST and _may_refine(problem):
+        problem = problem.refined(2)
+    return problem
+
+
+def _may_refine(problem: Problem) -> bool:
+    return problem.refinement < _FINEST and 2 * _cells(problem) <= _MOST_CELLS
+
+
+def _cells(problem: Problem) -> int:
+    """Blocks of all fit records together."""
+    return sum(experiment.blocks for experiment in problem.posterior.model.experiments)
+
+
+def optimum_shift(problem: Problem, values: Vector) -> float:
+    """Largest shift of a free plant parameter at an optimum on narrower blocks [posterior sd].
+
+    Parameters: values (rows,) of the table at the optimum. First order in the change of the response.
+    """
+    here = LeastSquares(problem.posterior)
+    x = here.coordinates(values)
+    residual, jacobian = here.residual(x, values)
+    precision = jacobian.T @ jacobian + _prior_precision(here)
+    covariance = np.asarray(np.linalg.pinv(precision, hermitian=True), dtype=float)
+    finer = [LeastSquares(problem.refined(factor).posterior) for factor in FACTORS]
+    changes = [each.residual(x, values)[0] - residual for each in finer]
+    return largest_shift(covariance, jacobian, changes)
+
+
+def largest_shift(covariance: Matrix, jacobian: Matrix, changes: Sequence[Vector]) -> float:
+    """Largest shift of a parameter by changes of the whitened response on narrower blocks [posterior sd].
+
+    Parameters: covariance (k, k) of the parameters at an optimum; jacobian (n, k) of the whitened response
+    there; changes (n,) on blocks `FACTORS` times narrower.
+    """
+    sd = np.sqrt(np.diag(covariance))
+    shifts = [np.abs(covariance @ (jacobian.T @ change)) / np.where(sd > 0, sd, np.inf) for change in changes]
+    return float(np.max(shifts)) * _REST
+
+
+def _prior_precision(problem: LeastSquares) -> Matrix:
+    """No direction is wider than its prior: precision of a uniform law between the bounds."""
+    low, high = problem.bounds
+    width = high - low
+    return np.diag(np.where(np.isfinite(width), 12.0 / np.where(width > 0, width, 1.0) ** 2, 0.0))
+
+
+def discretisation(problem: Problem, draws: Draws) -> Discretisation:
+    """Shift of the posterior mean of every free parameter on blocks four times narrower."""
+    finer = problem.refined(FACTORS[-1]).posterior
+    values = draws.thinned(_DRAWS)
+    change = finer.joint_log_likelihood(values) - problem.posterior.joint_log_likelihood(values)
+    weights = np.exp(change - change.max())
+    weights /= weights.sum()
+    rows = [k for k, row in enumerate(draws.table.rows) if row.free]
+    columns = values[:, rows]
+    sd = columns.std(axis=0)
+    scaled = (columns - columns.mean(axis=0)) / np.where(sd > 0, sd, np.inf)
+    shifts = weights @ scaled * _REST
+    errors = np.sqrt(np.mean(((weights * weights.size - 1.0)[:, None] * scaled) ** 2, axis=0) / weights.size)
+    worst = int(np.abs(shifts).argmax())
+    return Discretisation(
+        draws.table.names[rows[worst]],
+        float(shifts[worst]),
+        float(errors[worst]),
+        problem.refinement,
+        _cells(problem),
+    )

@@ -1,0 +1,160 @@
+"""The verb `fit`: posterior, bands, held-out scores and step metrics of a study."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Matrix
+from lcopa_bayes.core.checks import refuse_if
+from lcopa_bayes.core.estimate import Estimate
+from lcopa_bayes.core.files import writable_folder
+from lcopa_bayes.data.requirements import unmet
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.results.adequacy import limitations
+from lcopa_bayes.results.discretisation import Discretisation, discretisation, resolved
+from lcopa_bayes.results.prediction import Band, bands
+from lcopa_bayes.results.provenance import digest_of, fingerprint
+from lcopa_bayes.results.residuals import Residual, residuals
+from lcopa_bayes.results.sensitivity import Sensitivity, sensitivity
+from lcopa_bayes.results.steps import StepCurves, step_curves, step_metrics, too_fast
+from lcopa_bayes.sampling.crosscheck import CrossCheck
+from lcopa_bayes.sampling.draws import Draws, gather
+from lcopa_bayes.sampling.evidence import Evidence, evidence
+from lcopa_bayes.sampling.nested import NestedPlan, nested
+from lcopa_bayes.sampling.sampler import Run, SamplePlan, sample
+from lcopa_bayes.sampling.weightedrun import weighted_run
+
+_QUICK = 4
+"""How many times fewer steps a quick fit takes."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A fitted study."""
+
+    problem: Problem
+    run: Run
+    draws: Draws
+    bands: tuple[Band, ...]
+    residuals: tuple[Residual, ...]
+    curves: StepCurves
+    metrics: tuple[Estimate, ...]
+    sensitivity: tuple[Sensitivity, ...]
+    evidence: Evidence | None
+    """None for a single ensemble, which cannot tell its error."""
+    discretisation: Discretisation
+    """How far the width of the blocks moves the posterior."""
+    cross_check: CrossCheck | None = None
+
+    @property
+    def study(self) -> Study:
+        """The study that was fitted."""
+        return self.problem.study
+
+
+def fit(
+    study: Study,
+    *,
+    jobs: int = 1,
+    folder: Path | None = None,
+    resume: bool = False,
+    quick: bool = False,
+    cross_check: bool = False,
+    quiet: bool = True,
+    starts: Matrix | None = None,
+) -> Fit:
+    """Sample the posterior of a study and derive what it predicts.
+
+    `starts`, table values (starts, rows), are modes known from elsewhere that sampling proposes too.
+
+    With `folder`, sampling is stored there in `chain.h5` and `resume` goes on from it; the result is
+    the same as without interruption. With `cross_check` the posterior is also sampled by nested sampling,
+    always from the start, and where the two disagree every grade is lowered. Blocks are narrowed until their
+    width does not move the optimum; how far it moves the posterior is measured and, where too far, lowers the
+    grade. So does what speaks against the model itself (`adequacy`). InputError when the study does not fit
+    its records, these do not meet the requirements of a fit (`requirements`), or the folder cannot be written
+    to; then nothing is written.
+    """
+    refuse_if(unmet(study))
+    problem = problem_of(study)
+    if folder:
+        writable_folder(folder)
+    problem = resolved(problem)
+    plan = plan_of(problem, quick=quick)
+    expensive = problem.posterior.simulation is not None and study.sampler.method == "auto"
+    found = weighted_run(problem.posterior, plan, jobs=jobs, quick=quick) if expensive else None
+    check = None
+    weighed: Evidence | None
+    if found is not None:
+        run, draws, weighed = found.run, found.draws, found.evidence
+    else:
+        run = sample(
+            problem.posterior,
+            plan,
+            jobs=jobs,
+            chain_file=folder / "chain.h5" if folder else None,
+            fingerprint=fingerprint(study, plan) + ("" if starts is None else digest_of(starts)),
+            resume=resume,
+            quiet=quiet,
+            starts=starts,
+        )
+        draws = gather(problem.posterior, run)
+        weighed = evidence(problem.posterior, run.kept()[0], draws.ess, plan.seed)
+    if cross_check:
+        wanted = NestedPlan.of(problem.posterior.dimension, seed=plan.seed, quick=quick)
+        check = CrossCheck.of(
+            draws,
+            nested(problem.posterior, wanted, jobs=jobs, quiet=quiet),
+            log_evidence=weighed.value if weighed else None,
+            log_evidence_sd=weighed.sd if weighed else None,
+        )
+        draws = draws.limited(check.limitations(draws.grade))
+    width = discretisation(problem, draws)
+    curves = step_curves(draws, problem.scales.span)
+    draws = draws.limited([*width.limitations, *too_fast(draws, curves, problem.scales.period)])
+    noise, rng = problem.posterior.noise, np.random.default_rng([plan.seed, 2])
+    shown = bands(draws, problem.posterior.model, problem.posterior.samples, noise, held_out=False, rng=rng)
+    if study.held_out:
+        samples, model = problem.simulated(study.held_out)
+        shown += bands(draws, model, samples, noise, held_out=True, rng=rng)
+    left = residuals(draws, shown, noise, problem.scales.period)
+    draws = draws.limited(limitations(problem, draws, shown, left, np.random.default_rng([plan.seed, 4])))
+    metrics = step_metrics(draws, curves, time_unit=study.time_unit)
+    moved = sensitivity(draws, problem.posterior)
+    return Fit(
+        problem,
+        run,
+        draws,
+        tuple(shown),
+        tuple(left),
+        curves,
+        tuple(metrics),
+        moved,
+        weighed,
+        width,
+        check,
+    )
+
+
+def plan_of(problem: Problem, *, quick: bool) -> SamplePlan:
+    """How a study asks to be sampled."""
+    wanted, study = problem.study.sampler, problem.study
+    plan = SamplePlan.of(
+        problem.posterior.dimension,
+        seed=study.seed,
+        ensembles=wanted.ensembles,
+        walkers=wanted.walkers,
+        steps=wanted.steps,
+        thin=wanted.thin,
+        target_ess=wanted.target_ess,
+    )
+    if not quick:
+        return plan
+    steps = max(plan.thin, plan.steps // _QUICK)
+    return SamplePlan(plan.ensembles, plan.walkers, steps, plan.thin, plan.target_ess, plan.seed)

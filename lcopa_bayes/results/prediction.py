@@ -1,0 +1,221 @@
+"""What the posterior says a record looks like: pointwise credible bands, held-out scores."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.inference.noise import GaussianNoise, Noise
+from lcopa_bayes.inference.observations import Observed, Samples
+from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.inference.simulation import Simulation
+from lcopa_bayes.model.forward import ForwardModel
+from lcopa_bayes.sampling.draws import Draws
+
+LEVELS = (0.5, 0.9)
+"""Probabilities inside the bands [-]."""
+KIND = "pointwise"
+"""Kind of the bands: at each time by itself a band holds the response with its probability; a whole curve
+lies within it throughout with a smaller one."""
+BEFORE_DRIVE = "samples before the drive acts"
+"""Source of an offset."""
+_QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+_CELLS = 2_000_000
+"""Draws times samples behind the bands of one axis of one record."""
+_FEWEST = 200
+"""Draws behind a band at least."""
+_WITH_EFFECTS = 1000
+"""Draws behind a band at most where the plant has effects, which take a simulation each."""
+_SWEEPS = 20
+"""Sweeps after which a Gibbs chain of a level has forgotten its start [-]: 1e-6 of it is left at nu = 1."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Band:
+    """Pointwise bands of one response axis of one record, at the record's sample times."""
+
+    record: str
+    axis: str
+    unit: str
+    held_out: bool
+    time: Vector
+    """(n,) [time unit]."""
+    observed: Vector
+    """(n,) [response unit]."""
+    plant: Matrix
+    """5, 25, 50, 75, 95 % quantiles of the plant's response, (5, n) [response unit]."""
+    noisy: Matrix
+    """The same with noise, (5, n) [response unit]."""
+    offset_from: str
+    """Where the record's offset comes from."""
+    offset_samples: int
+    """Samples of a held-out record that its own offset was taken from [-]; 0 for an offset of the fit."""
+    draws: int
+    """Draws behind the quantiles."""
+
+    @property
+    def own_offset(self) -> bool:
+        """Whether every sample that is scored has served to set the offset: a constant error cannot show."""
+        return self.offset_samples == self.time.size
+
+    @property
+    def rmse(self) -> float:
+        """Root mean square of observed minus median [response unit]."""
+        return float(np.sqrt(np.mean((self.observed - self.plant[2]) ** 2)))
+
+    def coverage(self, level: float) -> float:
+        """Share of the samples inside the band with noise [-]."""
+        low, high = (self.noisy[0], self.noisy[4]) if level == LEVELS[1] else (self.noisy[1], self.noisy[3])
+        return float(np.mean((self.observed >= low) & (self.observed <= high)))
+
+
+def responses(table: ParameterTable, model: ForwardModel, values: Matrix) -> list[Array]:
+    """Plant responses without offsets, per experiment (axes, batch, samples) [response unit].
+
+    With effects NaN for plants without a bounded response; what differs from record to record is 0 on records
+    that were not fitted.
+    """
+    if model.effects is not None:
+        return Simulation(table, model).responses(values)
+    gains, layout, out = table.gains(values), table.layout, []
+    unit_responses = model.unit_responses(table.dynamics(values))
+    for experiment, units in zip(model.experiments, unit_responses, strict=True):
+        total = np.zeros((len(layout.responses), values.shape[0], units.shape[2]))
+        for i, row in enumerate(layout.unit_of):
+            for j, unit in enumerate(row):
+                total[i] += gains[:, i, j, None] * (experiment.rest[j] + units[unit])
+        out.append(total)
+    return out
+
+
+def bands(
+    draws: Draws,
+    model: ForwardModel,
+    samples: Sequence[Samples],
+    noise: Noise,
+    *,
+    held_out: bool,
+    rng: np.random.Generator,
+) -> list[Band]:
+    """Pointwise 50 and 90 % bands of every axis of every record, for the plant alone and with noise.
+
+    `model` simulates the records of `samples` at their sample times. An offset per record is not
+    known for a held-out record: it is taken from the samples before the drive can have acted, else
+    from the record itself (integrated out given its samples), and the band says which and from how many.
+    Effects that differ from record to record count as noise on a held-out record, as large as on the others.
+    """
+    out = []
+    for r, record in enumerate(samples):
+        one = model.only(r)
+        most = max(_FEWEST, _CELLS // record.times.size)
+        values = draws.thinned(most if model.effects is None else min(most, _WITH_EFFECTS))
+        parts = np.array_split(values, max(1, values.shape[0] * record.times.size // _CELLS * 4))
+        plant = np.concatenate([responses(draws.table, one, part)[0] for part in parts], axis=1)
+        disturbed = plant
+        if held_out and one.effects is not None and one.effects.per_record:
+            disturbed = Simulation(draws.table, one).disturbed(values, rng)[0]
+        for axis, observed in enumerate(record.axes):
+            if observed.values.size == 0:
+                continue
+            response = plant[axis][:, observed.index]
+            parameters = values[:, [draws.table.at(name, axis) for name in noise.names]]
+            offset, source, used = offset_draws(
+                draws.table, values, axis, r, record, response, noise, held_out=held_out, rng=rng
+            )
+            response = response + offset[:, None]
+            noisy = response + noise.draw(parameters, observed.gaps, rng)
+            if disturbed is not plant:
+                noisy += (disturbed - plant)[axis][:, observed.index]
+            response_axis = record.record.response_axes[axis]
+            out.append(
+                Band(
+                    record.record.name,
+                    response_axis.name,
+                    response_axis.unit,
+                    held_out,
+                    record.times[observed.index],
+                    observed.values,
+                    np.quantile(response, _QUANTILES, axis=0),
+                    np.quantile(noisy, _QUANTILES, axis=0),
+                    source,
+                    used,
+                    values.shape[0],
+                )
+            )
+    return out
+
+
+def offset_draws(
+    table: ParameterTable,
+    values: Matrix,
+    axis: int,
+    r: int,
+    record: Samples,
+    response: Matrix,
+    noise: Noise,
+    *,
+    held_out: bool,
+    rng: np.random.Generator,
+) -> tuple[Vector, str, int]:
+    """Offset of a record for each draw, where it comes from, and from how many samples of the record."""
+    places = {(table.rows[k].place.first, table.rows[k].place.second): k for k in table.of_kind("offset")}
+    if not places:
+        return np.zeros(values.shape[0]), "no offset", 0
+    if (axis, -1) in places:
+        return values[:, places[axis, -1]], "shared with the fit records", 0
+    if not held_out:
+        return values[:, places[axis, r]], "fitted", 0
+    observed = record.axes[axis]
+    quiet = record.times[observed.index] <= record.first_change
+    used, source = quiet, BEFORE_DRIVE
+    if quiet.all():
+        source = "all samples of the held-out record, whose drive does not change before the last of them"
+    elif not quiet.any():
+        used, source = ~quiet, "all samples of the held-out record, none of which is before the drive acts"
+    offset = _given(observed, used, response, noise, table, values, axis, rng)
+    return offset, source, int(used.sum())
+
+
+def _given(
+    observed: Observed,
+    used: np.ndarray[tuple[int], np.dtype[np.bool_]],
+    response: Matrix,
+    noise: Noise,
+    table: ParameterTable,
+    values: Matrix,
+    axis: int,
+    rng: np.random.Generator,
+) -> Vector:
+    """Draws of an offset given some samples, under a flat prior."""
+    parameters = values[:, [table.at(name, axis) for name in noise.names]]
+    misfit = (observed.values - response)[:, used]
+    if not isinstance(noise, GaussianNoise):
+        return _student_levels(misfit, parameters, rng)
+    columns = np.stack([np.ones_like(misfit), misfit], axis=1)
+    white, _ = noise.whiten(columns, parameters, observed.gaps[used])
+    precision = np.einsum("bn,bn->b", white[:, 0], white[:, 0])
+    mean = np.einsum("bn,bn->b", white[:, 0], white[:, 1]) / precision
+    return np.asarray(mean + rng.standard_normal(mean.size) / np.sqrt(precision))
+
+
+def _student_levels(misfit: Matrix, parameters: Matrix, rng: np.random.Generator) -> Vector:
+    """One draw of the level of every row of `misfit` (batch, n) [response unit] under Student noise.
+
+    Gibbs sampling of a Student law as normal laws whose precisions are Gamma distributed (Andrews and
+    Mallows 1974, J. R. Stat. Soc. B 36). A sweep forgets at the share of the information that the unknown
+    precisions hide, ``2 / (nu + 3)``; rows are chains of their own, and only their last state is kept.
+    """
+    sigma, nu = parameters[:, :1], parameters[:, 1:2]
+    level = np.median(misfit, axis=1)
+    for _ in range(_SWEEPS):
+        power = ((misfit - level[:, None]) / sigma) ** 2
+        precision = rng.gamma((nu + 1) / 2, 2 / (nu + power)) / sigma**2
+        total = precision.sum(axis=1)
+        mean = np.einsum("bn,bn->b", precision, misfit) / total
+        level = mean + rng.standard_normal(mean.size) / np.sqrt(total)
+    return np.asarray(level)

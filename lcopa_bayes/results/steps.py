@@ -1,0 +1,265 @@
+"""Figures engineers read off a step response, each with its credible interval."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
+from lcopa_bayes.core.estimate import Estimate
+from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.inference.simulation import Simulation
+from lcopa_bayes.model.forward import Experiment, ForwardModel
+from lcopa_bayes.model.grid import Mesh
+from lcopa_bayes.model.layout import Layout, Unit
+from lcopa_bayes.sampling.convergence import Limitation
+from lcopa_bayes.sampling.draws import Draws
+
+_POINTS = 1000
+"""Samples of the step response."""
+_DRAWS = 1000
+"""Draws behind the metrics."""
+_EFFECT_DRAWS = 250
+"""The same with effects, which take a simulation each."""
+_STATIC = 1e-60
+"""Time constant of a plant that follows at once [time unit]."""
+_SETTLED_SPANS = 200.0
+"""Time after which what effects add has settled, in spans of the record [-]."""
+_LATER = 4.0
+"""Time after the record over which a response must stay where it settled, in spans of the record [-]: a fast
+mode that crosses the steady value at the record's end has left it again long before."""
+_LATER_POINTS = 800
+"""Samples of the response after the record."""
+_SETTLED = 0.02
+"""A response within this share of its steady value counts as settled [-]."""
+_HALF = 0.5
+"""Share of the draws from which an element counts as too fast for the sampling [-]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class StepCurves:
+    """Responses of every path to a unit step at time 0, over the longest record."""
+
+    time: Vector
+    """(n,) [time unit]."""
+    normalised: Array
+    """Response over its steady value, (curves, draws, n) [-]; steady is 1 by construction."""
+    gains: Array
+    """Steady response per unit step, (draws, responses, drives) [response unit / drive unit]."""
+    delays: Matrix
+    """(draws, delay slots) [time unit]."""
+    curve_of: tuple[tuple[int, ...], ...]
+    """Curve of each path, [response][drive]."""
+    values: Matrix
+    """Table values of the draws, (draws, rows)."""
+
+
+def step_curves(draws: Draws, span: float) -> StepCurves:
+    """Unit step responses of posterior draws over `span` [time unit].
+
+    With effects the step is as high as the largest drive of the records, and the response is divided by it;
+    draws without a bounded response are left out.
+    """
+    time = span * np.arange(1, _POINTS + 1) / _POINTS
+    table = draws.table
+    if table.effects is not None:
+        return _with_effects(table, draws.thinned(_EFFECT_DRAWS), time)
+    values = draws.thinned(_DRAWS)
+    units, delays = _unit_steps(table, values, time), table.dynamics(values).delays
+    return StepCurves(time, units, table.gains(values), delays, table.layout.unit_of, values)
+
+
+def _with_effects(table: ParameterTable, values: Matrix, time: Vector) -> StepCurves:
+    """Curves of every path by simulation, over the static response of the plant with its effects."""
+    moved = _effect_steps(table, values, time)
+    still = values.copy()
+    still[:, table.of_kind("time")] = _STATIC
+    still[:, table.of_kind("delay")] = 0.0
+    level = _effect_steps(table, still, time[-1] * np.linspace(0.5, 1.0, 16) * _SETTLED_SPANS)[..., -1]
+    kept = np.isfinite(moved).all(axis=(0, 2)) & np.isfinite(level).all(axis=0)
+    values, moved, level = values[kept], moved[:, kept], level[:, kept]
+    shape = (len(table.layout.responses), len(table.layout.drives))
+    whole = np.where(level == 0.0, 1.0, level)[..., None]
+    normalised = np.where(level[..., None] == 0.0, 1.0, moved / whole)
+    paths = tuple(tuple(i * shape[1] + j for j in range(shape[1])) for i in range(shape[0]))
+    gains = level.T.reshape(-1, *shape)
+    return StepCurves(time, normalised, gains, table.dynamics(values).delays, paths, values)
+
+
+def _effect_steps(table: ParameterTable, values: Matrix, time: Vector) -> Array:
+    """Responses to a step of each drive at time 0 over its height, (paths, draws, n) [response unit / drive
+    unit]; NaN where there is no bounded one."""
+    told = table.effects
+    assert told is not None
+    heights, experiments = told.ranges.drive, []
+    for j, height in enumerate(heights):
+        step = Drive(np.zeros(1), np.array([float(height)]))
+        drives = tuple(step if j == k else Drive(np.empty(0), np.empty(0)) for k in range(heights.size))
+        experiments.append(Experiment("step", Mesh.of_samples(time, 0.0), drives, np.zeros(heights.size)))
+    count = len(experiments)
+    over = replace(told, epochs=np.zeros(count), times=(time,) * count, fitted=(None,) * count)
+    model = ForwardModel(table.layout, tuple(experiments), over)
+    read = Simulation(table, model).responses(values)
+    by_drive = [one / height for one, height in zip(read, heights, strict=True)]
+    return np.concatenate(list(np.stack(by_drive, axis=1)))
+
+
+def _unit_steps(table: ParameterTable, values: Matrix, time: Vector) -> Array:
+    """Responses to a unit step at time 0 over their steady values, (units, draws, n) [-]."""
+    step = Drive(np.zeros(1), np.ones(1))
+    rest = np.zeros(len(table.layout.drives))
+    drives = tuple(step for _ in table.layout.drives)
+    model = ForwardModel(table.layout, (Experiment("step", Mesh.of_samples(time, 0.0), drives, rest),))
+    parts = np.array_split(values, max(1, values.shape[0] // 64))
+    return np.concatenate([model.unit_responses(table.dynamics(part))[0] for part in parts], axis=1)
+
+
+def too_fast(draws: Draws, curves: StepCurves, period: float) -> list[Limitation]:
+    """A limitation for every element whose step response rises within a sampling `period` [time unit].
+
+    Rise is from 10 to 90 % of what the response reaches by the end of the record, in half of the draws or
+    more: of such a response no sample shows the course, and its times and orders are what the priors allow.
+    """
+    table = draws.table
+    out: list[Limitation] = []
+    for unit in table.layout.units:
+        k = _curve_of(table.layout, curves, unit)
+        reached = curves.normalised[k] / curves.normalised[k][:, -1:]
+        rise = _difference(crossing(curves.time, reached, 0.9), crossing(curves.time, reached, 0.1))
+        names = tuple(
+            row.name
+            for row in table.rows
+            if row.free and row.kind in ("time", "order") and row.place.first == unit.element
+        )
+        if names and float(np.mean(rise < period)) >= _HALF and all(names != one.parameters for one in out):
+            out.append(
+                Limitation(
+                    "tentative",
+                    f"the step response rises within one sampling period: {', '.join(names)} say no more "
+                    "than that it is too fast for the sampling, within their priors",
+                    "sample faster, or fix them under [priors]",
+                    names,
+                )
+            )
+    return out
+
+
+def _curve_of(layout: Layout, curves: StepCurves, unit: Unit) -> int:
+    """A curve of the first path that a unit response belongs to."""
+    paths = ((i, j) for i, row in enumerate(layout.unit_of) for j, k in enumerate(row))
+    i, j = next((i, j) for i, j in paths if layout.units[layout.unit_of[i][j]] == unit)
+    return curves.curve_of[i][j]
+
+
+def crossing(time: Vector, curves: Matrix, level: float) -> Vector:
+    """First time at which each curve (draws, n) reaches `level`; infinite when it never does."""
+    above = curves >= level
+    first = above.argmax(axis=1)
+    reached = above.any(axis=1)
+    rows = np.arange(curves.shape[0])
+    before = np.where(first > 0, curves[rows, first - 1], 0.0)
+    start = np.where(first > 0, time[first - 1], 0.0)
+    after = curves[rows, first]
+    share = (level - before) / np.where(after > before, after - before, 1.0)
+    return np.where(reached, start + share * (time[first] - start), np.inf)
+
+
+def settling(time: Vector, curves: Matrix, band: float, *, until: float = np.inf) -> Vector:
+    """Last time at which each curve (draws, n) is `band` away from 1; infinite when that is after `until`.
+
+    Infinite too when it is farther at the end. Curves that go on beyond `until` tell a response that has
+    settled by then from one that only passes through the band at that time.
+    """
+    time = np.concatenate(([0.0], time))
+    away = np.pad(curves - 1.0, ((0, 0), (1, 0)), constant_values=-1.0)  # nothing has moved at time 0
+    last = time.size - 1 - (np.abs(away) > band)[:, ::-1].argmax(axis=1)
+    after = np.minimum(last + 1, time.size - 1)
+    rows = np.arange(curves.shape[0])
+    outside, inside = away[rows, last], away[rows, after]
+    travelled = np.where(last < after, outside - inside, 1.0)
+    share = (outside - np.sign(outside) * band) / travelled
+    settled = np.where(last < after, time[last] + share * (time[after] - time[last]), np.inf)
+    return np.where(settled <= until, settled, np.inf)
+
+
+def step_metrics(draws: Draws, curves: StepCurves, *, time_unit: str) -> list[Estimate]:
+    """Metrics of every path: rise 10-90 %, delay, settling, overshoot, value at the end, steady state.
+
+    Times are counted from the step. What is not reached within the record is open above; a response has
+    settled when it stays within the band after the record too, to which the overshoot refers as well.
+    """
+    layout, grade, ess = draws.table.layout, draws.grade.level, draws.ess
+    out: list[Estimate] = []
+    end = float(curves.time[-1])
+    after = end * (1 + _LATER * np.arange(1, _LATER_POINTS + 1) / _LATER_POINTS)
+    later = _later(draws.table, curves, after)
+    time = np.concatenate((curves.time, after))
+
+    def add(name: str, unit: str, values: Vector, note: str = "") -> None:
+        out.append(Estimate.of(name, unit, values, ess=ess, grade=grade, note=note))
+
+    for i, response in enumerate(layout.responses):
+        for j, drive in enumerate(layout.drives):
+            k = curves.curve_of[i][j]
+            curve, whole = curves.normalised[k], np.concatenate((curves.normalised[k], later[k]), axis=1)
+            gain, unit = curves.gains[:, i, j], f"{response.unit}/{drive.unit}"
+            path = layout.path_name(i, j) or response.name
+            low, high = crossing(curves.time, curve, 0.1), crossing(curves.time, curve, 0.9)
+            settled = settling(time, whole, _SETTLED, until=end)
+            unsettled = float(np.mean(np.isinf(settled)))
+            note = (
+                f"{100 * unsettled:.0f} % of draws have not settled to {100 * _SETTLED:.0f} % of steady "
+                "state by the end of the record"
+                if unsettled > 0.05
+                else ""
+            )
+            add(f"rise_10_90[{path}]", time_unit, _difference(high, low), note)
+            add(f"delay[{path}]", time_unit, curves.delays[:, layout.delay_of[i][j]])
+            add(f"settling_2[{path}]", time_unit, settled, note)
+            add(f"settling_5[{path}]", time_unit, settling(time, whole, 0.05, until=end), note)
+            add(f"overshoot[{path}]", "-", np.maximum(whole.max(axis=1) - 1.0, 0.0))
+            add(f"value_at_end[{path}]", unit, gain * curve[:, -1])
+            add(f"steady_state[{path}]", unit, gain, note)
+    out.extend(_crosstalk(layout, curves, ess=ess, grade=grade))
+    return out
+
+
+def _later(table: ParameterTable, curves: StepCurves, time: Vector) -> Array:
+    """The curves at later times; infinite where there is no bounded response."""
+    if table.effects is None:
+        return _unit_steps(table, curves.values, time)
+    level = np.concatenate([curves.gains[:, i].T for i in range(curves.gains.shape[1])])[..., None]
+    moved = _effect_steps(table, curves.values, time)
+    moved = np.where(level == 0.0, 1.0, moved / np.where(level == 0.0, 1.0, level))
+    return np.where(np.isfinite(moved), moved, np.inf)
+
+
+def share_unsettled(curve: Matrix) -> float:
+    """Share of draws that are not within 2 % of their steady state at the end."""
+    return float(np.mean(np.abs(curve[:, -1] - 1.0) > _SETTLED))
+
+
+def _difference(high: Vector, low: Vector) -> Vector:
+    """high - low, infinite where `high` is never reached."""
+    reached: Flags = np.isfinite(high)
+    return np.where(reached, np.where(reached, high, 0.0) - np.where(reached, low, 0.0), np.inf)
+
+
+def _crosstalk(layout: Layout, curves: StepCurves, *, ess: float, grade: str) -> list[Estimate]:
+    """Steady response of the other axes over that of the driven one, where two axes respond."""
+    out = []
+    for j, drive in enumerate(layout.drives):
+        own = layout.own_response(j)
+        for i, response in enumerate(layout.responses):
+            if own is not None and i != own:
+                direct = curves.gains[:, own, j]
+                other = curves.gains[:, i, j]
+                ratio = np.where(direct != 0, other / np.where(direct != 0, direct, 1), np.inf)
+                name = f"crosstalk[{response.name}/{layout.responses[own].name} by {drive.name}]"
+                unit = f"{response.unit}/{layout.responses[own].unit}"
+                out.append(Estimate.of(name, unit, ratio, ess=ess, grade=grade))
+    return out

@@ -1,0 +1,156 @@
+"""What a fit says: its verdict in a sentence, and every number as plain JSON values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.results.fit import Fit
+from lcopa_bayes.results.prediction import KIND, Band
+from lcopa_bayes.results.residuals import WHITE_P
+from lcopa_bayes.results.steps import share_unsettled
+from lcopa_bayes.sampling.convergence import Grade, shares_grade
+
+
+def verdict(fit: Fit) -> str:
+    """One sentence: what was learned, how far it can be trusted, what is wrong with it."""
+    grade = fit.draws.grade
+    parts = [f"Grade {grade.level}: {grade.reason}."]
+    if fit.cross_check is not None and fit.cross_check.agrees:  # a disagreement is part of the grade
+        said = fit.cross_check.sentence
+        parts.append(f"{said[0].upper()}{said[1:]}.")
+    parts.append(f"{fit.discretisation.sentence}.")
+    worst = min((r for r in fit.residuals if not r.held_out), key=lambda r: r.p_white, default=None)
+    flags = [one.held_out for one in fit.residuals] + [one.held_out for one in fit.bands]
+    tried = flags.count(False)  # as many tests as `adequacy` corrects for
+    if worst is not None and tried * worst.p_white >= WHITE_P:  # what is not white is part of the grade
+        parts.append(f"What is left looks like the noise model (smallest p = {worst.p_white:.2g}).")
+    parts.extend(_held_out_sentence(fit))
+    slow = max(share_unsettled(curve) for curve in fit.curves.normalised)
+    if slow > 0.05:
+        parts.append(
+            f"At least one step response has not reached its steady state within the longest record "
+            f"({100 * slow:.0f} % of draws are more than 2 % away): algebraic tails are slow."
+        )
+    return " ".join(parts)
+
+
+def _held_out_sentence(fit: Fit) -> list[str]:
+    outside = [band for band in fit.bands if band.held_out]
+    if not outside:
+        return ["No record was held out, so prediction is untested."]
+    said = ", ".join(
+        f"{band.record}/{band.axis} RMSE {band.rmse:.3g} {band.unit} with {100 * band.coverage(0.9):.0f} % "
+        f"of samples in the pointwise 90 % band{' (offset from these samples)' if band.own_offset else ''}"
+        for band in outside
+    )
+    own = "A constant error of a record whose offset comes from its scored samples cannot show."
+    return [f"Held out: {said}.", *([own] if any(band.own_offset for band in outside) else [])]
+
+
+def results(fit: Fit) -> dict[str, Any]:
+    """Every number of the fit as plain JSON values; `None` is an open side or undefined."""
+    grade = fit.draws.grade
+    quality = {q.name: q for q in fit.draws.qualities}
+    parameters = [
+        estimate.as_json()
+        | {"rhat": quality[estimate.name].rhat, "ess_between": quality[estimate.name].ess_between}
+        for estimate in fit.draws.estimates()
+    ]
+    told: dict[str, Any] = plain(
+        {
+            "study": fit.study.name,
+            "verdict": verdict(fit),
+            "grade": grade.level,
+            "grade_reason": grade.reason,
+            "limitations": [one.as_json() for one in fit.draws.limitations],
+            "time_unit": fit.study.time_unit,
+            "parameters": parameters,
+            "fixed": [
+                {"name": row.name, "value": row.value, "unit": row.unit}
+                for row in fit.problem.posterior.table.rows
+                if not row.free
+            ],
+            "log_evidence": fit.evidence.value if fit.evidence else None,
+            "log_evidence_sd": fit.evidence.sd if fit.evidence else None,
+            "log_evidence_by_ensemble": fit.evidence.by_ensemble if fit.evidence else (),
+            "log_evidence_grade": _evidence_grade(fit),
+            "cross_check": None if fit.cross_check is None else fit.cross_check.as_json(),
+            "discretisation": fit.discretisation.as_json(),
+            "residual_rms": residual_rms(fit),
+            "held_out": scores(fit, held_out=True),
+            "fit_scores": scores(fit, held_out=False),
+            "ridges": [
+                r.as_json() | {"grade": fit.draws.level(r.parameter, shares_grade(r))}
+                for r in fit.draws.ridges
+            ],
+            "sensitivity": [moved.as_json() for moved in fit.sensitivity],
+            "step_metrics": [metric.as_json() for metric in fit.metrics],
+            "residual_tests": [
+                {
+                    "record": r.record,
+                    "axis": r.axis,
+                    "held_out": r.held_out,
+                    "p_white": r.p_white,
+                    "rms": r.rms,
+                }
+                for r in fit.residuals
+            ],
+            "sampler": _sampler(fit),
+        }
+    )
+    return told
+
+
+def _evidence_grade(fit: Fit) -> str | None:
+    """No better than the draws' grade: an evidence counts only the hills they have found."""
+    return Grade.worst([fit.evidence.grade, fit.draws.grade]).level if fit.evidence else None
+
+
+def residual_rms(fit: Fit) -> dict[str, float]:
+    """Root mean square residual of each response axis over the fit records [response unit]."""
+    pooled: dict[str, list[float]] = {}
+    for band in fit.bands:
+        if not band.held_out:
+            pooled.setdefault(band.axis, []).extend((band.observed - band.plant[2]) ** 2)
+    return {axis: float(np.sqrt(np.mean(squares))) for axis, squares in pooled.items()}
+
+
+def scores(fit: Fit, *, held_out: bool) -> list[dict[str, Any]]:
+    """Error and coverage of every axis of the records that were held out, or of those fitted."""
+    return [_score(band) for band in fit.bands if band.held_out == held_out]
+
+
+def _score(band: Band) -> dict[str, Any]:
+    return {
+        "record": band.record,
+        "axis": band.axis,
+        "unit": band.unit,
+        "rmse": band.rmse,
+        "coverage_50": band.coverage(0.5),
+        "coverage_90": band.coverage(0.9),
+        "bands": KIND,
+        "samples": band.time.size,
+        "offset_from": band.offset_from,
+        "offset_samples": band.offset_samples,
+        "draws": band.draws,
+    }
+
+
+def _sampler(fit: Fit) -> Mapping[str, Any]:
+    plan, ensembles = fit.run.plan, fit.run.ensembles
+    return {
+        "ensembles": plan.ensembles,
+        "walkers": plan.walkers,
+        "steps": ensembles[0].steps,
+        "most_steps": plan.steps,
+        "thin": plan.thin,
+        "acceptance": float(np.mean([ensemble.acceptance for ensemble in ensembles])),
+        "smallest_ess": fit.draws.ess,
+        "largest_rhat": max(q.rhat for q in fit.draws.qualities),
+        "target_ess": plan.target_ess,
+        "seed": plan.seed,
+    }

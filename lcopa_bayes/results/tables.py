@@ -1,0 +1,211 @@
+"""The tables of a run: every curve and number a figure shows, as one tidy table each."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from lcopa_bayes.results.fit import Fit
+from lcopa_bayes.results.summary import results
+from lcopa_bayes.sampling.crosscheck import CrossCheck
+
+_QUANTILE_NAMES = ("05", "25", "50", "75", "95")
+_PRIOR_POINTS = 200
+_BINS = 30
+
+
+def tables(fit: Fit) -> dict[str, pd.DataFrame]:
+    """Tables by file name."""
+    told = results(fit)
+    return {
+        "parameters": pd.DataFrame(told["parameters"]),
+        "sensitivity": pd.DataFrame(told["sensitivity"]),
+        "step_metrics": pd.DataFrame(told["step_metrics"]),
+        "scores": pd.DataFrame(
+            [row | {"held_out": False} for row in told["fit_scores"]]
+            + [row | {"held_out": True} for row in told["held_out"]]
+        ),
+        "bands": _bands(fit),
+        "drives": _drives(fit),
+        "residuals": _residuals(fit),
+        "autocorrelation": _autocorrelation(fit),
+        "spectrum": _spectrum(fit),
+        "step_response": _step_response(fit),
+        "priors": _priors(fit),
+        "prior_density": _prior_density(fit),
+    } | ({} if fit.cross_check is None else _cross_check(fit, fit.cross_check))
+
+
+def _bands(fit: Fit) -> pd.DataFrame:
+    frames = []
+    for band in fit.bands:
+        columns = {
+            "record": band.record,
+            "axis": band.axis,
+            "unit": band.unit,
+            "held_out": band.held_out,
+            "time": band.time,
+            "observed": band.observed,
+        }
+        columns |= {f"plant_{q}": row for q, row in zip(_QUANTILE_NAMES, band.plant, strict=True)}
+        columns |= {f"noisy_{q}": row for q, row in zip(_QUANTILE_NAMES, band.noisy, strict=True)}
+        frames.append(pd.DataFrame(columns))
+    return pd.concat(frames, ignore_index=True)
+
+
+def _drives(fit: Fit) -> pd.DataFrame:
+    frames = [
+        pd.DataFrame(
+            {
+                "record": record.name,
+                "axis": axis.name,
+                "unit": axis.unit,
+                "time": record.time,
+                "drive": record.drive[:, j],
+            }
+        )
+        for record in (*fit.study.fit, *fit.study.held_out)
+        for j, axis in enumerate(record.drive_axes)
+    ]
+    return pd.concat(frames, ignore_index=True)
+
+
+def _residuals(fit: Fit) -> pd.DataFrame:
+    frames = [
+        pd.DataFrame(
+            {
+                "record": left.record,
+                "axis": left.axis,
+                "unit": left.unit,
+                "held_out": left.held_out,
+                "time": left.time,
+                "residual": left.values,
+                "innovation": left.innovations,
+            }
+        )
+        for left in fit.residuals
+    ]
+    return _stacked(frames)
+
+
+def _autocorrelation(fit: Fit) -> pd.DataFrame:
+    frames = [
+        pd.DataFrame(
+            {
+                "record": left.record,
+                "axis": left.axis,
+                "held_out": left.held_out,
+                "lag": np.arange(1, left.autocorrelation.size + 1),
+                "autocorrelation": left.autocorrelation,
+                "white_band_95": left.white_band,
+            }
+        )
+        for left in fit.residuals
+    ]
+    return _stacked(frames)
+
+
+def _spectrum(fit: Fit) -> pd.DataFrame:
+    frames = [
+        pd.DataFrame(
+            {
+                "record": left.record,
+                "axis": left.axis,
+                "held_out": left.held_out,
+                "frequency": left.frequency,
+                "power_over_white": left.spectrum,
+            }
+        )
+        for left in fit.residuals
+    ]
+    return _stacked(frames)
+
+
+def _step_response(fit: Fit) -> pd.DataFrame:
+    layout, curves, frames = fit.draws.table.layout, fit.curves, []
+    for i, response in enumerate(layout.responses):
+        for j, drive in enumerate(layout.drives):
+            response_curve = curves.gains[:, i, j, None] * curves.normalised[curves.curve_of[i][j]]
+            rows = np.quantile(response_curve, (0.05, 0.25, 0.5, 0.75, 0.95), axis=0)
+            steady = np.quantile(curves.gains[:, i, j], (0.05, 0.5, 0.95))
+            columns = {
+                "path": layout.path_name(i, j) or response.name,
+                "unit": f"{response.unit}/{drive.unit}",
+                "time": curves.time,
+            }
+            columns |= {f"response_{q}": row for q, row in zip(_QUANTILE_NAMES, rows, strict=True)}
+            columns |= {f"steady_{q}": v for q, v in zip(("05", "50", "95"), steady, strict=True)}
+            frames.append(pd.DataFrame(columns))
+    return pd.concat(frames, ignore_index=True)
+
+
+def _priors(fit: Fit) -> pd.DataFrame:
+    return pd.DataFrame(
+        [
+            {
+                "name": row.name,
+                "unit": row.unit,
+                "prior": f"fixed at {row.value:.6g}" if row.prior is None else str(row.prior),
+                "from": "default" if row.default and row.free else "study",
+                "integrated_out": k in fit.problem.posterior.linear,
+            }
+            for k, row in enumerate(fit.draws.table.rows)
+        ]
+    )
+
+
+def _prior_density(fit: Fit) -> pd.DataFrame:
+    """Prior densities over the range the posterior covers, on the scale each parameter is sampled on."""
+    frames = []
+    for row in fit.draws.table.rows:
+        if row.prior is None:
+            continue
+        drawn = fit.draws.column(row.name)
+        low, high = float(drawn.min()), float(drawn.max())
+        reach = 0.3 * (high - low)
+        if row.log_scale:
+            factor = (high / low) ** 0.3
+            x = np.geomspace(low / factor, high * factor, _PRIOR_POINTS)
+        else:
+            x = np.linspace(low - reach, high + reach, _PRIOR_POINTS)
+        density = np.exp(row.log_prior(x)) * (x if row.log_scale else 1.0)
+        frames.append(
+            pd.DataFrame({"name": row.name, "log_scale": row.log_scale, "x": x, "density": density})
+        )
+    return pd.concat(frames, ignore_index=True)
+
+
+def _cross_check(fit: Fit, check: CrossCheck) -> dict[str, pd.DataFrame]:
+    """Marginals by both methods, as numbers and as densities over the same bins, which span 99.8 % of the
+    draws of both."""
+    rows, densities = [], []
+    for one in check.parameters:
+        told = {"name": one.name, "unit": one.unit}
+        for method, summary in (("ensembles", one.run), ("nested", one.nested)):
+            told |= {f"{method}_{key}": value for key, value in summary.as_json().items()}
+        rows.append(told | {"distance": one.distance, "p": one.p, "resolution": one.resolution})
+        k = fit.draws.table.names.index(one.name)
+        log = fit.draws.table.rows[k].log_scale
+        both = [draws[:, k] for draws in (fit.draws.flat, check.nested.values)]
+        both = [np.log(draws) for draws in both] if log else both
+        ends = np.array([np.quantile(draws, (0.001, 0.999)) for draws in both])
+        edges = np.linspace(ends[:, 0].min(), ends[:, 1].max(), _BINS + 1)
+        heights = [np.histogram(draws, edges)[0] / (draws.size * np.diff(edges)) for draws in both]
+        shown = np.exp(edges) if log else edges
+        densities.append(
+            pd.DataFrame(
+                {
+                    **{"name": one.name, "log_scale": log, "left": shown[:-1], "right": shown[1:]},
+                    **{"ensembles": heights[0], "nested": heights[1]},
+                }
+            )
+        )
+    return {
+        "cross_check": pd.DataFrame(rows),
+        "cross_check_density": pd.concat(densities, ignore_index=True),
+    }
+
+
+def _stacked(frames: list[pd.DataFrame]) -> pd.DataFrame:
+    """Frames below each other; empty when every record is too short for a residual test."""
+    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()

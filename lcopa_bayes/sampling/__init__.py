@@ -1,0 +1,1 @@
+"""Draws of a posterior: ensembles, tempering, nested and importance sampling, evidence, convergence."""

@@ -1,0 +1,135 @@
+"""Draws carried from one posterior to another of the same coordinates, without starting from the prior.
+
+Populations that stand in one posterior follow ``source^(1-b) target^b`` while b rises from 0 to 1, resampled
+and moved at every rise (Del Moral, Doucet and Jasra 2006, J. R. Statist. Soc. B 68), and then sample the
+target. This refits a model to fewer samples, or under other priors, at a fraction of the cost; what no
+walker of the source could see, as a hill the left-out data excluded, only moves can find.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import emcee
+import numpy as np
+from arviz_stats.base import array_stats  # type: ignore[attr-defined]
+from scipy.optimize import brentq
+from scipy.special import logsumexp
+
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.sampling.mixturemoves import learned
+from lcopa_bayes.sampling.ridgemoves import walking
+
+_EFFECTIVE = 0.5
+"""Share of a population that stays effective in one rise."""
+_MOVES = 15
+"""Moves of every walker at each rise."""
+_BURN = 40
+"""Moves in the target before draws are kept."""
+_KEPT = 20
+"""Draws kept of every walker ..."""
+_THIN = 5
+"""... one in this many moves."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Carried:
+    """Draws of the target."""
+
+    coordinates: Array
+    """(ensembles, walkers, draws, dimension)."""
+    ess: float
+    """Smallest effective sample size over the coordinates [draws]."""
+    rhat: float
+    """Largest nested R-hat between ensembles [-]."""
+
+
+def carried(source: Posterior, target: Posterior, positions: Array, seed: int, *, jump: bool) -> Carried:
+    """Draws of `target` from walkers (ensembles, walkers, dimension) of `source`.
+
+    With `jump` in one rise: for posteriors whose supports differ, but little else. Deterministic given
+    `seed`.
+    """
+    mixture = learned(target, list(positions), seed)
+    chains = []
+    for number, position in enumerate(positions):
+        sequence = np.random.SeedSequence(seed, spawn_key=(number, 3_000))
+        rng = np.random.default_rng(sequence)
+        random = tuple(np.random.RandomState(np.random.MT19937(sequence.spawn(1)[0])).get_state())
+        heat = 0.0
+        while heat < 1.0:
+            before, after = source.log_density(position), target.log_density(position)
+            gain = after - before
+            rise = 1.0 - heat if jump else _rise(gain, 1.0 - heat)
+            heat = 1.0 if heat + rise > 1.0 - 1e-9 else heat + rise
+            position = position[_resampled(rise * gain, rng)]
+            moves = _BURN if heat == 1.0 else _MOVES
+            sampler = walking(target, _Between(source, target, heat), len(position), mixture, random)
+            state = sampler.run_mcmc(
+                emcee.State(_parted(position, rng)), moves, skip_initial_state_check=True, store=False
+            )
+            position, random = np.array(state.coords), tuple(sampler.random_state)
+        sampler = walking(target, target.log_density, len(position), mixture, random)
+        sampler.run_mcmc(emcee.State(position), _KEPT, thin_by=_THIN, skip_initial_state_check=True)
+        chains.append(sampler.get_chain().swapaxes(0, 1))
+    return _judged(np.stack(chains))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Between:
+    """Log density on the way."""
+
+    source: Posterior
+    target: Posterior
+    heat: float
+
+    def __call__(self, coordinates: Matrix) -> Vector:
+        after = self.target.log_density(coordinates)
+        if self.heat == 1.0:
+            return after
+        total = np.full(len(coordinates), -np.inf)
+        inside = np.isfinite(after)
+        if inside.any():
+            before = self.source.log_density(coordinates[inside])
+            total[inside] = (1 - self.heat) * before + self.heat * after[inside]
+        return total
+
+
+def _parted(position: Matrix, rng: np.random.Generator) -> Matrix:
+    """Walkers in another sequence: the stretch of copies that resampling leaves is spread."""
+    return position[rng.permutation(len(position))]
+
+
+def _rise(gain: Vector, room: float) -> float:
+    """Largest rise that keeps the wanted share effective, at most `room`."""
+
+    def excess(log_rise: float) -> float:
+        weights = np.exp(log_rise) * gain
+        return float(np.exp(2 * logsumexp(weights) - logsumexp(2 * weights))) / gain.size - _EFFECTIVE
+
+    if excess(np.log(room)) >= 0.0:
+        return room
+    low = np.log(1e-3 / max(1.0, float(np.ptp(gain))))
+    return float(np.exp(brentq(excess, low, np.log(room), xtol=1e-3)))
+
+
+def _resampled(log_weights: Vector, rng: np.random.Generator) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+    """Systematic resampling: members in proportion to their weights, with one random number."""
+    weights = np.exp(log_weights - logsumexp(log_weights))
+    places = (np.arange(weights.size) + rng.random()) / weights.size
+    return np.minimum(np.searchsorted(np.cumsum(weights), places), weights.size - 1)
+
+
+def _judged(coordinates: Array) -> Carried:
+    ensembles, walkers = coordinates.shape[:2]
+    owner = np.repeat(np.arange(ensembles), walkers)
+    chains = coordinates.reshape(ensembles * walkers, *coordinates.shape[2:])
+    ess, rhat = [], []
+    for k in range(chains.shape[-1]):
+        ess.append(float(array_stats.ess(chains[..., k], method="bulk")))  # type: ignore[no-untyped-call]
+        rhat.append(float(array_stats.rhat_nested(chains[..., k], owner)))  # type: ignore[no-untyped-call]
+    return Carried(coordinates, min(ess), max(rhat))

@@ -1,0 +1,103 @@
+"""A chart of the posterior: coordinates without bounds in which its ridges are close to straight.
+
+Elements are given by their shape at fixed frequencies (`shapecoordinates`) in place of their time constants,
+gains by their ratio to the element's level, and what lies between two finite ends by its logit. In the chart
+a few ellipsoids cover a posterior that is thin and curved in the sampled coordinates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import final
+
+import numpy as np
+from scipy.special import expit, log_expit, logit
+
+from lcopa_bayes.core.arrays import Flags, Matrix, Vector
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.sampling.moves import Terrain
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """A smooth change of the sampled coordinates, one to one on terms by decreasing order."""
+
+    terrain: Terrain
+    low: Vector
+    """Lower end of each sampled coordinate, (dimension,); infinite where it is open."""
+    high: Vector
+    """Upper end, (dimension,)."""
+
+    @classmethod
+    def of(cls, posterior: Posterior) -> Chart:
+        """Chart of a posterior; its bounds are those of the priors."""
+        ends = np.array([posterior.table.rows[k].sampled_domain for k in posterior.sampled]).reshape(-1, 2)
+        return cls(Terrain.of(posterior), ends[:, 0], ends[:, 1])
+
+    @cached_property
+    def _bounded(self) -> Flags:
+        """Columns charted by their logit; times and gains of charted elements follow the shape."""
+        bounded = np.isfinite(self.low) & np.isfinite(self.high)
+        for element in self.terrain.elements:
+            bounded[element.times] = False
+            bounded[[column for column, _ in element.gains]] = False
+        return np.asarray(bounded)
+
+    @cached_property
+    def _frequencies(self) -> list[Vector]:
+        ends = np.log(self.terrain.slowest), np.log(self.terrain.fastest)
+        return [np.exp(np.linspace(*ends, element.terms + 1)) for element in self.terrain.elements]
+
+    def charted(self, z: Matrix) -> tuple[Matrix, Vector]:
+        """Chart of sampled coordinates (batch, dimension), and log |d chart / d coordinates|, (batch,).
+
+        Exchangeable terms are sorted first. Infinite where a coordinate stands on one of its ends.
+        """
+        z = self.terrain.sorted(z)
+        y, log_volume = z.copy(), np.zeros(len(z))
+        for element, frequencies in zip(self.terrain.elements, self._frequencies, strict=True):
+            shape = element.shape(z, frequencies)
+            y[:, element.times] = shape.log_ratios
+            log_volume += shape.log_volume
+            for column, by_logarithm in element.gains:
+                if by_logarithm:
+                    y[:, column] -= shape.log_level
+                else:
+                    y[:, column] *= np.exp(-shape.log_level)
+                    log_volume -= shape.log_level
+        width = (self.high - self.low)[self._bounded]
+        with np.errstate(divide="ignore"):
+            y[:, self._bounded] = logit((z[:, self._bounded] - self.low[self._bounded]) / width)
+        log_volume -= self._log_steepness(y)
+        return y, log_volume
+
+    def usable(self, z: Matrix) -> tuple[Matrix, Matrix, Vector]:
+        """Sampled coordinates that have a finite chart, with it and its log volume."""
+        y, log_volume = self.charted(z)
+        finite = np.isfinite(y).all(axis=1) & np.isfinite(log_volume)
+        return z[finite], y[finite], log_volume[finite]
+
+    def uncharted(self, y: Matrix) -> tuple[Matrix, Flags]:
+        """Sampled coordinates of charted ones, and which points of the chart have any, (batch,)."""
+        z = y.copy()
+        width = (self.high - self.low)[self._bounded]
+        z[:, self._bounded] = self.low[self._bounded] + width * expit(y[:, self._bounded])
+        exists: Flags = np.asarray(((z > self.low) & (z < self.high))[:, self._bounded].all(axis=1))
+        exists &= self.terrain.in_order(z)
+        for element, frequencies in zip(self.terrain.elements, self._frequencies, strict=True):
+            safe = np.where(exists[:, None], z[:, element.orders], 1.0)
+            times = element.log_times(y[:, element.times], safe, frequencies)
+            exists &= np.isfinite(times).all(axis=1)
+            z[:, element.times] = np.where(exists[:, None], times, 0.0)
+            level = element.shape(z, frequencies).log_level
+            for column, by_logarithm in element.gains:
+                z[:, column] = y[:, column] + level if by_logarithm else y[:, column] * np.exp(level)
+        return z, np.asarray(exists & np.isfinite(z).all(axis=1))
+
+    def _log_steepness(self, y: Matrix) -> Vector:
+        """Log of the product of d coordinate / d logit, (batch,)."""
+        logits = y[:, self._bounded]
+        width = (self.high - self.low)[self._bounded]
+        return np.asarray((np.log(width) + log_expit(logits) + log_expit(-logits)).sum(axis=1))

@@ -1,0 +1,134 @@
+"""Log evidence by bridge sampling between the posterior and a mixture fitted to it.
+
+Meng and Wong (1996), Statistica Sinica 6; Gronau et al. (2017), J. Math. Psychol. 81. Each ensemble gives
+an estimate of its own: a mixture fitted to the draws of the others, in the chart of the posterior, is
+bridged to its draws. So no draw is used twice, and the spread of the estimates tells the error of
+populations that have not found the same hills.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+from scipy.special import logsumexp
+
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.sampling.convergence import Grade, Level
+from lcopa_bayes.sampling.coordinates import Chart
+from lcopa_bayes.sampling.mixture import Mixture, spread_evenly
+
+_RELIABLE = 0.5
+"""Largest standard error of a reliable log evidence or log predictive density: a model comparison turns on a
+few nats [nat]."""
+_TENTATIVE = 2.0
+"""Above it the ensembles tell different stories [nat]."""
+_BRIDGED = 3_000
+"""Draws of each side of a bridge."""
+_PORTION = 256
+"""Draws whose density one process computes at once."""
+Mapped = Callable[..., Iterable[Any]]
+"""A map of a function over tasks, here or in other processes."""
+_SETTLED = 1e-10
+"""Change of the log ratio at which the iteration of a bridge stops [nat]."""
+
+
+@final
+@dataclass(frozen=True)
+class Evidence:
+    """Log evidence of a posterior."""
+
+    value: float
+    """Mean over ensembles [nat]."""
+    sd: float
+    """Standard error of the mean, by the ensembles' spread or the draws' number if that is larger [nat]."""
+    by_ensemble: tuple[float, ...]
+    """One estimate per ensemble [nat]."""
+
+    @property
+    def grade(self) -> Grade:
+        """Reliable when known to half a nat, unusable when not to two."""
+        return Grade(known_to(self.sd), f"log evidence {self.value:.2f}, standard error {self.sd:.2f} nat")
+
+
+def known_to(error: float) -> Level:
+    """Level of a sum of log densities by its Monte Carlo standard error [nat]; unusable without one."""
+    return "reliable" if error <= _RELIABLE else "tentative" if error <= _TENTATIVE else "unusable"
+
+
+def evidence(posterior: Posterior, coordinates: Array, ess: float, seed: int) -> Evidence | None:
+    """Log evidence from draws (ensembles, walkers, draws, dimension); None for a single ensemble.
+
+    `ess` is the smallest effective sample size of all the draws. Deterministic given `seed`.
+    """
+    ensembles, dimension = coordinates.shape[0], coordinates.shape[-1]
+    if ensembles < 2:
+        return None
+    random = np.random.RandomState(np.random.MT19937(np.random.SeedSequence(seed, spawn_key=(2_000,))))
+    chart = Chart.of(posterior)
+    pools = [chart.usable(spread_evenly(one.reshape(-1, dimension), _BRIDGED)) for one in coordinates]
+    found = []
+    for k, (pool, y, log_volume) in enumerate(pools):
+        others = np.concatenate([points for j, (_, points, _) in enumerate(pools) if j != k])
+        mixture = Mixture.fitted(others, seed)
+        drawn = mixture.draw(_BRIDGED, random)
+        own = posterior.log_density(pool) + posterior.table.log_permutations - log_volume
+        found.append(
+            bridge(
+                own - mixture.log_density(y),
+                charted_density(posterior, chart, drawn) - mixture.log_density(drawn),
+                ess / ensembles,
+            )
+        )
+    values = [value for value, _ in found]
+    spread = float(np.std(values, ddof=1))
+    claimed = float(np.sqrt(np.mean([error**2 for _, error in found])))
+    return Evidence(float(np.mean(values)), float(max(spread, claimed) / np.sqrt(ensembles)), tuple(values))
+
+
+def bridge(posterior_side: Vector, mixture_side: Vector, ess: float) -> tuple[float, float]:
+    """Log of the ratio of two normalising constants, and its standard error [nat].
+
+    Both arguments are log (unnormalised density / normalised density of the mixture): at draws of the
+    first, worth `ess` independent ones, and at independent draws of the mixture; -inf is allowed there.
+    """
+    ess = min(ess, float(posterior_side.size))
+    centre = float(np.median(posterior_side))
+    first, second = posterior_side - centre, mixture_side - centre
+    share = np.log(ess / (ess + second.size)), np.log(second.size / (ess + second.size))
+    ratio, change = 0.0, np.inf
+    while abs(change) > _SETTLED:
+        at_first = -np.logaddexp(share[0] + first, share[1] + ratio)
+        at_second = second - np.logaddexp(share[0] + second, share[1] + ratio)
+        new = float(logsumexp(at_second) - np.log(second.size) - logsumexp(at_first) + np.log(first.size))
+        ratio, change = new, new - ratio
+    error = _relative_variance(at_first) / ess + _relative_variance(at_second) / second.size
+    return ratio + centre, float(np.sqrt(error))
+
+
+def _relative_variance(log_terms: Vector) -> float:
+    terms = np.exp(log_terms - log_terms.max())
+    return float(np.var(terms) / np.mean(terms) ** 2)
+
+
+def charted_density(posterior: Posterior, chart: Chart, y: Matrix, mapped: Mapped = map) -> Vector:
+    """Log posterior density of charted coordinates, (batch,); -inf where the chart has no point.
+
+    `mapped` does portions of a batch, here or in other processes.
+    """
+    z, exists = chart.uncharted(y)
+    out = np.full(len(y), -np.inf)
+    if exists.any():
+        _, log_volume = chart.charted(z[exists])
+        density = posterior.log_density(z[exists]) if mapped is map else _spread(posterior, z[exists], mapped)
+        out[exists] = density + posterior.table.log_permutations - log_volume
+    return out
+
+
+def _spread(posterior: Posterior, z: Matrix, mapped: Mapped) -> Vector:
+    """Log density portion by portion, (batch,)."""
+    portions = np.array_split(z, max(1, len(z) // _PORTION))
+    return np.concatenate(list(mapped(posterior.log_density, portions)))

@@ -1,0 +1,125 @@
+"""A mixture of ellipsoids fitted to draws: a density that can be drawn from and evaluated anywhere."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, final
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.special import gammaln, logsumexp
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.mixture import GaussianMixture
+
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
+
+_COMPONENTS = 20
+"""Most components of a mixture."""
+_FITTED = 6_000
+"""Most points a mixture is fitted to."""
+FREEDOM = 5.0
+"""Degrees of freedom of the components: tails heavy enough to cover what the fit has not seen [-]."""
+_ROUNDS = 60
+"""Most rounds of expectation maximisation: a good cover is wanted, not the maximum."""
+_RIDGE = 1e-6
+"""Added to the variance of every direction, relative to the draws' own [-]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """Multivariate Student components with common degrees of freedom."""
+
+    weights: Vector
+    """(components,) [-]."""
+    means: Matrix
+    """(components, dimension)."""
+    factors: Array
+    """Lower Cholesky factors of the scale matrices, (components, dimension, dimension)."""
+
+    @classmethod
+    def fitted(cls, points: Matrix, seed: int) -> Mixture:
+        """Fit to points (n, dimension) by expectation maximisation of Gaussians.
+
+        Deterministic given `seed`. Fewer components are used when there are not ten points per
+        dimension for each of them.
+        """
+        points = spread_evenly(points, _FITTED)
+        count, dimension = points.shape
+        components = max(1, min(_COMPONENTS, count // (10 * dimension)))
+        shift, spread = points.mean(axis=0), points.std(axis=0)
+        spread = np.where(spread > 0, spread, 1.0)
+        random = np.random.RandomState(np.random.MT19937(np.random.SeedSequence(seed)))
+        fit = GaussianMixture(components, max_iter=_ROUNDS, reg_covar=_RIDGE, random_state=random)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            fit.fit((points - shift) / spread)
+        factors = spread[:, None] * np.linalg.cholesky(fit.covariances_)
+        return cls(np.asarray(fit.weights_), shift + spread * fit.means_, factors)
+
+    def levelled(self) -> Mixture:
+        """The same components with equal weights, so that a small hill is tried as often as a large one."""
+        return Mixture(np.full(self.weights.size, 1 / self.weights.size), self.means, self.factors)
+
+    def blended(self, other: Mixture, share: float) -> Mixture:
+        """A mixture of both, `share` of it the other."""
+        return Mixture(
+            np.concatenate([(1 - share) * self.weights, share * other.weights]),
+            np.concatenate([self.means, other.means]),
+            np.concatenate([self.factors, other.factors]),
+        )
+
+    @property
+    def dimension(self) -> int:
+        """Number of coordinates."""
+        return int(self.means.shape[1])
+
+    def draw(self, count: int, random: Any) -> Matrix:
+        """Independent draws, (count, dimension), from a generator of either kind of numpy's."""
+        component = random.choice(self.weights.size, size=count, p=self.weights / self.weights.sum())
+        normal = random.standard_normal((count, self.dimension))
+        stretch = np.sqrt(FREEDOM / random.chisquare(FREEDOM, size=count))
+        steps = np.einsum("nij,nj->ni", self.factors[component], normal)
+        return np.asarray(self.means[component] + stretch[:, None] * steps)
+
+    def log_density(self, points: Matrix) -> Vector:
+        """Log density, (n,)."""
+        return np.asarray(logsumexp(self.log_parts(points), axis=0))
+
+    def log_parts(self, points: Matrix) -> Matrix:
+        """Log density of each component times its weight, (components, n)."""
+        dimension = self.dimension
+        level = (
+            gammaln((FREEDOM + dimension) / 2)
+            - gammaln(FREEDOM / 2)
+            - 0.5 * dimension * np.log(FREEDOM * np.pi)
+        )
+        parts = -0.5 * (FREEDOM + dimension) * np.log1p(self.distances(points) / FREEDOM)
+        scale = np.log(np.diagonal(self.factors, axis1=1, axis2=2)).sum(axis=1)
+        with np.errstate(divide="ignore"):
+            return np.asarray(parts + (level - scale + np.log(self.weights))[:, None])
+
+    def distances(self, points: Matrix) -> Matrix:
+        """Squared Mahalanobis distance from every component, (components, n) [-]."""
+        out = np.empty((self.weights.size, len(points)))
+        for k, whitener in enumerate(self._whiteners):
+            out[k] = ((points @ whitener - self.means[k] @ whitener) ** 2).sum(axis=1)
+        return out
+
+    def log_shares(self, points: Matrix) -> Matrix:
+        """Log probability of each component given a point, (components, n)."""
+        parts = self.log_parts(points)
+        return np.asarray(parts - logsumexp(parts, axis=0))
+
+    @cached_property
+    def _whiteners(self) -> list[Matrix]:
+        """Transposed inverses of the factors."""
+        unit = np.eye(self.dimension)
+        return [np.ascontiguousarray(solve_triangular(factor, unit, lower=True).T) for factor in self.factors]
+
+
+def spread_evenly(points: Matrix, most: int) -> Matrix:
+    """At most `most` of the points (n, dimension), evenly spread over them."""
+    return np.asarray(points[np.linspace(0, len(points) - 1, min(most, len(points))).astype(int)])

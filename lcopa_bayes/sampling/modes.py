@@ -1,0 +1,216 @@
+"""Separate hills in the marginal of a parameter, and how differently the ensembles weigh them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations, pairwise
+from math import sqrt
+from typing import Any, final
+
+import numpy as np
+from arviz_stats.base import array_stats  # type: ignore[attr-defined]
+from scipy.ndimage import gaussian_filter1d
+
+from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector, frozen
+from lcopa_bayes.core.estimate import plain
+
+DEPTH = 0.5
+"""A valley is lower than this share of the lower hill beside it [-] ..."""
+CERTAINTY = 3.0
+"""... by this many Monte Carlo errors [-]."""
+LEAST_SHARE = 0.02
+"""A hill holds this share of all draws at least [-]: less changes no number by what a grade allows."""
+_CELLS = 1024
+"""Cells of the grid on which the density is smoothed."""
+_TAIL = 0.002
+"""Share of the draws beyond each end of the grid [-]."""
+_SMOOTHED_AS = (200.0, 2000.0)
+"""Effective draws [draws] that the width of smoothing is chosen for, at least and at most: ensembles on
+different hills have few, yet each hill is full of draws."""
+_NARROW = 0.6
+"""Width of smoothing over Silverman's [-], which blurs hills four standard deviations apart; that noise
+makes more valleys does not matter, as each has to be certain."""
+_COUNT = {2: "two", 3: "three", 4: "four"}
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Ridges:
+    """Hills of one parameter's marginal, from the lowest up; one when there are no boundaries."""
+
+    parameter: str
+    unit: str
+    boundaries: tuple[float, ...]
+    """Bottoms of the valleys between them, increasing, in `unit`."""
+    shares: Matrix
+    """Share of each ensemble's draws on each hill, (ensembles, hills) [-]."""
+    errors: Matrix
+    """Monte Carlo standard errors of the shares, (ensembles, hills) [-]."""
+
+    def __post_init__(self) -> None:
+        for key in ("shares", "errors"):
+            object.__setattr__(self, key, frozen(getattr(self, key), name=key, ndim=2))
+        hills = len(self.boundaries) + 1
+        if self.shares.shape != self.errors.shape or self.shares.shape[1] != hills:
+            raise ValueError(f"need a share and an error of {hills} hills; got {self.shares.shape}")
+
+    @property
+    def pooled(self) -> Vector:
+        """Share of all draws on each hill, (hills,) [-]."""
+        return np.asarray(self.shares.mean(axis=0))
+
+    @property
+    def pooled_errors(self) -> Vector:
+        """Their Monte Carlo standard errors, (hills,) [-]: what the ensembles' own errors say, or how they
+        differ where that is more."""
+        ensembles = self.shares.shape[0]
+        within = np.sqrt(np.sum(self.errors**2, axis=0)) / ensembles
+        between = self.shares.std(axis=0, ddof=1) / np.sqrt(ensembles) if ensembles > 1 else 0.0
+        return np.asarray(np.maximum(within, between))
+
+    @property
+    def ess(self) -> float:
+        """Number of independent draws that would know the shares as well, of the mode known worst [draws]."""
+        share = self.pooled
+        return float(np.min(share * (1 - share) / self.pooled_errors**2)) if self.boundaries else np.inf
+
+    @property
+    def spread(self) -> float:
+        """Largest difference of a hill's share between two ensembles beyond Monte Carlo error [-]: of those
+        above `CERTAINTY` standard errors; 0 when there is none."""
+        worst = 0.0
+        for one, other in combinations(range(self.shares.shape[0]), 2):
+            apart = np.abs(self.shares[one] - self.shares[other])
+            error = np.hypot(self.errors[one], self.errors[other])
+            worst = max([worst, *apart[apart > CERTAINTY * error]])
+        return float(worst)
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values; shares by ensemble and hill."""
+        told: dict[str, Any] = plain(
+            {
+                "parameter": self.parameter,
+                "unit": self.unit,
+                "boundaries": self.boundaries,
+                "shares": self.shares,
+                "shares_mcse": self.errors,
+                "pooled": self.pooled,
+                "pooled_mcse": self.pooled_errors,
+                "spread": self.spread,
+                "sentence": self.sentence(),
+            }
+        )
+        return told
+
+    def sentence(self) -> str:
+        """What was found, and the remedy when the ensembles weigh the hills differently."""
+        if not self.boundaries:
+            return f"one ridge in {self.parameter}"
+        hills = len(self.boundaries) + 1
+        where = " and ".join(f"{boundary:.3g}" for boundary in self.boundaries)
+        split = f"below and above {where}" if hills == 2 else f"parted at {where}"
+        told = f"{_COUNT.get(hills, str(hills))} ridges in {self.parameter} ({split})"
+        if self.spread == 0.0:
+            shares = " and ".join(f"{share:.2f}" for share in self.pooled)
+            return f"{told}, shares {shares}, the same in all populations within Monte Carlo error"
+        k = int(np.argmax(np.ptp(self.shares, axis=0)))
+        which = ("the lower one" if k == 0 else "the upper one") if hills == 2 else f"number {k + 1}"
+        low, high = self.shares[:, k].min(), self.shares[:, k].max()
+        return f"{told}, share of {which} {low:.2f} to {high:.2f} between populations: run longer"
+
+
+def ridges(parameter: str, unit: str, values: Array, *, log_scale: bool = False) -> Ridges:
+    """Hills of a parameter's marginal from draws (ensembles, walkers, draws) [unit].
+
+    The pooled draws, by their logarithm with `log_scale`, are smoothed with a Gaussian narrower than
+    Silverman's (1986, Density Estimation, Eq. 3.31) for the effective sample size. From all minima of that
+    density those are removed that cut off less than `LEAST_SHARE` and then, the least certain first, those
+    not below `DEPTH` times the lower hill beside them by `CERTAINTY` Monte Carlo errors of that difference.
+    Errors come from how walkers differ; an ensemble that stays on one hill gets that of one
+    walker, 1 / walkers. ValueError unless draws are finite, and positive with `log_scale`.
+    """
+    if values.ndim != 3 or not np.isfinite(values).all() or (log_scale and values.min() <= 0):
+        raise ValueError(f"{parameter}: draws must be finite, (ensembles, walkers, draws), positive for logs")
+    x = np.log(values) if log_scale else values
+    boundaries = _boundaries(x)
+    hill = np.searchsorted(boundaries, x)
+    on = np.stack([hill == k for k in range(boundaries.size + 1)]).astype(float)
+    shares = on.mean(axis=(2, 3)).T
+    errors = np.array([[_error(one) for one in ensemble] for ensemble in on.swapaxes(0, 1)])
+    back = np.exp(boundaries) if log_scale else boundaries
+    return Ridges(parameter, unit, tuple(float(b) for b in back), shares, errors)
+
+
+def _error(visits: Matrix) -> float:
+    """Monte Carlo error of a share from visits (walkers, draws), at least that of independent draws."""
+    share = float(visits.mean())
+    if share in (0.0, 1.0):
+        return 1.0 / len(visits)
+    return max(_batch_error(visits), sqrt(share * (1 - share) / visits.size))
+
+
+def _batch_error(chains: Matrix) -> float:
+    """Monte Carlo error of the mean from chains (walkers, draws) that differ by chance alone; exact however
+    slowly a walker moves, which effective sample sizes of split chains are not."""
+    return float(chains.mean(axis=1).std(ddof=1) / np.sqrt(chains.shape[0]))
+
+
+def _boundaries(x: Array) -> Vector:
+    """Bottoms of the valleys of the pooled draws, increasing."""
+    chains = x.reshape(-1, x.shape[-1])
+    low, high = np.quantile(x, [_TAIL, 1 - _TAIL])
+    width = _width(chains)
+    if not (high > low and width > 0):
+        return np.empty(0)
+    counts, edges = np.histogram(chains, bins=_CELLS, range=(low, high))
+    cell = (high - low) / _CELLS
+    density = gaussian_filter1d(counts.astype(float), width / cell, mode="reflect", truncate=5.0)
+    centre = 0.5 * (edges[1:] + edges[:-1])
+    bottoms = _bottoms(density)
+    while bottoms.size:
+        tops = _tops(density, bottoms)
+        shares = np.diff(np.searchsorted(np.sort(x, axis=None), [-np.inf, *centre[bottoms], np.inf])) / x.size
+        lower = [min(pair, key=lambda at: density[at]) for pair in pairwise(tops)]
+        slight = np.flatnonzero(np.minimum(shares[:-1], shares[1:]) < LEAST_SHARE)
+        if slight.size:  # the shallowest first: splinters of one hill join each other before another hill
+            bottoms = np.delete(bottoms, slight[np.argmax((density[bottoms] / density[lower])[slight])])
+            continue
+        certain = [
+            _certainty(chains, centre[top], centre[bottom], width)
+            for top, bottom in zip(lower, bottoms, strict=True)
+        ]
+        if min(certain) >= CERTAINTY:
+            break
+        bottoms = np.delete(bottoms, int(np.argmin(certain)))
+    return np.asarray(centre[bottoms])
+
+
+def _width(chains: Matrix) -> float:
+    """Width of smoothing."""
+    quarter, three_quarters = np.quantile(chains, [0.25, 0.75])
+    scale = min(float(chains.std()), float(three_quarters - quarter) / 1.34) or float(chains.std())
+    ess = float(array_stats.ess(chains, method="bulk")) if np.ptp(chains) > 0 else np.nan  # type: ignore[no-untyped-call]
+    effective = float(np.clip(ess, *_SMOOTHED_AS)) if ess > 0 else _SMOOTHED_AS[0]
+    return _NARROW * 0.9 * scale * float(effective**-0.2)
+
+
+def _bottoms(density: Vector) -> Index:
+    """Positions of the minima between hills, the middle of those that are wide."""
+    steps = np.flatnonzero(np.diff(density))
+    falls = np.diff(density)[steps] < 0
+    turns = [(a, b) for (a, down), (b, up) in pairwise(zip(steps, falls, strict=True)) if down and not up]
+    return np.array([(a + 1 + b) // 2 for a, b in turns], dtype=np.intp)
+
+
+def _tops(density: Vector, bottoms: Sequence[int] | Index) -> list[int]:
+    """Positions of the highest points between the bottoms."""
+    ends = [0, *(int(b) for b in bottoms), density.size]
+    return [a + int(np.argmax(density[a:b])) for a, b in pairwise(ends)]
+
+
+def _certainty(chains: Matrix, top: float, bottom: float, width: float) -> float:
+    """``DEPTH f(top) - f(bottom)`` of the smoothed density over its Monte Carlo error [-]."""
+    kernel = DEPTH * np.exp(-0.5 * ((chains - top) / width) ** 2)
+    kernel -= np.exp(-0.5 * ((chains - bottom) / width) ** 2)
+    return float(kernel.mean()) / _batch_error(kernel)

@@ -1,0 +1,161 @@
+"""A proposal that covers a posterior: Student components around its optima, fitted to weighted draws."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+from scipy.special import logsumexp
+
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.inference.optimum import Optimum
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.sampling.coordinates import Chart
+from lcopa_bayes.sampling.importanceweights import effective
+from lcopa_bayes.sampling.mixture import FREEDOM, Mixture
+
+_NEGLIGIBLE = 20.0
+"""Optima whose Gaussian mass lies this far below the best one's are left out [nat]."""
+_GROUP = 3
+"""Components that start around one optimum: a curved or skewed posterior needs more than one [-]."""
+_AROUND = 400
+"""Gaussian draws around an optimum that give its components their place and size in the chart."""
+_SMALL = 0.02
+"""Scale of such draws, over the linearised standard deviation, at which the chart is straight [-]."""
+_BENT = 3.0
+"""A chart that is this much steeper at an optimum than around it has no linear part there [-]."""
+_DEFENSIVE = 0.2
+"""Share of the proposal that is wider than the fit: half of it every component, half all draws as one [-]."""
+_WIDER = 2.0
+"""Factor by which it is [-]."""
+_LEAST_VARIANCE = 1e-6
+"""Least variance of a component along every coordinate, over that of the weighted draws [-]."""
+_PER_DIMENSION = 40
+"""Effective draws that a fit of the proposal needs for each dimension [-]."""
+_STEPS = 4
+"""Steps of expectation maximisation per round."""
+_NO_WEIGHT = 1e-9
+"""Draws with less than this share of the mean weight do not take part in the fit [-]."""
+_NO_MASS = 1e-4
+"""Components with less than this share of the weight are left out [-]."""
+
+
+def weighty(optima: Sequence[Optimum]) -> list[Optimum]:
+    """Optima whose Gaussian approximation has a mass that counts."""
+    masses = [
+        optimum.log_density + 0.5 * float(np.linalg.slogdet(optimum.covariance)[1]) for optimum in optima
+    ]
+    finite = [mass if np.isfinite(mass) else -np.inf for mass in masses]
+    chosen = [o for o, mass in zip(optima, finite, strict=True) if mass >= max(finite) - _NEGLIGIBLE]
+    return chosen or [optima[0]]
+
+
+def around(
+    posterior: Posterior, chart: Chart, optima: Sequence[Optimum], rng: np.random.Generator
+) -> Mixture:
+    """Groups of Gaussian shape around optima, first as wide in the chart as their linearised covariance."""
+    means, factors = [], []
+    for optimum in optima:
+        centre = posterior.coordinates(optimum.values[None])[0]
+        spread, vectors = np.linalg.eigh(optimum.covariance)
+        root = vectors * np.sqrt(np.maximum(spread, 1e-12 * spread.max()))
+        standard = rng.standard_normal((_AROUND, centre.size))
+        near, wide = (
+            _charted(posterior, chart, centre + scale * standard @ root.T) for scale in (_SMALL, 1.0)
+        )
+        if min(len(near), len(wide)) < 2 * centre.size:
+            continue
+        # on a bound the chart has no slope: there what lies inside it at full width gives place and size
+        linear, full = near.std(axis=0) / _SMALL, wide.std(axis=0)
+        bent = linear > _BENT * full
+        shrunk = np.where(bent, full / linear, 1.0)
+        mean = np.where(bent, wide.mean(axis=0), near.mean(axis=0))
+        covariance = np.cov(near, rowvar=False).reshape(centre.size, centre.size) / _SMALL**2
+        covariance *= np.outer(shrunk, shrunk)
+        factor = np.linalg.cholesky(covariance + 1e-12 * np.diag(np.diag(covariance)))
+        means += [mean, *(mean + standard[: _GROUP - 1] @ factor.T)]
+        factors += [factor] * _GROUP
+    if not means:
+        raise FloatingPointError("no optimum has a surrounding inside the prior and its chart")
+    return Mixture(np.full(len(means), 1 / len(means)), np.array(means), np.array(factors))
+
+
+def split(core: Mixture, rng: np.random.Generator) -> Mixture:
+    """Every component with others of its shape at draws from it, for a posterior that needs more of them."""
+    count = len(core.means)
+    steps = np.einsum("kij,gkj->gki", core.factors, rng.standard_normal((_GROUP - 1, count, core.dimension)))
+    means = np.concatenate([core.means[None], core.means + steps]).reshape(-1, core.dimension)
+    return Mixture(np.tile(core.weights / _GROUP, _GROUP), means, np.tile(core.factors, (_GROUP, 1, 1)))
+
+
+def _charted(posterior: Posterior, chart: Chart, z: Matrix) -> Matrix:
+    """Chart of those points that lie inside the prior."""
+    return chart.usable(z[posterior.log_prior(z) > -np.inf])[1]
+
+
+@final
+@dataclass(frozen=True)
+class Seen:
+    """Draws of all proposals so far, weighted as draws of their mixture (Cornuet, Marin, Mira and Robert
+    2012, Scand. J. Statist. 39)."""
+
+    proposals: tuple[Mixture, ...]
+    points: tuple[Matrix, ...]
+    log_densities: tuple[Vector, ...]
+
+    def joined(self, proposal: Mixture, y: Matrix, log_density: Vector) -> Seen:
+        """With the draws of another proposal."""
+        return Seen((*self.proposals, proposal), (*self.points, y), (*self.log_densities, log_density))
+
+    def last_weights(self) -> Vector:
+        """Of the last proposal's draws, as draws of it alone [nat]."""
+        return np.asarray(self.log_densities[-1] - self.proposals[-1].log_density(self.points[-1]))
+
+    def log_weights(self) -> Vector:
+        """One per point, not normalised [nat]."""
+        y = np.concatenate(self.points)
+        each = np.array([proposal.log_density(y) for proposal in self.proposals])
+        return np.asarray(np.concatenate(self.log_densities) - logsumexp(each, axis=0))
+
+
+def fitted(core: Mixture, y: Matrix, log_weights: Vector) -> tuple[Mixture, Mixture]:
+    """A mixture after a few steps of expectation maximisation on weighted draws; and with wider components,
+    as draws are proposed from it.
+
+    Weights of few effective draws are raised to a power below 1 that leaves enough of them (Koblents and
+    Miguez 2015, Statistics and Computing 25): the proposal nears the posterior without collapsing before.
+    """
+    wanted = min(_PER_DIMENSION * y.shape[1], 0.25 * log_weights.size)
+    power = 1.0
+    while effective(power * log_weights - logsumexp(power * log_weights)) < wanted:
+        power *= 0.9
+    weights = np.exp(power * log_weights - logsumexp(power * log_weights))
+    kept = weights > _NO_WEIGHT / weights.size
+    y, weights = y[kept], weights[kept] / weights[kept].sum()
+    centre = weights @ y
+    whole = (weights[:, None] * (y - centre)).T @ (y - centre)
+    floor = np.diag(_LEAST_VARIANCE * np.diag(whole))
+    for _ in range(_STEPS):
+        core = _maximised(core, y, weights, floor)
+    around_all = Mixture(np.ones(1), centre[None], _WIDER * np.linalg.cholesky(whole + floor)[None])
+    wider = Mixture(core.weights, core.means, _WIDER * core.factors)
+    return core, core.blended(wider.blended(around_all, 0.5), _DEFENSIVE)
+
+
+def _maximised(proposal: Mixture, y: Matrix, weights: Vector, floor: Matrix) -> Mixture:
+    """One step of expectation maximisation for Student components on weighted points."""
+    shares, distances = np.exp(proposal.log_shares(y)), proposal.distances(y)
+    means, factors, masses = [], [], []
+    for share, distance in zip(shares, distances, strict=True):
+        own = weights * share
+        mass = own.sum()
+        if mass < _NO_MASS:
+            continue
+        heavy = own * (FREEDOM + y.shape[1]) / (FREEDOM + distance)
+        mean = heavy @ y / heavy.sum()
+        means.append(mean)
+        factors.append(np.linalg.cholesky(((heavy[:, None] * (y - mean)).T @ (y - mean)) / mass + floor))
+        masses.append(mass)
+    return Mixture(np.array(masses) / np.sum(masses), np.array(means), np.array(factors))

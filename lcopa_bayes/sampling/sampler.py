@@ -1,0 +1,296 @@
+"""Independent ensembles from the prior, advanced in rounds until they agree or the budget is spent."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+from tqdm import tqdm
+
+from lcopa_bayes.core.arrays import Array, Matrix
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.sampling.chainfile import load_chain, save_chain
+from lcopa_bayes.sampling.convergence import CERTAIN, Quality, drifts, qualities
+from lcopa_bayes.sampling.ensemble import Ensemble, advance
+from lcopa_bayes.sampling.knownmodes import around
+from lcopa_bayes.sampling.mixture import Mixture
+from lcopa_bayes.sampling.mixturemoves import learned
+from lcopa_bayes.sampling.modes import Ridges, ridges
+
+LEARNING = 2
+"""Rounds before the mixture is learned from the draws of all ensembles; and again at each doubling."""
+_WIDE = 0.5
+"""Share of the mixture that is learned from the populations on their way from the prior [-]."""
+_KNOWN = 0.2
+"""Share of modes that are known from elsewhere, where there are any [-]."""
+
+_ROUND = 20
+"""Draws kept per round and walker."""
+_MEMORY = 0.4
+"""Largest memory of a walker at which sampling stops [-]."""
+_SWEEPS = 80
+"""Most moves of every walker at each temperature on the way from the prior."""
+_LEAST = 5
+"""Rounds before sampling may stop: what is kept of them comes after the first learning."""
+_AS_LONG = 0.4
+"""Sampling takes at least this share of the moves that the way from the prior took: a posterior that was
+hard to reach has hills that fill slowly [-]."""
+_TREND = 2.0
+"""Standard errors below which a drift of the kept draws is taken for chance where the run as a whole drifts
+[-]: there chance is the less likely reason, and to go on costs little."""
+_THIN = 5
+"""Steps per kept draw unless the study says otherwise."""
+
+
+@final
+@dataclass(frozen=True)
+class SamplePlan:
+    """How long and how wide to sample."""
+
+    ensembles: int
+    """Independent ensembles [-]."""
+    walkers: int
+    """Walkers per ensemble [-]."""
+    steps: int
+    """Most steps per ensemble [-]."""
+    thin: int
+    """Steps per kept draw [-]."""
+    target_ess: float
+    """Effective sample size that ends sampling [draws]."""
+    seed: int
+    """Root of all randomness of the run."""
+
+    @classmethod
+    def of(
+        cls,
+        dimension: int,
+        *,
+        seed: int,
+        ensembles: int = 4,
+        walkers: int | None = None,
+        steps: int | None = None,
+        thin: int | None = None,
+        target_ess: float = 400,
+    ) -> SamplePlan:
+        """A plan with what is left open chosen from the number of sampled parameters."""
+        least = 2 * dimension + 2
+        return cls(
+            ensembles,
+            max(least + least % 2, walkers or max(128, 16 * dimension)),
+            steps or 2000 + 400 * dimension,
+            thin or _THIN,
+            target_ess,
+            seed,
+        )
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What sampling gave."""
+
+    ensembles: tuple[Ensemble, ...]
+    plan: SamplePlan
+
+    def kept(self) -> tuple[Array, Array]:
+        """The last three fifths: coordinates (ensembles, walkers, draws, dimension), and log density."""
+        chain = np.stack([ensemble.chain for ensemble in self.ensembles])
+        log_density = np.stack([ensemble.log_density for ensemble in self.ensembles])
+        first = 2 * chain.shape[1] // 5
+        return chain[:, first:].swapaxes(1, 2), log_density[:, first:].swapaxes(1, 2)
+
+
+def sample(
+    posterior: Posterior,
+    plan: SamplePlan,
+    *,
+    jobs: int = 1,
+    chain_file: Path | None = None,
+    fingerprint: str = "",
+    resume: bool = False,
+    quiet: bool = True,
+    starts: Matrix | None = None,
+) -> Run:
+    """Sample a posterior: populations tempered from the prior, then rounds of emcee.
+
+    The draws depend on the arguments alone, not on `jobs` nor on interruptions: with `resume`, a run
+    killed at any moment continues from the last complete round in `chain_file`. `starts`, table values
+    (starts, rows), are modes known from elsewhere, which moves propose too (`knownmodes`); InputError when
+    none lies inside the prior.
+    """
+    known = None if starts is None else around(posterior, starts, plan.seed)
+    ensembles = load_chain(chain_file, fingerprint) if resume and chain_file else ()
+    rounds = max(2, -(-plan.steps // (_ROUND * plan.thin)))
+    done = ensembles[0].steps // (_ROUND * plan.thin) if ensembles else 0
+    with (
+        _crew(posterior, min(jobs, plan.ensembles)) as crew,
+        tqdm(total=rounds, initial=done, unit="round", disable=quiet, desc="from the prior") as bar,
+    ):
+        if not ensembles:
+            seeds = np.random.SeedSequence(plan.seed).spawn(plan.ensembles)
+            ensembles = tuple(crew(_Birth(plan.walkers, _SWEEPS), seeds))
+            _store(chain_file, ensembles, fingerprint)
+        bar.set_description("sampling")
+        mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
+        hardest = max(ensemble.way for ensemble in ensembles)
+        least = max(_LEAST, round(_AS_LONG * hardest / (_ROUND * plan.thin)))
+        while done < rounds and not (done >= least and finished(posterior, Run(ensembles, plan), bar)):
+            if done >= LEARNING and done.bit_count() == 1:
+                mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
+            ensembles = tuple(crew(_Round(plan.thin, mixture), ensembles))
+            done += 1
+            _store(chain_file, ensembles, fingerprint)
+            bar.update()
+    return Run(ensembles, plan)
+
+
+def _store(chain_file: Path | None, ensembles: Sequence[Ensemble], fingerprint: str) -> None:
+    if chain_file:
+        save_chain(chain_file, ensembles, fingerprint)
+
+
+def finished(posterior: Posterior, run: Run, bar: tqdm[Any] | None = None) -> bool:
+    """Whether every sampled parameter agrees between ensembles and has its effective sample size, and the
+    shares of its modes have.
+
+    Walkers travel a little further than a grade asks, so that the linear parameters, which are drawn
+    afterwards, have too.
+    """
+    found = sampled_qualities(posterior, run)
+    if bar is not None:
+        ess, rhat = float(np.min([q.ess for q in found])), float(np.max([q.rhat for q in found]))
+        memory = float(np.max([q.memory for q in found]))
+        acceptance = np.mean([ensemble.acceptance for ensemble in run.ensembles])
+        bar.set_postfix(
+            acceptance=f"{acceptance:.2f}", ess=f"{ess:.0f}", rhat=f"{rhat:.3f}", memory=f"{memory:.2f}"
+        )
+    target = run.plan.target_ess
+    good = all(q.grade(target).level == "reliable" and q.memory <= _MEMORY for q in found)
+    return (
+        good
+        and all(one.ess >= target for one in _sampled_ridges(posterior, run))
+        and _settled(posterior, run)
+    )
+
+
+def _settled(posterior: Posterior, run: Run) -> bool:
+    """Whether what drifts over the whole run with certainty shows no trend any more in what is kept of it.
+
+    A mode that few walkers had found at the start fills slowly and in all ensembles alike, so that neither
+    their agreement nor the effective sample size of what is kept can tell how much is still to come.
+    """
+    whole, kept = (_sampled_values(posterior, run, kept=part) for part in (False, True))
+    for column in range(whole.shape[-1]):
+        pairs = zip(drifts(whole[..., column]), drifts(kept[..., column]), strict=False)
+        for (far, far_error, _), (near, near_error, _) in pairs:
+            if abs(far) > CERTAIN * far_error and abs(near) > _TREND * near_error:
+                return False
+    return True
+
+
+def sampled_qualities(posterior: Posterior, run: Run) -> tuple[Quality, ...]:
+    """Quality of the sampled parameters over the kept part of a run."""
+    names = [posterior.table.names[k] for k in posterior.sampled]
+    return qualities(names, _sampled_values(posterior, run))
+
+
+def _sampled_ridges(posterior: Posterior, run: Run) -> Iterator[Ridges]:
+    """Modes of the sampled parameters over the kept part of a run."""
+    values = _sampled_values(posterior, run)
+    for column, k in enumerate(posterior.sampled):
+        row = posterior.table.rows[k]
+        yield ridges(row.name, row.unit, values[..., column], log_scale=row.log_scale)
+
+
+def _sampled_values(posterior: Posterior, run: Run, *, kept: bool = True) -> Array:
+    """Values of the sampled parameters that are kept, or all, (ensembles, walkers, draws, parameters)."""
+    chains = [ensemble.chain for ensemble in run.ensembles]
+    coordinates = run.kept()[0] if kept else np.stack(chains).swapaxes(1, 2)
+    values = posterior.values(coordinates.reshape(-1, coordinates.shape[-1]))[:, posterior.sampled]
+    return values.reshape(*coordinates.shape[:3], -1)
+
+
+@final
+@dataclass(frozen=True)
+class _Birth:
+    """Task: a new ensemble of a seed."""
+
+    walkers: int
+    sweeps: int
+
+    def __call__(self, posterior: Posterior, seed: np.random.SeedSequence) -> Ensemble:
+        return Ensemble.born(posterior, self.walkers, self.sweeps, seed)
+
+
+@final
+@dataclass(frozen=True)
+class _Round:
+    """Task: an ensemble one round further."""
+
+    thin: int
+    mixture: Mixture | None
+
+    def __call__(self, posterior: Posterior, ensemble: Ensemble) -> Ensemble:
+        return advance(posterior, ensemble, _ROUND, self.thin, self.mixture)
+
+
+_Crew = Callable[[Callable[[Posterior, Any], Ensemble], Sequence[Any]], Iterable[Ensemble]]
+
+
+@contextmanager
+def _crew(posterior: Posterior, jobs: int) -> Iterator[_Crew]:
+    """A map of a task over its inputs, in this process or in `jobs` others."""
+    if jobs <= 1:
+        with threadpool_limits(1):
+            yield lambda task, inputs: (task(posterior, one) for one in inputs)
+        return
+    with ProcessPoolExecutor(
+        jobs, mp_context=get_context("spawn"), initializer=_take_up, initargs=(posterior,)
+    ) as pool:
+        yield lambda task, inputs: pool.map(_perform, [task] * len(inputs), inputs)
+
+
+_posterior: Posterior | None = None
+"""The posterior a worker process samples; set once when the process starts."""
+
+
+def _take_up(posterior: Posterior) -> None:
+    global _posterior
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # an interrupt ends a worker without a word
+    threadpool_limits(1)
+    _posterior = posterior
+
+
+def _perform(task: Callable[[Posterior, Any], Ensemble], given: Any) -> Ensemble:
+    assert _posterior is not None
+    return task(_posterior, given)
+
+
+def taught(
+    posterior: Posterior, ensembles: Sequence[Ensemble], per_round: int, seed: int, known: Mixture | None
+) -> Mixture:
+    """The mixture that moves follow: learned from the later half of the draws at the last power of two,
+    and in part from the populations on their way from the prior, which saw modes that few walkers stand
+    on; blended with the modes `known` from elsewhere.
+
+    `per_round` draws are kept of each walker in a round. A function of the chains alone, so that a resumed
+    run learns the same; learning thins out, as the ergodicity of adaptive sampling asks (Roberts and
+    Rosenthal 2007, J. Appl. Probab. 44).
+    """
+    wide = learned(posterior, [ensemble.trail for ensemble in ensembles], seed).levelled()
+    done = ensembles[0].chain.shape[0] // per_round
+    if done < LEARNING:
+        found = wide
+    else:
+        lesson = per_round << (done.bit_length() - 1)
+        own = learned(posterior, [ensemble.chain[lesson // 2 : lesson] for ensemble in ensembles], seed)
+        found = own.levelled().blended(wide, _WIDE)
+    return found if known is None else found.blended(known, _KNOWN)

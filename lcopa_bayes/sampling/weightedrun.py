@@ -1,0 +1,110 @@
+"""A run of a posterior whose plant has effects: importance sampling around the optima.
+
+One response with effects costs as much as fifty without, and ensembles from the prior ask for a million.
+Draws of a proposal fitted to the posterior are weighted instead (`importance`). What no draw reaches no
+weight shows, so a run whose proposal is far from the posterior is tentative, and ensembles follow where
+weights fail.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import logsumexp
+
+from lcopa_bayes.core.parallel import crew
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.sampling.convergence import Limitation
+from lcopa_bayes.sampling.draws import Draws
+from lcopa_bayes.sampling.ensemble import Ensemble
+from lcopa_bayes.sampling.evidence import Evidence
+from lcopa_bayes.sampling.importance import (
+    LEAST_EFFICIENCY,
+    Effort,
+    Importance,
+    ImportancePlan,
+    first_look,
+    weighted_draws,
+)
+from lcopa_bayes.sampling.importanceweights import usable_k
+from lcopa_bayes.sampling.sampler import Run, SamplePlan
+
+_PLAN = ImportancePlan((Effort(4_000, 1_500, 6), Effort(8_000, 3_000, 6), Effort(16_000, 6_000, 4)), starts=4)
+_QUICK = ImportancePlan((Effort(2_000, 1_000, 5), Effort(4_000, 2_000, 4)), starts=2)
+_STREAM = 12
+"""Marks the randomness of such a run."""
+_STEPS = 50
+"""Draws of every walker that stand for a chain [-]."""
+
+
+class Weighted(NamedTuple):
+    """What importance sampling gave, in the form of a run of ensembles."""
+
+    run: Run
+    draws: Draws
+    evidence: Evidence
+    found: Importance
+
+
+def weighted_run(
+    posterior: Posterior, plan: SamplePlan, *, jobs: int = 1, quick: bool = False
+) -> Weighted | None:
+    """Draws, evidence and the weights they rest on; None where these are not usable.
+
+    Deterministic given the plan's seed, whatever `jobs` [processes]. Parts of the draws stand for ensembles:
+    each is resampled from its own proposals' draws.
+    """
+    rng = np.random.default_rng([plan.seed, _STREAM])
+    wanted = replace(
+        _QUICK if quick else _PLAN, wanted=min(plan.target_ess, 400.0) if quick else plan.target_ess
+    )
+    with crew(jobs) as mapped:
+        found = first_look(posterior, rng, wanted, mapped)
+    if found is None or not usable(found, 100.0):
+        return None
+    draws = weighted_draws(posterior, found, rng, target_ess=plan.target_ess)
+    share = found.ess / found.log_weights.size
+    if share < LEAST_EFFICIENCY:
+        draws = draws.limited(
+            [
+                Limitation(
+                    "tentative",
+                    f"the proposal of the importance sampling is {100 * share:.0f} % efficient (Pareto k "
+                    f"{found.pareto_k:.2f}): a mode away from the optima would be missed",
+                    'sample by ensembles, [sampler] method = "ensembles", or narrow the priors',
+                )
+            ]
+        )
+    return Weighted(_run(posterior, found, plan, rng), draws, _evidence(found, plan.ensembles), found)
+
+
+def usable(found: Importance, wanted: float) -> bool:
+    """Whether averages converge and enough draws count."""
+    return found.pareto_k <= usable_k(found.log_weights.size) and found.ess >= wanted
+
+
+def _parts(found: Importance, count: int) -> list[slice]:
+    size = found.log_weights.size
+    return [slice(k * size // count, (k + 1) * size // count) for k in range(count)]
+
+
+def _run(posterior: Posterior, found: Importance, plan: SamplePlan, rng: np.random.Generator) -> Run:
+    """Equally weighted draws as chains of walkers."""
+    ensembles = []
+    for part in _parts(found, plan.ensembles):
+        chosen = found.resampled(_STEPS * plan.walkers, rng, part=part)
+        chain = found.coordinates[chosen].reshape(_STEPS, plan.walkers, posterior.dimension)
+        density = found.log_density[chosen].reshape(_STEPS, plan.walkers)
+        accepted = np.full(plan.walkers, _STEPS * found.ess / found.log_weights.size)
+        ensembles.append(Ensemble(chain, density, chain[-1], density[-1], accepted, 0, (), chain[-1], 0))
+    return Run(tuple(ensembles), plan)
+
+
+def _evidence(found: Importance, count: int) -> Evidence:
+    """Log evidence of the whole and of every part."""
+    means = [
+        float(logsumexp(found.raw[part]) - np.log(found.raw[part].size)) for part in _parts(found, count)
+    ]
+    return Evidence(found.log_evidence, found.log_evidence_sd, tuple(means))

@@ -1,0 +1,149 @@
+"""Records that do not begin at rest are recognised, and noise is not taken for one of them."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+from small import U, Y, path, study
+
+from lcopa_bayes.bench.command import Command
+from lcopa_bayes.bench.device import Device
+from lcopa_bayes.cli import main
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.record import Record, save_record
+from lcopa_bayes.data.rest import not_at_rest, unrest
+from lcopa_bayes.data.studyfile import load_study
+from lcopa_bayes.loop.loop import loop
+from lcopa_bayes.results.fit import fit
+
+RECORDS = Path(os.environ.get("LCOPA_BAYES_DATA", Path(__file__).parents[2] / ".." / "shared")) / "records"
+ALWAYS = 1e-9
+"""A range of which every movement is a large part, so that significance alone decides."""
+
+
+def noise(n: int, correlation: float, rng: np.random.Generator) -> np.ndarray:
+    """Stationary first-order autoregressive noise of sd 1; a random walk at correlation 1."""
+    fresh = rng.standard_normal(n)
+    if correlation == 1.0:
+        return np.cumsum(fresh)
+    out = fresh.copy()
+    for k in range(1, n):
+        out[k] = correlation * out[k - 1] + np.sqrt(1 - correlation**2) * fresh[k]
+    return out
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.5, 0.9, 0.99, 1.0])
+@pytest.mark.parametrize(
+    ("sizes", "draws"), [((8, 20, 60), 200), pytest.param((8, 30, 400), 2000, marks=pytest.mark.slow)]
+)
+def test_noise_is_refused_in_less_than_one_case_of_a_hundred(correlation, sizes, draws):
+    """A failure is more than the 99.9 % quantile of what 1 % would give; half have white noise on top."""
+    rng, refused, count = np.random.default_rng(int(100 * correlation)), 0, 0
+    for n in sizes:
+        for k in range(draws):
+            values = noise(n, correlation, rng) + (k % 2) * rng.standard_normal(n)
+            refused += unrest(np.arange(n) * 0.2, values, ALWAYS) is not None
+            count += 1
+    assert refused <= stats.binom.ppf(0.999, count, 0.01)
+
+
+def switched(rng: np.random.Generator, *, before: float, first: float, noise_sd: float) -> Record:
+    """A plant that rested under `before`, in a record whose rows begin when the drive goes to `first`."""
+    order, time = rng.uniform(0.6, 1.6), rng.uniform(0.5, 8.0)
+    device = Device(((path(2.0, rng.uniform(0.0, 0.8), (time,), (order,)),),), (U,), (Y,), (0.3,))
+    off = rng.uniform(6.0, 14.0)
+    command = Command(np.array([0.0, off]), np.array([[first], [0.0]]), np.array([before]))
+    at = np.linspace(0.0, 20.0, int(rng.integers(80, 400)))
+    clean = device.response(command, at)[:, 0]
+    rho = rng.uniform(0.0, 0.6)
+    response = clean + noise_sd * noise(at.size, rho, rng)
+    drive = np.where(at < off, first, 0.0)
+    return Record("step", at, drive[:, None], response[:, None], (U,), (Y,), "ms")
+
+
+def test_a_drive_that_was_switched_on_as_the_record_began_is_recognised():
+    """100 plants at rest before a drive of 1 in the first row, and the same that had rested under it."""
+    rng = np.random.default_rng(11)
+    moving = [switched(rng, before=0.0, first=1.0, noise_sd=0.02) for _ in range(100)]
+    resting = [switched(rng, before=1.0, first=1.0, noise_sd=0.02) for _ in range(100)]
+    assert [k for k, one in enumerate(moving) if not not_at_rest([one])] == []
+    assert sum(bool(not_at_rest([one])) for one in resting) <= 4  # 1 % of a hundred, at p = 0.003
+
+
+def test_an_early_row_states_what_the_plant_rested_under():
+    record = switched(np.random.default_rng(2), before=0.0, first=1.0, noise_sd=0.02)
+    (problem,) = not_at_rest([record])
+    assert "record 'step': response 'y' moves by " in problem
+    assert "while the drive stays as in the first row (u = 1 V) until " in problem
+    for level in (0.0, 1.0):
+        assert not_at_rest([begun(record, level)]) == []
+    (problem,) = not_at_rest([begun(record, 0.0)], [replace(record, name="apart")])
+    assert "record 'apart'" in problem
+
+
+def begun(record: Record, level: float) -> Record:
+    """The record with an early row of this drive and no response."""
+    return replace(
+        record,
+        time=np.r_[record.time[0] - 1.0, record.time],
+        drive=np.vstack(([level], record.drive)),
+        response=np.vstack(([np.nan], record.response)),
+    )
+
+
+def test_a_readback_that_jitters_is_no_change_of_the_drive():
+    rng = np.random.default_rng(3)
+    record = switched(rng, before=0.0, first=1.0, noise_sd=0.02)
+    jitter = record.drive + rng.uniform(-0.004, 0.004, record.drive.shape)
+    assert len(not_at_rest([replace(record, drive=jitter)])) == 1
+    early = np.vstack((np.zeros((4, 1)), record.drive[4:]))  # a change in row 5 explains what follows
+    assert not_at_rest([replace(record, drive=early)]) == []
+
+
+def test_a_slight_drift_is_left_alone():
+    rng = np.random.default_rng(4)
+    record = switched(rng, before=1.0, first=1.0, noise_sd=0.002)
+    drift = 0.08 * record.time[:, None] / record.time[-1]
+    assert not_at_rest([replace(record, response=record.response + drift)]) == []
+
+
+def test_fit_and_loop_refuse_in_words_and_write_nothing(tmp_path, capfd):
+    record = switched(np.random.default_rng(5), before=0.0, first=1.0, noise_sd=0.02)
+    for refuses in (fit, lambda made: loop(made, sample=False, quick=True)):
+        with pytest.raises(InputError, match="not at rest there, as the model assumes"):
+            refuses(study(record))
+    save_record(record, tmp_path / "step.csv")
+    for verb in ("fit", "audit", "loop"):
+        out = tmp_path / verb
+        code = main([verb, str(tmp_path / "step.csv"), "--out", str(out), "--quick", "--quiet"])
+        printed, told = capfd.readouterr()
+        assert (code, printed) == (2, "")
+        assert told.startswith("error: record 'step': response 'y' moves by ")
+        assert "add a row before the first (time " in told
+        assert not list(out.glob("*"))
+
+
+@pytest.mark.skipif(not RECORDS.exists(), reason="no measured records")
+def test_measured_records_are_refused_without_the_row_that_states_their_rest():
+    """As they stand none is refused; stripped of the early row every switched-on one is, but for a creep
+    whose 58 samples, a growth as the logarithm of time, are no better than a random walk."""
+    refused = set()
+    for file in sorted(RECORDS.glob("*/study.toml")):
+        made = load_study(file)
+        assert not_at_rest(made.fit, made.held_out) == [], file
+        if not_at_rest([stripped(one) for one in made.fit], [stripped(one) for one in made.held_out]):
+            refused.add(file.parent.name)
+    panels = {file.parent.name for file in RECORDS.glob("lcd_panel_*/study.toml")}
+    assert refused == panels | {"hair_dryer", "heating_system", "tclab", "tclab_2x2"}
+
+
+def stripped(record: Record) -> Record:
+    """The record from its first response on."""
+    first = int(np.isfinite(record.response).any(axis=1).argmax())
+    parts = {key: getattr(record, key)[first:] for key in ("time", "drive", "response")}
+    return replace(record, **parts)

@@ -1,0 +1,422 @@
+"""The effect library: effects vanish exactly, agree with closed forms, and their slopes are their slopes."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from scipy.integrate import solve_ivp
+from small import ONE, problem, record
+
+from lcopa_bayes.bench.command import on_off, prbs, staircase, two_axis
+from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.drive import Drive, sorted_jumps
+from lcopa_bayes.data.record import Axis
+from lcopa_bayes.inference.effects import Effected, carried, effected, epochs_of
+from lcopa_bayes.model.effects import balance, sensor
+from lcopa_bayes.model.effects.catalogue import bundled, catalogue
+from lcopa_bayes.model.effects.commands import Hysteresis, RefreshHold
+from lcopa_bayes.model.effects.dynamics import (
+    CubicStiffness,
+    LevelDependentSpeed,
+    Overflow,
+    RiseFallAsymmetry,
+)
+from lcopa_bayes.model.effects.effect import UnstableError
+from lcopa_bayes.model.effects.parallel import Backflow
+from lcopa_bayes.model.effects.response import OddCurvature
+from lcopa_bayes.model.effects.ripples import Vibration
+from lcopa_bayes.model.effects.sensor import SensorLag
+from lcopa_bayes.results.prediction import responses
+
+NAMES = [
+    "rise_fall_asymmetry", "level_dependent_speed", "field_dependent_delay", "backflow", "cross_fade",
+    "odd_curvature", "even_curvature", "voltage_knee", "cubic_stiffness", "overdrive_pulse",
+    "refresh_hold", "grey_quantisation", "hysteresis", "ion_creep", "extra_mode", "missing_cross_path",
+    "bilinear_crosstalk", "axis_rotation", "sensor_lag", "exposure", "clipping", "centroid_locking",
+    "sampled_drive", "clock_skew", "viscosity_drift", "gain_drift", "pointing_offset", "pointing_drift",
+    "trigger_jitter", "vibration", "flicker", "outliers", "overflow", "unmodelled_linear",
+    "unmodelled_smooth", "unmodelled_nonlinear", "sampled_drive",
+]  # fmt: skip
+ALL = bundled()
+
+
+def two_axes() -> tuple[Effected, np.ndarray, list[np.ndarray]]:
+    """Base model of two records, its values, and its responses by `prediction`."""
+
+    def path(gain: float, terms: tuple[tuple[float, float], ...]) -> TransferPath:
+        return TransferPath(gain, 0.3873, tuple(t**a for t, a in terms), tuple(a for _, a in terms), 1.0)
+
+    direct, cross = ((1.2, 1.7), (1.6, 0.7)), ((2.0, 0.9),)
+    axes = (Axis("x", "rad"), Axis("y", "rad"))
+    paths = ((path(1.0, direct), path(0.2, cross)), (path(0.3, cross), path(1.5, direct)))
+    device = Device(paths, axes, axes, (0.1, 0.1))
+    commands = (
+        two_axis(on_off(1.0, hold=9.3, at=0.37), staircase([0.5, -0.4, 0.2], hold=6.1, start=1.03)),
+        two_axis(on_off(-0.6, hold=7.2, at=1.38, rest=0.2), on_off(0.8, hold=5.0, at=2.64)),
+    )
+    made = [
+        record(k, device=device, command=c, camera=0.1, duration=25.0, noise_sd=0.0, name=f"r{k}")
+        for k, c in enumerate(commands)
+    ]
+    posterior = problem(*made, terms={"direct": 2, "cross": 1}, share="paper", offset="shared").posterior
+    table = posterior.table
+    told = {
+        "gain": lambda p: paths[p.first][p.second].gain,
+        "time": lambda p: (direct, cross)[p.first][p.second][0],
+        "order": lambda p: (direct, cross)[p.first][p.second][1],
+        "delay": lambda p: 0.3873,
+        "offset": lambda p: 0.1,
+    }
+    values = np.array([told.get(row.kind, lambda p: 0.01)(row.place) for row in table.rows])
+    plain = [read[:, 0].T + 0.1 for read in responses(table, posterior.model, values[None])]
+    return effected(posterior, values), values, plain
+
+
+BASE, VALUES, PLAIN = two_axes()
+
+
+def middle(name: str) -> Effected:
+    grid = ALL[name].grid(BASE.ranges)
+    return BASE.with_effects([grid[len(grid) // 2]])
+
+
+def scales(made: Effected) -> np.ndarray:
+    return np.array([one.coefficient.scale for one in made.coefficients])
+
+
+def apart(first: list[np.ndarray], second: list[np.ndarray]) -> float:
+    return max(float(np.abs(a - b).max()) for a, b in zip(first, second, strict=True))
+
+
+def test_every_effect_asked_for_is_there():
+    assert set(NAMES) == set(ALL)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_card_says_everything(name: str):
+    kind = ALL[name]
+    card, grid = kind.card, kind.grid(BASE.ranges)
+    assert card.name == name
+    assert all(getattr(card, field.name) for field in fields(card) if field.type == "str")
+    assert grid
+    assert len({str(one.constants) for one in grid}) == len(grid)
+    for one in grid[0].coefficients(BASE.ranges):
+        assert one.scale > 0
+        assert one.unit in ("-", "time", "response")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_vanishes(name: str):
+    made = middle(name)
+    assert apart(made.responses(VALUES, made.vanishing), PLAIN) < 1e-12
+    # and nearly vanishes by its own path through the simulator, which at 0 is not taken
+    assert apart(made.responses(VALUES, 1e-9 * scales(made)), PLAIN) < 3e-9
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_signature_is_the_slope(name: str):
+    """What is left after the signature falls at first order per unit or faster (kinks) and is small."""
+    made = middle(name)
+    here, signature = made.responses(VALUES, made.vanishing), made.signature(VALUES)
+    assert [s.shape for s in signature] == [(*y.shape, made.vanishing.size) for y in here]
+    left = []
+    for part in (0.04, 0.02, 0.01):
+        psi = part * scales(made)
+        told = [y + s @ psi for y, s in zip(here, signature, strict=True)]
+        left.append(apart(made.responses(VALUES, psi), told))
+    size = max(float(np.abs(s @ scales(made)).max()) for s in signature)
+    assert left[2] < 0.02 * 0.01 * size + 2e-3 * 0.01 + 1e-12
+    assert left[2] < 0.75 * left[0] or left[0] < 1e-9
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if ALL[name].linear])
+def test_a_linear_effect_is_proportional_to_its_coefficients(name: str):
+    """What one difference for a slope rests on."""
+    made = middle(name)
+    psi, here = scales(made), made.responses(VALUES, made.vanishing)
+    once, twice = made.responses(VALUES, psi), made.responses(VALUES, 2 * psi)
+    size = max(float(np.abs(b - a).max()) for a, b in zip(here, once, strict=True))
+    left = [c - 2 * b + a for a, b, c in zip(here, once, twice, strict=True)]
+    assert max(float(np.abs(one).max()) for one in left) < 1e-8 * max(size, 1e-3)
+
+
+def test_axes_of_one_unit_share_their_scales():
+    """Drives of 1 and 0.8 and a device twice as long the other way: a coefficient means the same on both."""
+    ranges = BASE.ranges
+    assert ranges.drive[0] == ranges.drive[1] == 1.0
+    gains = [abs(VALUES[BASE.table.at("gain", k, k)]) for k in (0, 1)]
+    assert ranges.response[1] / ranges.response[0] == pytest.approx(gains[1] / gains[0])
+    assert ranges.period == pytest.approx(0.1, rel=1e-9)
+
+
+def test_grey_levels_are_those_of_one_driver():
+    """Both axes step by a sixteenth of the larger drive, at full strength."""
+    made = BASE.with_effects([ALL["grey_quantisation"](16.0)])
+    scene = made.simulator.scenes(made.plant(VALUES), np.array([1.0]))[0]
+    for drive in scene.drives:
+        assert np.allclose(16 * drive.values, np.round(16 * drive.values), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", sorted(set(NAMES) - {"outliers", "grey_quantisation", "unmodelled_smooth"}))
+def test_it_does_something(name: str):
+    made = middle(name)
+    assert apart(made.responses(VALUES, scales(made)), PLAIN) > 1e-4
+
+
+@pytest.mark.parametrize(
+    "name", ["odd_curvature", "overdrive_pulse", "cubic_stiffness", "sensor_lag", "ion_creep"]
+)
+def test_jacobian_with_an_effect(name: str):
+    """Against central differences of the responses, away from psi = 0."""
+    made = middle(name)
+    psi = 0.5 * scales(made)
+    exact = made.jacobian(VALUES, psi)
+    for k, row in enumerate(made.table.rows):
+        step = np.zeros(VALUES.size)
+        step[k] = 3e-6
+        up, down = made.responses(VALUES + step, psi), made.responses(VALUES - step, psi)
+        slope = [(a - b) / 6e-6 for a, b in zip(up, down, strict=True)]
+        size = max(float(np.abs(one).max()) for one in slope) + 1.0
+        assert apart([j[..., k] for j in exact], slope) < 2e-3 * size, row.name
+
+
+def test_jacobian_without_effects_is_exact():
+    plain = BASE.jacobian(VALUES)
+    for k in range(len(BASE.table.rows)):
+        step = np.zeros(VALUES.size)
+        step[k] = 1e-5
+        up, down = (BASE.responses(VALUES + sign * step, BASE.vanishing) for sign in (1, -1))
+        slope = [(a - b) / 2e-5 for a, b in zip(up, down, strict=True)]
+        assert apart([j[..., k] for j in plain], slope) < 1e-5
+
+
+# ------------------------------------------------------------ independent roads
+
+LAG = Device(((TransferPath(2.0, 0.3, (1.5,), (1.0,), 1.0),),), ONE.drive_axes, ONE.response_axes, (0.0,))
+LAG_VALUES = {"gain": 2.0, "time_1": 1.5, "order_1": 1.0, "delay": 0.3, "offset": 0.0, "sigma": 0.1}
+
+
+def lag_plant(blocks: int | None = 2000) -> tuple[Effected, np.ndarray]:
+    """A first-order plant, whose ordinary differential equation can be solved directly."""
+    command = staircase([1.0, -0.7, 0.4, 0.0], hold=2.7, start=0.35)
+    made = record(1, device=LAG, command=command, camera=0.1, duration=14.0, noise_sd=0.0)
+    posterior = problem(made, blocks=blocks).posterior
+    values = np.array([LAG_VALUES[name] for name in posterior.table.names])
+    return effected(posterior, values), values
+
+
+@pytest.mark.parametrize(
+    ("effect", "psi", "law"),
+    [
+        (CubicStiffness(), [0.4], lambda f, y, m: f - y - 0.4 * y**3 / m**2),
+        (CubicStiffness(), [40.0], lambda f, y, m: f - y - 40.0 * y**3 / m**2),
+        (LevelDependentSpeed(), [0.5], lambda f, y, m: (f - y) / (1 + 0.5 * (1 - 2 * abs(y) / m))),
+        (RiseFallAsymmetry(), [0.6], lambda f, y, m: (f - y) / (1 + 0.6 * (y * (f - y) < 0))),
+        (RiseFallAsymmetry(), [3.0], lambda f, y, m: (f - y) / (1 + 3.0 * (y * (f - y) < 0))),
+        (
+            Overflow(0.5),
+            [0.4, 3.0],
+            lambda f, y, m: (
+                f
+                - np.sign(y) * (m * (np.sqrt(1 + 0.8 * abs(y) / m) - 1) / 0.4 + 3 * max(abs(y) - 0.5 * m, 0))
+            ),
+        ),
+    ],
+)
+def test_forces_against_the_differential_equation(effect, psi, law):
+    """``T dy/dt = law(K u(t - tau), y)`` by a Runge-Kutta method, segment by segment."""
+    made, values = lag_plant()
+    scale = float(made.ranges.response[0])
+    told = made.with_effects([effect]).responses(values, np.array(psi))[0][:, 0]
+    times = made.simulator.times[0]
+    levels, edges = [0.0, 1.0, -0.7, 0.4, 0.0], [-1.0, 0.65, 3.35, 6.05, 8.75, 15.0]
+    exact, start = np.zeros(times.size), 0.0
+    for level, a, b in zip(levels, edges[:-1], edges[1:], strict=True):
+        inside = (times >= a) & (times < b)
+        at = np.append(times[inside], b)
+        found = solve_ivp(
+            lambda t, y, f=2.0 * level: [law(f, y[0], scale) / 1.5],
+            (a, b), [start], t_eval=at, rtol=1e-9, atol=1e-11, max_step=0.02,
+        )  # fmt: skip
+        exact[inside], start = found.y[0][:-1], found.y[0][-1]
+    assert np.abs(told - exact).max() < 2e-3 * np.abs(exact).max()
+
+
+def test_strong_cubic_stiffness_converges_in_blocks():
+    """Second order in the block width, also where whole-record sweeps do not converge."""
+    told = [
+        made.with_effects([CubicStiffness()]).responses(values, np.array([40.0]))[0]
+        for made, values in (lag_plant(blocks) for blocks in (250, 500, 1000, 4000))
+    ]
+    errors = [np.abs(one - told[-1]).max() for one in told[:-1]]
+    assert errors[0] / errors[1] > 2.5
+    assert errors[1] / errors[2] > 2.5
+
+
+def test_a_runaway_is_told_and_not_returned():
+    made, values = lag_plant(None)
+    with pytest.raises(UnstableError, match=r"cubic_stiffness.*runs away"):
+        made.with_effects([CubicStiffness()]).responses(values, np.array([-3.0]))
+
+
+def test_sensor_lag_is_one_more_lag():
+    """A first-order plant behind a sensor of first order, in closed form."""
+    command = on_off(1.0, hold=50.0, at=0.35)
+    posterior = problem(record(1, device=LAG, command=command, camera=0.1, noise_sd=0.0)).posterior
+    values = np.array([LAG_VALUES[name] for name in posterior.table.names])
+    made = effected(posterior, values, [SensorLag()])
+    for lag in (0.02, 0.1, 0.5, 3.0):
+        t = np.maximum(made.simulator.times[0] - 0.65, 0.0)
+        exact = 2.0 * (1 - (1.5 * np.exp(-t / 1.5) - lag * np.exp(-t / lag)) / (1.5 - lag))
+        told = made.responses(values, np.array([lag]))[0][:, 0]
+        assert np.abs(told - exact).max() < 0.012  # the kink at the onset falls within a block
+        assert np.abs(told - exact)[t > 1.0].max() < 1e-3
+
+
+@given(rate=st.floats(1e-3, 60.0))
+@settings(deadline=None, max_examples=60)
+def test_moments_of_the_lag(rate: float):
+    x, w = np.polynomial.legendre.leggauss(200)
+    s = (1 + x) / 2
+    exact = [float(np.sum(w / 2 * rate * np.exp(-rate * (1 - s)) * s**k)) for k in range(4)]
+    assert_allclose(sensor._moments(rate), exact, rtol=1e-10)
+
+
+def test_balance_of_a_linear_force_is_a_geometric_series():
+    """``y = k * (f - a y)`` has the solution of a triangular system, at any window."""
+    n, a, rng = 300, 30.0, np.random.default_rng(3)
+    kernel = np.exp(-np.arange(n) / 40.0)[None] / 40.0
+    f = rng.normal(size=(1, n)).cumsum(axis=1)
+    matrix = np.array([[kernel[0, i - j] if i >= j else 0.0 for j in range(n)] for i in range(n)])
+    exact = np.linalg.solve(np.eye(n) + a * matrix, matrix @ f[0])
+    told = balance.balanced(kernel, lambda blocks, y, one, two: f[:, blocks] - a * y, np.ones(1))
+    assert_allclose(told[0], exact, atol=1e-9)
+
+
+def test_backflow_kicks_only_after_falls():
+    made = BASE.with_effects([Backflow(0.5, False)])
+    kick = made.signature(VALUES)[0][:, 0, 0]
+    times = BASE.simulator.times[0]
+    assert np.all(kick[times < 0.37 + 9.3 + 0.43] == 0.0)
+    peak = times[np.argmax(np.abs(kick))]
+    assert abs(peak - (0.37 + 9.3 + 0.43 + 2 * 0.5)) < 0.11  # x^2 e^-x is largest at x = 2
+    assert np.abs(kick).max() == pytest.approx(2 * np.exp(-2), rel=0.01)
+
+
+def test_refresh_at_full_strength_is_on_the_grid():
+    made = BASE.with_effects([RefreshHold(1.0, 0.25)])
+    scenes = made.simulator.scenes(made.plant(VALUES), np.ones(1))
+    for before, after in zip(BASE.simulator.model.experiments, scenes, strict=True):
+        for old, new in zip(before.drives, after.drives, strict=True):
+            assert_allclose((new.times - 0.25) % 1.0 % (1 - 1e-9), 0.0, atol=1e-8)
+            assert ((new.times >= old.times - 1e-9) & (new.times < old.times + 1.0)).all()
+
+
+def test_hysteresis_needs_a_reversal():
+    """On a drive that goes one way the play only shifts levels; after a reversal it lags."""
+    up = Drive(np.arange(4.0), np.array([0.2, 0.4, 0.6, 0.4]))
+    drive, _ = Hysteresis(0.1).commands(up, 0.0, 0, BASE.simulator.scene(0, BASE.plant(VALUES)), np.ones(1))
+    assert_allclose(drive.values, [0.1, 0.3, 0.5])  # and the last step of 0.2 down is all play
+
+
+@given(st.lists(st.tuples(st.integers(0, 5), st.floats(-2, 2)), max_size=8))
+def test_sorted_jumps_keep_the_sum(told):
+    times, jumps = np.array([float(t) for t, _ in told]), np.array([j for _, j in told])
+    drive = sorted_jumps(times, jumps)
+    assert (np.diff(drive.times) > 0).all()
+    if jumps.any():
+        assert drive.values[-1] == pytest.approx(jumps.sum(), abs=1e-12)
+
+
+# ------------------------------------------------------------ interface
+
+
+def test_coefficients_of_records_and_of_all():
+    made = BASE.with_effects([OddCurvature(), Vibration(0.1)])
+    assert [one.record for one in made.coefficients] == [None, *[0] * 4, *[1] * 4]
+    assert made.coefficients[1].name == "vibration.a_x[r0]"
+    psi = np.zeros(9)
+    psi[0], psi[5] = 0.02, 1e-3
+    assert apart(made.responses(VALUES, psi)[:1], made.responses(VALUES, np.r_[0.02, np.zeros(8)])[:1]) == 0.0
+    alone = made.over(made.simulator.model, [], np.zeros(2))
+    assert_allclose(carried(psi, made, made), np.r_[0.02, np.zeros(8)])
+    assert alone.offsets is None
+
+
+def test_two_effects_do_not_only_add():
+    both = BASE.with_effects([CubicStiffness(), OddCurvature()])
+    psi = np.array([0.3, 0.1])
+    parts = [both.responses(VALUES, psi * mask) for mask in ([1, 0], [0, 1])]
+    summed = [a + b - c for a, b, c in zip(*parts, PLAIN, strict=True)]
+    assert 1e-4 < apart(both.responses(VALUES, psi), summed) < 0.05
+
+
+def test_epochs_by_number_or_by_order():
+    fit, held = epochs_of(["run1", "run10", "run3"], ["run2"])
+    assert_allclose(np.r_[fit, held], np.array([0, 3, 2, 1]) / 3 - 0.5)
+    fit, held = epochs_of(["a", "b"], ["c"])
+    assert_allclose(np.r_[fit, held], [-0.5, 0.0, 0.5])
+
+
+def test_campaign_speed_is_told_by_the_grid():
+    """A record pseudo-random for its whole length costs no more than its blocks: it is simulated at all."""
+    rng = np.random.default_rng(2)
+    made = record(3, device=LAG, command=prbs(-1.0, 1.0, hold=0.4, duration=12.0, rng=rng), noise_sd=0.0)
+    posterior = problem(made).posterior
+    values = np.array([LAG_VALUES[name] for name in posterior.table.names])
+    told = effected(posterior, values, [CubicStiffness()]).responses(values, np.array([5.0]))
+    assert np.isfinite(told[0]).all()
+
+
+OWN = """
+from dataclasses import dataclass
+from typing import ClassVar
+from lcopa_bayes.model.effects.effect import Card, ReadoutEffect, single
+
+@dataclass(frozen=True)
+class Doubled(ReadoutEffect):
+    card: ClassVar[Card] = Card("doubled", "output", "y -> (1 + d) y", "here", "all", "gain")
+    def coefficients(self, ranges):
+        return single("d", 1.0)
+    def seen(self, y, scene, psi):
+        return (1 + psi[0]) * y
+
+class Unfinished(ReadoutEffect):
+    pass
+
+class Taken(Doubled):
+    card = Card("backflow", "output", "", "", "", "")
+"""
+
+
+def test_a_class_of_the_user(tmp_path):
+    (tmp_path / "own.py").write_text(OWN)
+    kind = catalogue(["own.py:Doubled"], tmp_path)["doubled"]
+    made = BASE.with_effects([kind()])
+    told = made.responses(VALUES, np.ones(1))
+    assert apart(told, [2 * y - 0.1 for y in PLAIN]) < 1e-12
+
+
+def test_bad_classes_are_told_together(tmp_path):
+    (tmp_path / "own.py").write_text(OWN)
+    (tmp_path / "broken.py").write_text("1 / 0")
+    add = ["own.py:Unfinished", "own.py:Taken", "own.py:Dubbled", "none.py:A", "broken.py:A", "own.py"]
+    with pytest.raises(InputError) as told:
+        catalogue(add, tmp_path)
+    text = "\n".join(told.value.problems)
+    for part in (
+        "must be a concrete",
+        "backflow",
+        "did you mean 'Doubled'",
+        "not a file",
+        "Zero",
+        "expected file",
+    ):
+        assert part in text
+    assert len(told.value.problems) == len(add)

@@ -1,0 +1,472 @@
+"""The report: what it says, that it is one page on its own, and that it never invents a number."""
+
+import inspect
+import json
+import re
+from html import unescape
+from html.parser import HTMLParser
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.inference import defaultpriors
+from lcopa_bayes.report import write_page, write_report
+from lcopa_bayes.report.decimation import extremes
+from lcopa_bayes.report.formatting import NOT_REACHED, figures, interval, to_spread
+from lcopa_bayes.report.savedrun import load_run
+from lcopa_bayes.report.section import Column, Drawing, Section, Table
+from lcopa_bayes.report.sections import pairs, parameters, records, residuals, sensitivity, steps
+from lcopa_bayes.report.theme import inlined
+from lcopa_bayes.sampling.modes import Ridges
+
+PARAMETERS = {
+    "gain": ("rad/V", "reliable", False),
+    "time_1": ("ms", "tentative", True),
+    "delay": ("ms", "unusable", False),
+    "sigma": ("rad", "reliable", True),
+}
+"""Unit, grade and whether sampled on a log scale."""
+RECORDS = (("step", False), ("<i>odd$name$</i>", True))
+QUANTILES = {"05": -1.6, "25": -0.7, "50": 0.0, "75": 0.7, "95": 1.6}
+
+
+def estimate(name: str, unit: str, value: float | None, sd: float | None, grade: str, **more: object) -> dict:
+    told = {"name": name, "value": value, "unit": unit, "mean": value, "sd": sd, "grade": grade}
+    ends = {"lower": None, "upper": None} if value is None else {"lower": value - sd, "upper": value + sd}
+    return told | ends | {"level": 0.9, "interval": "equal-tailed credible", "ess": 512.0} | more
+
+
+def bands_of(record: str, held: bool, size: int) -> pd.DataFrame:
+    time = np.linspace(0.0, 25.0, size)
+    middle = 0.02 * (1 - np.exp(-time / 3))
+    table = {"record": record, "axis": "x", "unit": "rad", "held_out": held, "time": time}
+    table["observed"] = middle + 1e-4 * np.sin(40 * time)
+    for kind, scale in (("plant", 1e-4), ("noisy", 2e-4)):
+        table |= {f"{kind}_{q}": middle + scale * z for q, z in QUANTILES.items()}
+    return pd.DataFrame(table)
+
+
+def tables_of(size: int) -> dict[str, pd.DataFrame]:
+    bands = pd.concat([bands_of(record, held, size) for record, held in RECORDS])
+    labels = bands[["record", "axis", "unit", "held_out", "time"]]
+    time = np.linspace(0.1, 25.0, 60)
+    step = {"path": "x", "unit": "rad/V", "time": time}
+    step |= {f"response_{q}": 1 - np.exp(-time / 3) + 0.01 * z for q, z in QUANTILES.items()}
+    step |= {f"steady_{q}": 1.0 + 0.01 * QUANTILES[q] for q in ("05", "50", "95")}
+    x = np.linspace(0.5, 2.0, 20)
+    return {
+        "bands": bands,
+        "drives": pd.concat(
+            pd.DataFrame(
+                {"record": r, "axis": "x", "unit": "V", "time": [-1.0, 0.0, 25.0], "drive": [0, 1, 1]}
+            )
+            for r, _ in RECORDS
+        ),
+        "residuals": labels.assign(residual=1e-4 * np.sin(labels["time"]), innovation=0.0),
+        "autocorrelation": pd.concat(
+            pd.DataFrame(
+                {
+                    **{"record": r, "axis": "x", "held_out": h, "lag": np.arange(1, 6)},
+                    **{"autocorrelation": 0.1, "white_band_95": 0.2},
+                }
+            )
+            for r, h in RECORDS
+        ),
+        "spectrum": pd.concat(
+            pd.DataFrame(
+                {
+                    **{"record": r, "axis": "x", "held_out": h, "frequency": np.arange(1, 20) / 25},
+                    "power_over_white": np.linspace(0, 2, 19),
+                }
+            )
+            for r, h in RECORDS
+        ),
+        "step_response": pd.DataFrame(step),
+        "priors": pd.DataFrame(
+            {
+                **{"name": list(PARAMETERS), "unit": [row[0] for row in PARAMETERS.values()]},
+                **{"prior": "norm(loc=0, scale=1)", "from": "default", "integrated_out": False},
+            }
+        ),
+        "prior_density": pd.concat(
+            pd.DataFrame({"name": name, "log_scale": row[2], "x": x, "density": 0.3})
+            for name, row in PARAMETERS.items()
+        ),
+    }
+
+
+def moved(name: str, prior: float | None, diagnosis: str) -> dict:
+    told = {"parameter": name, "prior": prior, "prior_mcse": prior and 0.0123, "likelihood": prior}
+    told |= {"likelihood_mcse": prior and 0.0123, "prior_k": None, "likelihood_k": 0.312, "threshold": 0.05}
+    return told | {"grade": "tentative", "diagnosis": diagnosis, "note": ""}
+
+
+def results_of() -> dict:
+    scores = {"axis": "x", "unit": "rad", "coverage_50": 0.5, "coverage_90": 0.91, "samples": 80, "draws": 40}
+    return {
+        "study": "bench & co",
+        "verdict": "Something was learned.",
+        "grade": "tentative",
+        "grade_reason": "too few draws of time_1",
+        "time_unit": "ms",
+        "parameters": [
+            estimate(name, unit, 1.23456, 0.0321, grade, rhat=1.004)
+            for name, (unit, grade, _) in PARAMETERS.items()
+        ],
+        "fixed": [{"name": "order_1", "value": 1.8, "unit": "-"}],
+        "fit_scores": [scores | {"record": "step", "rmse": 1.84e-4, "offset_from": "fitted"}],
+        "held_out": [scores | {"record": RECORDS[1][0], "rmse": 9.1e-4, "offset_from": "integrated out"}],
+        "step_metrics": [
+            estimate("settling_2[x]", "ms", None, None, "reliable", note="all draws are late"),
+            estimate("settling_5[x]", "ms", None, None, "reliable", lower=7.5),
+            estimate("overshoot[x]", "-", 0.04, 0.002, "reliable"),
+        ],
+        "ridges": [],
+        "rival": None,
+        "log_evidence": -12.345,
+        "log_evidence_sd": 0.0123,
+        "log_evidence_grade": "tentative",
+        "cross_check": None,
+        "sensitivity": [moved("time_1", 0.21, "prior-data conflict"), moved("gain", None, "not trusted")],
+        "residual_tests": [
+            {"record": record, "axis": "x", "held_out": held, "p_white": 3.2e-7, "rms": 1e-4}
+            for record, held in RECORDS
+        ],
+        "sampler": {"ensembles": 2, "steps": 400, "thin": 4, "acceptance": 0.31234, "largest_rhat": 1.0041},
+    }
+
+
+def run_folder(path: Path, size: int = 80) -> Path:
+    path.mkdir(parents=True, exist_ok=True)
+    (path / "tables").mkdir(exist_ok=True)
+    for name, table in tables_of(size).items():
+        table.to_csv(path / "tables" / f"{name}.csv", index=False)
+    (path / "results.json").write_text(json.dumps(results_of()), encoding="utf-8")
+    provenance = {
+        "command": ["lcopa-bayes", "fit", "my study"],
+        "seed": 7,
+        "inputs_sha256": {"a.csv": "ab12"},
+    }
+    provenance |= {"python": "3.11.0", "versions": {"numpy": "2.0"}}
+    (path / "provenance.json").write_text(json.dumps(provenance), encoding="utf-8")
+    rng = np.random.default_rng(1)
+    drawn = {name: (("chain", "draw"), np.exp(0.1 * rng.normal(size=(2, 60)))) for name in PARAMETERS}
+    xr.Dataset(drawn).to_netcdf(path / "posterior.nc", group="posterior", engine="h5netcdf")
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return run_folder(tmp_path_factory.mktemp("reports") / "bench")
+
+
+@pytest.fixture(scope="module")
+def html(folder: Path) -> str:
+    path = write_report(folder)
+    assert path == folder / "report.html"
+    return path.read_text(encoding="utf-8")
+
+
+def rows_of(html: str) -> list[list[str]]:
+    rows = re.findall(r"<tr>(.*?)</tr>", html, flags=re.DOTALL)
+    return [[unescape(cell) for cell in re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row)] for row in rows]
+
+
+def test_verdict_stands_on_top_coloured_and_in_words(html):
+    box = html[html.index('<div class="verdict') : html.index("<nav>")]
+    assert 'class="verdict tentative"' in box
+    assert "Grade: tentative" in box
+    assert "Something was learned." in box
+    assert "too few draws of time_1" in box
+
+
+def test_sections_come_in_the_order_of_reading(html):
+    titles = re.findall(r"<h2>(.*?)</h2>", html)
+    assert titles == [
+        *("Data and bands", "Residuals", "Parameters", "Pairs of parameters", "Traces", "Step responses"),
+        *(
+            "Priors and posteriors",
+            "Prior sensitivity",
+            "Evidence",
+            "Second method",
+            "Sampler and provenance",
+        ),
+    ]
+
+
+def test_every_parameter_has_its_unit_interval_and_grade(html):
+    rows = rows_of(html)
+    for name, (unit, grade, _) in PARAMETERS.items():
+        row = ["1.235", unit, "1.202 to 1.267", "1.235", "0.032", "512", "1.004", grade]
+        assert [name, *row] in rows
+    assert ["order_1", "1.80000", "-"] in rows
+    assert "equal-tailed credible" in html
+
+
+def test_open_sides_are_said_and_not_printed_as_numbers(html):
+    told = {row[1]: row for row in rows_of(html) if len(row) == 8 and row[0] == "x"}
+    first, second, third = (
+        told[f"settling time to {share}"] if share else told["overshoot"] for share in ("2 %", "5 %", "")
+    )
+    assert first[2] == first[4] == NOT_REACHED
+    assert first[7] == "all draws are late"
+    assert second[4] == f"7.50 to {NOT_REACHED}"
+    assert third[4] == "0.0380 to 0.0420"
+    assert not re.search(r"\b(nan|inf|None)\b", re.sub(r"<svg.*?</svg>", "", html, flags=re.DOTALL))
+
+
+def test_captions_carry_scores_and_mark_held_out_records(html):
+    captions = [unescape(c) for c in re.findall(r"<figcaption>(.*?)</figcaption>", html)]
+    fitted = next(c for c in captions if "Record step, axis x, fitted" in c)
+    held = next(c for c in captions if "never seen by the fit" in c)
+    assert "RMSE 1.84×10⁻⁴ rad" in fitted  # noqa: RUF001
+    assert "91\u00a0% of the 80 samples" in fitted
+    assert "Offset: fitted." in fitted
+    assert "held out</span>" not in fitted
+    assert "held out</span>" in held
+    assert "Offset: integrated out." in held
+    assert all("pointwise 90\u00a0% band" in caption for caption in (fitted, held))
+    assert any("median, pointwise 50 and 90\u00a0% bands" in caption for caption in captions)
+    assert any("p\u00a0=\u00a03.2×10⁻⁷, not white" in c for c in captions)  # noqa: RUF001
+
+
+def test_default_priors_are_explained_in_the_words_of_their_module(html):
+    assert inspect.cleandoc(defaultpriors.__doc__) in unescape(html)
+
+
+def test_page_needs_nothing_else(html):
+    for outside in ("http:", "https:", "src=", "<script", "<link", "@import", "file:"):
+        assert outside not in html
+    assert not re.search(r"url\((?!#)", html)
+    assert all(link.startswith(("#", "data:")) for link in re.findall(r'href="([^"]*)"', html))
+
+
+def test_names_from_the_records_stay_text(html):
+    assert "<i>" not in html
+    assert "&lt;i&gt;odd$name$" in html
+    assert "bench &amp; co" in html
+
+
+class _Ids(HTMLParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.seen += [value for key, value in attrs if key == "id"]
+
+
+def test_ids_are_unique_and_references_lead_somewhere(html):
+    parser = _Ids()
+    parser.feed(html)
+    assert len(parser.seen) == len(set(parser.seen))
+    used = re.findall(r'href="#([^"]+)"', html) + re.findall(r"url\(#([^)]+)\)", html)
+    assert used
+    assert set(used) <= set(parser.seen)
+
+
+def test_second_rendering_gives_the_same_bytes(folder, html, tmp_path):
+    again = run_folder(tmp_path / "elsewhere")
+    assert write_report(again).read_text(encoding="utf-8") == html
+    names = sorted(path.name for path in (folder / "figures").iterdir())
+    assert names == sorted(path.name for path in (again / "figures").iterdir())
+    assert all((folder / "figures" / n).read_bytes() == (again / "figures" / n).read_bytes() for n in names)
+    assert all(re.fullmatch(r"[\w-]+\.svg", name) for name in names)
+
+
+def test_rendering_leaves_matplotlib_as_it_was(folder, html):
+    before = dict(matplotlib.rcParams)
+    with matplotlib.rc_context({"font.size": 31.0}):
+        assert write_report(folder).read_text(encoding="utf-8") == html
+        assert matplotlib.rcParams["font.size"] == 31.0
+    assert dict(matplotlib.rcParams) == before
+    assert matplotlib.pyplot.get_fignums() == []
+
+
+@pytest.mark.parametrize("missing", ["results.json", "provenance.json", "posterior.nc", "tables/bands.csv"])
+def test_missing_file_is_named(tmp_path, missing):
+    folder = run_folder(tmp_path / "run")
+    (folder / missing).unlink()
+    with pytest.raises(InputError, match=re.escape(str(folder / missing))):
+        write_report(folder)
+    assert not (folder / "report.html").exists()
+
+
+def test_all_that_is_wrong_is_told_at_once(tmp_path):
+    folder = run_folder(tmp_path / "run")
+    (folder / "tables" / "drives.csv").unlink()
+    (folder / "tables" / "priors.csv").write_text("name,unit,prior,from\n", encoding="utf-8")
+    (folder / "results.json").write_text('{"study": ', encoding="utf-8")
+    (folder / "posterior.nc").write_text("no netCDF", encoding="utf-8")
+    with pytest.raises(InputError) as refused:
+        load_run(folder)
+    told = "\n".join(refused.value.problems)
+    assert len(refused.value.problems) == 4
+    for word in ("drives.csv", "'integrated_out'", "results.json", "posterior.nc"):
+        assert word in told
+    with pytest.raises(InputError, match="no such run folder"):
+        write_report(tmp_path / "nowhere")
+
+
+def test_draws_of_another_run_are_refused(tmp_path):
+    folder = run_folder(tmp_path / "run")
+    told = results_of()
+    told["parameters"].append(estimate("rho", "-", 0.5, 0.1, "reliable", rhat=1.0))
+    (folder / "results.json").write_text(json.dumps(told), encoding="utf-8")
+    with pytest.raises(InputError, match="'rho'"):
+        load_run(folder)
+
+
+def test_records_too_short_for_residuals_leave_a_sentence(tmp_path):
+    folder = run_folder(tmp_path / "run")
+    for name in ("residuals", "autocorrelation", "spectrum"):
+        (folder / "tables" / f"{name}.csv").write_text("\n", encoding="utf-8")
+    section = residuals.section(load_run(folder))
+    assert section.drawings == ()
+    assert "too short" in section.text[0]
+
+
+def test_names_that_look_like_numbers_or_nothing_stay_names(tmp_path):
+    folder = run_folder(tmp_path / "run")
+    for name in ("bands", "drives"):
+        path = folder / "tables" / f"{name}.csv"
+        text = path.read_text(encoding="utf-8").replace("step,", "007,").replace("<i>odd$name$</i>,", "NA,")
+        path.write_text(text, encoding="utf-8")
+    assert load_run(folder).records("bands") == [("007", "x"), ("NA", "x")]
+
+
+def test_long_records_make_small_figures_and_say_so(tmp_path):
+    run = load_run(run_folder(tmp_path / "run", size=40_000))
+    drawings = (*records.section(run).drawings, *residuals.section(run).drawings)
+    assert max(len(drawing.svg) for drawing in drawings) < 300_000
+    assert all("the record has 40000 samples" in drawing.caption for drawing in drawings)
+
+
+CURVES = arrays(float, st.integers(2, 400), elements=st.floats(-1e6, 1e6) | st.just(np.nan))
+
+
+@settings(max_examples=100, deadline=None)
+@given(CURVES, st.integers(4, 60))
+def test_decimation_keeps_extremes_and_ends(curve, most):
+    other = -np.nan_to_num(curve) + np.arange(curve.size)
+    at = extremes(curve, other, most=most)
+    assert np.all(np.diff(at) > 0)
+    assert at[0] == 0
+    assert at[-1] == curve.size - 1
+    assert at.size <= most + 2
+    for values in (curve, other):
+        if not np.isnan(values).all():
+            assert np.nanmax(values[at]) == np.nanmax(values)
+            assert np.nanmin(values[at]) == np.nanmin(values)
+
+
+def test_decimation_keeps_a_single_spike_in_every_stretch():
+    curve = np.zeros(10_000)
+    spikes = np.arange(50, 10_000, 100)
+    curve[spikes] = 1.0 + np.arange(100)
+    assert np.isin(spikes, extremes(curve, most=200)).all()
+    assert np.array_equal(extremes(curve[:150], most=200), np.arange(150))
+    with pytest.raises(ValueError, match="one length"):
+        extremes(curve, curve[1:])
+
+
+@pytest.mark.parametrize(
+    ("value", "spread", "printed"),
+    [
+        (21.6337, 2.175, "21.6"),
+        (1879.63, 52.1, "1880"),
+        (701.6, 158.4, "700"),
+        (0.9958235, 0.00444, "0.9958"),
+        (0.99, 1.69, "0.99"),
+        (-3.0171, 0.0996, "−3.02"),  # noqa: RUF001
+        (0.0, 0.4, "0.00"),
+        (1.8432e-4, 3.1e-6, "1.843×10⁻⁴"),  # noqa: RUF001
+        (9.9996e-4, 3e-6, "1.0000×10⁻³"),  # noqa: RUF001
+        (2.5e7, 1.3e6, "2.50×10⁷"),  # noqa: RUF001
+        (1.25, None, "1.25"),
+        (None, 1.0, "–"),  # noqa: RUF001
+    ],
+)
+def test_digits_follow_the_spread(value, spread, printed):
+    assert to_spread(value, spread) == printed
+
+
+def test_intervals_and_significant_digits():
+    assert interval(0.02838, None, 0.015) == "0.028 to open"
+    assert interval(None, None, None, nothing=NOT_REACHED) == NOT_REACHED
+    assert [figures(x) for x in (0.0, 0.99996, 123456.0, float("inf"))] == ["0", "1.00", "123000", "–"]  # noqa: RUF001
+
+
+def test_interesting_parameters_come_first_and_the_rest_is_named(tmp_path):
+    names = ["sigma", "gain_a", "offset", "delay", "gate_1", "order_1", "time_2", "time_1"]
+    assert pairs.ranked(names) == [
+        "time_2",
+        "time_1",
+        "order_1",
+        "delay",
+        "gain_a",
+        "gate_1",
+        "offset",
+        "sigma",
+    ]
+
+
+def test_a_page_of_any_sections_can_be_written(tmp_path):
+    svg = '<svg xmlns="http://www.w3.org/2000/svg"><g id="a"/><use href="#a"/></svg>'
+    table = Table((Column("claim"), Column("how", "prose")), (("1", "by test"),))
+    section = Section("Far field", ("Text.",), (Drawing("far field", svg, "Caption."),), (table,))
+    path = write_page(tmp_path, "optics", [section], name="optics.html")
+    text = path.read_text(encoding="utf-8")
+    assert (tmp_path / "figures" / "far_field.svg").read_text(encoding="utf-8") == svg
+    assert inlined(svg, "far_field") == '<svg><g id="far_field-a"/><use href="#far_field-a"/></svg>'
+    assert '<use href="#far_field-a"/>' in text
+    assert "verdict" not in text[text.index("<body>") :]
+    with pytest.raises(ValueError, match="2 cells"):
+        Table(table.columns, (("1",),))
+
+
+def test_step_table_is_left_out_when_there_are_no_metrics(folder, tmp_path):
+    run = load_run(folder)
+    bare = type(run)({**run.results, "step_metrics": []}, run.provenance, run.tables, run.draws)
+    assert steps.section(bare).tables == ()
+
+
+def with_results(folder: Path, **more: object):
+    run = load_run(folder)
+    return type(run)({**run.results, **more}, run.provenance, run.tables, run.draws)
+
+
+def test_several_ridges_are_shown_with_their_shares(folder):
+    assert len(parameters.section(load_run(folder)).tables) == 2
+    found = Ridges("time_1", "ms", (1.1,), np.array([[0.3, 0.7], [0.5, 0.5]]), np.full((2, 2), 0.02))
+    row = found.as_json() | {"grade": "tentative"}
+    table = parameters.section(with_results(folder, ridges=[row])).tables[1]
+    assert table.rows[0][:6] == (
+        *("time_1", "1.10", "ms", "0.40 ± 0.10, 0.60 ± 0.10", "0.30 to 0.50, 0.50 to 0.70", "tentative"),
+    )
+    assert "run longer" in table.rows[0][6]
+
+
+def test_the_most_prior_sensitive_parameters_are_shown_and_the_rest_counted(folder):
+    shown = sensitivity.section(load_run(folder))
+    assert shown.tables[0].rows[0] == (
+        *("time_1", "0.210 ± 0.012", "0.210 ± 0.012", "prior-data conflict", "0.31", "tentative", ""),
+    )
+    assert shown.tables[0].rows[1][1:4] == ("–", "–", "not trusted")  # noqa: RUF001
+    assert any("matters for 1 of 2 parameters: time_1" in text for text in shown.text)
+    assert any("Not trusted for 1 parameter(s), gain" in text for text in shown.text)
+    many = sensitivity.section(
+        with_results(folder, sensitivity=[moved(f"p{k}", 0.01, "-") for k in range(30)])
+    )
+    assert len(many.tables[0].rows) == 20
+    assert any("20 most affected of 30" in text for text in many.text)
+    assert any("No parameter depends noticeably" in text for text in many.text)
+    assert sensitivity.section(with_results(folder, sensitivity=[])).tables == ()

@@ -1,0 +1,109 @@
+"""Bias by the width of the blocks: against records without noise made by the bench's own numerics."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small import U, Y, draws_of, path, record, study
+
+from lcopa_bayes.bench.command import step
+from lcopa_bayes.bench.device import Device
+from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.inference.leastsquares import LeastSquares
+from lcopa_bayes.results.discretisation import (
+    LARGEST,
+    Discretisation,
+    discretisation,
+    optimum_shift,
+    resolved,
+)
+
+TIME, GAIN = 3.4, 1.0
+
+
+def exact_problem(order: float, delay: float, *, sigma: float = 0.002, **model: object) -> Problem:
+    """One term, a step on a sample, 125 samples of 0.2, and not a trace of noise in the record."""
+    device = Device(((path(GAIN, delay, (TIME,), (order,)),),), (U,), (Y,), (0.0,))
+    own = record(device=device, command=step(1.0, at=0.0), camera=0.2, duration=25.0, noise_sd=0.0)
+    return problem_of(study(own, noise="white", priors={"sigma": sigma}, **model))
+
+
+def truth_of(problem: Problem, order: float, delay: float) -> np.ndarray:
+    known = {"gain": GAIN, "time": TIME, "order": order, "delay": delay, "offset": 0.0, "sigma": 0.002}
+    return np.array([known[row.kind] for row in problem.posterior.table.rows])
+
+
+def optimum(problem: Problem, start: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Search coordinates of the optimum, their covariance, and table values."""
+    least = LeastSquares(problem.posterior)
+    values, jacobian = least.solve(start)
+    return least.coordinates(values), np.linalg.inv(jacobian.T @ jacobian), values
+
+
+def bias(problem: Problem, order: float, delay: float) -> np.ndarray:
+    """Deviation of the optimum from the truth [posterior sd]."""
+    start = truth_of(problem, order, delay)
+    x, covariance, _ = optimum(problem, start)
+    return (x - LeastSquares(problem.posterior).coordinates(start)) / np.sqrt(np.diag(covariance))
+
+
+@pytest.mark.parametrize("order", [0.6, 0.9, 1.2, 1.8])
+@pytest.mark.parametrize("delay", [1.0, 1.07, 1.199])
+def test_no_parameter_is_biased_by_the_blocks_a_fit_chooses(order, delay):
+    """Noise 0.2 % of the step; on blocks that held the onset the delay was off by 17 sd at order 0.6."""
+    chosen = resolved(exact_problem(order, delay))
+    assert np.abs(bias(chosen, order, delay)).max() < LARGEST
+
+
+@pytest.mark.parametrize(("order", "delay"), [(1.8, 1.07), (0.4, 1.199), (1.5, 1.0)])
+def test_the_shift_of_the_optimum_is_its_bias(order, delay):
+    problem = exact_problem(order, delay, blocks=2)
+    actual = bias(problem, order, delay)
+    assert np.abs(actual).max() > 0.1
+    _, _, values = optimum(problem, truth_of(problem, order, delay))
+    assert optimum_shift(problem, values) == pytest.approx(np.abs(actual).max(), rel=0.15)
+
+
+def test_draws_move_as_the_optimum_does(rng):
+    """Reweighted draws against a refit on blocks sixteen times narrower, with its sign."""
+    problem = exact_problem(1.8, 1.07, blocks=2)
+    x, covariance, values = optimum(problem, truth_of(problem, 1.8, 1.07))
+    least = LeastSquares(problem.posterior)
+    drawn = np.array(
+        [least.values(each, values) for each in rng.multivariate_normal(x, covariance, size=400)]
+    )
+    draws = draws_of(problem.posterior.table, drawn)
+    found = discretisation(problem, draws)
+    refit, _, _ = optimum(problem.refined(16), values)
+    position = [problem.posterior.table.names[k] for k in least.columns].index(found.parameter)
+    actual = (refit - x)[position] / np.sqrt(covariance[position, position])
+    assert abs(actual) > 0.2
+    assert found.shift == pytest.approx(actual, abs=0.03 + 3 * found.error)
+    assert not found.negligible
+    assert discretisation(resolved(problem), draws).negligible
+
+
+def test_narrower_blocks_only_where_they_are_needed():
+    smooth, steep = exact_problem(1.2, 1.07, sigma=0.02), exact_problem(1.8, 1.07, sigma=0.0005)
+    assert resolved(smooth).refinement == 1
+    narrow = resolved(steep)
+    assert narrow.refinement > 1
+    widths = [each.posterior.model.experiments[0].mesh.lattice.step for each in (steep, narrow)]
+    assert widths[0] / widths[1] == pytest.approx(narrow.refinement)
+    samples, model = narrow.simulated(narrow.study.fit)
+    assert model.experiments[0].mesh.lattice.step == widths[1]
+    assert len(samples) == 1
+
+
+def test_a_shift_caps_the_grade():
+    small = Discretisation("delay", -0.05, 0.01, 1, 250)
+    assert small.negligible
+    assert small.limitations == ()
+    for shift, level in ((-0.4, "tentative"), (2.3, "unusable")):
+        (limitation,) = replace(small, shift=shift).limitations
+        assert limitation.level == level
+        assert "delay" in limitation.reason
+        assert "blocks" in limitation.remedy
+    assert replace(small, shift=0.15, error=0.05).negligible  # not more than its error beyond

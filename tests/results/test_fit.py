@@ -1,0 +1,160 @@
+"""The verb `fit`, end to end on one tiny record whose truth is known."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+from small import TRUTH, record, study
+
+from lcopa_bayes.bench.command import on_off
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.results.fit import Fit, fit, plan_of
+from lcopa_bayes.results.provenance import fingerprint, provenance
+from lcopa_bayes.results.summary import residual_rms, results, verdict
+
+TINY = {"ensembles": 2, "walkers": 32, "steps": 600, "thin": 3, "target_ess": 200}
+HELD = record(2, command=on_off(-0.7, hold=4.0, at=1.3), name="held")
+STUDY = study(record(), held_out=(HELD,), sampler=TINY)
+
+
+@pytest.fixture(scope="module")
+def fitted() -> Fit:
+    return fit(STUDY)
+
+
+def test_recovers_the_truth(fitted):
+    for name, exact in TRUTH.items():
+        low, high = np.quantile(fitted.draws.column(name), (0.005, 0.995))
+        assert low < exact < high, name
+        assert high - low < 0.5 * abs(exact), name  # and says something about it
+
+
+def test_predicts_the_record_it_never_saw(fitted):
+    (seen,), (unseen,) = ([b for b in fitted.bands if b.held_out == flag] for flag in (False, True))
+    assert (seen.record, unseen.record) == ("step", "held")
+    for band in (seen, unseen):
+        n = band.observed.size
+        assert abs(band.coverage(0.9) - 0.9) < 4 * np.sqrt(0.9 * 0.1 / n)
+        assert band.rmse == pytest.approx(TRUTH["sigma"], rel=4 / np.sqrt(2 * n))
+    assert seen.offset_from == "fitted"
+    assert unseen.offset_from == "samples before the drive acts"
+    assert residual_rms(fitted) == {"y": pytest.approx(seen.rmse)}
+    assert all(left.p_white > 1e-3 for left in fitted.residuals)
+
+
+def test_scores_say_what_kind_of_band_and_from_how_many_samples_the_offset_comes(fitted):
+    (told,) = results(fitted)["held_out"]
+    assert (told["bands"], told["offset_samples"]) == ("pointwise", 7)  # samples until 1.3, one per 0.2
+    assert "pointwise 90 % band" in verdict(fitted)
+    assert "constant error" not in verdict(fitted)
+    alone = [replace(b, offset_samples=b.time.size) if b.held_out else b for b in fitted.bands]
+    said = verdict(replace(fitted, bands=tuple(alone)))
+    assert "(offset from these samples)" in said
+    assert "A constant error of a record whose offset comes from its scored samples cannot show." in said
+
+
+def test_results_have_the_keys_that_other_tools_rely_on(fitted):
+    told = results(fitted)
+    assert {
+        "grade",
+        "grade_reason",
+        "parameters",
+        "log_evidence",
+        "log_evidence_sd",
+        "residual_rms",
+        "step_metrics",
+    } <= told.keys()
+    assert [row["name"] for row in told["parameters"]] == list(TRUTH)
+    for row in told["parameters"]:
+        assert {"name", "unit", "mean", "sd", "lower", "upper", "level", "ess", "rhat"} <= row.keys()
+        assert row["lower"] < row["value"] < row["upper"]
+        assert row["lower"] < row["mean"] < row["upper"]
+    for metric in told["step_metrics"]:
+        assert {"value", "unit", "lower", "upper", "level", "interval", "grade"} <= metric.keys()
+    assert {metric["name"] for metric in told["step_metrics"]} >= {
+        "rise_10_90[y]",
+        "settling_2[y]",
+        "delay[y]",
+    }
+    assert told["grade"] in ("reliable", "tentative", "unusable")
+    assert told["sampler"]["steps"] <= told["sampler"]["most_steps"] == 600
+    assert json.loads(json.dumps(told, allow_nan=False)) == told
+
+
+def test_the_verdict_names_grade_residual_and_held_out_record(fitted):
+    said = verdict(fitted)
+    assert said.startswith(f"Grade {fitted.draws.grade.level}: ")
+    assert "What is left looks like the noise model" in said
+    assert "Held out: held/y RMSE 0.0" in said
+    assert "untested" in verdict(replace(fitted, bands=fitted.bands[:1]))
+
+
+def test_correlated_noise_under_a_white_model_is_said_to_be_unexplained():
+    """Alternating noise: smooth correlation would partly be fitted by the plant."""
+    noisy = record(3, camera=0.1, correlation=-0.6)
+    said = verdict(fit(study(noisy, sampler=TINY | {"steps": 100})))
+    assert "intervals hold only if" in said
+    assert "step, axis y, is not white" in said
+    assert said.startswith("Grade tentative") or said.startswith("Grade unusable")
+
+
+def test_the_same_study_gives_the_same_fit_and_resumes_to_it(fitted, tmp_path):
+    again = fit(STUDY, folder=tmp_path)
+    assert_array_equal(again.draws.values, fitted.draws.values)
+    resumed = fit(STUDY, folder=tmp_path, resume=True)
+    assert results(resumed) == results(fitted)
+
+
+def test_a_chain_of_another_study_is_not_taken_up(fitted, tmp_path):
+    other = study(record(5), sampler=TINY | {"steps": 60})
+    fit(other, folder=tmp_path)
+    with pytest.raises(InputError, match="made from other records, settings or seed"):
+        fit(replace(other, fit=(record(6),)), folder=tmp_path, resume=True)
+
+
+def test_the_fingerprint_knows_all_that_the_draws_depend_on():
+    plan = plan_of(problem_of(STUDY), quick=False)
+    seen = {fingerprint(STUDY, plan)}
+    changed = np.array(STUDY.fit[0].response)
+    changed[5] += 1e-12
+    others = [
+        study(replace(STUDY.fit[0], response=changed), held_out=(HELD,), sampler=TINY),
+        study(replace(STUDY.fit[0], time=STUDY.fit[0].time + 1e-9), held_out=(HELD,), sampler=TINY),
+        replace(STUDY, seed=6),
+        study(*STUDY.fit, held_out=(HELD,), sampler=TINY, priors={"delay": 0.7}),
+        study(*STUDY.fit, held_out=(HELD,), sampler=TINY, noise="ar1"),
+        study(*STUDY.fit, held_out=(HELD,), sampler=TINY, terms=2),
+        replace(STUDY, inputs={"a.csv": "0"}),
+    ]
+    seen |= {fingerprint(other, plan) for other in others}
+    seen |= {fingerprint(STUDY, replace(plan, **{name: 7})) for name in ("seed", "thin", "steps", "walkers")}
+    assert len(seen) == 1 + len(others) + 4
+    assert fingerprint(study(record(), held_out=(HELD,), sampler=TINY), plan) == fingerprint(STUDY, plan)
+
+
+def test_provenance_is_plain_and_complete():
+    told = provenance(STUDY, ["lcopa-bayes", "fit", "small"])
+    assert told["command"] == ["lcopa-bayes", "fit", "small"]
+    assert told["seed"] == 5
+    assert {"lcopa-bayes", "numpy", "scipy", "emcee"} <= told["versions"].keys()
+    assert told["settings"]["held_out"] == ["held"]
+    assert json.loads(json.dumps(told, allow_nan=False)) == told
+
+
+def test_a_quick_fit_takes_a_quarter_of_the_steps():
+    problem = problem_of(STUDY)
+    assert (plan_of(problem, quick=False).steps, plan_of(problem, quick=True).steps) == (600, 150)
+
+
+def test_too_few_samples_and_nothing_to_sample_are_refused():
+    few = record(camera=3.0)
+    with pytest.raises(InputError, match="4 samples cannot determine 6 free parameters"):
+        fit(study(few))
+    known = {name: TRUTH[name] for name in ("time_1", "order_1", "delay", "sigma")}
+    with pytest.raises(InputError, match="leave at least one free"):
+        fit(study(record(), priors=known))

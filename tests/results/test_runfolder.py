@@ -1,0 +1,235 @@
+"""The run folder: every file there, readable, and telling the same story."""
+
+from __future__ import annotations
+
+import json
+
+import arviz_base
+import numpy as np
+import pandas as pd
+import pytest
+import xarray
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy import stats
+from small import record, study
+
+from lcopa_bayes.bench.command import on_off
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.report.savedrun import load_run
+from lcopa_bayes.results.fit import Fit, fit
+from lcopa_bayes.results.runfolder import save_fit, save_json, save_posterior, save_table, variable_names
+from lcopa_bayes.results.summary import results
+from lcopa_bayes.results.tables import tables
+
+TINY = {"ensembles": 2, "walkers": 16, "steps": 60, "thin": 1, "target_ess": 100}
+PAIR = (record(1, camera=0.4, name="a"), record(2, camera=0.5, name="b"))
+HELD = record(3, command=on_off(-0.7, hold=4.0, at=1.3), camera=0.3, name="held")
+
+
+@pytest.fixture(scope="module", params=["white", "student"])
+def fitted(request) -> Fit:
+    return fit(study(*PAIR, held_out=(HELD,), noise=request.param, sampler=TINY, priors={"delay": 0.73}))
+
+
+@pytest.fixture(scope="module")
+def folder(fitted, tmp_path_factory):
+    path = tmp_path_factory.mktemp("run")
+    save_fit(fitted, path, ["lcopa-bayes", "fit"])
+    return path
+
+
+def test_the_folder_holds_what_was_promised(fitted, folder):
+    assert sorted(p.name for p in folder.iterdir()) == [
+        "posterior.nc",
+        "provenance.json",
+        "results.json",
+        "tables",
+    ]
+    assert {p.stem for p in (folder / "tables").iterdir()} == set(tables(fitted))
+    assert json.loads((folder / "results.json").read_text()) == results(fitted) | {"rival": None}
+    assert json.loads((folder / "provenance.json").read_text())["command"] == ["lcopa-bayes", "fit"]
+
+
+def test_tables_read_back(fitted, folder):
+    for name, table in tables(fitted).items():
+        read = pd.read_csv(folder / "tables" / f"{name}.csv")
+        assert list(read.columns) == list(table.columns), name
+        assert len(read) == len(table) > 0, name
+    bands = pd.read_csv(folder / "tables" / "bands.csv")
+    assert set(bands["record"]) == {"a", "b", "held"}
+    assert (bands["noisy_05"] <= bands["noisy_95"]).all()
+    priors = pd.read_csv(folder / "tables" / "priors.csv").set_index("name")
+    assert priors.loc["delay", "prior"] == "fixed at 0.73"
+    assert priors.loc["gain", "integrated_out"] == (fitted.problem.posterior.noise.kind == "white")
+    for _, part in pd.read_csv(folder / "tables" / "prior_density.csv").groupby("name"):
+        assert np.isfinite(part["density"]).all()
+        assert (part["density"] >= 0).all()
+
+
+def test_posterior_has_the_arviz_groups(fitted, folder):
+    tree = arviz_base.from_dict({"posterior": {"x": np.zeros((2, 3))}})
+    with xarray.open_datatree(folder / "posterior.nc", engine="h5netcdf") as read:
+        assert type(read) is type(tree)
+        assert set(read.children) == {
+            "posterior",
+            "sample_stats",
+            "log_prior",
+            "log_likelihood",
+            "posterior_predictive",
+            "observed_data",
+            "constant_data",
+        }
+        free = [row.name for row in fitted.draws.table.rows if row.free]
+        assert "delay" not in free
+        assert set(read["posterior"].data_vars) == set(read["log_prior"].data_vars) == set(free)
+        for group in ("log_likelihood", "posterior_predictive", "observed_data"):
+            assert set(read[group].data_vars) == {"a_y", "b_y"}
+        ensembles, draws, _ = fitted.draws.values.shape
+        assert read["posterior"]["gain"].dims == ("chain", "draw")
+        assert dict(read["posterior"].sizes) == {"chain": ensembles, "draw": draws}
+        assert read["posterior"]["time_1"].attrs["units"] == "ms"
+        assert_array_equal(read["posterior"]["gain"], fitted.draws.values[..., 0])
+        assert_array_equal(read["sample_stats"]["lp"], fitted.draws.log_density)
+        assert_allclose(read["observed_data"]["a_y"], PAIR[0].response[~np.isnan(PAIR[0].response[:, 0]), 0])
+        assert_allclose(read["constant_data"]["b_y_time"], PAIR[1].time[~np.isnan(PAIR[1].response[:, 0])])
+        assert read.attrs["grade"] == fitted.draws.grade.level
+        predictive = np.median(read["posterior_predictive"]["a_y"], axis=(0, 1))
+        width = fitted.bands[0].noisy[4] - fitted.bands[0].noisy[0]
+        assert np.all(np.abs(predictive - fitted.bands[0].noisy[2]) < 0.2 * width)
+
+
+def test_log_prior_and_log_likelihood_are_consistent_with_the_density(fitted, folder):
+    """Their sum is the density sampled, plus that of the linear parameters given the others."""
+    posterior, draws = fitted.problem.posterior, fitted.draws
+    with xarray.open_datatree(folder / "posterior.nc", engine="h5netcdf") as read:
+        prior = sum(read["log_prior"][name].to_numpy() for name in read["log_prior"].data_vars)
+        prior = prior + read["log_prior"].attrs["joint_support"]
+        likelihood = sum(
+            part.to_numpy().astype(float).sum(axis=2) for part in read["log_likelihood"].data_vars.values()
+        )
+        lp = read["sample_stats"]["lp"].to_numpy()
+    sampled = [posterior.table.rows[k] for k in posterior.sampled]
+    volume = sum(
+        np.log(draws.values[..., k])
+        for k, row in zip(posterior.sampled, sampled, strict=True)
+        if row.log_scale
+    )
+    conditional = np.zeros(lp.shape)
+    for e, d in np.ndindex(*lp.shape) if posterior.linear else ():
+        if d % 25:
+            conditional[e, d] = np.nan
+            continue
+        values = draws.values[e, d]
+        at = dict(zip(posterior.table.names, values, strict=True))
+        units = posterior.model.unit_responses(posterior.table.dynamics(values[None]))
+        seen = [samples.axes[0] for samples in posterior.samples]
+        unit = [u[0, 0, o.index] for u, o in zip(units, seen, strict=True)]
+        first, second = (np.ones(u.size) for u in unit)
+        columns = np.stack([np.concatenate(unit), np.r_[first, 0 * second], np.r_[0 * first, second]])
+        priors = [posterior.table.rows[k].prior.frozen for k in posterior.linear]
+        precision = columns @ columns.T / at["sigma"] ** 2 + np.diag([1 / p.var() for p in priors])
+        data = np.concatenate([o.values for o in seen])
+        pull = columns @ data / at["sigma"] ** 2 + [p.mean() / p.var() for p in priors]
+        covariance = np.linalg.inv(precision)
+        normal = stats.multivariate_normal(covariance @ pull, covariance)
+        conditional[e, d] = normal.logpdf(values[list(posterior.linear)])
+    error = prior + likelihood + volume - conditional - lp
+    assert np.nanmax(np.abs(error)) < 1e-3  # the densities of single samples are stored to seven digits
+    assert np.isfinite(error).sum() >= 20
+
+
+def test_a_failed_save_leaves_no_file(fitted, tmp_path, monkeypatch):
+    def fail(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr("lcopa_bayes.results.runfolder.save_posterior", fail)
+    with pytest.raises(InputError, match=r"posterior\.nc: cannot be written \(disk full\)"):
+        save_fit(fitted, tmp_path, [])
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["tables"]
+
+
+def test_json_and_tables_refuse_what_json_cannot_say(tmp_path):
+    save_json({"a": np.nan, "b": np.array([1.0, np.inf])}, tmp_path / "a.json")
+    assert json.loads((tmp_path / "a.json").read_text()) == {"a": None, "b": [1.0, None]}
+    save_table(pd.DataFrame({"x": [1.0, np.nan]}), tmp_path / "a.csv")
+    assert (tmp_path / "a.csv").read_text() == 'x\n1.0\n""\n'
+
+
+def test_names_that_a_netcdf_group_would_split_are_kept_apart(tmp_path):
+    """A slash in an axis name is a path in a netCDF file."""
+    plain = PAIR[0]
+    axis = Axis("front/left", "rad")
+    slashed = Record("a", plain.time, plain.drive, plain.response, (Axis("u/1", "V"),), (axis,), "ms")
+    made = fit(study(slashed, sampler=TINY))
+    save_posterior(made, tmp_path / "posterior.nc")
+    with xarray.open_datatree(tmp_path / "posterior.nc", engine="h5netcdf") as read:
+        (name,) = read["observed_data"].data_vars
+        assert_allclose(read["observed_data"][name], made.bands[0].observed)
+        assert len(read.children) == 7
+
+
+def test_a_record_too_short_for_residual_tests_is_saved_all_the_same(tmp_path):
+    short = record(camera=1.5)
+    assert short.response.size - np.isnan(short.response).sum() == 8
+    told = save_fit(fit(study(short, sampler=TINY)), tmp_path, [])
+    assert told["residual_tests"] == []
+
+
+def test_names_are_kept_plain_unless_they_collide():
+    assert variable_names(["a_x", "b_x", "a/b_c"]) == ["a_x", "b_x", "a|b_c"]
+    assert variable_names(["a_b_c", "a_b_c", "d"]) == ["a_b_c_1", "a_b_c_2", "d"]
+    assert variable_names(["a_b_c", "a_b_c_1", "a_b_c"]) == ["a_b_c_2", "a_b_c_1", "a_b_c_3"]
+    assert variable_names(["a/b", "a|b"]) == ["a|b_1", "a|b_2"]
+    assert variable_names(["a_y", "a_y_time"]) == ["a_y", "a_y_time_1"]
+
+
+@given(st.lists(st.text("ab_/|1", min_size=1, max_size=3) | st.sampled_from(["a_time", "a_time_time"])))
+def test_names_and_their_times_never_collide(wanted):
+    names = variable_names(wanted)
+    times = [f"{name}_time" for name in names]
+    assert len({*names, *times}) == 2 * len(wanted)
+    assert not any("/" in name for name in names)
+    for name, want in zip(names, wanted, strict=True):
+        assert name.startswith(want.replace("/", "|"))
+    assert variable_names(wanted) == names
+
+
+def test_records_and_axes_with_the_same_joint_name_are_kept_apart(tmp_path):
+    """Record a_b with axis c against record a with axis b_c."""
+    plain = PAIR[0]
+    drive, response = np.tile(plain.drive, 1), np.column_stack([plain.response, 0.9 * plain.response])
+    axes = Axis("c", "rad"), Axis("b_c", "rad")
+    both = [
+        Record(name, plain.time, drive, response + shift, (Axis("u", "V"),), axes, "ms")
+        for name, shift in (("a_b", 0.0), ("a", 0.01))
+    ]
+    known = {"time_1": 1.5, "order_1": 0.8, "delay": 0.73}
+    made = fit(study(*both, sampler=TINY | {"steps": 20}, share="all", offset="shared", priors=known))
+    save_posterior(made, tmp_path / "posterior.nc")
+    with xarray.open_datatree(tmp_path / "posterior.nc", engine="h5netcdf") as read:
+        groups = [read[g] for g in ("observed_data", "log_likelihood", "posterior_predictive")]
+        for group in groups:
+            told = {(v.attrs["record"], v.attrs["axis"]): name for name, v in group.data_vars.items()}
+            assert told == {
+                ("a_b", "c"): "a_b_c_1",
+                ("a_b", "b_c"): "a_b_b_c",
+                ("a", "c"): "a_c",
+                ("a", "b_c"): "a_b_c_2",
+            }
+        seen = ~np.isnan(response[:, 1])
+        assert_array_equal(read["observed_data"]["a_b_c_2"], response[seen, 1] + 0.01)
+        assert read["constant_data"]["a_b_c_2_time"].attrs["record"] == "a"
+
+
+def test_the_report_finds_parameters_whose_names_hold_a_slash(tmp_path):
+    plain = PAIR[0]
+    axes = Axis("front/left", "rad"), Axis("rear", "rad")
+    two = Record(
+        "a", plain.time, plain.drive, np.column_stack([plain.response] * 2), (Axis("u", "V"),), axes, "ms"
+    )
+    known = {"time_1": 1.5, "order_1": 0.8, "delay": 0.73}
+    save_fit(fit(study(two, sampler=TINY | {"steps": 20}, share="all", priors=known)), tmp_path, [])
+    assert "gain_front/left_u" in load_run(tmp_path).draws

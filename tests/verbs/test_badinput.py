@@ -1,0 +1,113 @@
+"""What cannot be computed or is not computed long enough is told, whatever road leads there."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small import problem, record, study
+
+from lcopa_bayes.cli import main
+from lcopa_bayes.data.record import save_record
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.model.forward import Dynamics, ForwardModel
+from lcopa_bayes.results.fit import Fit, fit
+from lcopa_bayes.results.summary import results
+from lcopa_bayes.sampling.sampler import SamplePlan, sample
+
+PLAN = SamplePlan(2, 12, 200, 1, 100.0, 1)
+SLOW = 3.0
+"""Time constant above which the broken model has no response [ms]."""
+
+
+class Broken:
+    """A forward model that gives NaN for slow plants, from its `sound`-th evaluation on."""
+
+    def __init__(self, inner: ForwardModel, sound: int) -> None:
+        self.inner, self.sound = inner, sound
+        self.layout, self.experiments = inner.layout, inner.experiments
+
+    def unit_responses(self, dynamics: Dynamics) -> list[np.ndarray]:
+        self.sound -= 1
+        out = self.inner.unit_responses(dynamics)
+        if self.sound < 0:
+            out[0][:, dynamics.times[0][:, 0] > SLOW] = np.nan
+        return out
+
+
+def broken(sound: int) -> Posterior:
+    posterior = problem(record(camera=0.6)).posterior
+    return replace(posterior, model=Broken(posterior.model, sound))
+
+
+@pytest.mark.parametrize(
+    ("sound", "jobs"), [(0, 1), pytest.param(0, 2, marks=pytest.mark.slow), (3, 1), (40, 1)]
+)
+def test_a_likelihood_that_is_nan_stops_sampling_and_says_where(sound, jobs, capfd):
+    """At the prior draws, in this process or another, and early and late on the way from them."""
+    posterior = broken(sound)
+    with pytest.raises(FloatingPointError) as caught:
+        sample(posterior, PLAN, jobs=jobs)
+    told = re.fullmatch(r"the log density is NaN at (.*)", str(caught.value))
+    assert told is not None
+    values = {name: float(value) for name, value in (pair.split(" = ") for pair in told[1].split(", "))}
+    assert tuple(values) == posterior.table.names
+    assert values["time_1"] > SLOW
+    assert jobs > 1 or posterior.model.sound < 0
+    assert capfd.readouterr() == ("", "")  # the caller tells, once
+
+
+def test_the_command_line_says_where_a_likelihood_is_nan(tmp_path, capfd, monkeypatch):
+    sound = ForwardModel.unit_responses
+
+    def unit_responses(self: ForwardModel, dynamics: Dynamics) -> list[np.ndarray]:
+        out = sound(self, dynamics)
+        out[0][:, dynamics.times[0][:, 0] > SLOW] = np.nan
+        return out
+
+    monkeypatch.setattr(ForwardModel, "unit_responses", unit_responses)
+    path, out = tmp_path / "step.csv", tmp_path / "run"
+    save_record(record(camera=0.6), path)
+    code = main(["fit", str(path), "--out", str(out), "--jobs", "1", "--quiet", "--quick"])
+    printed, told = capfd.readouterr()
+    assert code == 2
+    assert printed == ""
+    assert told.count("\n") == 1
+    assert told.startswith("error: the log density is NaN at gain = ")
+    assert "time_1 = " in told
+    assert "narrow the priors" in told
+    assert not (out / "results.json").exists()
+    assert not (out / "chain.h5").exists()
+
+
+@pytest.fixture(scope="module")
+def hasty() -> Fit:
+    """As few walkers and steps as there may be, asked for more than they can give."""
+    told = {"ensembles": 2, "walkers": 4, "steps": 1, "thin": 1, "target_ess": 5000}
+    return fit(study(record(camera=0.6), sampler=told))
+
+
+def test_too_small_a_budget_is_told_with_a_remedy(hasty):
+    told = results(hasty)
+    assert told["grade"] in ("tentative", "unusable")
+    assert "sample more steps, about" in told["grade_reason"]
+    assert "5000 are wanted" in told["grade_reason"]
+    worst = min(told["parameters"], key=lambda one: one["ess"])
+    assert worst["grade"] == told["grade"]
+    assert worst["name"] in told["grade_reason"]
+
+
+def test_what_is_derived_from_too_few_draws_is_graded_no_better(hasty):
+    told = results(hasty)
+    graded = [*told["parameters"], *told["step_metrics"]]
+    assert len(graded) > len(told["parameters"]) > 0
+    assert {one["grade"] for one in graded} <= {"tentative", "unusable"}
+
+
+@pytest.mark.slow
+def test_the_advice_helps():
+    """The same study with the default budget is reliable."""
+    told = results(fit(study(record(camera=0.6), sampler={"ensembles": 2, "walkers": 32, "target_ess": 200})))
+    assert told["grade"] == "reliable", told["grade_reason"]
