@@ -15,7 +15,13 @@ from lcopa_bayes.bench.command import Command, on_off, step
 from lcopa_bayes.bench.device import Device, TransferPath
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.data.record import Axis, Record
-from lcopa_bayes.data.settings import EffectsSettings, ModelSettings, NoiseSettings, PriorSettings, SamplerSettings
+from lcopa_bayes.data.settings import (
+    EffectsSettings,
+    ModelSettings,
+    NoiseSettings,
+    PriorSettings,
+    SamplerSettings,
+)
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.parameter import Parameter, Place

@@ -17,8 +17,8 @@ def effect_slopes(simulation: Simulation, values: Vector, *, exact: bool = True)
     """Per record (samples, axes, rows), in the table's units, at canonical values (rows,).
 
     Coefficients by differences through the simulator (`model.effects.jacobian`), constants by central ones
-    over 1e-4. The plant's rows as there; unless `exact` those of the plant alone, fifty times cheaper and good
-    enough to descend with. Raises UnstableError where there is no bounded response.
+    over 1e-4. The plant's rows as there; unless `exact` those of the plant alone, fifty times cheaper and
+    good enough to descend with. Raises UnstableError where there is no bounded response.
     """
     made, psi = _effected(simulation, values), simulation.psi(values)
     plant = made if exact else made.with_effects(())

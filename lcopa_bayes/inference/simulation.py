@@ -15,11 +15,20 @@ from typing import NamedTuple, final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Flags, Index, Matrix, Vector
 from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.model.effects.batchpassage import BatchPassage
 from lcopa_bayes.model.effects.declared import Declared
-from lcopa_bayes.model.effects.effect import Effect, ParallelEffect, Scene, UnstableError
+from lcopa_bayes.model.effects.effect import (
+    DriveEffect,
+    Effect,
+    ForceEffect,
+    ParallelEffect,
+    ReadoutEffect,
+    Scene,
+    UnstableError,
+)
 from lcopa_bayes.model.effects.passage import Moved, Plant, deflections
 from lcopa_bayes.model.effects.simulator import Simulator
 from lcopa_bayes.model.forward import ForwardModel
@@ -134,7 +143,13 @@ class Simulation:
             for r, n in enumerate(sizes)
         ]
         effects, simulator = None, None
-        for b, row in enumerate(values):
+        left = np.arange(batch)
+        if told.forced:
+            left = self._forced(values, out)
+        elif self._scales_commands(values):
+            left = self._commanded(values, out)
+        for b in left.tolist():
+            row = values[b]
             own = self.effects(row)
             if simulator is None or own != effects:
                 effects, simulator = own, self.simulator(own)
@@ -183,13 +198,94 @@ class Simulation:
             return experiment.drives[drive].moves or experiment.rest[drive] != 0.0
         return self.declared.fitted[r] == row.place.second // self._counts[row.place.first]
 
+    def _forced(self, values: Matrix, out: list[Simulated]) -> Index:
+        """Write the responses of plants under forces, all at once; returns those that ask for more."""
+        told, layout, table = self.declared, self.table.layout, self.table
+        axes, gains, dynamics = len(layout.responses), table.gains(values), table.dynamics(values)
+        forces = []
+        for kind, rows, constants in zip(told.kinds, self.coefficients, self.constants, strict=True):
+            if issubclass(kind, ForceEffect):
+                psi = np.repeat(values[:, rows].T, axes, axis=1)[..., None]
+                own = [np.repeat(values[:, k], axes)[:, None] for k in constants]
+                forces.append((kind(*(c if np.ptp(c) else float(c[0, 0]) for c in own)), psi))
+        simulator = self.simulator(self.effects(values[0]))
+        done = np.ones(len(values), dtype=bool)
+        for r, units in enumerate(self.model.plain.unit_responses(dynamics)):
+            scene = simulator.scene(r, self.plant(values[0]))
+            change, found = BatchPassage(self.model, r, scene, gains, dynamics).change(forces)
+            done &= found
+            for i, row in enumerate(layout.unit_of):
+                for j, unit in enumerate(row):
+                    out[r].base[i] += gains[:, i, j, None] * (scene.rest[j] + units[unit])
+            out[r].base[...] += change
+        if len(forces) < len(told.kinds):
+            for b in np.flatnonzero(done).tolist():
+                simulator = self.simulator(self.effects(values[b]))
+                self._finished(simulator, values[b], b, out)
+        return np.flatnonzero(~done)
+
+    def _scales_commands(self, values: Matrix) -> bool:
+        """Whether all plants share one effect on the commands that is proportional to its coefficient, and
+        nothing else acts but on what is read."""
+        drive = [k for k in self.declared.kinds if issubclass(k, DriveEffect)]
+        if len(drive) != 1 or self.declared.bending or not drive[0].linear or drive[0].card.per_record:
+            return False
+        e = self.declared.kinds.index(drive[0])
+        others = [k for k in self.declared.kinds if k is not drive[0]]
+        read = all(issubclass(k, ReadoutEffect) and not k.affine for k in others)
+        same = not np.ptp(values[:, self.constants[e]], axis=0).any()
+        return read and same and len(self.coefficients[e]) == 1
+
+    def _commanded(self, values: Matrix, out: list[Simulated]) -> Index:
+        """Write the responses of plants under commands that change in proportion to one coefficient."""
+        layout, gains = self.table.layout, self.table.gains(values)
+        dynamics = self.table.dynamics(values)
+        e = next(k for k, kind in enumerate(self.declared.kinds) if issubclass(kind, DriveEffect))
+        unit, at = values[0].copy(), self.coefficients[e][0]
+        unit[[k for rows in self.coefficients for k in rows]] = 0.0
+        unit[at] = 1.0
+        simulator = self.simulator(self.effects(values[0]))
+        there = simulator.driven(simulator.scenes(self.plant(unit), self.psi(unit)))
+        plain, size = self.model.plain, values[:, at, None]
+        if not _as_exact(plain, there):
+            return np.arange(len(values))
+        pairs = zip(plain.unit_responses(dynamics), there.unit_responses(dynamics), strict=True)
+        for r, (before, after) in enumerate(pairs):
+            rests = plain.experiments[r].rest, there.experiments[r].rest
+            for i, row in enumerate(layout.unit_of):
+                for j, u in enumerate(row):
+                    column = rests[0][j] + before[u]
+                    column += size * (rests[1][j] + after[u] - column)
+                    k = self.table.at("gain", i, j)
+                    if not self.declared.affine:
+                        out[r].base[i] += gains[:, i, j, None] * column
+                    elif k in out[r].columns:
+                        out[r].columns[k][...] = column
+        if len(self.declared.kinds) > 1:
+            for b, row in enumerate(values):
+                self._finished(self.simulator(self.effects(row)), row, b, out)
+        return np.arange(0)
+
+    def _finished(self, simulator: Simulator, row: Vector, b: int, out: list[Simulated]) -> None:
+        """What comes after the reading, on responses of one plant that are there already."""
+        plant, psi = self.plant(row), self.psi(self._without_scaled(row))
+        scenes = simulator.scenes(plant, psi)
+        moved = [Moved(scene, record.base[:, b].T) for scene, record in zip(scenes, out, strict=True)]
+        for record, y in zip(out, simulator.finished(moved, psi), strict=True):
+            record.base[:, b] = y.T
+        self._added(simulator, plant, b, out)
+
+    def _without_scaled(self, row: Vector) -> Vector:
+        """Table values with the coefficients that have a column at 0."""
+        still = row.copy()
+        still[[k for k in self.scaled if self.table.rows[k].kind != "gain"]] = 0.0
+        return still
+
     def _one(
         self, simulator: Simulator, row: Vector, units: list[Matrix] | None, b: int, out: list[Simulated]
     ) -> None:
         """Write one plant's responses."""
-        plant, still = self.plant(row), row.copy()
-        still[[k for k in self.scaled if self.table.rows[k].kind != "gain"]] = 0.0
-        psi = self.psi(still)
+        plant, psi = self.plant(row), self.psi(self._without_scaled(row))
         if units is None and not self.declared.bending:
             driven = simulator.driven(simulator.scenes(plant, psi))
             units = [each[:, 0] for each in driven.unit_responses(plant.dynamics)]
@@ -243,3 +339,11 @@ class Simulation:
                     unit[k] = 1.0
                     at = rows[place * count + k]
                     out[r].columns[at][b] = effect.added(scene, unit)[:, self.table.rows[at].response]
+
+
+def _as_exact(before: ForwardModel, after: ForwardModel) -> bool:
+    """Whether more changes of a drive are simulated as exactly: too many phases are shared out to blocks."""
+    pairs = zip(before.experiments, after.experiments, strict=True)
+    return all(
+        len(a) <= len(b) for one, other in pairs for a, b in zip(one.phases, other.phases, strict=True)
+    )

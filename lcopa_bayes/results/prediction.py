@@ -124,13 +124,14 @@ def bands(
                 continue
             response = plant[axis][:, observed.index]
             parameters = values[:, [draws.table.at(name, axis) for name in noise.names]]
+            seen = response if disturbed is plant else disturbed[axis][:, observed.index]
             offset, source, used = offset_draws(
-                draws.table, values, axis, r, record, response, noise, held_out=held_out, rng=rng
+                draws.table, values, axis, r, record, seen, noise, held_out=held_out, rng=rng
             )
             response = response + offset[:, None]
             noisy = response + noise.draw(parameters, observed.gaps, rng)
             if disturbed is not plant:
-                noisy += (disturbed - plant)[axis][:, observed.index]
+                noisy += seen - plant[axis][:, observed.index]
             response_axis = record.record.response_axes[axis]
             out.append(
                 Band(

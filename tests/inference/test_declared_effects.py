@@ -72,9 +72,7 @@ def test_without_strength_it_is_the_plant_alone(name: str):
     made, plain = using(TWO_AXES, name).posterior, problem_of(TWO_AXES).posterior
     values = values_of(using(TWO_AXES, name), 0.0)[None]
     own = [made.table.names.index(known) for known in plain.table.names]
-    assert_allclose(
-        made.joint_log_likelihood(values), plain.joint_log_likelihood(values[:, own]), rtol=1e-10
-    )
+    assert_allclose(made.joint_log_likelihood(values), plain.joint_log_likelihood(values[:, own]), rtol=1e-10)
     assert made.without_effects.table.names == plain.table.names
 
 
@@ -96,7 +94,7 @@ def test_responses_are_those_of_the_simulator(name: str):
 
 @pytest.mark.parametrize("name", ACTING)
 def test_slopes_are_slopes(name: str):
-    """Of the whitened residual in every search coordinate, constants included, against central differences."""
+    """Of the whitened residual in every search coordinate, by central differences."""
     made = using(TWO_AXES, name)
     values, least = values_of(made, 0.5), LeastSquares(made.posterior)
     x = least.coordinates(values)
@@ -154,7 +152,9 @@ def test_gains_are_integrated_out_where_responses_are_linear_in_them(name: str, 
 
 def test_rows_have_units_priors_and_domains():
     made = using(one_axis(), "overdrive_pulse", "vibration", "sensor_lag").posterior.table
-    told = {row.name: (row.unit, row.kind, None if row.prior is None else row.prior.dist) for row in made.rows}
+    told = {
+        row.name: (row.unit, row.kind, None if row.prior is None else row.prior.dist) for row in made.rows
+    }
     assert told["overdrive_pulse.k"] == ("-", "coefficient", "norm")
     assert told["overdrive_pulse.frame"] == ("ms", "constant", "loguniform")
     assert told["vibration.a[r0]"] == ("rad", "coefficient", "norm")
@@ -276,7 +276,15 @@ def test_the_optimum_of_a_simulated_stiffness():
     made, truth = with_effect(
         one_axis(),
         ["cubic_stiffness"],
-        {"gain": 2.0, "time": 1.5, "order": 0.8, "delay": 0.73, "offset": 0.3, "sigma": 0.02, "coefficient": 0.4},
+        {
+            "gain": 2.0,
+            "time": 1.5,
+            "order": 0.8,
+            "delay": 0.73,
+            "offset": 0.3,
+            "sigma": 0.02,
+            "coefficient": 0.4,
+        },
     )
     posterior = problem_of(made).posterior
     best = find_optima(posterior, np.random.default_rng(1), starts=2)[0]
@@ -304,3 +312,41 @@ def test_scales_of_a_fit_and_of_the_records_give_the_same_model():
         level = made.posterior.table.offset(values[None], 0, r)[0]
         assert_allclose(one[0, 0] + level, told[r][:, 0], rtol=0, atol=1e-9)
     assert_array_equal(made.posterior.model.effects.epochs, [-0.5, 0.5])  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("cubic_stiffness",), ("level_dependent_speed",), ("rise_fall_asymmetry",), ("overflow",),
+        ("cubic_stiffness", "clipping", "vibration"), ("overdrive_pulse",), ("voltage_knee", "odd_curvature"),
+    ],
+)  # fmt: skip
+def test_many_plants_at_once_are_each_by_itself(names: tuple[str, ...]):
+    """Forces and commands of a batch against the simulation of every plant alone."""
+    made = using(TWO_AXES, *names)
+    rng, rows = np.random.default_rng(3), made.posterior.table.rows
+    values = np.tile(values_of(made, 0.7), (6, 1))
+    shared = [row.kind in CONSTANTS and "overdrive" in row.name for row in rows]
+    values *= np.where(shared, 1.0, 1 + 0.05 * rng.random(values.shape))
+    simulation = made.posterior.simulation
+    assert simulation is not None
+    batch = simulation.responses(values)
+    for k, row in enumerate(values):
+        one = Effected(
+            made.posterior.table, simulation.simulator(simulation.effects(row)), ("r1", "r2"), (0, 1)
+        )
+        plant = simulation.plant(row)
+        alone = one.simulator.responses(plant, simulation.psi(row))
+        for together, y in zip(batch, alone, strict=True):
+            assert_allclose(together[:, k], y.T, rtol=0, atol=1e-9)
+
+
+def test_a_force_that_runs_away_is_left_to_the_single_plant():
+    made = using(one_axis(), "cubic_stiffness")
+    values = np.tile(values_of(made, 1.0), (3, 1))
+    values[1, made.posterior.table.names.index("cubic_stiffness.c")] = -300.0
+    simulation = made.posterior.simulation
+    assert simulation is not None
+    told = simulation(values)
+    assert told[0].bounded.tolist() == [True, False, True]
+    assert_array_equal(told[0].base[0, 1], 0.0)

@@ -77,6 +77,13 @@ class Declared:
         return any(issubclass(kind, (ElementEffect, ForceEffect, SensorEffect)) for kind in self.kinds)
 
     @property
+    def forced(self) -> bool:
+        """Whether all that acts before the reading are forces that take many plants at once."""
+        acting = [kind for kind in self.kinds if issubclass(kind, (DriveEffect, ElementEffect, SensorEffect))]
+        forces = [kind for kind in self.kinds if issubclass(kind, ForceEffect)]
+        return bool(forces) and not acting and all(k.batched and not k.card.per_record for k in forces)
+
+    @property
     def commanding(self) -> bool:
         """Whether something changes the commands."""
         return any(issubclass(kind, DriveEffect) for kind in self.kinds)

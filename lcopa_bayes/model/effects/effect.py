@@ -237,6 +237,9 @@ class ForceEffect(Effect):
     """Changes the balance of forces in the direct paths: ``y + viscous(y) = v(f, y)`` instead of ``= f``."""
 
     affine = False
+    batched: ClassVar[bool] = False
+    """Whether `force` takes many plants at once, an axis of each per row: coefficients, constants and the
+    column of `Ranges` then have a value per row, (rows, 1), and no axis sees another."""
 
     @abstractmethod
     def force(self, f: Matrix, y: Matrix, rate: Matrix, scene: Scene, psi: Vector) -> Matrix:
