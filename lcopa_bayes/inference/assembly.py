@@ -8,6 +8,7 @@ from typing import final
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.record import Record
+from lcopa_bayes.data.settings import EffectsSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.declared import declared, effect_rows, noise_of, record_ranges, unused, used_kinds
 from lcopa_bayes.inference.defaultpriors import Scales
@@ -42,6 +43,14 @@ class Problem:
         if self.ranges is None:
             return samples, model
         return samples, replace(model, effects=declared(self.study, self.kinds, self.ranges, records))
+
+    @property
+    def stated_effects(self) -> EffectsSettings:
+        """The study's effects with their scales stated, so that other records do not change these."""
+        if self.ranges is None:
+            return self.study.effects
+        told = dict(zip(self.ranges.names, self.ranges.response.tolist(), strict=True))
+        return replace(self.study.effects, deflection=told, speed=self.ranges.speed)
 
     def refined(self, factor: int) -> Problem:
         """The same problem on blocks narrower by a further factor."""

@@ -177,7 +177,7 @@ class Posterior:
     def pointwise(self, values: Matrix) -> list[list[Matrix]]:
         """Log likelihood of each sample given those before it, [record][axis] (batch, n)."""
         units = self.responses(values)
-        return [
+        out = [
             [
                 self.noise.pointwise(
                     self.residual(axis, r, observed, values, units[r]),
@@ -188,6 +188,10 @@ class Posterior:
             ]
             for r, samples in enumerate(self.samples)
         ]
+        if self.simulation is not None:
+            for density in (axis for record in out for axis in record):
+                density[~bounded(units)] = -np.inf
+        return out
 
     def joint_log_likelihood(self, values: Matrix) -> Vector:
         """Log likelihood of canonical values, linear parameters included, (batch,) [nat]."""

@@ -24,6 +24,8 @@ _DRAWS = 1000
 """Draws behind the metrics."""
 _EFFECT_DRAWS = 250
 """The same with effects, which take a simulation each."""
+_AWAY = 1e6
+"""A response without bounds, over its steady value [-]."""
 _STATIC = 1e-60
 """Time constant of a plant that follows at once [time unit]."""
 _SETTLED_SPANS = 200.0
@@ -64,11 +66,15 @@ def step_curves(draws: Draws, span: float) -> StepCurves:
     With effects the step is as high as the largest drive of the records, and the response is divided by it;
     draws without a bounded response are left out.
     """
+    count = _DRAWS if draws.table.effects is None else _EFFECT_DRAWS
+    return curves_of(draws.table, draws.thinned(count), span)
+
+
+def curves_of(table: ParameterTable, values: Matrix, span: float) -> StepCurves:
+    """`step_curves` at table values (draws, rows)."""
     time = span * np.arange(1, _POINTS + 1) / _POINTS
-    table = draws.table
     if table.effects is not None:
-        return _with_effects(table, draws.thinned(_EFFECT_DRAWS), time)
-    values = draws.thinned(_DRAWS)
+        return _with_effects(table, values, time)
     units, delays = _unit_steps(table, values, time), table.dynamics(values).delays
     return StepCurves(time, units, table.gains(values), delays, table.layout.unit_of, values)
 
@@ -229,13 +235,13 @@ def step_metrics(draws: Draws, curves: StepCurves, *, time_unit: str) -> list[Es
 
 
 def _later(table: ParameterTable, curves: StepCurves, time: Vector) -> Array:
-    """The curves at later times; infinite where there is no bounded response."""
+    """The curves at later times; far away where there is no bounded response."""
     if table.effects is None:
         return _unit_steps(table, curves.values, time)
     level = np.concatenate([curves.gains[:, i].T for i in range(curves.gains.shape[1])])[..., None]
     moved = _effect_steps(table, curves.values, time)
     moved = np.where(level == 0.0, 1.0, moved / np.where(level == 0.0, 1.0, level))
-    return np.where(np.isfinite(moved), moved, np.inf)
+    return np.where(np.isfinite(moved), moved, _AWAY)
 
 
 def share_unsettled(curve: Matrix) -> float:

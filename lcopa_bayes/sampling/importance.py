@@ -81,8 +81,6 @@ class Importance:
     """Sampled coordinates of every draw, exchangeable terms by decreasing order, (draws, dimension)."""
     log_density: Vector
     """Log posterior density, as `Posterior.log_density`, (draws,) [nat]; -inf where there is none."""
-    raw: Vector
-    """Log of density over proposal, (draws,) [nat]."""
     log_weights: Vector
     """Normalised and Pareto-smoothed, (draws,) [nat]; -inf where the density is 0."""
     pareto_k: float
@@ -97,6 +95,8 @@ class Importance:
     """Optima the proposal started from."""
     evaluations: int
     """Evaluations of the density, those of the optimisation not counted."""
+    raw: Vector
+    """Log of density over proposal, (draws,) [nat]."""
 
     def good(self, wanted: float) -> bool:
         """Whether averages converge, the proposal is close to the posterior, and enough draws count."""
@@ -174,10 +174,10 @@ def _weighed(posterior: Posterior, chart: Chart, y: Matrix, charted: Vector, raw
     density[exists] = charted[exists] + chart.charted(z[exists])[1] - posterior.table.log_permutations
     log_weights, k = tail_smoothed(raw)
     if np.isneginf(raw).all():
-        return Importance(z, density, raw, log_weights, k, 0.0, -np.inf, np.inf, 0, 0)
+        return Importance(z, density, log_weights, k, 0.0, -np.inf, np.inf, 0, 0, raw)
     mean = float(logsumexp(raw) - np.log(raw.size))
     error = float(np.std(np.exp(raw - mean)) / np.sqrt(raw.size))
-    return Importance(z, density, raw, log_weights, k, effective(log_weights), mean, error, 0, 0)
+    return Importance(z, density, log_weights, k, effective(log_weights), mean, error, 0, 0, raw)
 
 
 def tail_smoothed(log_weights: Vector) -> tuple[Vector, float]:

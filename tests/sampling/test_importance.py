@@ -180,7 +180,9 @@ def test_weights_without_a_tail():
 
 def test_resampling_takes_each_draw_as_often_as_its_weight(rng):
     weights = rng.dirichlet(np.ones(50))
-    found = Importance(np.zeros((50, 1)), np.zeros(50), np.log(weights), 0.0, 30.0, 0.0, 0.0, 1, 0)
+    found = Importance(
+        np.zeros((50, 1)), np.zeros(50), np.log(weights), 0.0, 30.0, 0.0, 0.0, 1, 0, np.log(weights)
+    )
     counts = np.bincount(found.resampled(1000, rng), minlength=50)
     assert np.abs(counts - 1000 * weights).max() < 1 + 1e-9
     part = found.resampled(200, rng, part=slice(10, 20))
