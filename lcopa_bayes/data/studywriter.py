@@ -18,8 +18,8 @@ from lcopa_bayes.data.study import Study
 def write_study(study: Study, path: Path, *, note: str = "") -> tuple[Path, ...]:
     """Write a study file, with `note` as a comment at its head, and the records in a folder of its name.
 
-    Numbers are written to the last digit. Tables of candidates and stages are left out. Returns the paths, the
-    study file last; InputError when one of them cannot be written.
+    Numbers are written to the last digit. Tables of candidates and stages are left out. Returns the paths,
+    the study file last; InputError when one of them cannot be written.
     """
     folder = writable_folder(path.parent / path.stem)
     files = {}
@@ -30,7 +30,7 @@ def write_study(study: Study, path: Path, *, note: str = "") -> tuple[Path, ...]
     named = {role: [f"{folder.name}/{file.name}" for file in each] for role, each in files.items()}
     model = _given(study.model)
     model["exposure_ms"] = float(in_time_unit(model.pop("exposure"), study.time_unit, "ms"))
-    tables = {
+    tables: dict[str, dict[str, Any]] = {
         "study": {"name": study.name, "time_unit": study.time_unit, "seed": study.seed},
         "records": {role: each for role, each in named.items() if each},
         "model": model,

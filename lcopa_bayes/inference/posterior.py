@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeAlias, final
@@ -41,6 +41,8 @@ class Posterior:
     model: ForwardModel
     samples: tuple[Samples, ...]
     noise: Noise
+    surrogate: Callable[[Matrix], Sequence[Simulated]] | None = None
+    """What stands for the responses of a plant with effects; None: they are simulated."""
 
     @cached_property
     def linear(self) -> tuple[int, ...]:
@@ -56,6 +58,8 @@ class Posterior:
 
     def responses(self, values: Matrix) -> Sequence[Units]:
         """Unit responses of every fit record at canonical values, or with effects what stands for them."""
+        if self.surrogate is not None:
+            return self.surrogate(values)
         if self.simulation is not None:
             return self.simulation(values)
         return self.model.unit_responses(self.table.dynamics(values))
@@ -291,7 +295,7 @@ class Posterior:
         """The same of the plant alone; the noise stays."""
         rows = tuple(row for row in self.table.rows if row.kind not in (*COEFFICIENTS, *CONSTANTS))
         table = replace(self.table, rows=rows, effects=None)
-        return replace(self, table=table, model=self.model.plain)
+        return replace(self, table=table, model=self.model.plain, surrogate=None)
 
 
 def bounded(units: Sequence[Units]) -> Flags:

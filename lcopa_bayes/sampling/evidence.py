@@ -123,12 +123,12 @@ def charted_density(posterior: Posterior, chart: Chart, y: Matrix, mapped: Mappe
     out = np.full(len(y), -np.inf)
     if exists.any():
         _, log_volume = chart.charted(z[exists])
-        density = posterior.log_density(z[exists]) if mapped is map else _spread(posterior, z[exists], mapped)
+        density = posterior.log_density(z[exists]) if mapped is map else spread(posterior, z[exists], mapped)
         out[exists] = density + posterior.table.log_permutations - log_volume
     return out
 
 
-def _spread(posterior: Posterior, z: Matrix, mapped: Mapped) -> Vector:
-    """Log density portion by portion, (batch,)."""
+def spread(posterior: Posterior, z: Matrix, mapped: Mapped) -> Vector:
+    """Log density of sampled coordinates portion by portion, (batch,)."""
     portions = np.array_split(z, max(1, len(z) // _PORTION))
     return np.concatenate(list(mapped(posterior.log_density, portions)))

@@ -15,26 +15,36 @@ import numpy as np
 from scipy.special import logsumexp
 
 from lcopa_bayes.core.parallel import crew
+from lcopa_bayes.inference.optimum import Optimum, find_optima
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.surrogate import Surrogate
 from lcopa_bayes.sampling.convergence import Limitation
 from lcopa_bayes.sampling.draws import Draws
 from lcopa_bayes.sampling.ensemble import Ensemble
-from lcopa_bayes.sampling.evidence import Evidence
+from lcopa_bayes.sampling.evidence import Evidence, Mapped, spread
 from lcopa_bayes.sampling.importance import (
     LEAST_EFFICIENCY,
     Effort,
     Importance,
     ImportancePlan,
-    first_look,
+    importance,
+    tail_smoothed,
     weighted_draws,
 )
-from lcopa_bayes.sampling.importanceweights import usable_k
+from lcopa_bayes.sampling.importanceweights import effective, usable_k
+from lcopa_bayes.sampling.proposal import weighty
 from lcopa_bayes.sampling.sampler import Run, SamplePlan
 
 _PLAN = ImportancePlan((Effort(4_000, 1_500, 6), Effort(8_000, 3_000, 6), Effort(16_000, 6_000, 4)), starts=4)
 _QUICK = ImportancePlan((Effort(2_000, 1_000, 5), Effort(4_000, 2_000, 4)), starts=2)
 _STREAM = 12
 """Marks the randomness of such a run."""
+_FEWEST = 100.0
+"""Effective draws below which weights are not used [-]."""
+_EXACT = 4.0
+"""Draws of a surrogate that are weighted by the posterior itself, over the effective draws wanted [-]."""
+_SMALL = 0.5
+"""Largest Pareto k of the weights of a surrogate [-]: their variance is finite below it."""
 _STEPS = 50
 """Draws of every walker that stand for a chain [-]."""
 
@@ -61,11 +71,19 @@ def weighted_run(
         _QUICK if quick else _PLAN, wanted=min(plan.target_ess, 400.0) if quick else plan.target_ess
     )
     with crew(jobs) as mapped:
-        found = first_look(posterior, rng, wanted, mapped)
-    if found is None or not usable(found, 100.0):
+        optima = find_optima(posterior, rng, starts=wanted.starts)
+        if not optima:
+            return None
+        near, found, share = posterior, None, 0.0
+        chosen = weighty(optima)
+        if posterior.simulation is not None and len(chosen) == 1:
+            near, found, share = _by_surrogate(posterior, chosen[0], rng, wanted, mapped)
+        if found is None or not usable(found, _FEWEST):
+            near, found = posterior, importance(posterior, optima, rng, wanted, mapped)
+            share = found.ess / found.log_weights.size
+    if not usable(found, _FEWEST):
         return None
-    draws = weighted_draws(posterior, found, rng, target_ess=plan.target_ess)
-    share = found.ess / found.log_weights.size
+    draws = weighted_draws(near, found, rng, target_ess=plan.target_ess)
     if share < LEAST_EFFICIENCY:
         draws = draws.limited(
             [
@@ -78,6 +96,35 @@ def weighted_run(
             ]
         )
     return Weighted(_run(posterior, found, plan, rng), draws, _evidence(found, plan.ensembles), found)
+
+
+def _by_surrogate(
+    posterior: Posterior, optimum: Optimum, rng: np.random.Generator, plan: ImportancePlan, mapped: Mapped
+) -> tuple[Posterior, Importance | None, float]:
+    """The posterior of a surrogate about an optimum; draws of it weighted by the posterior itself; and how
+    efficient the worse of both steps was [-]. No draws where the surrogate does not hold."""
+    surrogate = Surrogate.of(posterior, optimum, rng, mapped)
+    if surrogate is None:
+        return posterior, None, 0.0
+    near = replace(posterior, surrogate=surrogate)
+    first = importance(near, [optimum], rng, plan, mapped)
+    if not usable(first, _FEWEST):
+        return posterior, None, 0.0
+    count = int(_EXACT * plan.wanted)
+    drawn = np.concatenate([first.resampled(count // 4, rng, part=part) for part in _parts(first, 4)])
+    z, about = first.coordinates[drawn], first.log_density[drawn]
+    exact = spread(posterior, z, mapped)
+    raw = exact - about
+    log_weights, k = tail_smoothed(raw)
+    if not (k <= _SMALL and effective(log_weights) >= LEAST_EFFICIENCY * count):
+        return posterior, None, 0.0
+    ess = 1.0 / (1.0 / effective(log_weights) + 1.0 / first.ess)
+    mean = float(logsumexp(raw) - np.log(raw.size))
+    error = float(np.hypot(np.std(np.exp(raw - mean)) / np.sqrt(raw.size), first.log_evidence_sd))
+    whole = first.log_evidence + mean
+    evaluations = count + len(surrogate.bases)
+    made = Importance(z, exact, log_weights, k, ess, whole, error, 1, evaluations, raw + first.log_evidence)
+    return near, made, min(effective(log_weights) / count, first.ess / first.log_weights.size)
 
 
 def usable(found: Importance, wanted: float) -> bool:
