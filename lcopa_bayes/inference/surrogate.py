@@ -17,9 +17,9 @@ from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.simulation import Simulated
 
-_WIDTH = 1.3
+_WIDTH = 1.6
 """Standard deviation of the points a surrogate is fitted to, over that of the optimum's covariance [-]."""
-_PER_TERM = 1.6
+_PER_TERM = 2.0
 """Such points per term of the quadratic [-]."""
 _PORTION = 16
 """Points that one process simulates at once [-]."""
@@ -35,8 +35,12 @@ class Surrogate:
     posterior: Posterior
     columns: tuple[int, ...]
     """Sampled coordinates that move the responses."""
+    delays: tuple[int, ...]
+    """Those of `columns` that are delays."""
     centre: Vector
     """(columns,)."""
+    sd: Vector
+    """Standard deviations at the optimum, (columns,)."""
     inverse: Matrix
     """From deviations to coordinates of unit variance, (columns, columns)."""
     bases: tuple[Array, ...]
@@ -61,7 +65,9 @@ class Surrogate:
         centre = posterior.coordinates(optimum.values[None])[0]
         spread, vectors = np.linalg.eigh(optimum.covariance[np.ix_(columns, columns)])
         root = vectors * np.sqrt(np.maximum(spread, 1e-12 * spread.max()))
-        terms = _features(np.zeros((1, len(columns)))).shape[1]
+        late = tuple(p for p, c in enumerate(columns) if rows[posterior.sampled[c]].kind == "delay")
+        sd = np.sqrt(np.diag(optimum.covariance)[list(columns)])
+        terms = _features(np.zeros((1, len(columns))), np.zeros((1, len(columns))), late).shape[1]
         points = _points(posterior, centre, columns, _WIDTH * root, int(_PER_TERM * terms), rng)
         values = posterior.values(points)
         points = posterior.coordinates(values)
@@ -71,7 +77,8 @@ class Surrogate:
         if known.sum() < terms:
             return None
         inverse = np.linalg.inv(root)
-        features = _features((points[:, columns] - centre[list(columns)]) @ inverse.T)[known]
+        apart = points[:, columns] - centre[list(columns)]
+        features = _features(apart @ inverse.T, apart / sd, late)[known]
         solve = np.linalg.pinv(features)
         bases, scaled = [], []
         for r in range(len(posterior.samples)):
@@ -84,12 +91,13 @@ class Surrogate:
                 }
             )
         own = centre[list(columns)]
-        return cls(posterior, columns, own, inverse, tuple(bases), tuple(scaled))
+        return cls(posterior, columns, late, own, sd, inverse, tuple(bases), tuple(scaled))
 
     def __call__(self, values: Matrix) -> list[Simulated]:
         """Every record at canonical table values, (batch, rows)."""
         z = self.posterior.coordinates(values)[:, self.columns]
-        features = _features((z - self.centre) @ self.inverse.T)
+        apart = z - self.centre
+        features = _features(apart @ self.inverse.T, apart / self.sd, self.delays)
         bounded: Flags = np.ones(len(values), dtype=bool)
         out = []
         for base, scaled in zip(self.bases, self.scaled, strict=True):
@@ -98,10 +106,19 @@ class Surrogate:
         return out
 
 
-def _features(u: Matrix) -> Matrix:
-    """Terms of a quadratic in coordinates (batch, d), (batch, 1 + d + d (d + 1) / 2)."""
+def _features(u: Matrix, x: Matrix, delays: tuple[int, ...]) -> Matrix:
+    """Terms in coordinates of unit variance, (batch, d), and in deviations over their own sd, (batch, d).
+
+    A quadratic in the first, third and fourth powers of the second, and of every delay, in which an onset is
+    steepest, the fifth to seventh power, and the square and cube times every coordinate: (batch, terms).
+    """
     a, b = np.triu_indices(u.shape[1])
-    return np.concatenate([np.ones((len(u), 1)), u, u[:, a] * u[:, b]], axis=1)
+    steep = [part for k in delays for part in _steep(x[:, k, None], u)]
+    return np.concatenate([np.ones((len(u), 1)), u, u[:, a] * u[:, b], x**3, x**4, *steep], axis=1)
+
+
+def _steep(x: Matrix, u: Matrix) -> list[Matrix]:
+    return [x ** np.arange(5, 8), x**2 * u, x**3 * u]
 
 
 def _points(
