@@ -171,7 +171,8 @@ def _weighed(posterior: Posterior, chart: Chart, y: Matrix, charted: Vector, raw
     """Charted draws of one proposal with their densities in the chart and their log weights."""
     z, exists = chart.uncharted(y)
     density = np.full(len(y), -np.inf)
-    density[exists] = charted[exists] + chart.charted(z[exists])[1] - posterior.table.log_permutations
+    inside = exists & np.isfinite(charted)
+    density[inside] = charted[inside] + chart.charted(z[inside])[1] - posterior.table.log_permutations
     log_weights, k = tail_smoothed(raw)
     if np.isneginf(raw).all():
         return Importance(z, density, log_weights, k, 0.0, -np.inf, np.inf, 0, 0, raw)
