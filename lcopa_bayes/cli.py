@@ -113,6 +113,18 @@ def _parser() -> argparse.ArgumentParser:
         metavar="RUNFOLDER",
         help="run folder of a comparison, to decide M1, M2, M4 and I5 (default: of a bundled study)",
     )
+    predicted = add("predict", runs.predict, [], "bands for a drive nobody has measured, by a finished fit")
+    predicted.add_argument("folder", type=Path, metavar="RUNFOLDER", help="run folder of a fit")
+    predicted.add_argument(
+        "drive", type=Path, help="record file without responses; with responses it is scored too"
+    )
+    predicted.add_argument("--out", type=Path, help="folder (default: RUNFOLDER/predict/<drive>)")
+    predicted.add_argument(
+        "--offset",
+        choices=["fitted", "zero"],
+        default="fitted",
+        help="add the offset of the fit records to the response, or none",
+    )
     report = add("report", runs.report, [], "render the report of a run folder again")
     report.add_argument("folder", type=Path, help="run folder")
     bench = add("simulate", runs.simulate, [], "measure a campaign file on the virtual bench")

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import re
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from io import FileIO, RawIOBase
 from pathlib import Path
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import plain
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _ELSEWHERE = "or choose another folder with --out"
 _REMEDIES = {
@@ -49,6 +54,16 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
 def write_text(path: Path, text: str) -> None:
     """`write_whole` for text in UTF-8."""
     write_whole(path, lambda beside: beside.write_text(text, encoding="utf-8"))
+
+
+def save_table(table: pd.DataFrame, path: Path) -> None:
+    """Write a table as CSV."""
+    write_whole(path, lambda beside: table.to_csv(beside, index=False))
+
+
+def save_json(values: Mapping[str, Any], path: Path) -> None:
+    """Write plain values as JSON."""
+    write_text(path, json.dumps(plain(values), indent=1, allow_nan=False) + "\n")
 
 
 @contextmanager

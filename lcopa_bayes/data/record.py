@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
+from typing import Protocol, final
 
 import numpy as np
 import pandas as pd
@@ -47,6 +48,17 @@ class Axis:
                 raise InputError(f"axis {self.name!r} in {self.unit!r}: both must be printable words")
         if "_" in self.unit:
             raise InputError(f"axis {self.name!r}: the unit {self.unit!r} must not hold an underscore")
+
+
+class Driven(Protocol):
+    """What a plant was, or is to be, driven with: a record, or a drive nobody has measured."""
+
+    @property
+    def name(self) -> str: ...  # noqa: D102
+    @property
+    def time(self) -> Vector: ...  # noqa: D102
+    @property
+    def drive(self) -> Matrix: ...  # noqa: D102
 
 
 @final
@@ -97,7 +109,7 @@ class Record:
         return Record, (self.name, *arrays, self.drive_axes, self.response_axes, self.time_unit)
 
 
-def _roles(table: CellTable) -> tuple[str, dict[str, dict[int, Axis]]]:
+def _roles(table: CellTable, needed: Sequence[str] = _ROLES) -> tuple[str, dict[str, dict[int, Axis]]]:
     """Time unit, and the axis of every usable column by role; what is wrong joins `table.problems`."""
     found: dict[str, dict[int, Axis]] = {role: {} for role in _ROLES}
     for index, name in enumerate(table.names):
@@ -115,7 +127,7 @@ def _roles(table: CellTable) -> tuple[str, dict[str, dict[int, Axis]]]:
             found[role][index] = Axis(axis.strip(), unit.strip())
             continue
         table.problems.append(f"{table.place(index)} (column {index + 1} of {len(table.names)}): {problem}")
-    for role in _ROLES:
+    for role in needed:
         if not any(name.partition("_")[0] == role for name in table.names):
             table.problems.append(f"{table.path}: has no {role} column; columns are {FORM}")
     return next((axis.unit for axis in found["time"].values()), "s"), found
@@ -140,18 +152,42 @@ def _numbers(table: CellTable, column: int, *, missing: bool) -> Vector:
     return out
 
 
-def load_record(path: Path, time_unit: str | None = None) -> Record:
-    """Read a record from CSV or Parquet; times come out in `time_unit`, by default the unit of the file.
+@final
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """Columns of a record file by role."""
 
-    Raises InputError with everything wrong in the file: place (file, line and column; in Parquet the
-    row, counted from 1), what was found and what was expected, at most five per column and kind.
-    Accuracy: numbers are read exactly; a converted time is off by half a unit in the last place.
+    name: str
+    """Stem of the file."""
+    time: Vector
+    """(n,) [time_unit]."""
+    drive: Matrix
+    """(n, n_drives) in the units of `drive_axes`."""
+    response: Matrix
+    """(n, n_responses) in the units of `response_axes`; NaN is a sample that was not taken."""
+    drive_axes: tuple[Axis, ...]
+    response_axes: tuple[Axis, ...]
+    time_unit: str
+
+    @property
+    def measured(self) -> bool:
+        """Whether a response was sampled."""
+        return bool(np.isfinite(self.response).any())
+
+
+def load_columns(path: Path, time_unit: str | None = None, *, responses: bool = True) -> Columns:
+    """Columns of a CSV or Parquet file; times come out in `time_unit`, by default the unit of the file.
+
+    A file need not hold responses unless `responses`. Raises InputError with everything wrong in the file:
+    place (file, line and column; in Parquet the row, counted from 1), what was found and what was expected,
+    at most five per column and kind. Accuracy: numbers are read exactly; a converted time is off by half a
+    unit in the last place.
     """
     if time_unit is not None and time_unit not in TIME_UNITS:
         raise InputError(f"unknown time unit {time_unit!r}{nearest(time_unit, TIME_UNITS)}")
     table = read_cells(Path(path))
     n_rows = len(table.rows) if not table.problems else 2  # rows of another length are told already
-    given, axes = _roles(table)
+    given, axes = _roles(table, _ROLES if responses else _ROLES[:2])
     values = {role: [_numbers(table, j, missing=role == "response") for j in axes[role]] for role in _ROLES}
     for column, time in zip(axes["time"], values["time"], strict=True):
         late = [int(i) for i in np.flatnonzero(time[1:] <= time[:-1])]
@@ -160,15 +196,28 @@ def load_record(path: Path, time_unit: str | None = None) -> Record:
         table.tell(told, table.place(column))
     if n_rows < 2:
         table.problems.append(f"{path}: has {n_rows} row(s) of data; a record needs two or more")
-    if not table.problems and np.isnan(values["response"]).all():
+    if responses and not table.problems and np.isnan(values["response"]).all():
         table.problems.append(f"{path}: no response column holds a sample; a record needs one or more")
     if table.problems:
         raise InputError(table.problems)
     wanted = time_unit or given
     time = in_time_unit(values["time"][0], given, wanted)
-    drive, response = np.column_stack(values["drive"]), np.column_stack(values["response"])
+    drive, response = (
+        np.array(values[role]).reshape(-1, time.size).T.copy() for role in ("drive", "response")
+    )
     both = tuple(axes["drive"].values()), tuple(axes["response"].values())
-    return Record(table.path.stem, time, drive, response, *both, wanted)
+    return Columns(table.path.stem, time, drive, response, *both, wanted)
+
+
+def load_record(path: Path, time_unit: str | None = None) -> Record:
+    """Read a record from CSV or Parquet; see `load_columns` for units, accuracy and what is refused."""
+    return record_of(load_columns(path, time_unit))
+
+
+def record_of(columns: Columns) -> Record:
+    """Record of a file's columns; InputError where these make none."""
+    arrays = (columns.time, columns.drive, columns.response)
+    return Record(columns.name, *arrays, columns.drive_axes, columns.response_axes, columns.time_unit)
 
 
 def save_record(record: Record, path: Path) -> None:

@@ -6,8 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import final
 
+import numpy as np
+
+from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.record import Record
+from lcopa_bayes.data.record import Driven, Record
 from lcopa_bayes.data.settings import EffectsSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.declared import declared, effect_rows, noise_of, record_ranges, unused, used_kinds
@@ -51,6 +54,22 @@ class Problem:
             return self.study.effects
         told = dict(zip(self.ranges.names, self.ranges.response.tolist(), strict=True))
         return replace(self.study.effects, deflection=told, speed=self.ranges.speed)
+
+    def driven(self, drive: Driven, times: Vector) -> ForwardModel:
+        """The model that simulates a drive, read at `times` [time unit], in the middle of the campaign."""
+        wanted, layout = self.study.model, self.posterior.table.layout
+        own = self.posterior.table.effects
+        model = forward_model(
+            layout,
+            [drive],
+            [times],
+            blocks=wanted.blocks,
+            exposure=wanted.exposure,
+            refinement=self.refinement,
+        )
+        if own is None:
+            return model
+        return replace(model, effects=replace(own, epochs=np.zeros(1), times=(times,), fitted=(None,)))
 
     def refined(self, factor: int) -> Problem:
         """The same problem on blocks narrower by a further factor."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.data.drive import Drive
-from lcopa_bayes.data.record import Record
+from lcopa_bayes.data.record import Driven
 from lcopa_bayes.model.grid import Mesh
 from lcopa_bayes.model.layout import Layout
 from lcopa_bayes.model.powerseries import Circle
@@ -69,7 +69,7 @@ class Experiment:
     @classmethod
     def of(
         cls,
-        record: Record,
+        record: Driven,
         times: Vector,
         *,
         blocks: int | None = None,
@@ -246,7 +246,7 @@ class ForwardModel:
 
 def forward_model(
     layout: Layout,
-    records: Sequence[Record],
+    records: Sequence[Driven],
     times: Sequence[Vector],
     *,
     blocks: int | None = None,

@@ -17,6 +17,7 @@ from lcopa_bayes.report.section import Drawing, Section
 from lcopa_bayes.report.sections import (
     crosscheck,
     evidence,
+    frequency,
     pairs,
     parameters,
     priors,
@@ -36,6 +37,7 @@ _SECTIONS = (
     pairs.section,
     traces.section,
     steps.section,
+    frequency.section,
     priors.section,
     sensitivity.section,
     evidence.section,

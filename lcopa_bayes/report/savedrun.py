@@ -15,6 +15,7 @@ import xarray as xr
 
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
 
 _BAND = ("05", "25", "50", "75", "95")
 _WORDS = ("record", "axis", "unit", "name", "path", "prior", "from")
@@ -32,6 +33,11 @@ _TABLES: Mapping[str, tuple[str, ...]] = {
         *("path", "unit", "time"),
         *(f"response_{q}" for q in _BAND),
         *("steady_05", "steady_50", "steady_95"),
+    ),
+    "frequency_response": (
+        *("path", "unit", "frequency"),
+        *(f"{curve}_{POINTWISE}_{q}" for curve in ("gain", "phase") for q in _BAND),
+        *(f"{curve}_{SIMULTANEOUS}_{q}" for curve in ("gain", "phase") for q in ("05", "95")),
     ),
     "priors": ("name", "unit", "prior", "from", "integrated_out"),
     "prior_density": ("name", "log_scale", "x", "density"),

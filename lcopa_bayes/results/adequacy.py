@@ -17,7 +17,8 @@ import numpy as np
 from scipy.stats import binom
 
 from lcopa_bayes.inference.assembly import Problem
-from lcopa_bayes.results.prediction import LEVELS, Band
+from lcopa_bayes.results.bands import LEVELS
+from lcopa_bayes.results.prediction import Band
 from lcopa_bayes.results.residuals import WHITE_P, Residual
 from lcopa_bayes.results.resonance import resonances
 from lcopa_bayes.sampling.convergence import Limitation

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import final
 
@@ -17,14 +17,16 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.results.adequacy import limitations
 from lcopa_bayes.results.discretisation import Discretisation, discretisation, resolved
+from lcopa_bayes.results.frequency import FrequencyResponse, frequency_response
 from lcopa_bayes.results.prediction import Band, bands
+from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.provenance import digest_of, fingerprint
 from lcopa_bayes.results.residuals import Residual, residuals
 from lcopa_bayes.results.sensitivity import Sensitivity, sensitivity
 from lcopa_bayes.results.steps import StepCurves, step_curves, step_metrics, too_fast
 from lcopa_bayes.sampling.crosscheck import CrossCheck
 from lcopa_bayes.sampling.draws import Draws, gather
-from lcopa_bayes.sampling.evidence import Evidence, evidence
+from lcopa_bayes.sampling.evidence import Evidence, evidence_of
 from lcopa_bayes.sampling.nested import NestedPlan, nested
 from lcopa_bayes.sampling.sampler import Run, SamplePlan, sample
 from lcopa_bayes.sampling.weightedrun import weighted_run
@@ -35,7 +37,7 @@ _QUICK = 4
 
 @final
 @dataclass(frozen=True, eq=False)
-class Fit:
+class Fit(Predictive):
     """A fitted study."""
 
     problem: Problem
@@ -50,12 +52,9 @@ class Fit:
     """None for a single ensemble, which cannot tell its error."""
     discretisation: Discretisation
     """How far the width of the blocks moves the posterior."""
+    frequency: FrequencyResponse
+    """Over the frequencies that the fit records resolve."""
     cross_check: CrossCheck | None = None
-
-    @property
-    def study(self) -> Study:
-        """The study that was fitted."""
-        return self.problem.study
 
 
 def fit(
@@ -71,7 +70,9 @@ def fit(
 ) -> Fit:
     """Sample the posterior of a study and derive what it predicts.
 
-    `starts`, table values (starts, rows), are modes known from elsewhere that sampling proposes too.
+    `starts`, table values (starts, rows), are modes known from elsewhere that sampling proposes too. A plant
+    with effects is sampled by importance around its optima (`weightedrun`) where the method is "auto" and its
+    weights hold.
 
     With `folder`, sampling is stored there in `chain.h5` and `resume` goes on from it; the result is
     the same as without interruption. With `cross_check` the posterior is also sampled by nested sampling,
@@ -87,12 +88,10 @@ def fit(
         writable_folder(folder)
     problem = resolved(problem)
     plan = plan_of(problem, quick=quick)
-    expensive = problem.posterior.simulation is not None and study.sampler.method == "auto"
-    found = weighted_run(problem.posterior, plan, jobs=jobs, quick=quick) if expensive else None
-    check = None
-    weighed: Evidence | None
+    effective = problem.posterior.simulation is not None and plan.method == "auto"
+    found = weighted_run(problem.posterior, plan, jobs=jobs, quick=quick) if effective else None
     if found is not None:
-        run, draws, weighed = found.run, found.draws, found.evidence
+        run, draws = found
     else:
         run = sample(
             problem.posterior,
@@ -105,7 +104,8 @@ def fit(
             starts=starts,
         )
         draws = gather(problem.posterior, run)
-        weighed = evidence(problem.posterior, run.kept()[0], draws.ess, plan.seed)
+    check = None
+    weighed = evidence_of(problem.posterior, run, draws.ess)
     if cross_check:
         wanted = NestedPlan.of(problem.posterior.dimension, seed=plan.seed, quick=quick)
         check = CrossCheck.of(
@@ -118,15 +118,18 @@ def fit(
     width = discretisation(problem, draws)
     curves = step_curves(draws, problem.scales.span)
     draws = draws.limited([*width.limitations, *too_fast(draws, curves, problem.scales.period)])
-    noise, rng = problem.posterior.noise, np.random.default_rng([plan.seed, 2])
-    shown = bands(draws, problem.posterior.model, problem.posterior.samples, noise, held_out=False, rng=rng)
+    noise, seed = problem.posterior.noise, plan.seed
+    shown = bands(draws, problem.posterior.model, problem.posterior.samples, noise, held_out=False, seed=seed)
     if study.held_out:
         samples, model = problem.simulated(study.held_out)
-        shown += bands(draws, model, samples, noise, held_out=True, rng=rng)
+        shown += bands(draws, model, samples, noise, held_out=True, seed=seed)
     left = residuals(draws, shown, noise, problem.scales.period)
     draws = draws.limited(limitations(problem, draws, shown, left, np.random.default_rng([plan.seed, 4])))
     metrics = step_metrics(draws, curves, time_unit=study.time_unit)
     moved = sensitivity(draws, problem.posterior)
+    response = frequency_response(
+        draws, span=problem.scales.span, period=problem.scales.period, time_unit=study.time_unit
+    )
     return Fit(
         problem,
         run,
@@ -138,6 +141,7 @@ def fit(
         moved,
         weighed,
         width,
+        response,
         check,
     )
 
@@ -153,8 +157,9 @@ def plan_of(problem: Problem, *, quick: bool) -> SamplePlan:
         steps=wanted.steps,
         thin=wanted.thin,
         target_ess=wanted.target_ess,
+        method=wanted.method or ("auto" if wanted.steps is None and wanted.thin is None else "ensembles"),
     )
     if not quick:
         return plan
     steps = max(plan.thin, plan.steps // _QUICK)
-    return SamplePlan(plan.ensembles, plan.walkers, steps, plan.thin, plan.target_ess, plan.seed)
+    return replace(plan, steps=steps)

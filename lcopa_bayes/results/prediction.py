@@ -1,29 +1,25 @@
-"""What the posterior says a record looks like: pointwise credible bands, held-out scores."""
+"""What the posterior says a record or a drive looks like: credible bands, held-out scores."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.data.record import Axis
 from lcopa_bayes.inference.noise import GaussianNoise, Noise
 from lcopa_bayes.inference.observations import Observed, Samples
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.simulation import Simulation
 from lcopa_bayes.model.forward import ForwardModel
+from lcopa_bayes.results.bands import LEVELS, POINTWISE, pointwise, simultaneous
 from lcopa_bayes.sampling.draws import Draws
 
-LEVELS = (0.5, 0.9)
-"""Probabilities inside the bands [-]."""
-KIND = "pointwise"
-"""Kind of the bands: at each time by itself a band holds the response with its probability; a whole curve
-lies within it throughout with a smaller one."""
 BEFORE_DRIVE = "samples before the drive acts"
 """Source of an offset."""
-_QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 _CELLS = 2_000_000
 """Draws times samples behind the bands of one axis of one record."""
 _FEWEST = 200
@@ -37,7 +33,7 @@ _SWEEPS = 20
 @final
 @dataclass(frozen=True, eq=False)
 class Band:
-    """Pointwise bands of one response axis of one record, at the record's sample times."""
+    """Bands of one response axis of one record, at the record's sample times, or under a new drive."""
 
     record: str
     axis: str
@@ -46,11 +42,16 @@ class Band:
     time: Vector
     """(n,) [time unit]."""
     observed: Vector
-    """(n,) [response unit]."""
+    """(n,) [response unit]; NaN under a drive that nobody has measured."""
     plant: Matrix
-    """5, 25, 50, 75, 95 % quantiles of the plant's response, (5, n) [response unit]."""
+    """5, 25, 50, 75, 95 % quantiles of the plant's response, (5, n) [response unit]: pointwise bands."""
     noisy: Matrix
     """The same with noise, (5, n) [response unit]."""
+    plant_simultaneous: Matrix
+    """Lower end at 90 and 50 %, upper end at 50 and 90 % of the bands that hold the plant's whole response on
+    this axis, (4, n) [response unit]."""
+    noisy_simultaneous: Matrix
+    """The same with noise, (4, n) [response unit]."""
     offset_from: str
     """Where the record's offset comes from."""
     offset_samples: int
@@ -72,6 +73,22 @@ class Band:
         """Share of the samples inside the band with noise [-]."""
         low, high = (self.noisy[0], self.noisy[4]) if level == LEVELS[1] else (self.noisy[1], self.noisy[3])
         return float(np.mean((self.observed >= low) & (self.observed <= high)))
+
+    def score(self) -> dict[str, Any]:
+        """Error and coverage as plain values."""
+        return {
+            "record": self.record,
+            "axis": self.axis,
+            "unit": self.unit,
+            "rmse": self.rmse,
+            "coverage_50": self.coverage(LEVELS[0]),
+            "coverage_90": self.coverage(LEVELS[1]),
+            "bands": POINTWISE,
+            "samples": self.time.size,
+            "offset_from": self.offset_from,
+            "offset_samples": self.offset_samples,
+            "draws": self.draws,
+        }
 
 
 def responses(table: ParameterTable, model: ForwardModel, values: Matrix) -> list[Array]:
@@ -100,55 +117,89 @@ def bands(
     noise: Noise,
     *,
     held_out: bool,
-    rng: np.random.Generator,
+    seed: int,
 ) -> list[Band]:
-    """Pointwise 50 and 90 % bands of every axis of every record, for the plant alone and with noise.
+    """50 and 90 % bands of every axis of every record, for the plant alone and with noise.
 
     `model` simulates the records of `samples` at their sample times. An offset per record is not
     known for a held-out record: it is taken from the samples before the drive can have acted, else
     from the record itself (integrated out given its samples), and the band says which and from how many.
     Effects that differ from record to record count as noise on a held-out record, as large as on the others.
+    What is drawn depends on `seed` and the record's name alone, not on the other records.
     """
     out = []
     for r, record in enumerate(samples):
-        one = model.only(r)
-        most = max(_FEWEST, _CELLS // record.times.size)
-        values = draws.thinned(most if model.effects is None else min(most, _WITH_EFFECTS))
-        parts = np.array_split(values, max(1, values.shape[0] * record.times.size // _CELLS * 4))
-        plant = np.concatenate([responses(draws.table, one, part)[0] for part in parts], axis=1)
+        rng = named_rng(seed, record.record.name)
+        alone = model.only(r)
+        values, plant = plant_draws(draws, alone)
         disturbed = plant
-        if held_out and one.effects is not None and one.effects.per_record:
-            disturbed = Simulation(draws.table, one).disturbed(values, rng)[0]
+        if held_out and alone.effects is not None and alone.effects.per_record:
+            disturbed = Simulation(draws.table, alone).disturbed(values, rng)[0]
         for axis, observed in enumerate(record.axes):
             if observed.values.size == 0:
                 continue
             response = plant[axis][:, observed.index]
-            parameters = values[:, [draws.table.at(name, axis) for name in noise.names]]
             seen = response if disturbed is plant else disturbed[axis][:, observed.index]
-            offset, source, used = offset_draws(
+            offset = offset_draws(
                 draws.table, values, axis, r, record, seen, noise, held_out=held_out, rng=rng
             )
-            response = response + offset[:, None]
-            noisy = response + noise.draw(parameters, observed.gaps, rng)
+            parameters = values[:, [draws.table.at(name, axis) for name in noise.names]]
+            times = record.times[observed.index]
+            noises = noise.draw(parameters, observed.gaps, rng)
             if disturbed is not plant:
-                noisy += seen - plant[axis][:, observed.index]
-            response_axis = record.record.response_axes[axis]
-            out.append(
-                Band(
-                    record.record.name,
-                    response_axis.name,
-                    response_axis.unit,
-                    held_out,
-                    record.times[observed.index],
-                    observed.values,
-                    np.quantile(response, _QUANTILES, axis=0),
-                    np.quantile(noisy, _QUANTILES, axis=0),
-                    source,
-                    used,
-                    values.shape[0],
-                )
-            )
+                noises += seen - response
+            one = (record.record.name, record.record.response_axes[axis], held_out)
+            out.append(band_of(one, times, observed.values, response, noises, offset))
     return out
+
+
+def named_rng(seed: int, name: str) -> np.random.Generator:
+    """Random numbers of the bands of one record or drive, whatever else is predicted beside it."""
+    return np.random.default_rng([seed, 2, *name.encode()])
+
+
+def plant_draws(draws: Draws, model: ForwardModel) -> tuple[Matrix, Array]:
+    """Table values behind the bands of a model's one experiment, (draws, rows), and the plant's responses
+    without offsets, (axes, draws, samples) [response unit]."""
+    size = model.experiments[0].mesh.reading.samples
+    most = max(_FEWEST, _CELLS // size)
+    values = draws.thinned(most if model.effects is None else min(most, _WITH_EFFECTS))
+    parts = np.array_split(values, max(1, values.shape[0] * size // _CELLS * 4))
+    return values, np.concatenate([responses(draws.table, model, part)[0] for part in parts], axis=1)
+
+
+def band_of(
+    one: tuple[str, Axis, bool],
+    times: Vector,
+    observed: Vector,
+    response: Matrix,
+    noises: Matrix,
+    offset: tuple[Vector, str, int],
+) -> Band:
+    """Band from draws of the response and of the noise, both (draws, n), and of the offset with its source.
+
+    `one` is the record, its response axis and whether it was held out.
+    """
+    name, axis, held_out = one
+    level, source, used = offset
+    response = response + level[:, None]
+    noisy = response + noises
+    plant_quantiles, noisy_quantiles = pointwise(response), pointwise(noisy)
+    return Band(
+        name,
+        axis.name,
+        axis.unit,
+        held_out,
+        times,
+        observed,
+        plant_quantiles,
+        noisy_quantiles,
+        simultaneous(response, plant_quantiles),
+        simultaneous(noisy, noisy_quantiles),
+        source,
+        used,
+        response.shape[0],
+    )
 
 
 def offset_draws(

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 import arviz_base
 import numpy as np
-import pandas as pd
 
 from lcopa_bayes.core.estimate import plain
-from lcopa_bayes.core.files import enduring, writable_folder, write_text, write_whole
+from lcopa_bayes.core.files import enduring, save_json, save_table, writable_folder, write_text, write_whole
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.integerrival import Rival
 from lcopa_bayes.results.prediction import responses
 from lcopa_bayes.results.provenance import provenance
+from lcopa_bayes.results.savedfit import NAME, fit_to_json
 from lcopa_bayes.results.summary import results
 from lcopa_bayes.results.tables import tables
 
@@ -37,19 +37,10 @@ def save_fit(fit: Fit, folder: Path, command: Sequence[str], *, rival: Rival | N
     for name, table in tables(fit).items():
         save_table(table, folder / "tables" / f"{name}.csv")
     write_whole(folder / "posterior.nc", lambda beside: save_posterior(fit, beside))
+    write_text(folder / NAME, json.dumps(fit_to_json(fit.problem, fit.draws), allow_nan=False) + "\n")
     save_json(provenance(fit.study, command), folder / "provenance.json")
     save_json(told, folder / "results.json")
     return told
-
-
-def save_table(table: pd.DataFrame, path: Path) -> None:
-    """Write a table as CSV."""
-    write_whole(path, lambda beside: table.to_csv(beside, index=False))
-
-
-def save_json(values: Mapping[str, Any], path: Path) -> None:
-    """Write plain values as JSON."""
-    write_text(path, json.dumps(plain(values), indent=1, allow_nan=False) + "\n")
 
 
 def save_posterior(fit: Fit, path: Path) -> None:

@@ -8,6 +8,7 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
+from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.data.drive import Drive
 from lcopa_bayes.inference.parameters import ParameterTable
@@ -190,6 +191,23 @@ def settling(time: Vector, curves: Matrix, band: float, *, until: float = np.inf
     share = (outside - np.sign(outside) * band) / travelled
     settled = np.where(last < after, time[last] + share * (time[after] - time[last]), np.inf)
     return np.where(settled <= until, settled, np.inf)
+
+
+def path_metrics(draws: Draws, *, span: float, time_unit: str, path: str | None = None) -> list[Estimate]:
+    """`step_metrics` over any `span` [time unit], of one path ``<response>_<drive>`` or of all.
+
+    The only path of a plant goes by the name of its response. InputError for a span that is not positive and
+    a path the plant does not have.
+    """
+    if not 0 < span < np.inf:
+        raise InputError(f"`span` must be a positive time [{time_unit}]; got {span!r}")
+    layout = draws.table.layout
+    places = np.ndindex(len(layout.responses), len(layout.drives))
+    paths = [layout.path_name(i, j) or layout.responses[i].name for i, j in places]
+    if path is not None and path not in paths:
+        raise InputError(f"the plant has no path {path!r}{nearest(path, paths)}")
+    found = step_metrics(draws, step_curves(draws, span), time_unit=time_unit)
+    return [one for one in found if path is None or one.name.endswith(f"[{path}]")]
 
 
 def step_metrics(draws: Draws, curves: StepCurves, *, time_unit: str) -> list[Estimate]:

@@ -9,7 +9,6 @@ import numpy as np
 
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.results.fit import Fit
-from lcopa_bayes.results.prediction import KIND, Band
 from lcopa_bayes.results.residuals import WHITE_P
 from lcopa_bayes.results.steps import share_unsettled
 from lcopa_bayes.sampling.convergence import Grade, shares_grade
@@ -121,36 +120,26 @@ def residual_rms(fit: Fit) -> dict[str, float]:
 
 def scores(fit: Fit, *, held_out: bool) -> list[dict[str, Any]]:
     """Error and coverage of every axis of the records that were held out, or of those fitted."""
-    return [_score(band) for band in fit.bands if band.held_out == held_out]
-
-
-def _score(band: Band) -> dict[str, Any]:
-    return {
-        "record": band.record,
-        "axis": band.axis,
-        "unit": band.unit,
-        "rmse": band.rmse,
-        "coverage_50": band.coverage(0.5),
-        "coverage_90": band.coverage(0.9),
-        "bands": KIND,
-        "samples": band.time.size,
-        "offset_from": band.offset_from,
-        "offset_samples": band.offset_samples,
-        "draws": band.draws,
-    }
+    return [band.score() for band in fit.bands if band.held_out == held_out]
 
 
 def _sampler(fit: Fit) -> Mapping[str, Any]:
-    plan, ensembles = fit.run.plan, fit.run.ensembles
-    return {
+    plan, ensembles, weighted = fit.run.plan, fit.run.ensembles, fit.run.weighted
+    common = {
+        "method": "ensembles" if weighted is None else "importance draws",
         "ensembles": plan.ensembles,
         "walkers": plan.walkers,
-        "steps": ensembles[0].steps,
+        "steps": ensembles[0].steps if ensembles else 0,
         "most_steps": plan.steps,
         "thin": plan.thin,
-        "acceptance": float(np.mean([ensemble.acceptance for ensemble in ensembles])),
+        "acceptance": float(np.mean([ensemble.acceptance for ensemble in ensembles])) if ensembles else None,
         "smallest_ess": fit.draws.ess,
         "largest_rhat": max(q.rhat for q in fit.draws.qualities),
         "target_ess": plan.target_ess,
         "seed": plan.seed,
     }
+    if weighted is None:
+        return common
+    for key in ("steps", "most_steps", "thin", "acceptance"):
+        common.pop(key)
+    return {**common, "draws": weighted.count, "pareto_k": weighted.pareto_k, "weights_ess": weighted.ess}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
+from lcopa_bayes.results.bands import SIMULTANEOUS
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.summary import results
 from lcopa_bayes.sampling.crosscheck import CrossCheck
@@ -31,6 +32,7 @@ def tables(fit: Fit) -> dict[str, pd.DataFrame]:
         "autocorrelation": _autocorrelation(fit),
         "spectrum": _spectrum(fit),
         "step_response": _step_response(fit),
+        "frequency_response": fit.frequency.table(),
         "priors": _priors(fit),
         "prior_density": _prior_density(fit),
     } | ({} if fit.cross_check is None else _cross_check(fit, fit.cross_check))
@@ -49,6 +51,9 @@ def _bands(fit: Fit) -> pd.DataFrame:
         }
         columns |= {f"plant_{q}": row for q, row in zip(_QUANTILE_NAMES, band.plant, strict=True)}
         columns |= {f"noisy_{q}": row for q, row in zip(_QUANTILE_NAMES, band.noisy, strict=True)}
+        for name, ends in (("plant", band.plant_simultaneous), ("noisy", band.noisy_simultaneous)):
+            rows = zip(("05", "25", "75", "95"), ends, strict=True)
+            columns |= {f"{name}_{SIMULTANEOUS}_{q}": row for q, row in rows}
         frames.append(pd.DataFrame(columns))
     return pd.concat(frames, ignore_index=True)
 

@@ -61,8 +61,8 @@ def carried(source: Posterior, target: Posterior, positions: Array, seed: int, *
         )
         found = weighted_run(target, plan)
         if found is not None:
-            rhat = max(quality.rhat for quality in found.draws.qualities)
-            return Carried(found.run.kept()[0], found.found.ess, rhat)
+            run, draws = found
+            return Carried(run.kept()[0], draws.ess, max(quality.rhat for quality in draws.qualities))
     mixture = learned(target, list(positions), seed)
     chains = []
     for number, position in enumerate(positions):

@@ -1,18 +1,16 @@
 """A run of a posterior whose plant has effects: importance sampling around the optima.
 
-One response with effects costs as much as fifty without, and ensembles from the prior ask for a million.
-Draws of a proposal fitted to the posterior are weighted instead (`importance`). What no draw reaches no
-weight shows, so a run whose proposal is far from the posterior is tentative, and ensembles follow where
-weights fail.
+One response with effects costs as much as ten without, and ensembles from the prior ask for a million. Draws
+of a proposal fitted to the posterior are weighted instead (`importance`), by way of a surrogate where one
+holds. What no draw reaches no weight shows, so a run whose proposal is far from the posterior is tentative,
+and ensembles follow where weights fail.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
-from scipy.special import logsumexp
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.parallel import crew
@@ -20,23 +18,16 @@ from lcopa_bayes.inference.optimum import Optimum, find_optima
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.surrogate import Surrogate
 from lcopa_bayes.sampling.convergence import Limitation, qualities
-from lcopa_bayes.sampling.draws import Draws
+from lcopa_bayes.sampling.draws import Draws, gather
 from lcopa_bayes.sampling.ensemble import Ensemble, advance
-from lcopa_bayes.sampling.evidence import Evidence, Mapped, spread
-from lcopa_bayes.sampling.importance import (
-    LEAST_EFFICIENCY,
-    Effort,
-    Importance,
-    ImportancePlan,
-    importance,
-    tail_smoothed,
-    weighted_draws,
-)
-from lcopa_bayes.sampling.importanceweights import effective, usable_k
+from lcopa_bayes.sampling.evidence import Mapped, spread
+from lcopa_bayes.sampling.importance import LEAST_EFFICIENCY, Effort, ImportancePlan, importance
+from lcopa_bayes.sampling.importanceweights import usable_k
 from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.mixturemoves import learned
 from lcopa_bayes.sampling.proposal import weighty
 from lcopa_bayes.sampling.sampler import Run, SamplePlan
+from lcopa_bayes.sampling.weighted import BATCHES, Weighted
 
 _PLAN = ImportancePlan((Effort(4_000, 1_500, 6), Effort(8_000, 3_000, 6), Effort(16_000, 6_000, 4)), starts=4)
 _QUICK = ImportancePlan((Effort(2_000, 1_000, 5), Effort(4_000, 2_000, 4)), starts=2)
@@ -54,31 +45,18 @@ _WALKED = 1000.0
 """Effective draws at which they end [-]."""
 _SMALL = 0.5
 """Largest Pareto k of the weights of a surrogate [-]: their variance is finite below it."""
-_STEPS = 50
-"""Draws of every walker that stand for a chain [-]."""
-
-
-class Weighted(NamedTuple):
-    """What importance sampling gave, in the form of a run of ensembles."""
-
-    run: Run
-    draws: Draws
-    evidence: Evidence
-    found: Importance
 
 
 def weighted_run(
     posterior: Posterior, plan: SamplePlan, *, jobs: int = 1, quick: bool = False
-) -> Weighted | None:
-    """Draws, evidence and the weights they rest on; None where these are not usable.
+) -> tuple[Run, Draws] | None:
+    """Importance draws as a run, and its draws; None where no weights are usable.
 
-    Deterministic given the plan's seed, whatever `jobs` [processes]. Parts of the draws stand for ensembles:
-    each is resampled from its own proposals' draws.
+    Deterministic given the plan's seed, whatever `jobs` [processes].
     """
     rng = np.random.default_rng([plan.seed, _STREAM])
-    wanted = replace(
-        _QUICK if quick else _PLAN, wanted=min(plan.target_ess, 400.0) if quick else plan.target_ess
-    )
+    size = min(plan.target_ess, 400.0) if quick else plan.target_ess
+    wanted = replace(_QUICK if quick else _PLAN, wanted=size)
     with crew(jobs) as mapped:
         optima = find_optima(posterior, rng, starts=wanted.starts)
         if not optima:
@@ -87,12 +65,13 @@ def weighted_run(
         chosen = weighty(optima)
         if posterior.simulation is not None and len(chosen) == 1:
             near, found, share = _by_surrogate(posterior, chosen[0], rng, wanted, mapped)
-        if found is None or not usable(found, _FEWEST):
-            near, found = posterior, importance(posterior, optima, rng, wanted, mapped)
-            share = found.ess / found.log_weights.size
-    if not usable(found, _FEWEST):
+        if found is None or not usable(found):
+            near, found = posterior, importance(posterior, optima, rng, wanted, mapped).weighted
+            share = found.ess / found.count
+    if not usable(found):
         return None
-    draws = weighted_draws(near, found, rng, target_ess=plan.target_ess)
+    run = Run((), plan, found)
+    draws = gather(near, run)
     if share < LEAST_EFFICIENCY:
         draws = draws.limited(
             [
@@ -104,54 +83,54 @@ def weighted_run(
                 )
             ]
         )
-    return Weighted(_run(posterior, found, plan, rng), draws, _evidence(found, plan.ensembles), found)
+    return run, draws
+
+
+def usable(found: Weighted) -> bool:
+    """Whether averages converge and enough draws count."""
+    return found.pareto_k <= usable_k(found.count) and found.ess >= _FEWEST
 
 
 def _by_surrogate(
     posterior: Posterior, optimum: Optimum, rng: np.random.Generator, plan: ImportancePlan, mapped: Mapped
-) -> tuple[Posterior, Importance | None, float]:
+) -> tuple[Posterior, Weighted | None, float]:
     """The posterior of a surrogate about an optimum; draws of it weighted by the posterior itself; and how
-    efficient the worse of both steps was [-]. No draws where the surrogate does not hold."""
+    efficient they can be called [-]. No draws where the surrogate does not hold."""
     surrogate = Surrogate.of(posterior, optimum, rng, mapped)
     if surrogate is None:
         return posterior, None, 0.0
     near = replace(posterior, surrogate=surrogate)
-    first = importance(near, [optimum], rng, plan, mapped)
-    if not usable(first, _FEWEST):
+    first = importance(near, [optimum], rng, plan, mapped).weighted
+    if not usable(first):
         return posterior, None, 0.0
-    count, share = int(_EXACT * plan.wanted), first.ess / first.log_weights.size
+    count, share = int(_EXACT * plan.wanted), first.ess / first.count
     if share < LEAST_EFFICIENCY:
-        z, about, ess, share = _walked(near, first, count, rng, mapped)
+        z, about, share = _walked(near, first, count, rng, mapped)
     else:
-        drawn = np.concatenate([first.resampled(count // 4, rng, part=part) for part in _parts(first, 4)])
-        z, about, ess = first.coordinates[drawn], first.log_density[drawn], first.ess
+        drawn = first.batches(int(min(count, first.ess)) // BATCHES, rng).ravel()
+        z, about = first.coordinates[drawn], first.log_density[drawn]
     exact = spread(posterior, z, mapped)
-    raw = exact - about
-    log_weights, k = tail_smoothed(raw)
-    if not (k <= _SMALL and effective(log_weights) >= LEAST_EFFICIENCY * count):
+    inside = np.isfinite(exact)
+    raw = (exact - about)[inside] + first.log_evidence
+    found = Weighted.of(posterior, z[inside], exact[inside], raw, len(z), smooth=True)
+    if not (found.pareto_k <= _SMALL and found.ess >= LEAST_EFFICIENCY * found.count):
         return posterior, None, 0.0
-    ess = 1.0 / (1.0 / effective(log_weights) + 1.0 / ess)
-    mean = float(logsumexp(raw) - np.log(raw.size))
-    error = float(np.hypot(np.std(np.exp(raw - mean)) / np.sqrt(raw.size), first.log_evidence_sd))
-    whole = first.log_evidence + mean
-    evaluations = count + len(surrogate.bases)
-    made = Importance(z, exact, log_weights, k, ess, whole, error, 1, evaluations, raw + first.log_evidence)
-    return near, made, share
+    error = float(np.hypot(found.log_evidence_sd, first.log_evidence_sd))
+    return near, replace(found, log_evidence_sd=error), share
 
 
 def _walked(
-    near: Posterior, first: Importance, count: int, rng: np.random.Generator, mapped: Mapped
-) -> tuple[Matrix, Vector, float, float]:
-    """Draws of weighted ones moved on as four ensembles of walkers, `count` of them; log densities, effective
-    size, and 1 where the ensembles agree, else the efficiency of the weights.
+    near: Posterior, first: Weighted, most: int, rng: np.random.Generator, mapped: Mapped
+) -> tuple[Matrix, Vector, float]:
+    """Draws of weighted ones moved on as ensembles of walkers, as many as they are worth and `most` at most;
+    log densities, and 1 where the ensembles agree, else the efficiency of the weights.
 
     Resampling and moving (Gilks and Berzuini 2001, J. R. Statist. Soc. B 63): where the proposal is far from
     the posterior the walkers leave it, and their agreement tells whether they have arrived.
     """
     walkers = max(_WALKERS, 2 * near.dimension + 2)
     ensembles = []
-    for part in _parts(first, 4):
-        chosen = first.resampled(walkers, rng, part=part)
+    for chosen in first.batches(walkers, rng):
         position, density = first.coordinates[chosen], first.log_density[chosen]
         random = tuple(np.random.RandomState(rng.integers(2**32)).get_state())
         nothing = np.empty((0, walkers, near.dimension)), np.empty((0, walkers))
@@ -168,45 +147,15 @@ def _walked(
         if all(quality.grade(_WALKED).level == "reliable" for quality in found):
             break
     agree = all(quality.grade(_FEWEST).level == "reliable" for quality in found)
+    worth = float(np.min([quality.ess for quality in found]))
     log_density = np.stack([one.log_density for one in ensembles])[:, -kept.shape[2] :].swapaxes(1, 2)
     flat = kept.reshape(len(ensembles), -1, near.dimension)
-    places = np.linspace(0, flat.shape[1] - 1, count // 4).astype(int)
-    order = rng.permutation(flat.shape[1])[places]
+    count = max(1, int(min(most, worth)) // BATCHES)
+    order = rng.permutation(flat.shape[1])[:count]
     z = flat[:, order].reshape(-1, near.dimension)
     about = log_density.reshape(len(ensembles), -1)[:, order].ravel()
-    share = 1.0 if agree else first.ess / first.log_weights.size
-    return z, about, float(np.min([quality.ess for quality in found])), share
+    return z, about, 1.0 if agree else first.ess / first.count
 
 
 def _advanced(task: tuple[Posterior, Ensemble, int, int, Mixture]) -> Ensemble:
     return advance(*task)
-
-
-def usable(found: Importance, wanted: float) -> bool:
-    """Whether averages converge and enough draws count."""
-    return found.pareto_k <= usable_k(found.log_weights.size) and found.ess >= wanted
-
-
-def _parts(found: Importance, count: int) -> list[slice]:
-    size = found.log_weights.size
-    return [slice(k * size // count, (k + 1) * size // count) for k in range(count)]
-
-
-def _run(posterior: Posterior, found: Importance, plan: SamplePlan, rng: np.random.Generator) -> Run:
-    """Equally weighted draws as chains of walkers."""
-    ensembles = []
-    for part in _parts(found, plan.ensembles):
-        chosen = found.resampled(_STEPS * plan.walkers, rng, part=part)
-        chain = found.coordinates[chosen].reshape(_STEPS, plan.walkers, posterior.dimension)
-        density = found.log_density[chosen].reshape(_STEPS, plan.walkers)
-        accepted = np.full(plan.walkers, _STEPS * found.ess / found.log_weights.size)
-        ensembles.append(Ensemble(chain, density, chain[-1], density[-1], accepted, 0, (), chain[-1], 0))
-    return Run(tuple(ensembles), plan)
-
-
-def _evidence(found: Importance, count: int) -> Evidence:
-    """Log evidence of the whole and of every part."""
-    means = [
-        float(logsumexp(found.raw[part]) - np.log(found.raw[part].size)) for part in _parts(found, count)
-    ]
-    return Evidence(found.log_evidence, found.log_evidence_sd, tuple(means))

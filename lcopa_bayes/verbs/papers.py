@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from lcopa_bayes.core.files import writable_folder
+from lcopa_bayes.core.files import save_json, writable_folder
 from lcopa_bayes.paper.auditclaims import load_audit
 from lcopa_bayes.paper.claims import judge
 from lcopa_bayes.paper.comparisonclaims import load_comparison
@@ -17,7 +17,6 @@ from lcopa_bayes.paper.staticoptics import static_optics
 from lcopa_bayes.paper.steptable import load_posterior, step_table
 from lcopa_bayes.paper.verdict import Evidence
 from lcopa_bayes.report.paperpages import write_claims, write_identification, write_optics
-from lcopa_bayes.results.runfolder import save_json
 from lcopa_bayes.verbs.outcome import Told, place_of, study_of, with_report
 
 BUNDLED = ("paper-step-x", "paper-step")

@@ -6,22 +6,22 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from lcopa_bayes.audit.audit import audit
-from lcopa_bayes.compare.candidates import candidates_of
-from lcopa_bayes.compare.compare import compare
-from lcopa_bayes.core.files import writable_folder
+from lcopa_bayes.comparison.candidates import candidates_of
+from lcopa_bayes.comparison.compare import compare
+from lcopa_bayes.core.files import save_json, writable_folder
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_candidates
 from lcopa_bayes.data.studywriter import write_study
-from lcopa_bayes.design.confirmation import REPLICAS, confirmed
-from lcopa_bayes.design.design import DRAWS, checked, design
-from lcopa_bayes.design.nextmeasurement import next_measurement
-from lcopa_bayes.design.summary import as_json
-from lcopa_bayes.design.template import write_template
+from lcopa_bayes.effectsearch.loop import loop
+from lcopa_bayes.effectsearch.summary import drawn, words
+from lcopa_bayes.effectsearch.summary import results as loop_results
+from lcopa_bayes.experiments.confirmation import REPLICAS, confirmed
+from lcopa_bayes.experiments.design import DRAWS, checked, design
+from lcopa_bayes.experiments.nextmeasurement import next_measurement
+from lcopa_bayes.experiments.summary import as_json
+from lcopa_bayes.experiments.template import write_template
+from lcopa_bayes.identifiability.audit import audit
 from lcopa_bayes.inference.assembly import problem_of
-from lcopa_bayes.loop.loop import loop
-from lcopa_bayes.loop.summary import drawn, words
-from lcopa_bayes.loop.summary import results as loop_results
 from lcopa_bayes.report import write_report
 from lcopa_bayes.report.audit import write_audit
 from lcopa_bayes.report.compare import write_comparison
@@ -30,7 +30,7 @@ from lcopa_bayes.report.design import write_design
 from lcopa_bayes.report.loop import write_loop
 from lcopa_bayes.results.fit import Fit, fit
 from lcopa_bayes.results.provenance import provenance
-from lcopa_bayes.results.runfolder import save_fit, save_json
+from lcopa_bayes.results.runfolder import save_fit
 from lcopa_bayes.verbs.outcome import Told, place_of, study_of, with_report
 
 _QUICK = 4

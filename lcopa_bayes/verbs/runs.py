@@ -10,12 +10,12 @@ import numpy as np
 
 from lcopa_bayes.bench.campaign import write_campaign
 from lcopa_bayes.bench.campaignfile import load_plan
-from lcopa_bayes.calibrate.calibrate import calibrate
-from lcopa_bayes.calibrate.summary import results as calibration_results
-from lcopa_bayes.calibrate.summary import tables
-from lcopa_bayes.calibrate.truths import Stated
+from lcopa_bayes.calibration.calibrate import calibrate
+from lcopa_bayes.calibration.summary import results as calibration_results
+from lcopa_bayes.calibration.summary import tables
+from lcopa_bayes.calibration.truths import Stated
 from lcopa_bayes.core.checks import refuse_if
-from lcopa_bayes.core.files import writable_folder
+from lcopa_bayes.core.files import save_json, save_table, writable_folder
 from lcopa_bayes.core.parallel import cores
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.report import write_report
@@ -24,10 +24,13 @@ from lcopa_bayes.report.calibrate import is_calibration, write_calibration
 from lcopa_bayes.report.compare import write_comparison
 from lcopa_bayes.report.design import write_design
 from lcopa_bayes.report.loop import write_loop
+from lcopa_bayes.report.predict import write_prediction
 from lcopa_bayes.results.fit import fit
 from lcopa_bayes.results.integerrival import integer_rival
+from lcopa_bayes.results.newdrive import NAME as PREDICTED
 from lcopa_bayes.results.provenance import provenance
-from lcopa_bayes.results.runfolder import save_fit, save_json, save_table
+from lcopa_bayes.results.runfolder import save_fit
+from lcopa_bayes.results.savedfit import load_fit
 from lcopa_bayes.verbs.outcome import Told, place_of, study_of, with_report
 
 _PAGES = {
@@ -35,6 +38,7 @@ _PAGES = {
     "design.json": write_design,
     "compare.json": write_comparison,
     "loop.json": write_loop,
+    PREDICTED: write_prediction,
 }
 """Pages beside the report of a fit, by what they are drawn from."""
 
@@ -78,6 +82,15 @@ def report(options: argparse.Namespace, command: list[str]) -> Told:
     if (folder / "results.json").is_file() or not pages:
         pages.insert(0, write_report(folder))
     return with_report({"pages": [str(page) for page in pages]}, pages[0])
+
+
+def predict(options: argparse.Namespace, command: list[str]) -> Told:
+    """Bands for a drive, or scores of a record, by the fit of a run folder, without a new fit."""
+    fitted = load_fit(options.folder)
+    found = fitted.predict(options.drive, offset=options.offset)
+    folder = options.out or options.folder / "predict" / options.drive.stem
+    values = found.save(folder, provenance=provenance(fitted.study, command))
+    return with_report(values, write_prediction(folder), found.verdict)
 
 
 def simulate(options: argparse.Namespace, command: list[str]) -> Told:

@@ -25,18 +25,18 @@ import numpy as np
 from scipy.stats import beta
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.audit.curvature import curvature
 from lcopa_bayes.bench.acquisition import Bench, truth
 from lcopa_bayes.bench.command import staircase
 from lcopa_bayes.bench.device import Device, TransferPath
-from lcopa_bayes.calibrate.simulation import measured
-from lcopa_bayes.compare.candidates import candidates_of
-from lcopa_bayes.compare.gains import by_evidence, simplest
+from lcopa_bayes.calibration.simulation import measured
+from lcopa_bayes.comparison.candidates import candidates_of
+from lcopa_bayes.comparison.gains import by_evidence, simplest
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.files import writable_folder, write_text
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.data.settings import ModelSettings, NoiseSettings, PriorSettings
 from lcopa_bayes.data.study import Study
+from lcopa_bayes.identifiability.curvature import curvature
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.likelihood import Landscape
 from lcopa_bayes.results.prediction import responses

@@ -16,9 +16,9 @@ from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.data.literature import PAPER
 from lcopa_bayes.data.studyfile import load_study
-from lcopa_bayes.design.candidates import candidates
-from lcopa_bayes.design.information import Bench
-from lcopa_bayes.design.limits import limits_of
+from lcopa_bayes.experiments.candidates import candidates
+from lcopa_bayes.experiments.information import Bench
+from lcopa_bayes.experiments.limits import limits_of
 from lcopa_bayes.inference.assembly import Problem, problem_of
 
 STUDY = Path(__file__).parents[1] / "paper-step-x"

@@ -14,8 +14,8 @@ from lcopa_bayes.bench.undeclared import NOISE, Campaign, campaign, drawn
 from lcopa_bayes.core.files import write_text
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.loop.loop import Loop, Side, loop
-from lcopa_bayes.loop.scores import pooled_coverage
+from lcopa_bayes.effectsearch.loop import Loop, Side, loop
+from lcopa_bayes.effectsearch.scores import pooled_coverage
 
 _ATTEMPTS = 20
 TERMS = {"direct": 2, "cross": 1}

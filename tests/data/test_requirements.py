@@ -14,9 +14,9 @@ from lcopa_bayes.cli import main
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.record import Record, save_record
 from lcopa_bayes.data.requirements import unmet
+from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.optimum import find_optima
-from lcopa_bayes.loop.loop import loop
 from lcopa_bayes.results.discretisation import resolved
 from lcopa_bayes.results.fit import fit
 

@@ -18,7 +18,7 @@ from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.record import Record, save_record
 from lcopa_bayes.data.rest import not_at_rest, unrest
 from lcopa_bayes.data.studyfile import load_study
-from lcopa_bayes.loop.loop import loop
+from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.results.fit import fit
 
 RECORDS = Path(os.environ.get("LCOPA_BAYES_DATA", Path(__file__).parents[2] / ".." / "shared")) / "records"

@@ -62,7 +62,12 @@ def tables_of(size: int) -> dict[str, pd.DataFrame]:
     step |= {f"response_{q}": 1 - np.exp(-time / 3) + 0.01 * z for q, z in QUANTILES.items()}
     step |= {f"steady_{q}": 1.0 + 0.01 * QUANTILES[q] for q in ("05", "50", "95")}
     x = np.linspace(0.5, 2.0, 20)
+    bode = {"path": "x", "unit": "rad/V", "frequency": np.geomspace(0.04, 5.0, 40)}
+    for curve, middle in (("gain", 1 / (1 + bode["frequency"])), ("phase", -90 * bode["frequency"])):
+        bode |= {f"{curve}_pointwise_{q}": middle + 0.01 * z for q, z in QUANTILES.items()}
+        bode |= {f"{curve}_simultaneous_{q}": middle + 0.02 * QUANTILES[q] for q in ("05", "95")}
     return {
+        "frequency_response": pd.DataFrame(bode),
         "bands": bands,
         "drives": pd.concat(
             pd.DataFrame(
@@ -192,6 +197,7 @@ def test_sections_come_in_the_order_of_reading(html):
     titles = re.findall(r"<h2>(.*?)</h2>", html)
     assert titles == [
         *("Data and bands", "Residuals", "Parameters", "Pairs of parameters", "Traces", "Step responses"),
+        "Frequency response",
         *(
             "Priors and posteriors",
             "Prior sensitivity",

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from small import TRUTH, U, Y, draws_of, problem, record, study
 
-from lcopa_bayes.audit.audit import audit
 from lcopa_bayes.bench.command import step
 from lcopa_bayes.data.record import Record
+from lcopa_bayes.identifiability.audit import audit
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.results.adequacy import _coverage, limitations
@@ -40,7 +40,7 @@ def named(made: Problem):
 
 def found(made: Problem, draws: Draws) -> tuple[Limitation, ...]:
     posterior, rng = made.posterior, np.random.default_rng(1)
-    shown = bands(draws, posterior.model, posterior.samples, posterior.noise, held_out=False, rng=rng)
+    shown = bands(draws, posterior.model, posterior.samples, posterior.noise, held_out=False, seed=0)
     left = residuals(draws, shown, posterior.noise, made.scales.period)
     return limitations(made, draws, shown, left, rng)
 
@@ -79,8 +79,8 @@ def test_correlated_noise_under_a_white_model_is_named():
 def test_a_whiteness_that_one_of_many_records_lacks_by_chance_is_not_called():
     """p just below the threshold on one record counts alone, not among twenty."""
     made = problem(measured(1), noise="white")
-    posterior, draws, rng = made.posterior, about(made), np.random.default_rng(1)
-    shown = bands(draws, posterior.model, posterior.samples, posterior.noise, held_out=False, rng=rng)
+    posterior, draws = made.posterior, about(made)
+    shown = bands(draws, posterior.model, posterior.samples, posterior.noise, held_out=False, seed=0)
     (left,) = residuals(draws, shown, posterior.noise, made.scales.period)
     slight = replace(left, p_white=2e-3)
     alone = limitations(made, draws, shown, [slight], np.random.default_rng(2))
@@ -107,7 +107,7 @@ def test_coverage_is_judged_by_the_independent_samples_there_are():
         made = problem(measured(seed, correlation=0.9), noise="ar1")
         draws = about(made, rho=0.9)
         posterior, rng = made.posterior, np.random.default_rng(seed)
-        (band,) = bands(draws, posterior.model, posterior.samples, posterior.noise, held_out=False, rng=rng)
+        (band,) = bands(draws, posterior.model, posterior.samples, posterior.noise, held_out=False, seed=seed)
         small += _coverage(made, draws, band, rng).p < 0.05
     assert small <= 40 * 0.05 + 4 * np.sqrt(40 * 0.05)
 

@@ -20,7 +20,8 @@ def residual_of(values: np.ndarray, noise: str = "white", time: np.ndarray | Non
     draws = draws_of(posterior.table, np.tile(row_values(posterior.table, KNOWN), (4, 1)))
     n = values.size
     time = np.arange(n) * 0.5 if time is None else time
-    band = Band("r", "y", "rad", False, time, 1.0 + values, np.ones((5, n)), np.ones((5, n)), "", 0, 4)
+    five, four = np.ones((5, n)), np.ones((4, n))
+    band = Band("r", "y", "rad", False, time, 1.0 + values, five, five, four, four, "", 0, 4)
     (found,) = residuals(draws, [band], posterior.noise, 0.5)
     return found
 

@@ -17,10 +17,11 @@ from small import record, study
 
 from lcopa_bayes.bench.command import on_off
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.files import save_json, save_table
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.report.savedrun import load_run
 from lcopa_bayes.results.fit import Fit, fit
-from lcopa_bayes.results.runfolder import save_fit, save_json, save_posterior, save_table, variable_names
+from lcopa_bayes.results.runfolder import save_fit, save_posterior, variable_names
 from lcopa_bayes.results.summary import results
 from lcopa_bayes.results.tables import tables
 
@@ -43,6 +44,7 @@ def folder(fitted, tmp_path_factory):
 
 def test_the_folder_holds_what_was_promised(fitted, folder):
     assert sorted(p.name for p in folder.iterdir()) == [
+        "fit.json",
         "posterior.nc",
         "provenance.json",
         "results.json",

@@ -1,0 +1,228 @@
+"""One candidate fitted and scored, as plain values that its folder keeps."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+import pandas as pd
+from threadpoolctl import threadpool_limits
+
+from lcopa_bayes.comparison.candidates import Candidate
+from lcopa_bayes.comparison.criteria import criteria
+from lcopa_bayes.comparison.integerorder import integer_orders
+from lcopa_bayes.comparison.predictivedensity import Predicted, predictions
+from lcopa_bayes.comparison.priorwidth import widths
+from lcopa_bayes.core.arrays import Matrix
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.files import save_json, save_table, writable_folder
+from lcopa_bayes.data.settings import SamplerSettings
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.inference.likelihood import Peak
+from lcopa_bayes.results.fit import Fit, fit, plan_of
+from lcopa_bayes.results.provenance import digest, fingerprint, settings_of
+from lcopa_bayes.results.summary import residual_rms, scores
+from lcopa_bayes.sampling.convergence import Grade
+
+CARD = "candidate.json"
+"""File of a candidate's scores inside its folder."""
+WALKERS = 32
+"""Walkers of a comparison where the study leaves their number open, if the dimension does not ask for more
+[-]. Ensembles and effective draws are those of a fit, so that a grade means the same."""
+_STARTS = 64
+"""Draws kept as starts of richer models [-]."""
+_VERSION = 2
+"""Raised when what a card holds changes."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Contender:
+    """A candidate and how it is to be fitted."""
+
+    candidate: Candidate
+    """With the short plan of a comparison."""
+    patient: SamplerSettings
+    """The study's own plan, for when the short one leaves nothing usable."""
+    folder: Path | None
+    quick: bool
+    resume: bool
+
+    @property
+    def fingerprint(self) -> str:
+        """Hash of everything the scores depend on."""
+        study = self.candidate.study
+        told = (
+            fingerprint(study, plan_of(problem_of(study), quick=self.quick)),
+            self.candidate.improper,
+            _VERSION,
+            [digest(record) for record in study.held_out],
+        )
+        return hashlib.sha256(json.dumps(told).encode()).hexdigest()
+
+    def stored(self) -> Mapping[str, Any] | None:
+        """The card of an earlier run of the same candidate; None when there is none."""
+        path = None if self.folder is None else self.folder / CARD
+        if not self.resume or path is None or not path.is_file():
+            return None
+        try:
+            told: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+            own = told["fingerprint"] == self.fingerprint
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(
+                f"{path}: not a candidate this program wrote, or damaged ({error}); leave out --resume to "
+                "start anew, or choose another --out"
+            ) from None
+        return told if own else None
+
+    def __call__(self) -> Mapping[str, Any]:
+        """The card: from the folder where it is complete, else by fitting. Deterministic given the study."""
+        found = self.stored()
+        if found is not None:
+            return found
+        with threadpool_limits(1):
+            began = time.perf_counter()
+            made = self._fitted(self.candidate.study, self.folder)
+            if made.draws.grade.level == "unusable" and self.patient != self.candidate.study.sampler:
+                longer = replace(self.candidate.study, sampler=self.patient)
+                made = self._fitted(longer, None if self.folder is None else self.folder / "longer")
+            told = self.scored(made) | {"seconds": time.perf_counter() - began}
+        self.store(told)
+        return told
+
+    def fitted_from(self, starts: Matrix) -> Fit:
+        """The candidate fitted as its study asks, with modes known from elsewhere, table values
+        (starts, rows), among the proposals."""
+        study = replace(self.candidate.study, sampler=self.patient)
+        return self._fitted(study, None if self.folder is None else self.folder / "again", starts)
+
+    def scored(self, made: Fit, also: Sequence[Peak] = ()) -> dict[str, Any]:
+        """The card of a fit; `also` are maxima of its likelihood known from elsewhere."""
+        told, found_parts = card(self.candidate, made, also)
+        return told | {
+            "fingerprint": self.fingerprint,
+            "pointwise": _pointwise(found_parts),
+            "curves": _curves(made),
+        }
+
+    def store(self, told: Mapping[str, Any]) -> None:
+        """Keep a card and its tables in the folder, where there is one."""
+        if self.folder is not None:
+            tables = writable_folder(self.folder / "tables")
+            save_table(pd.DataFrame(told["curves"]), tables / "curves.csv")
+            save_table(pd.DataFrame(told["pointwise"]), tables / "pointwise.csv")
+            save_json(told, self.folder / CARD)
+
+    def _fitted(self, study: Study, folder: Path | None, starts: Matrix | None = None) -> Fit:
+        return fit(study, folder=folder, resume=self.resume, quick=self.quick, quiet=True, starts=starts)
+
+
+def contender(candidate: Candidate, folder: Path | None, *, quick: bool, resume: bool) -> Contender:
+    """A candidate with fewer walkers than a fit has; what the study's ``[sampler]`` states is kept.
+
+    Where the short plan leaves a posterior that is unusable it is sampled again as a fit would.
+    """
+    study, own = candidate.study, candidate.study.sampler
+    sampler = replace(own, walkers=own.walkers or WALKERS)
+    # the study file may name candidates that say nothing of this one
+    return Contender(
+        replace(candidate, study=replace(study, sampler=sampler, inputs={})), own, folder, quick, resume
+    )
+
+
+def card(
+    candidate: Candidate, made: Fit, also: Sequence[Peak] = ()
+) -> tuple[dict[str, Any], tuple[Predicted, ...]]:
+    """Everything a comparison needs of a fitted candidate, as plain values, and its predictions."""
+    grade = made.draws.grade
+    usable = grade.level != "unusable"
+    weighed = None if candidate.improper else made.evidence
+    parts = predictions(made) if usable else ()
+    found = criteria(made, also)
+    told: dict[str, Any] = plain(
+        {
+            "name": candidate.name,
+            "about": candidate.about,
+            "notes": candidate.notes,
+            "integer": candidate.integer,
+            "terms": candidate.terms,
+            "settings": settings_of(candidate.study),
+            "time_unit": made.study.time_unit,
+            "grade": grade.level,
+            "grade_reason": grade.reason,
+            "usable": usable,
+            "log_evidence": weighed.value if weighed else None,
+            "log_evidence_sd": weighed.sd if weighed else None,
+            "log_evidence_grade": Grade.worst([weighed.grade, grade]).level if weighed else None,
+            "evidence_undefined": (
+                f"improper prior of {', '.join(candidate.improper)}" if candidate.improper else ""
+            ),
+            "prior_widths": [one.as_json() for one in widths(made)] if usable and weighed else [],
+            **found.as_json(),
+            "starts": {"optimum": found.values, "draws": made.draws.thinned(_STARTS)},
+            "refinement": made.problem.refinement,
+            "residual_rms": residual_rms(made),
+            "fit_scores": scores(made, held_out=False),
+            "held_out": scores(made, held_out=True),
+            "predictions": [one.as_json() | {"grade": one.grade(grade.level)} for one in parts],
+            "order_is_integer": [one.as_json() for one in integer_orders(made)],
+            "parameters_told": [one.as_json() for one in made.draws.estimates()],
+            "step_metrics": [one.as_json() for one in made.metrics],
+            "residual_tests": [
+                {
+                    "record": one.record,
+                    "axis": one.axis,
+                    "held_out": one.held_out,
+                    "p_white": one.p_white,
+                    "rms": one.rms,
+                    "lag_1": float(one.autocorrelation[0]) if one.autocorrelation.size else None,
+                }
+                for one in made.residuals
+            ],
+            "ess": made.draws.ess,
+        }
+    )
+    return told, parts
+
+
+def _pointwise(parts: tuple[Predicted, ...]) -> dict[str, list[Any]]:
+    """Log predictive density of every sample predicted, one list per column."""
+    told: dict[str, list[Any]] = {"part": [], "kind": [], "axis": [], "time": [], "log_density": []}
+    for one in parts:
+        told["part"] += [one.part.name] * one.time.size
+        told["kind"] += [one.part.kind] * one.time.size
+        told["axis"] += list(one.axis)
+        told["time"] += one.time.tolist()
+        told["log_density"] += one.log_density.tolist()
+    return told
+
+
+def _curves(made: Fit) -> dict[str, list[Any]]:
+    """Observed, median and 90 % band of every record, one list per column."""
+    told: dict[str, list[Any]] = {
+        name: []
+        for name in ("record", "axis", "unit", "held_out", "time", "observed", "middle", "low", "high")
+    }
+    for band in made.bands:
+        size = band.time.size
+        told["record"] += [band.record] * size
+        told["axis"] += [band.axis] * size
+        told["unit"] += [band.unit] * size
+        told["held_out"] += [band.held_out] * size
+        for name, values in (
+            ("time", band.time),
+            ("observed", band.observed),
+            ("middle", band.plant[2]),
+            ("low", band.noisy[0]),
+            ("high", band.noisy[4]),
+        ):
+            told[name] += np.asarray(values).tolist()
+    return told

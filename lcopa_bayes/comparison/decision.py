@@ -1,0 +1,177 @@
+"""Which candidate is preferred, why, and whether fractional orders are warranted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from lcopa_bayes.comparison.fractional import fractional, undecided
+from lcopa_bayes.comparison.gains import Gain, Row, by_evidence, by_prediction, simplest
+
+RESONANT = 1.5
+"""Order from which a single term overshoots visibly [-]."""
+NOT_WHITE = 0.01
+"""p-value below which a whitened residual is not white [-]."""
+
+
+def decided(rows: Sequence[Row]) -> dict[str, Any]:
+    """Preferred candidate with the reason, the flag of disagreement, and the verdict on fractional orders."""
+    unranked = [
+        {"name": row["name"], "reason": f"its posterior is unusable: {row['grade_reason']}"}
+        for row in rows
+        if not row["usable"]
+    ]
+    undefined = [
+        {"name": row["name"], "reason": f"its evidence is undefined: {row['evidence_undefined']}"}
+        for row in rows
+        if row["usable"] and row["log_evidence"] is None
+    ]
+    usable = [row for row in rows if row["usable"]]
+    weighed = [row for row in usable if row["log_evidence"] is not None]
+    told = {"unranked": unranked, "evidence_undefined": undefined, "flags": flags(rows)}
+    if len(usable) < 2:
+        why = "fewer than two candidates have a usable posterior: nothing can be compared"
+        return told | {
+            "preferred": None,
+            "why": why,
+            "agreement": {"agree": None, "sentence": why},
+            "fractional": undecided(why),
+            "by_evidence": None,
+            "by_prediction": None,
+        }
+    evident = simplest(weighed, by_evidence, "log_evidence") if weighed else None
+    predictive = simplest([row for row in usable if row["elpd"] is not None], by_prediction, "elpd")
+    agree, sentence = _agreement(evident, predictive, usable)
+    preferred = evident or predictive
+    unseen = any(row["held_out"] for row in usable)
+    if agree is False and unseen and predictive is not None:
+        preferred = predictive
+    why = _why(preferred, evident, usable, agree, sentence, unseen)
+    why += "".join(
+        f" {row['name']} is not ranked: it has not met a mode of a model that it contains."
+        for row in rows
+        if not row["containment"]["met"]
+    )
+    return told | {
+        "preferred": None if preferred is None else preferred["name"],
+        "why": why,
+        "agreement": {"agree": agree, "sentence": sentence},
+        "fractional": fractional(usable),
+        "by_evidence": None if evident is None else evident["name"],
+        "by_prediction": None if predictive is None else predictive["name"],
+    }
+
+
+def _agreement(evident: Row | None, predictive: Row | None, usable: Sequence[Row]) -> tuple[bool | None, str]:
+    """Whether the records left out contradict the evidence, in words."""
+    if evident is None or predictive is None or evident["elpd"] is None:
+        return None, "Either evidence or prediction is missing; one stands alone."
+    best = max((row for row in usable if row["elpd"] is not None), key=lambda row: row["elpd"])
+    if best is evident:
+        return True, f"Evidence and prediction agree: {evident['name']} also predicts best."
+    lost = by_prediction(best, evident)
+    assert lost is not None
+    if not lost.counts:
+        return True, (
+            f"Evidence and prediction agree: no candidate predicts better than {evident['name']} beyond "
+            f"chance (best: {best['name']}, {lost})."
+        )
+    last = min((row for row in usable if row["elpd"] is not None), key=lambda row: row["elpd"])
+    worst = " and predicts worst of all" if last is evident else ""
+    return False, (
+        f"Fit and prediction disagree: {evident['name']} has the evidence{worst}, but {best['name']} "
+        f"predicts what was left out better by {lost}. The models leave something out that both notice "
+        "differently."
+    )
+
+
+def _why(
+    preferred: Row | None,
+    evident: Row | None,
+    usable: Sequence[Row],
+    agree: bool | None,
+    sentence: str,
+    unseen: bool,
+) -> str:
+    """The decision with its reason."""
+    if preferred is None:
+        return "No candidate has a score to be ranked by."
+    name = preferred["name"]
+    if evident is None:
+        return f"{name} is preferred by prediction alone: no candidate has an evidence."
+    if preferred is not evident or agree is False:
+        reason = "records that were not fitted decide" if unseen else "no whole record was held out to decide"
+        return f"{name} is preferred, with a warning: {sentence} Here {reason}."
+    richer = [row for row in usable if row["parameters"] > preferred["parameters"]]
+    others = [row for row in usable if row is not preferred and row not in richer]
+    parts = [f"{row['name']}, with more parameters, gains {gain}" for row, gain in _gains(richer, preferred)]
+    parts += [f"{row['name']} stands at {gain}" for row, gain in _gains(others, preferred)]
+    word = "suffices" if richer else "is preferred"
+    return f"{name} {word}: in log evidence {'; '.join(parts)}. {sentence}"
+
+
+def _gains(rows: Sequence[Row], against: Row) -> list[tuple[Row, Gain]]:
+    """Rows with what they gain over another, the best first; those without evidence are left out."""
+    told = [(row, by_evidence(row, against)) for row in rows]
+    return sorted(((row, gain) for row, gain in told if gain is not None), key=lambda pair: -pair[1].nats)
+
+
+def flags(rows: Sequence[Row]) -> list[dict[str, str]]:
+    """What a reader must not overlook, per candidate."""
+    out: list[dict[str, str]] = []
+    for row in rows:
+        out += missed_modes(row)
+        if not row["usable"]:
+            continue
+        left = [one for one in row["residual_tests"] if not one["held_out"]]
+        worst = min(left, key=lambda one: one["p_white"], default=None)
+        if worst is None or worst["p_white"] >= NOT_WHITE:
+            continue
+        high = [one["estimate"] for one in row["order_is_integer"] if one["estimate"]["lower"] > RESONANT]
+        said = (
+            f"on {worst['record']}, axis {worst['axis']}, what it leaves is not white "
+            f"(p = {worst['p_white']:.1g})"
+        )
+        if high:
+            names = ", ".join(f"{one['name']} = {one['value']:.3g}" for one in high)
+            said = (
+                f"{names} makes it overshoot, and {said}: the high order may imitate an overshoot of another "
+                "origin, such as a pulse of the drive that is not in the record"
+            )
+        out.append({"model": row["name"], "kind": "imitation" if high else "residual", "sentence": said})
+    ranked = [row for row in rows if row["usable"] and row["held_out"]]
+    for axis in dict.fromkeys(one["axis"] for row in ranked for one in row["fit_scores"]):
+        fitted = min(ranked, key=lambda row: row["residual_rms"][axis])
+        error = {row["name"]: row["held_out_rmse"].get(axis) for row in ranked}
+        if None in error.values() or len(ranked) < 2:
+            continue
+        if max(error, key=lambda name: error[name]) == fitted["name"]:
+            least = min(error, key=lambda name: error[name])
+            out.append(
+                {
+                    "model": fitted["name"],
+                    "kind": "overfit",
+                    "sentence": (
+                        f"it fits axis {axis} best (RMSE {fitted['residual_rms'][axis]:.3g}) and predicts it "
+                        f"worst (RMSE {error[fitted['name']]:.3g}; {least}: {error[least]:.3g})"
+                    ),
+                }
+            )
+    return out
+
+
+def missed_modes(row: Row) -> list[dict[str, str]]:
+    """That a candidate was sampled again because a model it contains had found a mode it had missed."""
+    held = row["containment"]
+    missed = [one for one in held["contains"] if one["missed"]]
+    if not missed:
+        return []
+    best = max(missed, key=lambda one: one["reached"])
+    said = (
+        f"its first sampling missed a mode that {best['model']}, which it contains, had found (best log "
+        f"likelihood {best['own']:.1f} against {best['reached']:.1f} there); it was sampled again with that "
+        "mode among the proposals"
+    )
+    if not held["met"]:
+        said += ", and still has not met it: it is ranked nowhere"
+    return [{"model": row["name"], "kind": "missed mode", "sentence": said}]

@@ -1,0 +1,180 @@
+"""The base fit: noise measured first, then the plant's optimum from several starts, and whether it failed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.effectsearch.autoregression import Autoregression, unbroken
+from lcopa_bayes.effectsearch.basemodel import BaseModel
+from lcopa_bayes.effectsearch.gaussnewton import Optimum, Regression
+from lcopa_bayes.effectsearch.noisesamples import AxisNoise, axis_noise, joint_noise, quiet_pieces
+from lcopa_bayes.effectsearch.starts import screened
+from lcopa_bayes.effectsearch.whitening import Whitening, parts
+from lcopa_bayes.inference.posterior import Posterior
+
+_STARTS = 8
+_DELAYS = (0.7, 0.85, 1.15, 1.3)
+"""Factors on the fitted delays from which the descent is started again: delays can jump [-]."""
+_EXPLAINED = 0.5
+"""Share of the response variance that a usable base fit explains at least [-]."""
+_ROUNDS = 3
+_SPARE = 2
+"""Independent samples beyond the parameters with which a residual can be judged at all [-]."""
+_MOVED = 0.05
+"""Change of the dead time from which the noise is measured anew [-]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class BaseFit:
+    """The plant alone at its optimum under the measured noise."""
+
+    model: BaseModel
+    noise: tuple[AxisNoise, ...]
+    regression: Regression
+    optimum: Optimum
+    failed: str
+    """Why no effect may be named from it; empty when it is usable."""
+    caution: tuple[str, ...]
+    """What limits the verdict."""
+
+    @property
+    def noise_samples(self) -> tuple[int, ...]:
+        """Samples that the noise of each axis is known from, 0 where it was fitted jointly [-]."""
+        return tuple(one.samples if one.known else 0 for one in self.noise)
+
+    @property
+    def noise_known(self) -> bool:
+        """Whether the noise of every axis was measured apart from the fit."""
+        return all(one.known for one in self.noise)
+
+
+def base_fit(
+    model: BaseModel, rng: np.random.Generator, *, starts: int = _STARTS, near: Sequence[Vector] = ()
+) -> BaseFit:
+    """Noise, then damped Gauss-Newton from several starts and delays; `near` are further coordinates to start
+    from.
+
+    Where an axis has too few quiet samples its noise is fitted to the residual in turn with the plant.
+    """
+    posterior = model.posterior
+    seeds = [model.coordinates(values) for values in screened(posterior, rng, count=starts)]
+    white = Whitening(posterior.samples, _guessed(posterior))
+    optimum = Regression(model, white).best([*near, *seeds])
+    optimum = Regression(model, white).best([optimum.x, *_other_delays(model, optimum.x)])
+    noise: tuple[AxisNoise, ...] = ()
+    for _ in range(_ROUNDS):
+        delay = model.dead_time(optimum.x)
+        again = measured(posterior, optimum.residual, delay)
+        if noise and all(_alike(a, b) for a, b in zip(noise, again, strict=True)):
+            break
+        noise = again
+        regression = Regression(model, whitening(model, noise))
+        optimum = regression.descend(optimum.x)
+        if all(one.known for one in noise) and abs(model.dead_time(optimum.x) - delay) <= _MOVED * delay:
+            break
+    for _ in range(_ROUNDS):
+        if optimum.converged:
+            break
+        optimum = regression.descend(optimum.x)  # damped to a standstill: start again undamped
+    return BaseFit(model, noise, regression, optimum, _failure(model, optimum), _cautions(noise, optimum))
+
+
+def _guessed(posterior: Posterior) -> tuple[Autoregression, ...]:
+    """White noise of a hundredth of each response's spread, to find the hill with."""
+    axes = range(len(posterior.table.layout.responses))
+    pooled = [np.concatenate([s.axes[axis].values for s in posterior.samples]) for axis in axes]
+    return tuple(Autoregression(np.empty(0), 0.01 * (float(values.std()) or 1.0)) for values in pooled)
+
+
+def measured(posterior: Posterior, residual: Vector, delay: float) -> tuple[AxisNoise, ...]:
+    """Noise of every axis; from the stacked `residual` [response unit] where nothing else gives it."""
+    out = []
+    for axis, response in enumerate(posterior.table.layout.responses):
+        found = axis_noise(posterior.samples, axis, delay, response.name)
+        if found is None:
+            quiet = sum(p.size for p in quiet_pieces(posterior.samples, axis, delay))
+            found = joint_noise(axis_pieces(posterior, residual, axis), response.name, quiet)
+        out.append(found)
+    return tuple(out)
+
+
+def whitening(model: BaseModel, noise: Sequence[AxisNoise]) -> Whitening:
+    """The whitening operator of the fit records."""
+    processes = tuple(one.process for one in noise)
+    known = tuple(one.posterior for one in noise)
+    dependence = () if all(one.known for one in noise) else tuple(one.dependence for one in noise)
+    return Whitening(model.posterior.samples, processes, dependence, known)
+
+
+def renewed(model: BaseModel, optimum: Optimum, known: Whitening) -> Whitening:
+    """The noise as the residual of another optimum gives it, where it had to be fitted jointly."""
+    if not known.dependence:
+        return known
+    delay = model.dead_time(optimum.x[: len(model.names)])
+    return whitening(model, measured(model.posterior, optimum.residual, delay))
+
+
+def axis_pieces(posterior: Posterior, stacked: Vector, axis: int) -> list[Vector]:
+    """Unbroken stretches of one axis of stacked values."""
+    out, start = [], 0
+    for record in posterior.samples:
+        for number, observed in enumerate(record.axes):
+            part = stacked[start : start + observed.values.size]
+            start += observed.values.size
+            if number == axis and observed.values.size:
+                out += [part[piece] for piece in unbroken(observed.gaps)]
+    return out
+
+
+def _other_delays(model: BaseModel, x: Vector) -> list[Vector]:
+    """The same coordinates with every free delay scaled."""
+    rows = [model.posterior.table.rows[k] for k in model.least.columns]
+    where = [k for k, row in enumerate(rows) if row.kind == "delay"]
+    out = []
+    for factor in _DELAYS if where else ():
+        other = x.copy()
+        for k in where:
+            other[k] += np.log(factor) if rows[k].log_scale else (factor - 1) * x[k]
+        out.append(other)
+    return out
+
+
+def _alike(one: AxisNoise, other: AxisNoise) -> bool:
+    a, b = one.process, other.process
+    return one.samples == other.samples and a.order == b.order and abs(a.sd / b.sd - 1) < 0.01
+
+
+def _failure(model: BaseModel, optimum: Optimum) -> str:
+    if not optimum.converged:
+        return "the base fit did not converge within its steps"
+    if optimum.effective < optimum.x.size + _SPARE:
+        return (
+            f"the residual of the base fit is so smooth that its samples count as {optimum.effective:.0f} "
+            f"independent ones, too few beside {optimum.x.size} parameters"
+        )
+    responses = model.posterior.table.layout.responses
+    for axis, response in enumerate(responses):
+        own = [part.rows for part in parts(model.posterior.samples) if part.axis == axis]
+        seen = [model.observed[rows] for rows in own if rows.stop > rows.start]
+        spread = sum(float(((values - values.mean()) ** 2).sum()) for values in seen)
+        missed = sum(float((optimum.residual[rows] ** 2).sum()) for rows in own)
+        if missed > (1 - _EXPLAINED) * spread > 0 and len(responses) == 1:
+            return f"the base model explains less than half of the variance of {response.name}"
+    return ""
+
+
+def _cautions(noise: Sequence[AxisNoise], optimum: Optimum) -> tuple[str, ...]:
+    out = [one.caution for one in noise if one.caution]
+    if optimum.at_bound:
+        out.append(
+            f"{', '.join(optimum.at_bound)} stand(s) at the end of its prior in the base fit; widen the "
+            "prior "
+            "or take the parameter out: what a bound takes away may look like an effect"
+        )
+    return tuple(out)

@@ -1,0 +1,248 @@
+"""The loop: find what the residual of a fit holds, trace it to an effect, add the effect, look again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, final
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from lcopa_bayes.core.estimate import LEVEL
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.effectsearch.bandwidening import Widening
+from lcopa_bayes.effectsearch.basefit import BaseFit
+from lcopa_bayes.effectsearch.explained import (
+    coordinates_of,
+    declarable,
+    estimate_name,
+    explained_draws,
+    explained_study,
+    unit_of,
+)
+from lcopa_bayes.effectsearch.heldouteffects import missed, unseen_share
+from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
+from lcopa_bayes.effectsearch.outliers import Outlying, outlying
+from lcopa_bayes.effectsearch.rounds import CLEAR, SINGLE, Round, search
+from lcopa_bayes.effectsearch.scores import Score, State, fit_scores, held_out_scores, left_out_scores
+from lcopa_bayes.effectsearch.terms import fitted_base
+from lcopa_bayes.effectsearch.trace import Trace
+from lcopa_bayes.effectsearch.verdict import ALONE, EXPLAINED, Found, Verdict, beside, decide
+from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.model.effects.catalogue import catalogue
+from lcopa_bayes.model.effects.effect import Effect
+from lcopa_bayes.sampling.convergence import Grade
+from lcopa_bayes.sampling.draws import Draws
+
+Z90 = 1.6448536269514722
+"""Half width of a central 90 % interval of a normal distribution [sd]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Side:
+    """Model and errors before or after."""
+
+    state: State
+    fit: tuple[Score, ...]
+    unseen: tuple[Score, ...]
+    """On held-out records, or with each fit record left out in turn."""
+    log_evidence: float
+    """Laplace approximation, noise held at its estimate [nat]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """What the loop found in a study."""
+
+    problem: Problem
+    base: BaseFit
+    enlarged: str
+    """What was changed in the base model before anything was traced; empty when nothing was."""
+    rounds: tuple[Round, ...]
+    effects: tuple[Effect, ...]
+    """Named effects of the final model; none when the verdict is `unexplained` or `clean`."""
+    groups: tuple[tuple[str, ...], ...]
+    """For each effect, the names it cannot be told apart from, its own first."""
+    verdict: Verdict
+    before: Side
+    after: Side
+    left_out: bool
+    """Whether unseen errors come from leaving fit records out in turn, for want of held-out records."""
+
+    cautions: tuple[str, ...] = ()
+    """What limits the verdict."""
+    draws: Draws | None = None
+    """Draws of the explained study; None when none were asked for, or none could be had."""
+    outliers: Outlying | None = None
+    """Samples left out before anything was traced; None without any."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What is named: the effects, and outliers."""
+        return (*(e.name for e in self.effects), *([OUTLIERS] if self.outliers else []))
+
+    @property
+    def grade(self) -> Grade:
+        """How far the numbers can be trusted; without draws they rest on a Laplace approximation."""
+        if self.draws is not None:
+            return self.draws.grade
+        return Grade(
+            "tentative", "intervals are those of a Laplace approximation at the mode; nothing was sampled"
+        )
+
+    def estimate(self, k: int) -> dict[str, Any]:
+        """A coordinate of the final model with unit, 90 % interval and grade."""
+        state = self.after.state
+        if self.draws is not None:
+            name = estimate_name(state.model, self.draws, k)
+            return next(one for one in self.draws.estimates() if one.name == name).as_json()
+        name, unit, factor = unit_of(state.model, k)
+        middle, sd = float(state.optimum.x[k]) * factor, float(np.sqrt(state.covariance[k, k])) * factor
+        return {
+            "name": name,
+            "value": middle,
+            "unit": unit,
+            "mean": middle,
+            "sd": sd,
+            "lower": middle - Z90 * sd,
+            "upper": middle + Z90 * sd,
+            "level": LEVEL,
+            "interval": "Laplace",
+            "ess": None,
+            "grade": "tentative",
+        }
+
+    @property
+    def study(self) -> Study:
+        """The study with the effects that were found declared: what a fit, an audit or a comparison takes."""
+        return explained_study(self.problem.study, self.after.state.model)
+
+    @property
+    def trace(self) -> Trace | None:
+        """Evidence of every effect in the first residual; None when the base fit failed."""
+        return self.rounds[0].trace if self.rounds else None
+
+
+def loop(
+    study: Study,
+    *,
+    library: Sequence[type[Effect]] | None = None,
+    jobs: int = 1,
+    sample: bool = True,
+    quick: bool = False,
+    as_stated: bool = False,
+) -> Loop:
+    """Trace what a study's base model lacks; deterministic given the study's seed.
+
+    Unless `as_stated`, a study with one viscous term gets as many as the evidence asks for. Without
+    `sample` intervals and bands are those of a Laplace approximation. With `quick` fewer chance residuals
+    are drawn and ensembles are half as long. InputError when the study does not fit its records.
+    """
+    kinds = list(catalogue(study.effects.add, study.folder).values()) if library is None else list(library)
+    with threadpool_limits(1):  # many small products: more threads only wait for each other
+        return _looped(study, kinds, jobs=jobs, sample=sample, quick=quick, as_stated=as_stated)
+
+
+def _looped(
+    study: Study, kinds: Sequence[type[Effect]], *, jobs: int, sample: bool, quick: bool, as_stated: bool
+) -> Loop:
+    draws = 1000 if quick else 2000
+    problem, base, start, enlarged = fitted_base(study, kinds, as_stated=as_stated, draws=draws)
+    outliers = outlying(study, base)
+    if outliers is not None:
+        study, kinds = outliers.study, [kind for kind in kinds if kind.card.name != OUTLIERS]
+        problem, base, start, enlarged = fitted_base(study, kinds, as_stated=as_stated, draws=draws)
+    before = _side(problem, start)
+    cautions = (*base.caution, *_alone(study))
+    if base.failed:
+        found = Found(base.failed, cautions, False, np.nan, np.nan, (), (), 0, 0, "", 0, 0, "", np.nan)
+        verdict = decide(found)
+        return Loop(
+            *(problem, base, enlarged, (), (), (), verdict, before, before, not study.held_out, cautions),
+            outliers=outliers,
+        )
+    alone = len(study.fit) == 1 and not study.held_out
+    rng = np.random.default_rng([study.seed, 11])
+    searched = search(start, kinds, rng, noise_samples=base.noise_samples, draws=draws, alone=alone)
+    first, last = searched.rounds[0].trace, searched.rounds[-1].trace
+    generic = max(
+        (one for one in first.traced if one.card.place == "generic"),
+        key=lambda one: one.log_bayes_factor,
+        default=None,
+    )
+    reached = _side(problem, searched.state)
+    names = tuple(effect.name for effect in searched.state.model.effects)
+    verdict = decide(
+        Found(
+            failed="",
+            cautions=cautions,
+            alarmed=first.alarmed or bool(names),
+            largest=first.largest,
+            threshold=first.threshold,
+            effects=names,
+            disturbances=tuple(e.name for e in searched.state.model.effects if e.card.disturbance),
+            gained=searched.gained,
+            generic=generic.log_bayes_factor if generic else -np.inf,
+            generic_name=generic.name if generic else "",
+            remaining=last.largest,
+            remaining_threshold=last.threshold,
+            remaining_name=last.leader.name if last.leader else "",
+            share=searched.share,
+            excess=start.whitening.excess(start.optimum.residual),
+            enough=ALONE if alone else EXPLAINED,
+            scatter=first.scatter,
+            missed=missed(study, before.fit, before.unseen, start) if study.held_out else np.nan,
+            unseen=unseen_share(study, before.unseen, reached.unseen, searched.state)
+            if study.held_out
+            else np.nan,
+        )
+    )
+    if outliers is not None:
+        verdict = beside(verdict, outliers.sentence)
+    named = verdict.kind in ("explained", "disturbance")
+    last_state, sampled = searched.state if named else start, None
+    if verdict.kind == "unexplained" or last.alarmed:  # something significant remains
+        white, residual = last_state.whitening, last_state.optimum.residual
+        last_state = replace(last_state, widening=Widening.of(white.samples, residual, white.noise))
+    if sample and declarable(study, last_state.model.effects):
+        sampled = explained_draws(explained_study(problem.study, last_state.model), jobs=jobs, quick=quick)
+    if sampled is not None:
+        covariance = np.cov(coordinates_of(last_state.model, sampled).T)
+        last_state = replace(last_state, covariance=np.asarray(covariance))
+    return Loop(
+        problem,
+        base,
+        enlarged,
+        searched.rounds,
+        last_state.model.effects,
+        searched.groups if named else (),
+        verdict,
+        before,
+        reached if last_state is searched.state else _side(problem, last_state),
+        not study.held_out,
+        cautions,
+        sampled,
+        outliers,
+    )
+
+
+def _alone(study: Study) -> tuple[str, ...]:
+    """What a single record cannot tell."""
+    if len(study.fit) > 1:
+        return ()
+    told = "a single record cannot tell an effect of the device from a peculiarity of that record"
+    if not study.held_out:
+        told += (
+            f": an effect is named only where the residual is {CLEAR:g} times the noise and it takes "
+            f"{100 * SINGLE:.0f} % of its power"
+        )
+    return (f"{told}; fit a second one",)
+
+
+def _side(problem: Problem, state: State) -> Side:
+    unseen = held_out_scores(state, problem) if problem.study.held_out else left_out_scores(state)
+    log_evidence = state.optimum.log_evidence + state.model.base.log_support
+    return Side(state, tuple(fit_scores(state)), tuple(unseen), log_evidence)

@@ -1,0 +1,220 @@
+"""Leading candidates refitted with everything free: what their evidence is worth beyond the linearisation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import final
+
+import numpy as np
+from scipy.stats import chi2
+
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.effectsearch.basefit import renewed
+from lcopa_bayes.effectsearch.constants import polished
+from lcopa_bayes.effectsearch.crossvalidation import groups, log_scores
+from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
+from lcopa_bayes.effectsearch.gaussnewton import Optimum, Regression
+from lcopa_bayes.effectsearch.noisesamples import quiet_samples
+from lcopa_bayes.effectsearch.signature import Scale
+from lcopa_bayes.effectsearch.whitening import Whitening
+from lcopa_bayes.inference.effects import Placed
+from lcopa_bayes.model.effects.effect import Effect
+
+SIGNIFICANT = 2.7e-3
+"""Two-sided p-value of three standard deviations [-]."""
+_PROCESSES = 400
+"""Plausible noise processes over which a p-value is averaged [-]."""
+_NEAR = 0.5
+"""Expected gain of a step with which a descent by the plant's own tangents ends [nat]."""
+_DELAYS = (-0.25, -0.1)
+"""Shares of a delay by which it is also started earlier, for effects that act on the drive [-]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Refit:
+    """The plant with a set of effects at its optimum."""
+
+    model: ExtendedModel
+    optimum: Optimum
+    before: Optimum
+    """That of the plant with the effects it had before."""
+    whitening: Whitening
+    """The noise both are judged under."""
+    added: tuple[str, ...]
+    """Names of the effects that are new."""
+    quiet: float
+    """Samples the noise scale is known from [-]."""
+    paid: float
+    """Evidence of signs that are known less that of the choice among what was tried [nat]."""
+
+    @cached_property
+    def log_bayes_factor(self) -> float:
+        """Laplace evidence over that of the plant before [nat]."""
+        return log_bayes_factor(self.before, self.optimum, self.quiet) + self.paid
+
+    @cached_property
+    def left_out(self) -> float:
+        """Gain of the summed log predictive densities of records left out in turn [nat]."""
+        apart = groups(self.whitening)
+        return float(log_scores(self.optimum, apart).sum() - log_scores(self.before, apart).sum())
+
+    @property
+    def taken(self) -> float:
+        """Share of the residual's power that the new effects take [-]."""
+        return 1.0 - self.optimum.cost / self.before.cost
+
+    @property
+    def excess(self) -> float:
+        """Root mean square of the residual before over that of the noise [-]."""
+        return self.whitening.excess(self.before.residual)
+
+    def without(self, names: Sequence[str]) -> tuple[ExtendedModel, Vector]:
+        """The model less these effects, and the coordinates that are left."""
+        gone = {k for name in names for k in self.places(name)}
+        kept = (e for e in self.model.effects if e.name not in names)
+        return self.model.having(*kept), np.delete(self.optimum.x, sorted(gone))
+
+    @cached_property
+    def resting(self) -> bool:
+        """Whether new effects that go on where nothing moves make the residual there smaller.
+
+        What only follows the drive may look like a vibration, but not before the first command.
+        """
+        names = [e.name for e in self.model.effects if e.card.resting and e.name in self.added]
+        if not names:
+            return True
+        model, x = self.without(names)
+        delay = model.dead_time(x)
+        bare = self.whitening(self.whitening.observed - model.predict(x))
+        drop = 0.0
+        for part in self.whitening.parts:
+            count = quiet_samples(self.whitening.samples[part.record], part.axis, delay)
+            rows = slice(part.rows.start, part.rows.start + count)
+            drop += float((bare[rows] ** 2 - self.optimum.white[rows] ** 2).sum())
+        return drop >= 0.0
+
+    def under(self, whitening: Whitening) -> Refit:
+        """The same judged under another noise."""
+        plain, _ = self.without(self.added)
+        before = Regression(plain, whitening).descend(self.before.x, most=12, gain=_NEAR)
+        optimum = Regression(self.model, whitening).descend(self.optimum.x, most=12, gain=_NEAR)
+        optimum = _no_worse(self.model, whitening, optimum, before)
+        return replace(self, optimum=optimum, before=before, whitening=whitening)
+
+    def wald(self, name: str) -> float:
+        """p-value of an effect's coefficients being zero, over all noise that is plausible [-].
+
+        Their covariance is that of the estimate under the noise as it is, not as it was weighted: larger
+        where noise is as slow as the tangents (White 1982, Econometrica 50). Other coordinates held by an end
+        of their support stay there: a delay that cannot shrink is no alias.
+        """
+        where = self.places(name)
+        psi = self.optimum.x[where]
+        free = np.flatnonzero(~self.optimum.stuck | np.isin(np.arange(self.optimum.x.size), where))
+        at = np.searchsorted(free, where)
+        tangents = self.optimum.jacobian[:, free]
+        information = self.optimum.information[np.ix_(free, free)]
+        gain = np.linalg.pinv(information, hermitian=True)[:, at]
+        held = information - tangents.T @ tangents  # what priors say
+        noise = self.whitening.covariances(tangents @ gain, _PROCESSES)
+        power = [psi @ np.linalg.solve(one + gain.T @ held @ gain, psi) for one in noise]
+        return float(np.mean(chi2.sf(power, len(where))))
+
+    def places(self, name: str) -> list[int]:
+        """Coordinates of an effect's coefficients."""
+        first = self.model.plant_size
+        effects = self.model.effects
+        told = self.model.effected.coefficients
+        return [first + k for k, one in enumerate(told) if effects[one.effect].name == name]
+
+    @property
+    def new(self) -> tuple[Placed, ...]:
+        """Coefficients of the new effects."""
+        told, effects = self.model.effected.coefficients, self.model.effects
+        return tuple(one for one in told if effects[one.effect].name in self.added)
+
+    @cached_property
+    def significant(self) -> bool:
+        """Whether all new effects are three standard deviations or more away from zero."""
+        return all(self.wald(name) < SIGNIFICANT for name in self.added)
+
+
+def refit(
+    model: ExtendedModel,
+    before: Optimum,
+    whitening: Whitening,
+    added: Sequence[tuple[Effect, Vector]],
+    quiet: float,
+    near: Vector | None = None,
+) -> Refit:
+    """With effects added to those of `model`, each started from zero and from its linear estimate.
+
+    `added` holds each effect with its coefficients over their prior sd; `quiet` [-] are the samples the
+    noise scale is known from (`Scale`). The descent uses the plant's own tangents first, then moves the
+    effects' internal constants too (`polished`), and ends with the tangents of the whole. The evidence pays
+    for the choice among the instances that were tried. `near` are further coordinates to start from.
+    ArithmeticError when no start has a bounded response.
+    """
+    extended = model.having(*model.effects, *(effect for effect, _ in added))
+    linear = np.concatenate([psi for _, psi in added])
+    low, high = extended.bounds
+    starts = [np.concatenate([before.x, factor * linear]) for factor in (1.0, 0.3, 0.0)]
+    if any(effect.card.place == "drive" for effect, _ in added):
+        starts += [_earlier(model, starts[0], share) for share in _DELAYS]
+    starts += [near] if near is not None else []
+    starts = [np.clip(start, low, high) for start in starts]  # starts only
+    quick = Regression(replace(extended, exact=False), whitening).best(starts, gain=_NEAR)
+    extended, start = polished(extended, quick.x, whitening, tuple(effect.name for effect, _ in added))
+    optimum = Regression(extended, whitening).descend(start, most=12, gain=0.02)
+    optimum = _no_worse(extended, whitening, optimum, before)
+    sides = sum(one.coefficient.one_signed for one in extended.effected.coefficients[-linear.size :])
+    tried = sum(np.log(len(effect.grid(extended.effected.ranges))) for effect, _ in added)
+    names = tuple(effect.name for effect, _ in added)
+    return Refit(
+        extended, optimum, before, whitening, names, quiet, sides * float(np.log(2.0)) - float(tried)
+    )
+
+
+def _no_worse(model: ExtendedModel, whitening: Whitening, reached: Optimum, before: Optimum) -> Optimum:
+    """An optimum of `model`; where it is less likely than that `before` its last effects were added, which
+    the model contains at their vanishing, the one reached from there."""
+    if reached.cost <= before.cost:
+        return reached
+    vanishing = np.zeros(reached.x.size - before.x.size)
+    start = np.concatenate([before.x, vanishing])
+    other = Regression(model, whitening).descend(start, most=12, gain=0.02)
+    return min(reached, other, key=lambda one: one.cost)
+
+
+def under_one_noise(made: Sequence[Refit]) -> list[Refit]:
+    """Refits of one residual, by falling evidence.
+
+    Where noise is known from residuals alone it holds the misfit too: then all are judged under that of the
+    refit that leaves least.
+    """
+    if made and made[0].whitening.dependence:
+        least = max(made, key=lambda one: one.taken)
+        noise = renewed(least.model.base, least.optimum, least.whitening)
+        made = [one.under(noise) for one in made]
+    return sorted(made, key=lambda one: -one.log_bayes_factor)
+
+
+def log_bayes_factor(before: Optimum, after: Optimum, quiet: float) -> float:
+    """Laplace evidence of one model over another's under the same whitening, noise scale integrated out
+    [nat]."""
+    volume = (after.log_evidence + after.cost) - (before.log_evidence + before.cost)
+    known = Scale(quiet, after.effective - after.x.size, np.array([2 * before.cost]))
+    return float(volume + known.gain(np.array([before.cost - after.cost]))[0])
+
+
+def _earlier(model: ExtendedModel, start: Vector, share: float) -> Vector:
+    """The start with every free delay changed by a share of it."""
+    out = start.copy()
+    rows = model.base.posterior.table.rows
+    for position, k in enumerate(model.base.least.columns):
+        if rows[k].kind == "delay":
+            out[position] += np.log1p(share) if rows[k].log_scale else share * start[position]
+    return out

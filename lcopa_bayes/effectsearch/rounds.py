@@ -1,0 +1,224 @@
+"""Rounds of the loop: trace, refit the leading candidates, add the best, until nothing is left to find."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.effectsearch.candidates import refitted
+from lcopa_bayes.effectsearch.gaussnewton import Regression
+from lcopa_bayes.effectsearch.refits import SIGNIFICANT, Refit, log_bayes_factor, refit, under_one_noise
+from lcopa_bayes.effectsearch.scores import State
+from lcopa_bayes.effectsearch.signature import Signature, expected_margin, pair_evidence
+from lcopa_bayes.effectsearch.trace import Trace, Traced, trace
+from lcopa_bayes.effectsearch.verdict import MARGIN
+from lcopa_bayes.model.effects.effect import Effect
+
+MOST = 3
+"""Effects that are added at most [-]."""
+SINGLE = 0.3
+"""Share of the residual's power that an effect must take when a single record is all there is [-]."""
+CLEAR = 1.5
+"""Residual over noise from which a single record names anything: its noise may differ from level to level
+[-]."""
+_PAIRED = 8
+"""Single effects of which pairs are formed [-]."""
+_PAIRS = 2
+"""Pairs refitted [-]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Round:
+    """One look at a residual."""
+
+    trace: Trace
+    refits: tuple[Refit, ...]
+    """Leading candidates with everything free, by falling evidence."""
+    failures: tuple[str, ...]
+    """Candidates that could not be refitted, and why."""
+    chosen: Refit | None
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Search:
+    """All rounds and the model they end with."""
+
+    rounds: tuple[Round, ...]
+    state: State
+    groups: tuple[tuple[str, ...], ...]
+    """For each effect of the state, the names it cannot be told apart from, its own first."""
+    gained: float
+    """Log evidence of the final model over the base model [nat]."""
+    share: float
+    """Half the residual power that the effects took, over that and what the best class left would
+    take [-]."""
+
+
+def search(
+    start: State,
+    library: Sequence[type[Effect]],
+    rng: np.random.Generator,
+    *,
+    noise_samples: Sequence[int],
+    draws: int,
+    alone: bool = False,
+) -> Search:
+    """Add effects one at a time, up to three, while evidence, records left out and significance all speak
+    for it, from a record that stands `alone` only large ones; then try pairs where something remains, and
+    take back what is no longer significant."""
+    state, rounds, groups = start, [], {}
+    for number in range(MOST + 1):
+        seen = trace(state, library, rng, noise_samples=noise_samples, draws=draws)
+        if not (seen.alarmed or state.whitening.dependence) or number == MOST:
+            rounds.append(Round(seen, (), (), None))
+            break
+        refits, failures, tuned_best = refitted(state, seen)
+        # what one refit leaves is not noise alone: a further effect must stand out from it
+        bar = seen.threshold + (MARGIN if number else 0.0)
+        chosen = _leader([one for one in refits if _accepted(one, seen, bar) and (not alone or _large(one))])
+        rounds.append(Round(seen, tuple(refits), tuple(failures), chosen))
+        if chosen is None:
+            break
+        groups[chosen.added[0]] = group(chosen, refits, seen, tuned_best)
+        state = _kept(chosen)
+    if rounds[-1].trace.alarmed and rounds[0].trace.alarmed and not alone:
+        paired = _paired(start, state, rounds[0].trace)
+        if paired is not None:
+            state = _state(paired)
+            seen = trace(state, library, rng, noise_samples=noise_samples, draws=draws)
+            rounds += [Round(rounds[0].trace, (paired,), (), paired), Round(seen, (), (), None)]
+    names = [effect.name for effect in state.model.effects]
+    told = tuple(groups.get(name, (name,)) for name in names)
+    gained, dropped = _gained(start, state, float(sum(noise_samples)))
+    last = rounds[-1].trace
+    left = last.scale.drop(last.largest) if last.alarmed else 0.0
+    share = dropped / (dropped + left) if dropped > 0 else float(left <= 0)
+    return Search(tuple(rounds), state, told, gained, share)
+
+
+def _gained(start: State, state: State, quiet: float) -> tuple[float, float]:
+    """Log evidence over the base model's under one whitening, that of the final noise [nat], and the drop of
+    half the residual power [-]."""
+    if not state.model.effects:
+        return 0.0, 0.0
+    plain = start.optimum
+    if state.whitening is not start.whitening:
+        plain = Regression(start.model, state.whitening).descend(start.optimum.x)
+    sides = sum(one.coefficient.one_signed for one in state.model.effected.coefficients)
+    gained = log_bayes_factor(plain, state.optimum, quiet) + sides * float(np.log(2.0))
+    return gained, plain.cost - state.optimum.cost
+
+
+def leading(start: State, seen: Trace) -> float:
+    """Largest log Bayes factor of a single named effect that would be accepted, 0 without any [nat]."""
+    refits, _, _ = refitted(start, seen)
+    accepted = [one.log_bayes_factor for one in refits if _accepted(one, seen, seen.threshold)]
+    return max(accepted, default=0.0)
+
+
+def _accepted(made: Refit, seen: Trace, bar: float) -> bool:
+    generic = max((g.log_bayes_factor for g in seen.traced if g.card.place == "generic"), default=-np.inf)
+    ahead = made.log_bayes_factor > generic + MARGIN
+    return made.log_bayes_factor > bar and ahead and made.left_out > 0 and made.significant and made.resting
+
+
+def _large(made: Refit) -> bool:
+    return made.taken > SINGLE and made.excess > CLEAR
+
+
+def _leader(accepted: Sequence[Refit]) -> Refit | None:
+    """The refit of largest evidence; of those level with it the first whose coefficients all records share,
+    since one of a single record predicts no other."""
+    level = [one for one in accepted if one.log_bayes_factor > accepted[0].log_bayes_factor - MARGIN]
+    shared = (one for one in level if not any(c.record is not None for c in one.new))
+    return next(shared, accepted[0] if accepted else None)
+
+
+def _state(made: Refit) -> State:
+    return State(made.model, made.optimum, made.whitening, made.optimum.covariance)
+
+
+def _kept(made: Refit) -> State:
+    """Without effects that are no longer significant beside the new one, and not missed when they go."""
+    idle = [
+        effect.name
+        for effect in made.model.effects
+        if effect.name not in made.added and made.wald(effect.name) > SIGNIFICANT
+    ]
+    if not idle:
+        return _state(made)
+    model, x = made.without(idle)
+    optimum = Regression(model, made.whitening).descend(x, most=12, gain=0.02)
+    if log_bayes_factor(optimum, made.optimum, made.quiet) > MARGIN:
+        return _state(made)
+    return State(model, optimum, made.whitening, optimum.covariance)
+
+
+def _paired(start: State, state: State, seen: Trace) -> Refit | None:
+    """The best pair of effects, when its evidence beats what was found one by one; else None.
+
+    It is one of many, and its evidence pays for the choice.
+    """
+    named = [one for one in seen.traced if one.card.place != "generic" and one.signatures][:_PAIRED]
+    ranked = sorted(
+        combinations(named, 2),
+        key=lambda pair: -pair_evidence(_best(pair[0]), _best(pair[1]), seen.residual),
+    )
+    have = {effect.name for effect in state.model.effects}
+    choice = float(np.log(max(len(ranked), 1)))
+    more = 2 - len(have) if len(have) < 2 else 0
+    bar, best = _gained(start, state, seen.scale.quiet)[0] + (1 + more) * MARGIN, None
+    for pair in ranked[:_PAIRS]:
+        if {one.name for one in pair} <= have:
+            continue
+        columns = np.concatenate([_best(one).columns for one in pair], axis=1)
+        inner = np.linalg.solve(np.eye(columns.shape[1]) + columns.T @ columns, columns.T @ seen.residual)
+        size = _best(pair[0]).columns.shape[1]
+        added = [(_best(pair[0]).effect, inner[:size]), (_best(pair[1]).effect, inner[size:])]
+        try:
+            made = refit(start.model, start.optimum, start.whitening, added, seen.scale.quiet)
+        except ArithmeticError:
+            continue
+        made = replace(under_one_noise([made])[0], paid=made.paid - choice)
+        if made.log_bayes_factor > bar and _accepted(made, seen, seen.threshold):
+            bar, best = made.log_bayes_factor, made
+    return best
+
+
+def _best(one: Traced) -> Signature:
+    return one.signatures[one.best]
+
+
+def group(
+    chosen: Refit, refits: Sequence[Refit], seen: Trace, signatures: Mapping[str, Signature]
+) -> tuple[str, ...]:
+    """Names that these records cannot tell from the chosen one.
+
+    A rival that was refitted belongs to the group when it lost by less than 3 nat; one that was not, when the
+    margin expected at the fitted size, which the angle between projected signatures sets, is below 3 nat.
+    Where noise was fitted jointly that margin would count the effect as noise, and only refits say.
+    """
+    name = chosen.added[0]
+    own = signatures[name]
+    amplitude = chosen.optimum.x[chosen.places(name)]
+    out = [name]
+    fitted = {one.added[0]: one for one in refits}
+    for one in seen.traced:
+        if one.name == name or one.card.place == "generic" or not one.signatures:
+            continue
+        if one.name in fitted:
+            if chosen.log_bayes_factor - fitted[one.name].log_bayes_factor < MARGIN:
+                out.append(one.name)
+            continue
+        if chosen.whitening.dependence:
+            continue
+        margin = min(expected_margin(own, amplitude, rival, seen.scale) for rival in one.signatures)
+        if margin < MARGIN:
+            out.append(one.name)
+    return tuple(out)

@@ -1,0 +1,137 @@
+"""Signatures: what an effect would leave in the residual, and the evidence for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+from scipy.special import log_ndtr
+
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
+from lcopa_bayes.effectsearch.scoreevidence import Projection, log_bayes_factors, survival
+from lcopa_bayes.effectsearch.whitening import Whitening
+from lcopa_bayes.model.effects.effect import Effect
+
+_LEAST_POWER = 1e-10
+"""Power of a direction of a signature at one prior sd below which it is nothing [-]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Scale:
+    """What is known of the noise scale: quiet samples and, to the same rights, the residuals themselves.
+
+    With the variance integrated out under ``1 / variance`` (its scale in the whitening is only an
+    estimate), a
+    drop of half the residual power by g is worth ``(m + n) / 2 * log((m + P) / (m + P - 2 g))`` nat, m
+    quiet samples, n
+    degrees of freedom and power P of the residual; g itself where m is large and P = n.
+    """
+
+    quiet: float
+    """Samples the noise was known from [-]."""
+    freedom: float
+    """Degrees of freedom of the residual [-]."""
+    power: Vector
+    """Squared whitened residual, (draws,) [-]."""
+
+    def gain(self, half_power: Vector) -> Vector:
+        """Log evidence of a drop of half the residual power, (draws,) [nat]."""
+        whole = self.quiet + self.power
+        return np.asarray(-0.5 * (self.quiet + self.freedom) * np.log1p(-2 * half_power / whole))
+
+    def drop(self, gain: float) -> float:
+        """Drop of half the residual power that is worth `gain` nat, the inverse of `gain` [-]."""
+        whole = self.quiet + float(self.power[0])
+        return float(-0.5 * whole * np.expm1(-2 * gain / (self.quiet + self.freedom)))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Signature:
+    """One instance of an effect, whitened and projected off what the base model can imitate."""
+
+    effect: Effect
+    span: Matrix
+    """Orthonormal columns that span the projected signatures, (n, rank); single precision, there are
+    hundreds."""
+    scale: Vector
+    """Length of each direction at one prior sd of its combination of coefficients, (rank,) [-]."""
+    turned: Matrix
+    """Combination of coefficients behind each direction, (rank, k) [-]."""
+    survival: float
+    """Share of the signature that is left [-]."""
+    one_signed: bool
+    """Whether its single coefficient cannot be negative."""
+
+    @classmethod
+    def of(cls, effect: Effect, columns: Matrix, survival: float, one_signed: bool) -> Signature:
+        """From projected signatures over the prior sd of their coefficients, (n, k) [-].
+
+        By the small Gram matrix: ten times faster than of the tall one, and exact enough for weights of
+        order 1.
+        """
+        power, turned = np.linalg.eigh(columns.T @ columns)
+        kept = power > max(_LEAST_POWER, 1e-12 * float(power.max(initial=0.0)))
+        scale = np.sqrt(power[kept])
+        span = (columns @ turned[:, kept] / scale).astype(np.float32)
+        return cls(effect, span, scale, turned[:, kept].T, survival, one_signed)
+
+    @property
+    def columns(self) -> Matrix:
+        """Projected signatures over the prior sd of their coefficients, (n, k) [-]."""
+        return np.asarray(self.span @ (self.scale[:, None] * self.turned), dtype=float)
+
+    def evidence(self, inner: Matrix, scale_of: Scale) -> Vector:
+        """Log Bayes factors against no effect from ``span.T @ r``, (k, draws) -> (draws,) [nat].
+
+        A coefficient of one sign has a half-normal prior: the factor is 2 Phi(mean / sd) of the normal one.
+        """
+        scale, power = self.scale, self.scale**2
+        gain = scale_of.gain(0.5 * np.einsum("k,kd->d", power / (1 + power), inner**2))
+        gain = gain - 0.5 * np.log1p(power).sum()
+        if self.one_signed and scale.size == 1:
+            sign = np.sign(self.turned[0, 0])
+            gain = gain + np.log(2) + log_ndtr(sign * scale[0] * inner[0] / np.sqrt(1 + power[0]))
+        return np.asarray(gain)
+
+    def cosine(self, other: Signature) -> float:
+        """Cosine of the smallest angle between the spans [-]; 0 when either is empty."""
+        if 0 in (self.scale.size, other.scale.size):
+            return 0.0
+        return float(min(np.linalg.svd(self.span.T @ other.span, compute_uv=False).max(), 1.0))
+
+    def amplitude(self, residual: Vector) -> Vector:
+        """Posterior mean of the coefficients over their prior sd; the normal part of a one-signed one."""
+        weight = self.scale / (1 + self.scale**2)
+        return np.asarray(self.turned.T @ (weight * (self.span.T @ residual)))
+
+
+def signature_of(
+    model: ExtendedModel, x: Vector, whitening: Whitening, project: Projection, effect: Effect
+) -> Signature:
+    """Signature of one more effect beside those of `model`; ArithmeticError where it cannot be simulated."""
+    raw, told = model.signature(x, effect)
+    if not np.isfinite(raw).all():
+        raise FloatingPointError(f"{effect.name}: its signature is not finite")
+    white = whitening(raw.T).T
+    left = project(white)
+    one_signed = len(told) == 1 and told[0].coefficient.one_signed
+    return Signature.of(effect, left, survival(white, left), one_signed)
+
+
+def expected_margin(truth: Signature, amplitude: Vector, rival: Signature, scale: Scale) -> float:
+    """Log evidence by which `truth` of that size is expected to beat `rival` [nat]: the difference of their
+    closed-form evidences on the noise-free residual it leaves."""
+    shift = (truth.span @ (truth.scale * (truth.turned @ amplitude)))[:, None]
+    size = Scale(scale.quiet, scale.freedom, scale.freedom + (shift**2).sum(axis=0))
+    own = float(truth.evidence(truth.span.T @ shift, size)[0])
+    return own - float(rival.evidence(rival.span.T @ shift, size)[0])
+
+
+def pair_evidence(first: Signature, second: Signature, residual: Vector) -> float:
+    """Log Bayes factor of two effects at once against none [nat]."""
+    both = np.concatenate([first.columns, second.columns], axis=1)
+    return float(log_bayes_factors(both, residual[:, None])[0])

@@ -1,0 +1,310 @@
+"""What a loop found, as plain JSON values and in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.effectsearch.crossvalidation import in_turn
+from lcopa_bayes.effectsearch.loop import Loop, Side
+from lcopa_bayes.effectsearch.residuals import View, views
+from lcopa_bayes.effectsearch.rounds import Round
+from lcopa_bayes.effectsearch.scores import Score, pooled_coverage, pooled_rmse
+from lcopa_bayes.effectsearch.trace import SEEN
+from lcopa_bayes.model.effects.effect import Card
+
+FAR = 2.0
+"""Shifts beyond so many standard deviations are listed [-]."""
+
+_NEAREST = 4
+"""Rivals that are listed for each named effect [-]."""
+
+
+def results(found: Loop) -> dict[str, Any]:
+    """Every number of the loop; `None` is open or undefined."""
+    trace, unit = found.trace, found.problem.study.time_unit
+    chances = trace.probabilities if trace else {}
+    told: dict[str, Any] = {
+        "study": found.problem.study.name,
+        "verdict": found.verdict.kind,
+        "confidence": found.verdict.confidence,
+        "sentence": found.verdict.sentence,
+        "cautions": found.cautions,
+        "base_failed": found.base.failed,
+        "base_enlarged": found.enlarged,
+        "time_unit": unit,
+        "grade": found.grade.level,
+        "grade_reason": found.grade.reason,
+        "noise": [
+            {
+                "axis": axis.name,
+                "unit": axis.unit,
+                "order": one.process.order,
+                "partial": one.process.partial,
+                "innovation_sd": one.process.innovation_sd,
+                "sd": one.process.sd,
+                "samples": one.samples,
+                "source": one.source,
+                "sentence": one.sentence,
+            }
+            for axis, one in zip(found.problem.study.response_axes, found.base.noise, strict=True)
+        ],
+        "effects": _effects(found, chances),
+        "outliers": _outliers(found),
+        "before": side(found.before, found),
+        "after": side(found.after, found),
+        "unseen_by": in_turn(len(found.problem.study.fit)) if found.left_out else "held-out records",
+        "survival": {one.name: one.survival for one in trace.traced} if trace else {},
+        "invisible": [one.name for one in trace.traced if one.survival < SEEN] if trace else [],
+        "evidence": _evidence(found),
+        "rounds": [_round(one) for one in found.rounds],
+        "moved": moved(found),
+        "next_measurement": next_measurement(found),
+        "parameters": [found.estimate(k) for k in range(found.after.state.model.plant_size)],
+        "residual": {
+            when: [{"name": view.name, "axis": view.axis, "sentence": view.sentence} for view in shown]
+            for when, shown in _views(found).items()
+        },
+        "seed": found.problem.study.seed,
+    }
+    values: dict[str, Any] = plain(told)
+    return values
+
+
+def drawn(found: Loop) -> dict[str, Any]:
+    """What the figures need beyond `results`: residual views and residuals before and after."""
+    shown = {when: [view.as_json() for view in each] for when, each in _views(found).items()}
+    values: dict[str, Any] = plain({"views": shown, "curves": _curves(found)})
+    return values
+
+
+def _views(found: Loop) -> dict[str, list[View]]:
+    unit = found.problem.study.time_unit
+    return {"before": views(found.before.state, unit), "after": views(found.after.state, unit)}
+
+
+def side(one: Side, found: Loop) -> dict[str, Any]:
+    """Errors before or after, pooled per axis and for each record."""
+    axes = [axis.name for axis in found.problem.study.response_axes]
+    noise = {score.axis: score.noise_sd for score in one.fit}
+    fit = {axis: pooled_rmse(one.fit, axis) for axis in axes}
+    unseen = {axis: pooled_rmse(one.unseen, axis) for axis in axes}
+    return {
+        "fit_rmse": fit,
+        "held_out_rmse": unseen,
+        "fit_rmse_over_noise": {axis: fit[axis] / noise[axis] for axis in axes if axis in noise},
+        "held_out_rmse_over_noise": {axis: unseen[axis] / noise[axis] for axis in axes if axis in noise},
+        "fit_coverage_90": pooled_coverage(one.fit),
+        "held_out_coverage_90": pooled_coverage(one.unseen),
+        "held_out_level_from": sorted({score.level_from for score in one.unseen}),
+        "log_evidence": one.log_evidence,
+        "scores": [score.as_json() for score in (*one.fit, *one.unseen)],
+    }
+
+
+def _effects(found: Loop, chances: dict[str, float]) -> list[dict[str, Any]]:
+    model, optimum = found.after.state.model, found.after.state.optimum
+    first, out = model.plant_size, []
+    for number, effect in enumerate(found.effects):
+        told = [(k, one) for k, one in enumerate(model.effected.coefficients) if one.effect == number]
+        out.append(
+            {
+                "name": effect.name,
+                "place": effect.card.place,
+                "formula": effect.card.formula,
+                "source": effect.card.source,
+                "group": list(found.groups[number]),
+                "nearest": _nearest(found, effect.name),
+                "probability": chances.get(effect.name),
+                "constants": effect.constants,
+                "parameters": [
+                    found.estimate(first + k)
+                    | {"prior_sd": one.coefficient.scale, "one_signed": one.coefficient.one_signed}
+                    for k, one in told
+                ],
+                "disturbance": effect.card.disturbance,
+                "significance": float(np.abs(optimum.x[first + told[0][0]] / optimum.sd[first + told[0][0]])),
+            }
+        )
+    return out
+
+
+def _nearest(found: Loop, name: str) -> list[dict[str, Any]]:
+    """Effects whose signatures lie closest to a named one, as what the base model cannot imitate of them."""
+    assert found.trace is not None
+    own = found.trace.of(name)
+    others = [one for one in found.trace.traced if one.signatures and one.name != name]
+    angles = {one.name: own.signatures[own.best].cosine(one.signatures[one.best]) for one in others}
+    ranked = sorted(angles, key=lambda other: -angles[other])[:_NEAREST]
+    return [{"name": other, "cosine": angles[other]} for other in ranked]
+
+
+def _outliers(found: Loop) -> dict[str, Any] | None:
+    if found.outliers is None:
+        return None
+    keys = ("count", "share", "width", "log_bayes_factor", "sentence")
+    return {key: getattr(found.outliers, key) for key in keys}
+
+
+def _evidence(found: Loop) -> dict[str, Any]:
+    trace = found.trace
+    if trace is None:
+        empty = dict.fromkeys(("threshold", "threshold_between", "p_value", "least_p_value"))
+        return {**empty, "draws": 0, "classes": []}
+    chances = trace.probabilities
+    return {
+        "threshold": trace.threshold,
+        "threshold_between": trace.between,
+        "p_value": trace.p_value,
+        "least_p_value": 1 / (trace.draws + 1),
+        "draws": trace.draws,
+        "none": chances["none"],
+        "classes": [
+            {
+                "name": one.name,
+                "place": one.card.place,
+                "log_bayes_factor": one.log_bayes_factor,
+                "probability": chances[one.name],
+                "survival": one.survival,
+                "instances": len(one.signatures),
+                "reveals": one.card.reveals,
+                "mistaken_for": one.card.mistaken_for,
+                "failed": one.failed,
+            }
+            for one in trace.traced
+        ],
+    }
+
+
+def _round(one: Round) -> dict[str, Any]:
+    return {
+        "largest": one.trace.largest,
+        "threshold": one.trace.threshold,
+        "p_value": one.trace.p_value,
+        "leading": [
+            {"name": each.name, "log_bayes_factor": each.log_bayes_factor} for each in one.trace.traced[:6]
+        ],
+        "refits": [
+            {
+                "added": list(made.added),
+                "log_bayes_factor": made.log_bayes_factor,
+                "left_out_gain": made.left_out,
+                "significant": made.significant,
+                "converged": made.optimum.converged,
+            }
+            for made in one.refits
+        ],
+        "failures": list(one.failures),
+        "chosen": list(one.chosen.added) if one.chosen else [],
+    }
+
+
+def _curves(found: Loop) -> list[dict[str, Any]]:
+    """Residuals before and after, thinned for drawing."""
+    pairs = [*zip(found.before.fit, found.after.fit, strict=True)]
+    if not found.left_out:
+        pairs += [*zip(found.before.unseen, found.after.unseen, strict=True)]
+    return [_curve(before, after) for before, after in pairs]
+
+
+def _curve(before: Score, after: Score, most: int = 1500) -> dict[str, Any]:
+    step = max(1, -(-before.time.size // most))
+    return {
+        "record": before.record,
+        "axis": before.axis,
+        "unit": before.unit,
+        "held_out": before.held_out,
+        "time": before.time[::step],
+        "observed": before.observed[::step],
+        "noise_sd": before.noise_sd,
+        "before": (before.observed - before.predicted)[::step],
+        "after": (after.observed - after.predicted)[::step],
+        "half_width_before": before.half_width[::step],
+        "half_width_after": after.half_width[::step],
+    }
+
+
+def words(told: dict[str, Any]) -> Sequence[str]:
+    """Lines for a reader."""
+    out = [f"{told['verdict']} ({told['confidence']}): {told['sentence']}"]
+    out += [one for one in (told["base_enlarged"], *(f"caution: {c}" for c in told["cautions"])) if one]
+    for effect in told["effects"]:
+        group = f" (cannot be told from {', '.join(effect['group'][1:])})" if len(effect["group"]) > 1 else ""
+        out.append(f"effect {effect['name']}, acts on the {effect['place']}{group}")
+        out += [
+            f"  {p['name']} = {p['value']:.4g} [{p['lower']:.4g}, {p['upper']:.4g}] {p['unit']}, {p['grade']}"
+            for p in effect["parameters"][:6]
+        ]
+    after = told["after"]
+    for axis, value in told["before"]["fit_rmse"].items():
+        out.append(
+            f"axis {axis}: fit RMSE {value:.4g} -> {after['fit_rmse'][axis]:.4g}, unseen "
+            f"{told['before']['held_out_rmse'][axis]:.4g} -> {after['held_out_rmse'][axis]:.4g} "
+            f"({told['unseen_by']})"
+        )
+    coverage = [told[side]["held_out_coverage_90"] for side in ("before", "after")]
+    if None not in coverage:
+        first, last = (f"{100 * share:.0f} %" for share in coverage)
+        out.append(f"pointwise 90 % bands hold {first} of unseen samples before, {last} after")
+    out += [f"next measurement: {told['next_measurement']}"] if told["next_measurement"] else []
+    return out
+
+
+def moved(found: Loop) -> list[dict[str, Any]]:
+    """Plant parameters that the effects moved by more than two standard deviations of the fit with them."""
+    if not found.effects:
+        return []
+    before, after = found.before.state, found.after.state
+    base, n = found.base.model, after.model.plant_size
+    first, last = base.values(before.optimum.x), base.values(after.optimum.x[:n])
+    sds = np.sqrt(np.diag(after.covariance))[:n]
+    out = []
+    rows = base.posterior.table.rows
+    for position, k in enumerate(base.least.columns):
+        shift = (after.optimum.x[position] - before.optimum.x[position]) / sds[position]
+        if abs(shift) > FAR:
+            row = rows[k]
+            out.append(
+                {
+                    "name": row.name,
+                    "unit": row.unit,
+                    "before": first[k],
+                    "after": last[k],
+                    "shift_in_sd": shift,
+                }
+            )
+    return sorted(out, key=lambda row: -abs(row["shift_in_sd"]))
+
+
+def next_measurement(found: Loop) -> str:
+    """In words: what excitation splits a group, finds what is unexplained, or shows what stayed invisible."""
+    trace = found.trace
+    if trace is None:
+        return "Mend the base fit first: give it records in which it can follow the response."
+    if not found.base.noise_known:
+        quiet = (
+            "a stretch before the first command, or a repeat, so that the noise is known apart from the fit"
+        )
+        return f"Record {quiet}."
+    cards = {one.name: one.card for one in trace.traced}
+    for group in found.groups:
+        if len(group) > 1:
+            wanted = _wanted([cards[name] for name in group if name in cards])
+            return f"To tell {', '.join(group)} apart, record {wanted}."
+    if found.verdict.kind == "unexplained":
+        near = [one for one in trace.traced if one.card.place != "generic"][:2]
+        return f"To find what is missing, record {_wanted([one.card for one in near])}." if near else ""
+    hidden = [one for one in trace.traced if one.survival < SEEN and one.card.place != "generic"]
+    if hidden:
+        names = ", ".join(one.name for one in hidden[:3])
+        return f"These records could not show {names}; {_wanted([one.card for one in hidden[:3]])} would."
+    return ""
+
+
+def _wanted(cards: Sequence[Card]) -> str:
+    """What reveals these effects, each excitation once."""
+    told = (part.strip() for card in cards for part in card.reveals.split(";")[0].split(","))
+    return ", ".join(dict.fromkeys(told))

@@ -1,0 +1,197 @@
+"""How many viscous terms the base model needs before anything is called missing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.checks import refuse_if
+from lcopa_bayes.data.requirements import unmet_apart_from_rest
+from lcopa_bayes.data.rest import not_at_rest
+from lcopa_bayes.data.settings import PriorSettings
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.effectsearch.basefit import BaseFit, base_fit
+from lcopa_bayes.effectsearch.basemodel import BaseModel
+from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
+from lcopa_bayes.effectsearch.gaussnewton import Regression
+from lcopa_bayes.effectsearch.prediction import taken
+from lcopa_bayes.effectsearch.refits import log_bayes_factor
+from lcopa_bayes.effectsearch.rounds import leading
+from lcopa_bayes.effectsearch.scores import State
+from lcopa_bayes.effectsearch.startlevel import Mended, started
+from lcopa_bayes.effectsearch.trace import trace
+from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.inference.nestedmodels import lifted
+from lcopa_bayes.model.effects.effect import Effect
+from lcopa_bayes.results.discretisation import FACTORS, largest_shift, narrowed
+
+_MOST = 3
+_GAIN = 10.0
+"""Log evidence that one more viscous term must bring [nat]: it is an assumption of the user's that
+changes."""
+_COPIES = 6
+"""Starts in which the terms that a smaller model lacks are added to its optimum [-]."""
+_BELOW = 0.5
+"""Log likelihood by which a fit may stay below that of a model it contains [nat]."""
+_LONGER = 2.0
+"""Factor on the default prior of a delay that ends at it: 0.4 becomes 0.8 of the records' span [-]."""
+_AT_END = 1e-2
+"""Closer to the end of its prior than this share, a delay stands at it [-]."""
+
+
+class Base(NamedTuple):
+    """A study's base fit, perhaps with more viscous terms than it states."""
+
+    problem: Problem
+    fit: BaseFit
+    start: State
+    sentence: str
+    """What was changed; empty when nothing was."""
+
+
+def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: bool, draws: int) -> Base:
+    """The base fit; with one free viscous term stated and not `as_stated`, of the number the evidence asks
+    for.
+
+    A plant with too few terms is no undeclared effect, and would be named as one; one with a term too many
+    may imitate an effect. So a further term is a candidate like any other: it is added when it is worth more
+    than the best named effect, or more together with what it leaves to be named. InputError when a record
+    moves before its drive does and no drive before the first row explains that.
+    """
+    refuse_if(unmet_apart_from_rest(study))
+    base = _based(study)
+    for mended in (started, _later):
+        better = mended(study, base.fit)
+        if mended is started and better is None:
+            refuse_if(not_at_rest(study.fit, study.held_out))
+        if better is not None:
+            study = better.study
+            base = _based(study)._replace(sentence=f"{base.sentence} {better.sentence}".strip())
+    if as_stated or study.model.terms != 1 or study.model.orders != "free":
+        return base
+    for terms in range(2, _MOST + 1):
+        try:
+            wider = _wider(study, base, terms)
+        except ArithmeticError:
+            break
+        gain = _gain(base, wider)
+        if wider.fit.failed or not gain > _GAIN:
+            if base.fit.failed:
+                continue
+            break
+        if base.fit.failed:
+            told = f"The base model has {terms} viscous terms, because with fewer {base.fit.failed}."
+        else:
+            rng = np.random.default_rng([study.seed, 12, terms])
+            named = _named(base, library, rng, draws)
+            if named >= gain and not gain + _named(wider, library, rng, draws) > named + _GAIN:
+                break
+            told = (
+                f"The base model has {terms} viscous terms: one more than {terms - 1} is worth {gain:.0f} "
+                "nat, with the effects that each leaves to be named."
+            )
+        base = wider._replace(sentence=f"{base.sentence} {told}".strip())
+    return base
+
+
+def _wider(study: Study, base: Base, terms: int) -> Base:
+    """The base fit with more terms, also from the optimum with fewer, which it contains.
+
+    Where it stays less likely than that, it has failed.
+    """
+    wider = _based(replace(study, model=replace(study.model, terms=terms)), terms, contained=base)
+    regression = wider.fit.regression
+    inner = Regression(base.fit.model, regression.whitening).descend(base.fit.optimum.x)
+    if wider.fit.optimum.cost <= inner.cost + _BELOW:
+        return wider
+    starts = _lifted(wider.fit.model, base, np.random.default_rng([study.seed, 13, terms]))
+    optimum = regression.best([wider.fit.optimum.x, *starts])
+    short = optimum.cost - inner.cost
+    failed = wider.fit.failed
+    if short > _BELOW:
+        failed = failed or (
+            f"the fit of {terms} viscous terms is {short:.1f} nat less likely than that of fewer, which it "
+            "contains"
+        )
+    fit = replace(wider.fit, optimum=optimum, failed=failed)
+    return wider._replace(fit=fit, start=_state(study, fit))
+
+
+def _lifted(model: BaseModel, base: Base, rng: np.random.Generator) -> list[Vector]:
+    """Coordinates of a wider model at which it is close to the optimum of a base fit that it contains."""
+    values = np.repeat(base.fit.model.values(base.fit.optimum.x)[None], _COPIES, axis=0)
+    starts = lifted(values, base.problem.posterior, model.posterior, rng)
+    return [] if starts is None else [model.coordinates(each) for each in starts]
+
+
+def _based(study: Study, *key: int, contained: Base | None = None) -> Base:
+    """A study's base fit as it stands; `key` tells its random numbers from others'. It starts from the
+    optimum of a `contained` model too."""
+    problem = problem_of(study)
+    fit = _fit(problem, key, contained)
+    narrow = narrowed(problem, partial(_shift, fit))
+    if narrow is not problem:
+        problem = narrow
+        fit = _fit(problem, key, contained)
+    return Base(problem, fit, _state(study, fit), "")
+
+
+def _fit(problem: Problem, key: Sequence[int], contained: Base | None) -> BaseFit:
+    model, seed = BaseModel(problem.posterior), [problem.study.seed, 10, *key]
+    near = _lifted(model, contained, np.random.default_rng([*seed, 1])) if contained else []
+    return base_fit(model, np.random.default_rng(seed), near=near)
+
+
+def _state(study: Study, fit: BaseFit) -> State:
+    model = ExtendedModel.of(fit.model, fit.optimum.x, taken=taken(study))
+    return State(model, fit.optimum, fit.regression.whitening, fit.optimum.covariance)
+
+
+def _shift(fit: BaseFit, problem: Problem) -> float:
+    """Largest shift of the base fit's parameters on narrower blocks than the problem's [posterior sd]."""
+    model, x, white = BaseModel(problem.posterior), fit.optimum.x, fit.regression.whitening
+    here, tangents = model.tangents(x)
+    finer = [BaseModel(problem.refined(factor).posterior) for factor in FACTORS]
+    changes = [white(each.predict(x) - here) for each in finer]
+    return largest_shift(fit.optimum.covariance, white(tangents.T).T, changes)
+
+
+def _gain(base: Base, wider: Base) -> float:
+    """Log evidence of the wider model over the other under the wider one's noise [nat]."""
+    quiet = float(sum(wider.fit.noise_samples))
+    same = Regression(base.fit.model, wider.fit.regression.whitening).descend(base.fit.optimum.x)
+    ordering = wider.fit.model.log_support - base.fit.model.log_support
+    return log_bayes_factor(same, wider.fit.optimum, quiet) + ordering
+
+
+def _named(base: Base, library: Sequence[type[Effect]], rng: np.random.Generator, draws: int) -> float:
+    """Log evidence that the best named effect adds to a base fit [nat]; 0 without one."""
+    seen = trace(base.start, library, rng, noise_samples=base.fit.noise_samples, draws=draws)
+    return leading(base.start, seen) if seen.alarmed else 0.0
+
+
+def _later(study: Study, fit: BaseFit) -> Mended | None:
+    """The study with a longer default prior of its delays, where one stands at the end of it; else None."""
+    model = fit.model
+    stuck = []
+    for position, k in enumerate(model.least.columns):
+        row = model.posterior.table.rows[k]
+        late = fit.optimum.x[position] > (1 - _AT_END) * model.bounds[1][position]
+        if row.kind == "delay" and row.default and late and not row.log_scale:
+            stuck.append((row.name, row.domain[1]))
+    if not stuck:
+        return None
+    longer = {
+        name: PriorSettings(name, dist="uniform", parameters={"loc": 0.0, "scale": _LONGER * end})
+        for name, end in stuck
+    }
+    names = ", ".join(f"{name} (ends at {end:.4g} {model.time_unit})" for name, end in stuck)
+    return Mended(
+        replace(study, priors={**study.priors, **longer}),
+        f"The default prior of {names} is too short for these records and was made twice as long.",
+    )

@@ -1,0 +1,243 @@
+"""Signatures of every effect of a library held against the residual of a fit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import final
+
+import numpy as np
+from scipy.special import logsumexp
+from scipy.stats import binom
+
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.effectsearch.scatter import scatter_evidence
+from lcopa_bayes.effectsearch.scoreevidence import Projection
+from lcopa_bayes.effectsearch.scores import State
+from lcopa_bayes.effectsearch.signature import Scale, Signature, signature_of
+from lcopa_bayes.effectsearch.whitening import Whitening
+from lcopa_bayes.model.effects.effect import Card, Effect, ScatterEffect
+
+LEAST = 3.0
+"""Log Bayes factor that an effect needs at least [nat]."""
+QUANTILE = 0.99
+LEVEL = 0.5
+"""Difference of log evidence up to which instances of an effect are level [nat]."""
+_DRAWS = 2000
+"""Chance residuals: the probability beyond the threshold is known to 0.002 [-]."""
+_TAIL = 0.05
+"""Probability outside the interval of a threshold [-]."""
+_BATCH = 200
+"""Chance residuals drawn at once [-]."""
+_NONE = 0.5
+"""Prior probability that nothing is missing [-]; the effects share the rest evenly."""
+MOST_COMMANDS = 400
+"""Commands per record up to which effects are traced that follow each by itself [-]."""
+SEEN = 0.1
+"""Below this survival the records cannot see an effect [-]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Traced:
+    """An effect with all its instances against one residual."""
+
+    card: Card
+    signatures: tuple[Signature, ...]
+    log_bayes_factor: float
+    """Against no effect, averaged over the instances [nat]."""
+    best: int
+    """First instance within 0.5 nat of the largest evidence: effects list likely constants first."""
+    failed: str = ""
+    """Why it could not be simulated."""
+
+    @property
+    def name(self) -> str:
+        """Name of the effect."""
+        return self.card.name
+
+    @property
+    def scatters(self) -> bool:
+        """Whether it changes the distribution of the noise alone."""
+        return not self.signatures and not self.failed
+
+    @property
+    def survival(self) -> float:
+        """Largest share of an instance's signature that is left [-]; NaN for one that changes only the
+        noise."""
+        return max((one.survival for one in self.signatures), default=np.nan)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """All effects against one residual, and what chance alone gives."""
+
+    traced: tuple[Traced, ...]
+    """By falling evidence."""
+    threshold: float
+    """Largest of 3 and the 99 % quantile of the largest log Bayes factor by chance [nat]."""
+    between: tuple[float, float]
+    """95 % interval of that quantile: so many draws do not give it better [nat]."""
+    p_value: float
+    """Share of chance maxima at or above `largest`, no less than 1 / (draws + 1) [-]."""
+    draws: int
+    """Chance maxima drawn [-]."""
+    residual: Vector
+    """Whitened, projected residual, (n,) [-]."""
+    scale: Scale
+    """What is known of the noise scale."""
+
+    @property
+    def leader(self) -> Traced | None:
+        """The effect of largest evidence among those that change the response; None without any."""
+        return next((one for one in self.traced if not one.scatters), None)
+
+    @property
+    def largest(self) -> float:
+        """Its log Bayes factor [nat]; -inf without any."""
+        return self.leader.log_bayes_factor if self.leader else -np.inf
+
+    @property
+    def alarmed(self) -> bool:
+        """Whether any effect that changes the response is above the threshold."""
+        return self.largest > self.threshold
+
+    @property
+    def scatter(self) -> float:
+        """Evidence that the noise is not normal [nat]; -inf where that was not asked."""
+        return max((one.log_bayes_factor for one in self.traced if one.scatters), default=-np.inf)
+
+    @cached_property
+    def probabilities(self) -> dict[str, float]:
+        """Posterior probability of each effect and of "none", if exactly one of them is there [-]."""
+        share = np.log((1 - _NONE) / max(len(self.traced), 1))
+        logs = np.array([np.log(_NONE), *(one.log_bayes_factor + share for one in self.traced)])
+        chances = np.exp(logs - logsumexp(logs))
+        return dict(zip(("none", *(one.name for one in self.traced)), chances.tolist(), strict=True))
+
+    def alone(self, signature: Signature) -> float:
+        """Log Bayes factor of one instance [nat]."""
+        return float(signature.evidence(signature.span.T @ self.residual[:, None], self.scale)[0])
+
+    def of(self, name: str) -> Traced:
+        """The effect of that name; KeyError when it was not traced."""
+        for one in self.traced:
+            if one.name == name:
+                return one
+        raise KeyError(name)
+
+
+def trace(
+    state: State,
+    library: Sequence[type[Effect]],
+    rng: np.random.Generator,
+    *,
+    noise_samples: Sequence[int] = (),
+    draws: int = _DRAWS,
+) -> Trace:
+    """Evidence of every effect of `library` in the residual of a model, and the threshold of chance.
+
+    `noise_samples`: samples each axis' noise was known from; the scale of a chance residual is uncertain by
+    as much. Effects the model already has are left out.
+    """
+    model, optimum, whitening = state.model, state.optimum, state.whitening
+    project = Projection(optimum.moving * model.spread)
+    residual = project(optimum.settled)
+    quiet, freedom = float(sum(noise_samples)), whitening.effective - optimum.x.size
+    scale = Scale(quiet, freedom, np.array([residual @ residual]))
+    present = {effect.name for effect in model.effects}
+    found: list[Traced] = []
+    for kind in library:
+        if kind.card.name in present or not kind.applies(model.base.posterior.table.layout):
+            continue
+        if issubclass(kind, ScatterEffect):
+            joint = "the noise is known from the residual alone" if whitening.dependence else ""
+            told = -np.inf if joint else scatter_evidence(optimum.white)
+            found.append(Traced(kind.card, (), told, 0, joint))
+            continue
+        commands = max(commands_of(one.record.drive) for one in whitening.samples)
+        if kind.per_command and commands > MOST_COMMANDS:
+            why = f"it follows every command by itself, and a record has {commands} (at most {MOST_COMMANDS})"
+            found.append(Traced(kind.card, (), -np.inf, 0, why))
+            continue
+        found.append(_traced(state, project, residual, scale, kind))
+    maxima = _chance(project, whitening, found, rng, draws, scale)
+    found.sort(key=lambda one: -one.log_bayes_factor)
+    threshold, low, high = threshold_of(maxima)
+    made = Trace(tuple(found), threshold, (low, high), np.nan, draws, residual, scale)
+    beaten = int(np.count_nonzero(maxima >= made.largest))
+    return replace(made, p_value=(beaten + 1) / (draws + 1))
+
+
+def threshold_of(maxima: Vector) -> tuple[float, float, float]:
+    """Threshold from chance maxima, and the ends of the 95 % interval of their quantile [nat].
+
+    The ends are order statistics: the number of draws below a quantile is binomial. None is below 3 nat.
+    """
+    if not maxima.size:
+        return LEAST, LEAST, LEAST
+    ordered = np.sort(maxima)
+    ranks = np.array([binom.ppf(p, maxima.size, QUANTILE) for p in (_TAIL / 2, 1 - _TAIL / 2)], dtype=int)
+    low, high = ordered[np.clip(ranks - [1, 0], 0, maxima.size - 1)]
+    return max(LEAST, float(np.quantile(ordered, QUANTILE))), max(LEAST, low), max(LEAST, high)
+
+
+def commands_of(drive: Matrix) -> int:
+    """Instants at which any drive changes [-]."""
+    return int((np.diff(drive, axis=0) != 0).any(axis=1).sum())
+
+
+def _traced(state: State, project: Projection, residual: Vector, scale: Scale, kind: type[Effect]) -> Traced:
+    signatures, evidence, failed = [], [], ""
+    for instance in kind.grid(state.model.effected.ranges):
+        try:
+            signatures.append(signature_of(state.model, state.optimum.x, state.whitening, project, instance))
+        except ArithmeticError as error:
+            failed = str(error)
+            continue
+        evidence.append(float(signatures[-1].evidence(signatures[-1].span.T @ residual[:, None], scale)[0]))
+    if not signatures:
+        return Traced(kind.card, (), -np.inf, 0, failed or "it cannot be simulated")
+    mean = float(logsumexp(evidence) - np.log(len(evidence)))
+    best = int(np.argmax(np.array(evidence) > max(evidence) - LEVEL))
+    return Traced(kind.card, tuple(signatures), mean, best, failed)
+
+
+def _chance(
+    project: Projection,
+    whitening: Whitening,
+    found: Sequence[Traced],
+    rng: np.random.Generator,
+    draws: int,
+    scale: Scale,
+) -> Vector:
+    """Largest log Bayes factor of each of `draws` residuals of the base model alone, (draws,) [nat]."""
+    listed = [one for traced in found for one in traced.signatures]
+    if not listed:
+        return np.zeros(0)
+    spans = [one.span for one in listed]
+    edges = np.cumsum([0, *(span.shape[1] for span in spans)])
+    every = np.concatenate(spans, axis=1).T
+    maxima = []
+    for first in range(0, draws, _BATCH):
+        z = whitening.chance(min(_BATCH, draws - first), rng)
+        left = project(z)
+        inner = (every @ left.astype(np.float32)).astype(float)
+        known = Scale(scale.quiet, scale.freedom, np.einsum("nd,nd->d", left, left))
+        scatters = any(one.scatters for one in found)
+        scatter = [scatter_evidence(column) for column in z.T] if scatters else None
+        evidence = [
+            one.evidence(inner[a:b], known) for one, a, b in zip(listed, edges[:-1], edges[1:], strict=True)
+        ]
+        start, by_effect = 0, []
+        for traced in found:
+            count = len(traced.signatures)
+            if count:
+                by_effect.append(logsumexp(evidence[start : start + count], axis=0) - np.log(count))
+            start += count
+        if scatter is not None:
+            by_effect.append(np.array(scatter))
+        maxima.append(np.max(by_effect, axis=0))
+    return np.concatenate(maxima)

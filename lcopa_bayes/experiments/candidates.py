@@ -1,0 +1,156 @@
+"""Candidate drives of a given length, all within the limits of the bench and on its refresh grid."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.bench.command import Command
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.experiments.limits import Limits
+
+PLAIN = "step"
+"""Name of the drive all others are compared with."""
+_LINES = 24
+"""Most frequencies of a multisine."""
+_LEVELS = 4
+"""Levels of a staircase and of an amplitude series."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A drive that may be played."""
+
+    name: str
+    family: str
+    words: str
+    command: Command
+
+
+Shape = Callable[[int, np.random.Generator], Vector]
+"""Share of the way from the near end (0) to the far end (1) of a range, on so many refreshes, [-]."""
+
+
+def candidates(limits: Limits, time: float, rng: np.random.Generator, *, unit: str) -> tuple[Candidate, ...]:
+    """Every drive worth trying for `time` [time unit], the plain step first.
+
+    With several drive axes the plain step moves one axis after the other, each for an equal part of the
+    time; every other shape moves all axes at once with shapes of their own (random ones are drawn for each,
+    periodic ones are shifted), and two of them one axis alone.
+    """
+    ticks, axes = max(2, round(time / limits.refresh)), limits.rest.size
+    made: list[Candidate] = []
+    for name, family, words, shape in _shapes(ticks, limits.refresh, unit):
+        shares = _stacked(name, shape, ticks, axes, rng)
+        made.append(Candidate(name, family, words, _command(limits, shares)))
+    for axis in range(axes if axes > 1 else 0):
+        for name, shape in ((PLAIN, _step), ("binary, every refresh", _binary(1))):
+            alone = np.zeros((ticks, axes))
+            alone[:, axis] = shape(ticks, rng)
+            made.append(
+                Candidate(
+                    f"{name}, axis {axis + 1} alone",
+                    "one axis",
+                    "the other axes rest",
+                    _command(limits, alone),
+                )
+            )
+    return tuple(made)
+
+
+def _stacked(name: str, shape: Shape, ticks: int, axes: int, rng: np.random.Generator) -> Matrix:
+    """Shares of all axes, (ticks, axes)."""
+    out = np.zeros((ticks, axes))
+    for axis in range(axes):
+        begin = axis * ticks // axes if name == PLAIN else axis * ticks // (3 * axes)
+        out[begin:, axis] = shape(ticks - begin, rng)
+    return out
+
+
+def _command(limits: Limits, shares: Matrix) -> Command:
+    """Shares of each range as a command; only refreshes at which some axis changes are kept."""
+    far = limits.far
+    near = np.where(far == limits.high, limits.low, limits.high)
+    levels = near + shares * (far - near)
+    levels = np.where(shares == 0.0, limits.rest, levels)
+    moved = (np.diff(levels, axis=0, prepend=limits.rest[None]) != 0).any(axis=1)
+    times = np.round(limits.refresh * np.arange(shares.shape[0]), 9)
+    return Command(times[moved], levels[moved], limits.rest)
+
+
+def _shapes(ticks: int, refresh: float, unit: str) -> Iterator[tuple[str, str, str, Shape]]:
+    """Name, family, words and shape of every kind of drive that has room in `ticks`."""
+    whole = f"{ticks * refresh:.4g} {unit}"
+    yield PLAIN, "step", f"on at 0 and held for {whole}", _step
+    holds = sorted({max(1, ticks // k) for k in (2, 8, 32, 128)} | {1} & {ticks // 2})
+    for hold in reversed(holds):
+        told = f"{hold * refresh:.4g} {unit}"
+        yield f"on/off, {told}", "on/off", f"on for {told}, off for as long, repeated", _square(hold)
+    if ticks >= 2 * _LEVELS:
+        words = f"steps to 1/{_LEVELS}, 2/{_LEVELS}, ... of the range, each followed by as long a rest"
+        yield "amplitude series", "amplitude series", words, _series
+        words = f"up and down in {_LEVELS} steps over the whole time"
+        yield "staircase", "staircase", words, _staircase
+    for hold in (1, 4, 16):
+        if ticks >= 4 * hold:
+            told = f"{hold * refresh:.4g} {unit}"
+            name = "binary, every refresh" if hold == 1 else f"binary, {told}"
+            yield name, "pseudo-random binary", f"low or high, drawn anew every {told}", _binary(hold)
+    if ticks >= 16:
+        words = f"low and high by turns, dwells log-uniform from {refresh:.4g} {unit} to a quarter of {whole}"
+        yield "telegraph", "random telegraph", words, _telegraph
+        words = f"sines from 1/{whole} to a quarter of the refresh rate, log-spaced, Schroeder phases"
+        yield "multisine", "multisine", words, _multisine
+
+
+def _step(ticks: int, rng: np.random.Generator) -> Vector:
+    return np.ones(ticks)
+
+
+def _square(hold: int) -> Shape:
+    def shape(ticks: int, rng: np.random.Generator) -> Vector:
+        return np.asarray((np.arange(ticks) // hold + 1) % 2, dtype=float)
+
+    return shape
+
+
+def _series(ticks: int, rng: np.random.Generator) -> Vector:
+    part = np.arange(ticks) * 2 * _LEVELS // ticks
+    return np.asarray(np.where(part % 2 == 0, (part // 2 + 1) / _LEVELS, 0.0))
+
+
+def _staircase(ticks: int, rng: np.random.Generator) -> Vector:
+    part = np.arange(ticks) * 2 * _LEVELS // ticks
+    return np.asarray(np.minimum(part + 1, 2 * _LEVELS - 1 - part) / _LEVELS)
+
+
+def _binary(hold: int) -> Shape:
+    def shape(ticks: int, rng: np.random.Generator) -> Vector:
+        bits = rng.integers(0, 2, -(-ticks // hold)).astype(float)
+        bits[0] = 1.0  # nothing is learnt before the first change
+        return np.repeat(bits, hold)[:ticks]
+
+    return shape
+
+
+def _telegraph(ticks: int, rng: np.random.Generator) -> Vector:
+    """Dwells log-uniform between one refresh and a quarter of the time."""
+    out, at, level = np.empty(ticks), 0, 1.0
+    while at < ticks:
+        dwell = max(1, round(float(np.exp(rng.uniform(0.0, np.log(ticks / 4))))))
+        out[at : at + dwell] = level
+        at, level = at + dwell, 1.0 - level
+    return out
+
+
+def _multisine(ticks: int, rng: np.random.Generator) -> Vector:
+    """Equal lines at log-spaced harmonics (Schroeder 1970, IEEE Trans. Inf. Theory 16), filling 0 to 1."""
+    harmonics = np.unique(np.round(np.geomspace(1, ticks / 4, _LINES)))
+    k = np.arange(harmonics.size)
+    turn = 2 * np.pi * np.arange(ticks)[:, None] / ticks * harmonics
+    wave = np.cos(turn - np.pi * k * (k + 1) / harmonics.size + rng.uniform(0, 2 * np.pi)).sum(axis=1)
+    return np.asarray((wave - wave.min()) / np.ptp(wave))

@@ -1,0 +1,239 @@
+"""Does a drive keep its promise: records of the virtual bench under it and under the plain step, refitted."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from math import isfinite
+from typing import Any, final
+
+import numpy as np
+from scipy.stats import chi2
+
+from lcopa_bayes.bench.acquisition import Bench as VirtualBench
+from lcopa_bayes.bench.acquisition import truth
+from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
+from lcopa_bayes.core.estimate import LEVEL, plain
+from lcopa_bayes.core.parallel import crew
+from lcopa_bayes.experiments.design import LINEAR, Design
+from lcopa_bayes.experiments.information import Bench
+from lcopa_bayes.experiments.refit import Trial, device_of
+
+REPLICAS = 12
+"""Records simulated and fitted per drive."""
+_RESAMPLED = 2000
+"""Bootstrap samples behind the interval of a factor."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Achieved:
+    """Estimates from independent records of one drive."""
+
+    drive: str
+    errors: Matrix
+    """Estimate minus truth relative to the size of the truth, in logarithms for time constants,
+    (records, parameters) [-]."""
+    expected: Vector
+    """Cramer-Rao standard deviations at the truth, likewise relative, (parameters,) [-]."""
+    at_bound: Array
+    """Whether an estimate leans on the end of its search, (records, parameters) [-]."""
+
+    @property
+    def spread(self) -> Vector:
+        """Standard deviations of the estimates, (parameters,) [-]."""
+        return np.asarray(self.errors.std(axis=0, ddof=1))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Confirmation:
+    """Expected against achieved precision of the winner and the plain step at one draw of the posterior."""
+
+    where: str
+    """Which draw, in words."""
+    names: tuple[str, ...]
+    among: Flags
+    """Parameters that the worst is sought among, (parameters,)."""
+    truth: Vector
+    """Values the records were simulated with, each in its unit, (parameters,)."""
+    winner: Achieved
+    step: Achieved
+    factor: float
+    """Worst achieved standard deviation after the step over that after the winner [-]."""
+    lower: float
+    """Lower end of its bootstrap interval at `LEVEL` [-]."""
+    upper: float
+    """Upper end [-]."""
+
+    @property
+    def expected(self) -> float:
+        """The factor that the Cramer-Rao bounds promise at this truth [-]; perhaps infinite."""
+        return float(self.step.expected[self.among].max() / self.winner.expected[self.among].max())
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether the winner is better by more than the scatter of the simulation."""
+        return self.lower > 1.0
+
+    @property
+    def sentence(self) -> str:
+        """What the simulation says."""
+        count = self.winner.errors.shape[0]
+        told = (
+            f"{self.where}, {count} simulated records and fits each: the worst standard deviation achieved "
+            f"is {self.factor:.3g} times ({100 * LEVEL:g} %: {self.lower:.3g} to {self.upper:.3g}) smaller "
+            "than after the plain step"
+        )
+        promised = (
+            f"{self.expected:.3g} promised there" if isfinite(self.expected) else "the step promises none"
+        )
+        held = int(self.step.at_bound[:, self.among].any(axis=1).sum())
+        bound = (
+            f"; {held} of {count} fits after the step lean on the end of a prior, so that its scatter is "
+            "smaller than the data alone would leave it"
+        ) * (held > 0)
+        return f"{'confirmed' if self.confirmed else 'not confirmed'}: {told} ({promised}){bound}"
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values; infinite ones are None."""
+        told: dict[str, Any] = plain(
+            {
+                "confirmed": self.confirmed,
+                "sentence": self.sentence,
+                "where": self.where,
+                "replicas": self.winner.errors.shape[0],
+                "factor": {
+                    "value": self.factor,
+                    "unit": "-",
+                    "lower": self.lower,
+                    "upper": self.upper,
+                    "level": LEVEL,
+                    "interval": "bootstrap over records",
+                    "expected": self.expected,
+                },
+                "parameters": [
+                    {
+                        "name": name,
+                        "truth": self.truth[k],
+                        "winner": _row(self.winner, k),
+                        "step": _row(self.step, k),
+                    }
+                    for k, name in enumerate(self.names)
+                ],
+            }
+        )
+        return told
+
+
+def _row(achieved: Achieved, k: int) -> dict[str, Any]:
+    """Expected and achieved of one parameter, with the interval of a standard deviation of few estimates."""
+    freedom, spread = achieved.errors.shape[0] - 1, float(achieved.spread[k])
+    ends = [spread * np.sqrt(freedom / chi2.ppf(q, freedom)) for q in (0.5 + LEVEL / 2, 0.5 - LEVEL / 2)]
+    return {
+        "expected_relative_sd": float(achieved.expected[k]),
+        "achieved_relative_sd": spread,
+        "lower": ends[0],
+        "upper": ends[1],
+        "level": LEVEL,
+        "interval": "chi-squared",
+        "bias": float(achieved.errors[:, k].mean()),
+        "at_bound": int(achieved.at_bound[:, k].sum()),
+    }
+
+
+def confirm(made: Design, *, replicas: int = REPLICAS, jobs: int = 1) -> tuple[Confirmation, ...]:
+    """Simulate and fit records of the winner and of the plain step; nothing when these are the same drive.
+
+    Truths are two draws of the posterior: the one with the middle factor among those where the winner's
+    bounds are small enough to be believed, and the one whose worst bound is the median of all. Fits are
+    output-error least squares within the support of the study's priors, started at the truth. One record
+    per fit, whatever the `repeats` of the design.
+    """
+    if not made.determined.any() or made.winner is made.step:
+        return ()
+    worst, factors = made.winner.worst(made.determined), made.factors(made.winner)
+    finite = np.flatnonzero(np.isfinite(worst))
+    small = finite[worst[finite] <= LINEAR]
+    places: dict[int, str] = {}
+    if small.size:
+        ranked = small[np.argsort(factors[small])]
+        places[int(ranked[(small.size - 1) // 2])] = "where linear bounds can be believed"
+    ranked = finite[np.argsort(worst[finite])]
+    places.setdefault(int(ranked[(finite.size - 1) // 2]), "at the draw of median precision")
+    return tuple(_confirmed(made, k, told, replicas, jobs) for k, told in places.items())
+
+
+def confirmed(made: Design, *, jobs: int = 1, replicas: int = REPLICAS) -> dict[str, Any]:
+    """`confirm` as plain values under the key `confirmed`: the verdict and factor of the first trial, where
+    bounds can be believed if they can anywhere, and whether every trial agrees."""
+    trials = confirm(made, jobs=jobs, replicas=replicas)
+    sentence = (
+        "; ".join(one.sentence for one in trials) or "nothing to confirm: no drive beats the plain step"
+    )
+    return {
+        "confirmed": {
+            "confirmed": bool(trials) and trials[0].confirmed,
+            "where": trials[0].where if trials else None,
+            "everywhere": bool(trials) and all(one.confirmed for one in trials),
+            "factor": trials[0].as_json()["factor"] if trials else None,
+            "sentence": sentence,
+            "trials": [one.as_json() for one in trials],
+        }
+    }
+
+
+def _confirmed(made: Design, chosen: int, where: str, replicas: int, jobs: int) -> Confirmation:
+    """Both drives at one truth; a replica has the same noise whatever the number of processes."""
+    problem, period = made.fit.problem, made.limits.period
+    device = device_of(problem, made.draws[chosen])
+    camera = VirtualBench(camera=period, exposure=problem.study.model.exposure)
+    tasks = []
+    for which, each in enumerate((made.winner, made.step)):
+        clean = truth(device, camera, each.candidate.command, duration=each.time, name="simulated")
+        bench = Bench(problem, each.time, period)
+        tasks += [
+            Trial(bench, clean, made.draws[chosen], made.names, (problem.study.seed, 9, chosen, which, k))
+            for k in range(replicas)
+        ]
+    found = list(_performed(tasks, min(jobs, replicas)))
+    winner, step = (
+        Achieved(
+            promise.candidate.name,
+            np.array([errors for errors, _ in part]),
+            np.sqrt(np.diagonal(promise.covariance[chosen])) * np.sqrt(made.repeats),
+            np.array([bound for _, bound in part]),
+        )
+        for promise, part in ((made.winner, found[:replicas]), (made.step, found[replicas:]))
+    )
+    rng = np.random.default_rng([made.fit.run.plan.seed, 10])
+    factor, low, high = _factor(winner.errors, step.errors, made.determined, rng)
+    columns = [made.fit.draws.table.names.index(name) for name in made.names]
+    at = made.draws[chosen, columns]
+    return Confirmation(where, made.names, made.determined, at, winner, step, factor, low, high)
+
+
+def _performed(tasks: list[Trial], jobs: int) -> Iterable[tuple[Vector, Flags]]:
+    with crew(jobs) as mapped:
+        yield from mapped(_perform, tasks)
+
+
+def _perform(task: Trial) -> tuple[Vector, Flags]:
+    return task()
+
+
+def _factor(
+    winner: Matrix, step: Matrix, among: Flags, rng: np.random.Generator
+) -> tuple[float, float, float]:
+    """Ratio of the worst standard deviations with its bootstrap interval."""
+
+    def worst(errors: Array) -> Array:
+        return np.asarray(errors[..., among].std(axis=-2, ddof=1).max(axis=-1))
+
+    drawn = [
+        worst(errors[rng.integers(0, errors.shape[0], (_RESAMPLED, errors.shape[0]))])
+        for errors in (step, winner)
+    ]
+    told = (drawn[0] > 0) & (drawn[1] > 0)  # a resample of one record, over and over, has no spread
+    low, high = np.quantile(drawn[0][told] / drawn[1][told], (0.5 - LEVEL / 2, 0.5 + LEVEL / 2))
+    return float(worst(step) / worst(winner)), float(low), float(high)

@@ -1,0 +1,234 @@
+"""The verb `design`: which drive, for how long, makes which parameters how precise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Flags, Matrix, Vector
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import Estimate
+from lcopa_bayes.experiments.candidates import PLAIN, candidates
+from lcopa_bayes.experiments.information import Bench
+from lcopa_bayes.experiments.limits import Limits, bench_times, limits_of
+from lcopa_bayes.experiments.precision import Promise, median, promises, ratios, reached, within
+from lcopa_bayes.identifiability.contraction import prior_draws, prior_spread
+from lcopa_bayes.identifiability.symmetries import Structure, structure
+from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.likelihood import Landscape
+from lcopa_bayes.results.fit import Fit
+
+DRAWS = 24
+"""Draws of the posterior that are averaged over."""
+WANTED = 0.1
+"""Relative standard deviation that bench times are sought for [-]."""
+LINEAR = 0.5
+"""Relative standard deviation up to which a linear bound is believed [-]."""
+_TOLERANCES = (1e-9, 3e-10, 1e-10)
+"""Relative singular values below which a direction is blind [-]; under drives that change often the series
+leave those of true symmetries at up to 1e-11."""
+_PRIOR_POINTS = 12
+"""Draws of the prior at which symmetries are looked for, besides those of the posterior."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Design:
+    """Promises of every drive at every bench time tried."""
+
+    fit: Fit
+    limits: Limits
+    repeats: int
+    time: float
+    """Bench time designed for [time unit]."""
+    draws: Matrix
+    """Table values averaged over, (draws, rows)."""
+    names: tuple[str, ...]
+    """Plant parameters."""
+    tried: tuple[tuple[Promise, ...], ...]
+    """Per bench time, increasing, one promise per drive, the plain step first."""
+    structure: Structure
+
+    @cached_property
+    def here(self) -> tuple[Promise, ...]:
+        """Promises at the bench time designed for."""
+        return next(row for row in self.tried if row[0].time == self.time)
+
+    @property
+    def step(self) -> Promise:
+        """The plain step of equal time."""
+        return self.here[0]
+
+    @cached_property
+    def determined(self) -> Flags:
+        """Whether some drive determines a parameter within the time designed for, (parameters,)."""
+        best = np.min([one.expected for one in self.here], axis=0)
+        blind = np.array([name in self.structure.blind for name in self.names])
+        return np.asarray(np.isfinite(best) & ~blind)
+
+    def factors(self, promise: Promise) -> Vector:
+        """How many times smaller the worst relative standard deviation is than after the plain step of equal
+        time, at every draw, (draws,) [-]; infinite where only the step leaves a parameter open."""
+        return ratios(self.step.worst(self.determined), promise.worst(self.determined))
+
+    @cached_property
+    def winner(self) -> Promise:
+        """Best for the worst parameter, against the plain step at the median draw; of equals the better on
+        the whole. Draws are compared one by one because bounds differ by decades between them."""
+
+        def key(one: Promise) -> tuple[float, float]:
+            return -float(median(self.factors(one)[:, None])[0]), one.typical(self.determined)
+
+        return min(self.here, key=key)
+
+    @cached_property
+    def overall(self) -> Promise:
+        """D-optimal: smallest volume of the region of confidence."""
+        return min(self.here, key=lambda one: one.typical(self.determined))
+
+    @property
+    def worst(self) -> str:
+        """The parameter the winner knows least at most draws."""
+        places = np.argmax(np.where(self.determined, self.winner.relative, -np.inf), axis=1)
+        return self.names[int(np.bincount(places).argmax())]
+
+    @property
+    def factor(self) -> Estimate:
+        """`factors` of the winner: median and interval over the draws."""
+        return self._over_draws("factor over the plain step", self.factors(self.winner))
+
+    @property
+    def linear(self) -> float:
+        """Share of the draws at which the winner's worst bound is small enough to be believed [-]."""
+        return float(np.mean(self.winner.worst(self.determined) <= LINEAR))
+
+    def _over_draws(self, name: str, column: Vector) -> Estimate:
+        return Estimate.of(name, "-", column, ess=float(column.size), grade=self.fit.draws.grade.level)
+
+    def estimate(self, promise: Promise, name: str) -> Estimate:
+        """Expected relative standard deviation of a parameter, with its spread over the draws."""
+        return self._over_draws(name, promise.relative[:, self.names.index(name)])
+
+    def worst_of(self, promise: Promise) -> Estimate:
+        """Worst relative standard deviation over the parameters, with its spread over the draws."""
+        return self._over_draws("worst", promise.worst(self.determined))
+
+    def best(self, name: str, row: tuple[Promise, ...]) -> Promise:
+        """Best drive for one parameter at one bench time."""
+        at = self.names.index(name)
+        return min(row, key=lambda one: float(one.expected[at]))
+
+    def time_needed(self, name: str) -> tuple[float, bool] | None:
+        """Bench time for `WANTED` on a parameter by the best drive at each; see `reached`."""
+        at = self.names.index(name)
+        times = np.array([row[0].time for row in self.tried])
+        spreads = np.array([self.best(name, row).expected[at] for row in self.tried])
+        return None if name in self.structure.blind else reached(times, spreads, WANTED)
+
+    def reason(self, name: str) -> str:
+        """Why a parameter has no number, in words; empty when it has."""
+        for symmetry in self.structure.symmetries:
+            if name in symmetry.parameters:
+                return f"structurally unidentifiable: before any noise, {symmetry.sentence}"
+        if not self.determined[self.names.index(name)]:
+            unit = self.fit.study.time_unit
+            return f"at most draws of the posterior no drive tried determines it within {self.time:g} {unit}"
+        return ""
+
+    @cached_property
+    def sentence(self) -> str:
+        """The design in a sentence."""
+        unit = self.fit.study.time_unit
+        if not self.determined.any():
+            return f"no drive tried determines any parameter within {self.time:g} {unit}"
+        told = f"{self.winner.candidate.name} for {self.time:g} {unit}"
+        if self.winner is self.step:
+            return f"{told}: no drive tried is better for the worst parameter than the plain step"
+        factor = self.factor.value
+        gained = (
+            f"{factor:.3g} times smaller than after the plain step of equal time"
+            if np.isfinite(factor)
+            else "bounded, where the plain step of equal time leaves a parameter open"
+        )
+        few = (
+            f"; linear bounds can be believed at {100 * self.linear:.0f} % of the draws, elsewhere they say "
+            "which drive is better but not how precise it will be"
+        ) * (self.linear < 1)
+        return f"{told}: the worst relative standard deviation (mostly {self.worst}) is {gained}{few}"
+
+
+def checked(
+    problem: Problem,
+    *,
+    time: float | None = None,
+    repeats: int = 1,
+    amplitude: float | None = None,
+    refresh: float | None = None,
+) -> tuple[Limits, tuple[float, ...], float]:
+    """Limits, bench times to try and the one to design for; InputError when a design cannot be made."""
+    if repeats < 1:
+        raise InputError(f"`repeats` must be one or more; got {repeats}")
+    limits = limits_of(problem, amplitude=amplitude, refresh=refresh)
+    times, chosen = bench_times(problem, limits, time)
+    if not Bench(problem, times[0], limits.period).columns:
+        raise InputError(
+            f"{problem.study.name}: no parameter of the plant is free; there is nothing to design for"
+        )
+    return limits, times, chosen
+
+
+def design(
+    fit: Fit,
+    *,
+    time: float | None = None,
+    repeats: int = 1,
+    amplitude: float | None = None,
+    refresh: float | None = None,
+    with_prior: bool = False,
+    draws: int = DRAWS,
+    ladder: bool = True,
+) -> Design:
+    """Compare candidate drives for a fitted study at many bench times.
+
+    `time` [time unit of the study] is what the winner is chosen for, by default 40 spans of the records;
+    without `ladder` no other time is tried. The measurement counts alone unless `with_prior`. InputError as
+    `limits_of` and `bench_times`, for fewer than one repeat, and when no plant parameter is free.
+    """
+    problem, study = fit.problem, fit.study
+    limits, times, chosen = checked(problem, time=time, repeats=repeats, amplitude=amplitude, refresh=refresh)
+    first = Bench(problem, times[0], limits.period)
+    averaged = fit.draws.thinned(draws)
+    landscape = Landscape(problem.posterior)
+    rng = np.random.default_rng([fit.run.plan.seed, 7])
+    believed = prior_draws(landscape, rng)
+    known = prior_spread(landscape, believed)[list(first.columns)] if with_prior else None
+    tried = []
+    for each in times if ladder else (chosen,):
+        drives = candidates(limits, each, np.random.default_rng([study.seed, 8]), unit=study.time_unit)
+        possible = [drive for drive in drives if within(drive, limits)]
+        if not possible or possible[0].name != PLAIN:
+            raise InputError(f"no candidate drive lies inside the amplitude limit at {each:g}")
+        bench = Bench(problem, each, limits.period)
+        tried.append(tuple(promises(bench, possible, averaged, repeats=repeats, prior=known)))
+    found = _symmetries(first, limits, np.concatenate([averaged, believed[:_PRIOR_POINTS]]))
+    return Design(fit, limits, repeats, chosen, averaged, first.names, tuple(tried), found)
+
+
+def _symmetries(bench: Bench, limits: Limits, points: Matrix) -> Structure:
+    """What no drive can tell apart, from all candidates of the shortest bench time together."""
+    unit = bench.problem.study.time_unit
+    drives = candidates(limits, bench.time, np.random.default_rng(0), unit=unit)
+    slopes, values = [], []
+    for point in points:
+        elements, sizes = bench.elements(point), bench.sizes(point)
+        if not (sizes > 0).all():  # a size of zero has no relative change
+            continue
+        stacked = [s for drive in drives for s in bench.slopes(point, elements, drive.command)]
+        slopes.append((np.concatenate(stacked, axis=1) * sizes[:, None]).T)
+        values.append(point[list(bench.columns)])
+    if not slopes:
+        return Structure((), 0, 0, True, np.empty(0))
+    return structure(bench.names, slopes, values, tolerances=_TOLERANCES)

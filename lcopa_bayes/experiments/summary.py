@@ -1,0 +1,116 @@
+"""A design as plain values, every open or undefined number with its reason in words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.estimate import Estimate, plain
+from lcopa_bayes.experiments.design import Design
+from lcopa_bayes.experiments.precision import Promise, median
+
+
+def as_json(made: Design) -> dict[str, Any]:
+    """Every number of a design; what is infinite or undefined is None and has a reason in words."""
+    study, table = made.fit.study, made.fit.draws.table
+    determined = bool(made.determined.any())
+    told: dict[str, Any] = plain(
+        {
+            "study": study.name,
+            "verdict": made.sentence,
+            "grade": made.fit.draws.grade.level,
+            "grade_reason": made.fit.draws.grade.reason,
+            "time": made.time,
+            "time_unit": study.time_unit,
+            "repeats": made.repeats,
+            "draws": made.draws.shape[0],
+            "refresh": made.limits.refresh,
+            "period": made.limits.period,
+            "range": [
+                {"axis": axis.name, "unit": axis.unit, "rest": rest, "low": low, "high": high}
+                for axis, rest, low, high in zip(
+                    study.drive_axes, made.limits.rest, made.limits.low, made.limits.high, strict=True
+                )
+            ],
+            "winner": _row(made, made.winner) if determined else None,
+            "d_optimal": made.overall.candidate.name if determined else None,
+            "factor_over_step": made.factor.as_json() | {"parameter": made.worst} if determined else None,
+            "linear_share": made.linear if determined else None,
+            "parameters": [
+                _parameter(made, name, table.rows[table.names.index(name)].unit) for name in made.names
+            ],
+            "table": [_row(made, one) for one in made.here],
+            "curve": _curve(made),
+            "structure": [one.as_json() for one in made.structure.symmetries],
+        }
+    )
+    return told
+
+
+def _row(made: Design, promise: Promise) -> dict[str, Any]:
+    """One drive at one bench time."""
+    among = made.determined
+    return {
+        "drive": promise.candidate.name,
+        "family": promise.candidate.family,
+        "words": promise.candidate.words if promise.excites else "excites nothing that could be seen",
+        "changes": promise.candidate.command.times.size,
+        "time": promise.time,
+        "worst": made.worst_of(promise).as_json() if among.any() else None,
+        "factor_over_step": median(made.factors(promise)[:, None])[0] if among.any() else None,
+        "typical": promise.typical(among) if among.any() else None,
+        "relative_sd": [
+            made.estimate(promise, name).as_json() if made.determined[k] else None
+            for k, name in enumerate(made.names)
+        ],
+    }
+
+
+def _parameter(made: Design, name: str, unit: str) -> dict[str, Any]:
+    """What becomes of one parameter."""
+    at, needed, reason = made.names.index(name), made.time_needed(name), made.reason(name)
+    best = made.best(name, made.here)
+    sizes = np.abs(made.draws[:, made.fit.draws.table.names.index(name)])
+    spread: Vector = best.relative[:, at] * sizes
+    told = "not by any drive tried"
+    if needed is not None:
+        told = f"{'at most ' * needed[1]}{needed[0]:.3g} {made.fit.study.time_unit}"
+    return {
+        "name": name,
+        "unit": unit,
+        "reason": reason,
+        "best_drive": None if reason else best.candidate.name,
+        "relative_sd": None if reason else made.estimate(best, name).as_json(),
+        "sd": None
+        if reason
+        else Estimate.of(
+            name, unit, spread, ess=float(spread.size), grade=made.fit.draws.grade.level
+        ).as_json(),
+        "relative_sd_step": None if reason else made.estimate(made.step, name).as_json(),
+        "relative_sd_winner": None if reason else made.estimate(made.winner, name).as_json(),
+        "time_for_10_percent": None if needed is None else needed[0],
+        "time_is_upper_bound": needed is not None and needed[1],
+        "time_words": told,
+    }
+
+
+def _curve(made: Design) -> list[dict[str, Any]]:
+    """Per bench time, the best drive and the plain step for every parameter."""
+    out = []
+    for row in made.tried:
+        best = {name: made.best(name, row) for name in made.names if name not in made.structure.blind}
+        out.append(
+            {
+                "time": row[0].time,
+                "best": {name: one.expected[made.names.index(name)] for name, one in best.items()},
+                "drive": {
+                    name: one.candidate.name
+                    for name, one in best.items()
+                    if np.isfinite(one.expected[made.names.index(name)])
+                },
+                "step": {name: row[0].expected[made.names.index(name)] for name in best},
+            }
+        )
+    return out

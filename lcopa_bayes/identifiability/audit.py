@@ -1,0 +1,237 @@
+"""The verb `audit`: what the records of a study determine, joined from four ways of asking."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from typing import Any, final
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.identifiability.contraction import Known, beliefs, known_best, prior_draws, prior_spread
+from lcopa_bayes.identifiability.curvature import Curvature, curvature
+from lcopa_bayes.identifiability.delays import Delays, delays
+from lcopa_bayes.identifiability.printedform import printed_structure
+from lcopa_bayes.identifiability.profile import Profile
+from lcopa_bayes.identifiability.profilepath import profile
+from lcopa_bayes.identifiability.radial import Radial, radial
+from lcopa_bayes.identifiability.sensitivities import Sensitivities, sensitivities
+from lcopa_bayes.identifiability.symmetries import DIFFERENCED, TOLERANCES, Structure, exchanges, structure
+from lcopa_bayes.identifiability.tolerance import Tolerance
+from lcopa_bayes.identifiability.verdict import Finding, judged
+from lcopa_bayes.inference.likelihood import Landscape, Peak
+from lcopa_bayes.inference.optimum import find_optima
+from lcopa_bayes.inference.parameter import Parameter
+from lcopa_bayes.model.effects.effect import UnstableError
+from lcopa_bayes.results.fit import Fit
+from lcopa_bayes.results.resonance import unresolved
+
+_POINTS = 24
+"""Prior draws at which symmetries are looked for, besides likely ones."""
+_WITNESSES = 400
+"""Draws that profiles are started from."""
+_CLIMBED = 8
+"""Draws from which the maximum is sought, besides the optima."""
+_RADIUS = 0.5
+"""Radius of the radial test [prior standard deviations]."""
+_BETTER = 0.05
+"""A higher maximum than this [nat] starts the profiles anew ..."""
+_TRIES = 3
+"""... this many times at most."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Audit:
+    """Identifiability of a fitted study."""
+
+    fit: Fit
+    findings: tuple[Finding, ...]
+    """One per free parameter, in table order."""
+    structure: Structure
+    printed: Structure | None
+    """The same of the printed parametrisation, for a plant with one path and free orders."""
+    curvature: Curvature | None
+    """None when only noise parameters are free."""
+    radial: Radial | None
+    known: tuple[Known, ...]
+    delays: Delays
+    peak: Peak
+
+    @property
+    def sentence(self) -> str:
+        """The audit in a sentence."""
+        counted: dict[str, list[str]] = {}
+        for found in self.findings:
+            counted.setdefault(found.verdict, []).append(found.profile.parameter)
+        told = "; ".join(f"{verdict}: {', '.join(names)}" for verdict, names in counted.items())
+        best = self.known[0].estimate.name if self.known else ""
+        limits = "; ".join(one.reason for one in self.fit.draws.limitations)
+        return (
+            f"Given this model, {told}."
+            + (f" Known best: {best}." if best else "")
+            + (f" But {limits}." if limits else "")
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """Every number of the audit; what is open, infinite or undefined is None."""
+        draws = self.fit.draws
+        told: dict[str, Any] = plain(
+            {
+                "study": self.fit.study.name,
+                "verdict": self.sentence,
+                "grade": draws.grade.level,
+                "grade_reason": draws.grade.reason,
+                "limitations": [one.as_json() for one in draws.limitations],
+                "time_unit": self.fit.study.time_unit,
+                "parameters": [found.as_json() for found in self.findings],
+                "symmetries": [found.as_json() for found in self.structure.symmetries],
+                "structure": _structure(self.structure),
+                "printed_form": None if self.printed is None else _structure(self.printed),
+                "spectrum": [] if self.curvature is None else self.curvature.spectrum(),
+                "local": None if self.curvature is None else self.curvature.as_json(),
+                "radial": None if self.radial is None else self.radial.as_json(),
+                "functions": [known.as_json() for known in self.known],
+                "delays": self.delays.as_json(),
+                "log_likelihood": self.peak.log_likelihood,
+                "next_measurement": None,
+            }
+        )
+        return told
+
+
+def _structure(found: Structure) -> dict[str, Any]:
+    return {
+        "parameters": found.parameters,
+        "rank": found.rank,
+        "certain": found.certain,
+        "singular_values": found.singular,
+        "symmetries": [one.as_json() for one in found.symmetries],
+    }
+
+
+def audit(fit: Fit, *, jobs: int = 1) -> Audit:
+    """Verdict for every free parameter of a fitted study; profiles are made in `jobs` processes."""
+    posterior, seed = fit.problem.posterior, fit.run.plan.seed
+    landscape, rng = Landscape(posterior), np.random.default_rng([seed, 5])
+    with threadpool_limits(1):
+        prior = prior_draws(landscape, rng)
+        spread = prior_spread(landscape, prior)
+        optima = np.array([o.values for o in find_optima(posterior, rng)]).reshape(-1, prior.shape[1])
+        thinned = fit.draws.thinned(_WITNESSES)
+        likely = thinned[np.argsort(-landscape.log_likelihood(thinned))[:_CLIMBED]]
+        starts = np.concatenate([optima, likely])
+        peak = max((landscape.climb(v) for v in starts), key=lambda found: found.log_likelihood)
+        known = known_best(fit.draws, prior, fit.problem.scales.span, time_unit=fit.study.time_unit)
+    profiles, peak = _profiles(landscape, peak, np.concatenate([thinned, optima]), jobs)
+    points = _points(landscape, (*prior[:_POINTS], *likely)) if landscape.least.columns else []
+    symmetric, curved, moved, printed = Structure((), 0, 0, True, np.empty(0)), None, None, None
+    if points:
+        tolerances = TOLERANCES if posterior.simulation is None else DIFFERENCED
+        symmetric = structure(
+            points[0].names, [p.relative() for p in points], [p.values for p in points], tolerances=tolerances
+        )
+        symmetric = replace(symmetric, symmetries=(*symmetric.symmetries, *exchanges(posterior.table)))
+        printed = printed_structure(points, rng)
+        curved = curvature(landscape, peak.values, spread)
+        moved = radial(landscape, peak, spread, curved.directions[-1], _RADIUS)
+    believed = beliefs(landscape, fit.draws, spread, fit.sensitivity)
+    rows = [posterior.table.rows[k] for k in landscape.free]
+    scales = fit.problem.scales
+    fast = unresolved(fit.draws, scales.period)
+    findings = tuple(
+        judged(
+            *(one, belief, symmetric, curved, _flat(row), Tolerance.of(row, scales)),
+            next((f.sentence(scales.period, fit.study.time_unit) for f in fast if f.concerns(row)), ""),
+        )
+        for one, belief, row in zip(profiles, believed, rows, strict=True)
+    )
+    apart = delays(fit.study, posterior.table, peak.values)
+    return Audit(fit, findings, symmetric, printed, curved, moved, known, apart, peak)
+
+
+def _points(landscape: Landscape, values: Iterable[Vector]) -> list[Sensitivities]:
+    """Sensitivities at table values; where effects leave no bounded response, or one of them vanishes, there
+    are none."""
+    out = []
+    for each in values:
+        try:
+            point = sensitivities(landscape, each)
+        except UnstableError:
+            continue
+        if landscape.posterior.simulation is None or (point.values != 0).all():
+            out.append(point)
+    return out
+
+
+def _flat(row: Parameter) -> bool:
+    """Whether the prior has no density to prefer one value on the sampled scale."""
+    assert row.prior is not None
+    return row.prior.dist == ("loguniform" if row.log_scale else "uniform")
+
+
+def _profiles(landscape: Landscape, peak: Peak, witnesses: Matrix, jobs: int) -> tuple[list[Profile], Peak]:
+    """Profiles of all free parameters about one maximum, and that maximum."""
+    for _ in range(_TRIES):
+        tasks = [_Task(k, peak, witnesses, _first_step(landscape, k, witnesses)) for k in landscape.free]
+        made = list(_performed(landscape, tasks, jobs))
+        top = max(made, key=lambda one: one.best)
+        better = top.best - peak.log_likelihood
+        if better > 0:
+            peak = Peak(top.top, top.best)
+        if better <= _BETTER:
+            break
+    return [replace(one, best=max(peak.log_likelihood, one.best)) for one in made], peak
+
+
+def _first_step(landscape: Landscape, k: int, witnesses: Matrix) -> float:
+    """A tenth of the spread of the draws, on the sampled scale."""
+    spread = float(landscape.column(k, witnesses).std())
+    low, high = landscape.search(k)
+    return 0.1 * spread if spread > 0 else 1e-3 * (high - low)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """One profile to make."""
+
+    k: int
+    peak: Peak
+    witnesses: Matrix
+    step: float
+
+    def __call__(self, landscape: Landscape) -> Profile:
+        return profile(landscape, self.k, self.peak, self.witnesses, self.step)
+
+
+def _performed(landscape: Landscape, tasks: Sequence[_Task], jobs: int) -> Iterable[Profile]:
+    """Profiles in the order of the tasks, from this process or from others; the same either way."""
+    if min(jobs, len(tasks)) <= 1:
+        with threadpool_limits(1):
+            yield from (task(landscape) for task in tasks)
+        return
+    with ProcessPoolExecutor(
+        jobs, mp_context=get_context("spawn"), initializer=_take_up, initargs=(landscape,)
+    ) as pool:
+        yield from pool.map(_perform, tasks)
+
+
+_landscape: Landscape | None = None
+"""What a worker process profiles; set once when the process starts."""
+
+
+def _take_up(landscape: Landscape) -> None:
+    global _landscape
+    threadpool_limits(1)
+    _landscape = landscape
+
+
+def _perform(task: _Task) -> Profile:
+    assert _landscape is not None
+    return task(_landscape)

@@ -1,0 +1,178 @@
+"""What the draws say: contraction, companions, and the functions of parameters that are known best."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, final
+
+import numpy as np
+from scipy.stats import rankdata
+
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.estimate import Estimate, plain
+from lcopa_bayes.identifiability.tolerance import FACTOR, Tolerance
+from lcopa_bayes.inference.likelihood import Landscape
+from lcopa_bayes.results.sensitivity import Sensitivity
+from lcopa_bayes.results.steps import StepCurves, step_curves, step_metrics
+from lcopa_bayes.sampling.draws import Draws
+
+_PRIOR_DRAWS = 4000
+_COMPANION = 0.6
+"""Rank correlation from which two parameters move together [-]."""
+_STRAYING = 1000.0
+"""A width relative to the median beyond this says nothing any more [-]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """Posterior of one parameter beside its prior."""
+
+    parameter: str
+    contraction: float
+    """``1 - var(posterior) / var(prior)`` on the sampled scale [-]: the data's share of what is known."""
+    companions: tuple[str, ...]
+    """Parameters whose draws are rank-correlated with this one's, strongest first."""
+    correlations: tuple[float, ...]
+    """Spearman's rank correlations with them [-]."""
+    hills: int
+    """Separate hills of the marginal."""
+    sensitivity: Sensitivity | None
+    estimate: Estimate
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        told: dict[str, Any] = plain(
+            {
+                "parameter": self.parameter,
+                "contraction": self.contraction,
+                "companions": dict(zip(self.companions, self.correlations, strict=True)),
+                "hills": self.hills,
+                "power_scaling": None if self.sensitivity is None else self.sensitivity.diagnosis,
+            }
+        )
+        return told
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Known:
+    """A function of the parameters beside what the prior says of it."""
+
+    estimate: Estimate
+    relative_width: float
+    """Width of the interval over the size of the median [-]; infinite when a side is open."""
+    prior_relative_width: float
+    """The same of prior draws [-]."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        told: dict[str, Any] = self.estimate.as_json() | plain(
+            {
+                "relative_width": self.relative_width,
+                "prior_relative_width": self.prior_relative_width,
+                "verdict": self.verdict,
+            }
+        )
+        return told
+
+    @property
+    def verdict(self) -> str:
+        """Whether the draws bound the function, on both sides, one or none, and how narrowly."""
+        ends = [np.isfinite(self.estimate.lower), np.isfinite(self.estimate.upper)]
+        if not any(ends):
+            return "practically unidentifiable"
+        if not all(ends):
+            return "one-sided"
+        if not self.relative_width < 0.5 * self.prior_relative_width:
+            return "prior-dominated"
+        wide = Tolerance(0.0, FACTOR, self.estimate.unit).exceeded(self.estimate.lower, self.estimate.upper)
+        return "weakly identified" if wide else "identified"
+
+
+def prior_draws(landscape: Landscape, rng: np.random.Generator) -> Matrix:
+    """Canonical draws of the prior, (draws, rows)."""
+    return landscape.posterior.table.draw(_PRIOR_DRAWS, rng)
+
+
+def prior_spread(landscape: Landscape, prior: Matrix) -> Vector:
+    """Standard deviations of prior draws on the sampled scale, (rows,); NaN for what is fixed."""
+    out = np.full(prior.shape[1], np.nan)
+    for k in landscape.free:
+        out[k] = landscape.column(k, prior).std()
+    return out
+
+
+def beliefs(
+    landscape: Landscape, draws: Draws, prior_sd: Vector, moved: tuple[Sensitivity, ...]
+) -> tuple[Belief, ...]:
+    """Of every free parameter, in table order."""
+    flat, names = draws.flat, [landscape.posterior.table.names[k] for k in landscape.free]
+    columns = np.stack([landscape.column(k, flat) for k in landscape.free], axis=1)
+    ranks = np.apply_along_axis(rankdata, 0, columns)
+    spread = ranks.std(axis=0)
+    centred = (ranks - ranks.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
+    spearman = centred.T @ centred / ranks.shape[0]
+    by_name = {one.parameter: one for one in moved}
+    estimates = {one.name: one for one in draws.estimates()}
+    hills = {one.parameter: len(one.boundaries) + 1 for one in draws.ridges}
+    out = []
+    for p, (k, name) in enumerate(zip(landscape.free, names, strict=True)):
+        order = [q for q in np.argsort(-np.abs(spearman[p])) if q != p and abs(spearman[p, q]) >= _COMPANION]
+        out.append(
+            Belief(
+                name,
+                float(1 - columns[:, p].var() / prior_sd[k] ** 2),
+                tuple(names[q] for q in order),
+                tuple(float(spearman[p, q]) for q in order),
+                hills.get(name, 1),
+                by_name.get(name),
+                estimates[name],
+            )
+        )
+    return tuple(out)
+
+
+def known_best(draws: Draws, prior: Matrix, span: float, *, time_unit: str) -> tuple[Known, ...]:
+    """Step metrics and steepest slopes of every path, the most precisely known first.
+
+    `prior`, (draws, rows): draws of the prior; `span`: length of the record [time unit].
+    """
+    before = replace(draws, values=prior[None], log_density=np.zeros((1, prior.shape[0])))
+    told = [_functions(each, span, time_unit) for each in (draws, before)]
+    found = [
+        Known(after, _width(after), _width(first)) for after, first in zip(told[0], told[1], strict=True)
+    ]
+    return tuple(sorted(found, key=lambda known: known.relative_width))
+
+
+def _functions(draws: Draws, span: float, time_unit: str) -> list[Estimate]:
+    curves = step_curves(draws, span)
+    metrics = [m for m in step_metrics(draws, curves, time_unit=time_unit) if m.value != 0 or m.upper != 0]
+    wanted = ("rise_10_90", "value_at_end", "steady_state")
+    return [m for m in metrics if m.name.startswith(wanted)] + _slopes(draws, curves, time_unit)
+
+
+def _slopes(draws: Draws, curves: StepCurves, time_unit: str) -> list[Estimate]:
+    """Steepest slope of the step response of every path, over the thousandth part of the record."""
+    layout, step, out = draws.table.layout, float(curves.time[0]), []
+    for i, response in enumerate(layout.responses):
+        for j, drive in enumerate(layout.drives):
+            curve = curves.normalised[curves.curve_of[i][j]]
+            steepest = np.diff(curve, axis=1, prepend=0.0).max(axis=1) / step
+            path = layout.path_name(i, j) or response.name
+            unit = f"{response.unit}/{drive.unit}/{time_unit}"
+            slope = curves.gains[:, i, j] * steepest
+            out.append(
+                Estimate.of(f"steepest_slope[{path}]", unit, slope, ess=draws.ess, grade=draws.grade.level)
+            )
+    return out
+
+
+def _width(estimate: Estimate) -> float:
+    """Width of the interval over the size of the median."""
+    if not (np.isfinite(estimate.lower) and np.isfinite(estimate.upper)):
+        return np.inf
+    size = abs(estimate.value)
+    width = estimate.upper - estimate.lower
+    return float(width / size) if width < _STRAYING * size else np.inf

@@ -1,0 +1,144 @@
+"""Curvature of the likelihood at its maximum: Fisher information, spectrum, correlations, collinearity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any, final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.identifiability.sensitivities import sensitivities
+from lcopa_bayes.inference.likelihood import Landscape
+
+_SINGULAR = 1e-11
+"""Eigenvalues below this share of the largest are rounding [-]."""
+_TOUCHED = 1e-6
+"""Squared weight in a singular direction from which a parameter's variance is infinite [-]."""
+_SHOWN = 0.1
+"""Weights of a direction that are named [-]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Curvature:
+    """Local precision of the free plant parameters on their sampled scale."""
+
+    names: tuple[str, ...]
+    sd: Vector
+    """Cramer-Rao standard deviation on the sampled scale (a relative one for logarithms), (parameters,);
+    infinite where the Fisher matrix is singular."""
+    relative_sd: Vector
+    """Standard deviation over the size of the value, (parameters,) [-]; infinite likewise."""
+    eigenvalues: Vector
+    """Of the Fisher information in units of prior standard deviations, decreasing [-]: how many times as
+    precise as the prior the data are along a direction; below 1 the prior knows more."""
+    directions: Matrix
+    """Unit vectors in units of prior standard deviations, one per row, (parameters, parameters) [-]."""
+    correlations: Matrix
+    """Of the linearised estimates, (parameters, parameters) [-]; NaN where a variance is infinite."""
+    overlap: Matrix
+    """Cosines between sensitivities, (parameters, parameters) [-]; 0 with one that is nil."""
+    collinearity: float
+    """``1 / sqrt(smallest eigenvalue)`` of the cosines [-] (Brun et al. 2001, Water Resources Research 37):
+    above 10 to 15 some sensitivity is nearly a combination of the others; infinite when it is one."""
+
+    def at(self, name: str) -> tuple[float, float] | None:
+        """Standard deviation on the sampled scale and relative to the size; None for noise parameters."""
+        if name not in self.names:
+            return None
+        place = self.names.index(name)
+        return float(self.sd[place]), float(self.relative_sd[place])
+
+    def partners(self, name: str, least: float = 0.8) -> tuple[str, ...]:
+        """Parameters whose linearised estimates are correlated with this one's, strongest first."""
+        if name not in self.names:
+            return ()
+        row = np.abs(self.correlations[self.names.index(name)])
+        order = np.argsort(-np.nan_to_num(row))
+        return tuple(self.names[p] for p in order if self.names[p] != name and row[p] >= least)
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values without the spectrum; infinite ones are None."""
+        pairs = sorted(combinations(range(len(self.names)), 2), key=lambda ab: -abs(self.overlap[ab]))
+        told: dict[str, Any] = plain(
+            {
+                "relative_sd": dict(zip(self.names, self.relative_sd, strict=True)),
+                "collinearity": self.collinearity,
+                "most_alike": [
+                    {
+                        "pair": [self.names[a], self.names[b]],
+                        "cosine": self.overlap[a, b],
+                        "correlation": self.correlations[a, b],
+                    }
+                    for a, b in pairs[:5]
+                ],
+                "names": self.names,
+                "correlations": self.correlations,
+            }
+        )
+        return told
+
+    def spectrum(self) -> list[dict[str, Any]]:
+        """Directions by falling precision with the parameters that make them up."""
+        out = []
+        for value, row in zip(self.eigenvalues, self.directions, strict=True):
+            order = [p for p in np.argsort(-np.abs(row)) if abs(row[p]) >= _SHOWN]
+            sign = np.sign(row[order[0]])
+            out.append(
+                {
+                    "eigenvalue": float(value),
+                    "direction": {self.names[p]: float(sign * row[p]) for p in order},
+                    "prior_knows_more": bool(value < 1),
+                }
+            )
+        told: list[dict[str, Any]] = plain(out)
+        return told
+
+
+def curvature(landscape: Landscape, values: Vector, prior_sd: Vector) -> Curvature:
+    """Fisher information of the plant parameters at table values, noise parameters as they stand there.
+
+    `prior_sd`, (rows,): standard deviations of the prior on the sampled scale. The mean of the samples does
+    not depend on noise parameters, so that theirs is a block of its own and is left out.
+    """
+    found = sensitivities(landscape, values)
+    slopes, columns = found.matrix, landscape.least.columns
+    norms = np.linalg.norm(slopes, axis=0)
+    unit = slopes / np.where(norms > 0, norms, 1.0)
+    overlap = unit.T @ unit
+    singular, rows = _spectral(unit)
+    blind = singular <= _SINGULAR * max(singular[0], 1e-300)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shape = (rows[~blind].T / singular[~blind]) @ rows[~blind]
+        sd = np.sqrt(np.diag(shape)) / norms
+    touched = (rows[blind] ** 2).sum(axis=0) > _TOUCHED
+    sd = np.where(touched | (norms == 0), np.inf, sd)
+    scale = np.sqrt(np.diag(shape))
+    correlations = shape / np.outer(np.where(scale > 0, scale, 1.0), np.where(scale > 0, scale, 1.0))
+    correlations[~np.isfinite(sd)] = correlations[:, ~np.isfinite(sd)] = np.nan
+    sizes = np.where(found.logarithmic, 1.0, np.abs(found.values))
+    with np.errstate(divide="ignore"):
+        relative = np.where(sizes > 0, sd / np.where(sizes > 0, sizes, 1.0), np.inf)
+    eigenvalues, directions = _spectral(slopes * prior_sd[columns])
+    least = float(singular[-1])
+    return Curvature(
+        found.names,
+        sd,
+        relative,
+        eigenvalues,
+        directions,
+        correlations,
+        overlap,
+        float(1 / np.sqrt(least)) if not blind[-1] else np.inf,
+    )
+
+
+def _spectral(matrix: Matrix) -> tuple[Vector, Matrix]:
+    """Eigenvalues, decreasing, and eigenvectors as rows of ``matrix.T @ matrix``, without squaring first."""
+    _, singular, rows = np.linalg.svd(matrix, full_matrices=matrix.shape[0] < matrix.shape[1])
+    whole = np.zeros(matrix.shape[1])
+    whole[: singular.size] = singular**2
+    return whole, rows

@@ -1,0 +1,105 @@
+"""Can the delays of several paths be told apart, given which drives moved and when."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any, final
+
+import numpy as np
+from scipy.stats import norm
+
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.estimate import LEVEL, plain
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.identifiability.curvature import curvature
+from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.inference.likelihood import Landscape
+from lcopa_bayes.inference.parameters import ParameterTable
+
+
+@final
+@dataclass(frozen=True)
+class Separation:
+    """How different the delays of two paths must be to be told apart."""
+
+    pair: tuple[str, str]
+    """Names of the paths."""
+    smallest: float
+    """Smallest difference that a two-sided interval at `LEVEL` keeps apart from 0 [time unit]; infinite
+    where the records say nothing about one of the two."""
+
+
+@final
+@dataclass(frozen=True)
+class Delays:
+    """Delay separation at the maximum of the likelihood, every path given a delay of its own."""
+
+    paths: tuple[str, ...]
+    sd: tuple[float, ...]
+    """Cramer-Rao standard deviation of the delay of each path [time unit]; infinite when unbounded."""
+    separations: tuple[Separation, ...]
+    time_unit: str
+    sentence: str
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values; what is infinite is None."""
+        told: dict[str, Any] = plain(
+            {
+                "paths": [
+                    {"path": path, "sd": sd, "unit": self.time_unit}
+                    for path, sd in zip(self.paths, self.sd, strict=True)
+                ],
+                "separations": [
+                    {"pair": one.pair, "smallest_difference": one.smallest, "level": LEVEL}
+                    for one in self.separations
+                ],
+                "sentence": self.sentence,
+            }
+        )
+        return told
+
+
+def delays(study: Study, table: ParameterTable, values: Vector) -> Delays:
+    """Linearised at table values; every path has the delay its slot has there and may leave it."""
+    paths = [
+        table.layout.path_name(i, j) or "the path"
+        for i in range(len(table.layout.responses))
+        for j in range(len(table.layout.drives))
+    ]
+    if len(paths) == 1:
+        return Delays((), (), (), study.time_unit, "one path: there are no delays to tell apart")
+    priors = {name: prior for name, prior in study.priors.items() if name.split("_")[0] != "delay"}
+    apart = replace(study, model=replace(study.model, delay="path"), priors=priors)
+    landscape = Landscape(problem_of(apart).posterior)
+    own = landscape.posterior.table
+    at = np.empty(len(own.rows))
+    for k, row in enumerate(own.rows):
+        if row.kind == "delay":
+            i, j = divmod(row.place.first, len(own.layout.drives))
+            at[k] = values[table.at("delay", table.layout.delay_of[i][j])]
+        else:
+            at[k] = values[table.names.index(row.name)]
+    found = curvature(landscape, at, np.ones(at.size))
+    where = [found.names.index(f"delay_{path}") for path in paths]
+    wide = float(norm.ppf(0.5 + LEVEL / 2))
+    separations = []
+    for a, b in combinations(range(len(paths)), 2):
+        p, q = where[a], where[b]
+        both = np.isfinite(found.sd[[p, q]]).all()
+        mixed = 2 * found.correlations[p, q] * found.sd[p] * found.sd[q] if both else 0.0
+        spread = np.sqrt(max(found.sd[p] ** 2 + found.sd[q] ** 2 - mixed, 0.0)) if both else np.inf
+        separations.append(Separation((paths[a], paths[b]), float(wide * spread)))
+    sd = tuple(float(found.sd[p]) for p in where)
+    return Delays(tuple(paths), sd, tuple(separations), study.time_unit, _said(separations, study.time_unit))
+
+
+def _said(separations: list[Separation], unit: str) -> str:
+    lost = [one for one in separations if not np.isfinite(one.smallest)]
+    if len(lost) == len(separations):
+        return "no two path delays can be told apart: the records bound at most one of them"
+    worst = max((one for one in separations if one not in lost), key=lambda one: one.smallest)
+    told = f"{worst.pair[0]} and {worst.pair[1]} from a difference of {worst.smallest:.2g} {unit} on"
+    if lost:
+        return f"{len(lost)} of {len(separations)} pairs of path delays can never be told apart; {told}"
+    return f"all path delays can be told apart, {told} at worst"

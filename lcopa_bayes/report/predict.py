@@ -1,0 +1,175 @@
+"""The page of a prediction, drawn from `predict.json` and its tables alone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.report.decimation import extremes
+from lcopa_bayes.report.formatting import figures, interval, percent
+from lcopa_bayes.report.page import Verdict, write_page
+from lcopa_bayes.report.section import Column, Drawing, Section, Table
+from lcopa_bayes.report.theme import BAND, CYCLE, HELD_OUT, NOISE, blank, label, look, plain, svg_of
+from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
+from lcopa_bayes.results.newdrive import BANDS, DRIVES, NAME
+
+PAGE = "predict.html"
+"""Name of the page inside its folder."""
+_NEEDS = (
+    *("study", "drive", "verdict", "grade", "grade_reason", "time_unit", "axes", "outside"),
+    *("scores", "draws", "measured"),
+)
+_OUTSIDE = "#faf0e8"
+"""Shade of what lies outside the fitted range."""
+
+
+def write_prediction(folder: Path) -> Path:
+    """`predict.html` with bands, drives and what lies outside the fitted range; returns its path.
+
+    InputError when a file of the prediction is missing or cannot be used.
+    """
+    path = folder / NAME
+    try:
+        values: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        bands, drives = (
+            pd.read_csv(folder / "tables" / name, dtype={"axis": str, "unit": str}, keep_default_na=True)
+            for name in (BANDS, DRIVES)
+        )
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); run `predict` to write it") from None
+    absent = [key for key in _NEEDS if key not in values]
+    if absent:
+        raise InputError(f"{path}: lacks {', '.join(absent)}; run `predict` again")
+    with look():
+        sections = [_curves(values, bands, drives), _range(values), *_scores(values)]
+    verdict = Verdict(str(values["grade"]), str(values["verdict"]), str(values["grade_reason"]))
+    return write_page(folder, f"{values['study']}: response to {values['drive']}", sections, verdict, PAGE)
+
+
+def _curves(values: Mapping[str, Any], bands: pd.DataFrame, drives: pd.DataFrame) -> Section:
+    drawings, rows = [], []
+    for number, one in enumerate(values["axes"], start=1):
+        own = bands[bands["axis"] == str(one["axis"])]
+        drawings.append(
+            Drawing(
+                f"predict_{number:02d}_{one['axis']}",
+                _drawn(values, own, drives),
+                f"Response {one['axis']}, offset: {one['offset_from']}. {values['draws']} draws.",
+            )
+        )
+        spread = (one["upper"] - one["lower"]) / 3.29
+        rows.append(
+            (
+                *(str(one["axis"]), figures(one["end"]), figures(one["value_at_end"])),
+                *(interval(one["lower"], one["upper"], spread), str(one["unit"])),
+                figures(one[f"half_width_{POINTWISE}"], 2),
+                figures(one[f"half_width_{SIMULTANEOUS}"], 2),
+                figures(one["half_width_noisy"], 2),
+            )
+        )
+    columns = (
+        *(Column("axis"), Column(f"end [{values['time_unit']}]", "number"), Column("median there", "number")),
+        *(Column("90 % interval", "interval"), Column("unit"), Column(f"widest {POINTWISE}", "number")),
+        Column(f"widest {SIMULTANEOUS}", "number"),
+        Column("widest with noise", "number"),
+    )
+    caption = "Half widths of the 90 % bands where they are widest; the plant alone but for the last."
+    text = (
+        f"A {POINTWISE} band holds the response at each time by itself; a {SIMULTANEOUS} band holds the "
+        "whole curve of its axis, at all times at once. Blue: the plant alone. Grey: samples, with noise.",
+    )
+    return Section("Predicted response", text, tuple(drawings), (Table(columns, tuple(rows), caption),))
+
+
+def _drawn(values: Mapping[str, Any], rows: pd.DataFrame, drives: pd.DataFrame) -> str:
+    units = list(dict.fromkeys(drives["unit"]))
+    figure = blank(3.0 + 0.85 * len(units))
+    top, *below = figure.subplots(
+        1 + len(units), 1, sharex=True, squeeze=False, height_ratios=[3.4] + [1.0] * len(units)
+    ).ravel()
+    _bands(top, rows, measured=bool(values["measured"]))
+    time = rows["time"].to_numpy()
+    first, last = float(time[0]), float(time[-1])
+    beyond = time[~rows["inside"].to_numpy(dtype=bool)]
+    for panel in (top, *below):
+        if beyond.size:
+            shade = "outside the fitted range" if panel is top else None
+            panel.axvspan(float(beyond[0]), last, color=_OUTSIDE, lw=0, zorder=-1, label=shade)
+    for panel, unit in zip(below, units, strict=True):
+        own = drives[drives["unit"] == unit]
+        names = list(dict.fromkeys(own["axis"]))
+        for name, colour in zip(names, CYCLE * len(names), strict=False):
+            one = own[own["axis"] == name]
+            at, value = one["time"].to_numpy(), one["drive"].to_numpy()
+            at, value = np.append(at, max(last, at[-1])), np.append(value, value[-1])
+            panel.plot(at, value, drawstyle="steps-post", color=colour, label=plain(name))
+        panel.set_ylabel(label(names[0] if len(names) == 1 else "drive", unit))
+        panel.margins(y=0.12)
+        if len(names) > 1:
+            panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    top.set_ylabel(label(str(rows["axis"].iloc[0]), str(rows["unit"].iloc[0])))
+    margin = 0.02 * (last - first)
+    top.set_xlim(first - margin, last + margin)
+    (below[-1] if below else top).set_xlabel(label("time", str(values["time_unit"])))
+    figure.align_ylabels()
+    figure.legend(*top.get_legend_handles_labels(), loc="outside upper center", ncols=4, markerscale=2)
+    return svg_of(figure)
+
+
+def _bands(panel: Axes, rows: pd.DataFrame, *, measured: bool) -> None:
+    time = rows["time"].to_numpy()
+    for what, kind, low, high, colour, alpha, name in (
+        ("noisy", POINTWISE, "05", "95", NOISE, 0.30, f"90 % with noise, {POINTWISE}"),
+        ("plant", POINTWISE, "05", "95", BAND, 0.30, f"90 % plant, {POINTWISE}"),
+        ("plant", POINTWISE, "25", "75", BAND, 0.55, f"50 % plant, {POINTWISE}"),
+    ):
+        lower, upper = (rows[f"{what}_{kind}_{end}"].to_numpy() for end in (low, high))
+        at = extremes(lower, upper)
+        panel.fill_between(time[at], lower[at], upper[at], color=colour, alpha=alpha, lw=0, label=name)
+    for what, colour, name in (("noisy", NOISE, "with noise"), ("plant", BAND, "plant")):
+        for end in ("05", "95"):
+            edge = rows[f"{what}_{SIMULTANEOUS}_{end}"].to_numpy()
+            at = extremes(edge)
+            text = f"90 % {name}, {SIMULTANEOUS}" if end == "05" else None
+            panel.plot(time[at], edge[at], color=colour, lw=0.7, ls=(0, (4, 3)), label=text)
+    middle = rows[f"plant_{POINTWISE}_50"].to_numpy()
+    at = extremes(middle)
+    panel.plot(time[at], middle[at], color=BAND, label="median")
+    if measured:
+        seen = rows["observed"].to_numpy()
+        at = extremes(seen)
+        panel.plot(time[at], seen[at], ".", ms=2.5, mew=0, color=HELD_OUT, label="observed", zorder=3)
+
+
+def _range(values: Mapping[str, Any]) -> Section:
+    outside = [str(one["sentence"]) for one in values["outside"]]
+    inside = "Amplitude, duration and frequencies of the drive lie within those of the fit records."
+    return Section("Fitted range", tuple(outside) or (inside,))
+
+
+def _scores(values: Mapping[str, Any]) -> list[Section]:
+    if not values["scores"]:
+        return []
+    columns = (
+        *(Column("axis"), Column("RMSE", "number"), Column("unit"), Column("in 50 % band", "number")),
+        *(Column("in 90 % band", "number"), Column("samples", "number"), Column("offset from", "prose")),
+    )
+    rows = tuple(
+        (
+            *(str(row["axis"]), figures(row["rmse"]), str(row["unit"]), percent(row["coverage_50"])),
+            *(percent(row["coverage_90"]), str(row["samples"]), str(row["offset_from"])),
+        )
+        for row in values["scores"]
+    )
+    caption = (
+        f"RMSE is against the median of the plant; coverage is by the {POINTWISE} bands with noise. "
+        "The record was not fitted."
+    )
+    return [Section("Scores", (), (), (Table(columns, rows, caption),))]

@@ -1,0 +1,308 @@
+"""Prediction by a fitted posterior: bands for a new drive, scores for a new record."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Literal, final
+
+import numpy as np
+import pandas as pd
+
+from lcopa_bayes.core.arrays import Array, Vector
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.files import save_json, save_table, writable_folder
+from lcopa_bayes.data.drives import Drive, drive_of
+from lcopa_bayes.data.record import Record, load_columns, record_of
+from lcopa_bayes.data.requirements import unmet
+from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
+from lcopa_bayes.results.fittedrange import FittedRange, Outside, beginning
+from lcopa_bayes.results.frequency import Bands, named, transfer_function
+from lcopa_bayes.results.prediction import Band, band_of, bands, named_rng, plant_draws
+from lcopa_bayes.sampling.draws import Draws
+
+Level = Literal["fitted", "zero"]
+"""Offset of a response under a new drive: as in the fit records, or none."""
+NAME, BANDS, DRIVES = "predict.json", "predict_bands.csv", "predict_drives.csv"
+"""Files of a saved prediction; the tables stand in `tables/`."""
+_LEAD = 5
+"""Sampling periods at rest before the first change of a drive that is given by its steps."""
+_MOST = 100_000
+"""Most samples of a prediction."""
+_WEIGHTS = 100
+"""Draws behind the median gain that weighs frequencies."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Bands of every response axis under one drive."""
+
+    study: str
+    """Name of the study that was fitted."""
+    driven: Drive | Record
+    """The drive, with the study's axes and time unit; a record where responses were measured too."""
+    bands: tuple[Band, ...]
+    """One per response axis."""
+    outside: tuple[Outside, ...]
+    """What lies outside the fitted range of amplitude, time and frequency."""
+    grade: str
+    """Grade of the fit."""
+    grade_reason: str
+    time_unit: str
+    seed: int
+
+    @property
+    def verdict(self) -> str:
+        """What was predicted and how far it can be trusted, in words."""
+        axes = ", ".join(band.axis for band in self.bands)
+        parts = [
+            f"Response of {axes} to {self.driven.name} from {self.bands[0].time[0]:.4g} to "
+            f"{self.bands[0].time[-1]:.4g} {self.time_unit}."
+        ]
+        if isinstance(self.driven, Record):
+            parts += [
+                f"{band.axis}: RMSE {band.rmse:.3g} {band.unit}, {100 * band.coverage(0.9):.0f} % "
+                f"of the samples in the {POINTWISE} 90 % band."
+                for band in self.bands
+            ]
+        parts += [one.sentence for one in self.outside] or ["The drive lies within the fitted range."]
+        return " ".join(parts)
+
+    @property
+    def scores(self) -> list[dict[str, Any]]:
+        """Error and coverage of every axis of a measured record, as a fit gives them; empty for a drive."""
+        return [band.score() for band in self.bands] if isinstance(self.driven, Record) else []
+
+    def table(self) -> pd.DataFrame:
+        """One row per axis and time: ends of the bands by kind, plant alone and with noise [`unit`], and
+        whether the time lies within the fitted range of amplitude and duration."""
+        since = min((one.since for one in self.outside if one.since is not None), default=np.inf)
+        frames = []
+        for band in self.bands:
+            columns: dict[str, Any] = {
+                "axis": band.axis,
+                "unit": band.unit,
+                "time": band.time,
+                "observed": band.observed,
+            }
+            columns |= named("plant", Bands(band.plant, band.plant_simultaneous))
+            columns |= named("noisy", Bands(band.noisy, band.noisy_simultaneous))
+            columns["inside"] = band.time < since
+            frames.append(pd.DataFrame(columns))
+        return pd.concat(frames, ignore_index=True)
+
+    def drives(self) -> pd.DataFrame:
+        """One row per drive axis and row of the drive: its value from there on [`unit`]."""
+        axes = (
+            [(axis.name, axis.unit) for axis in self.driven.drive_axes]
+            if isinstance(self.driven, Record)
+            else list(zip(self.driven.axes, self.driven.units, strict=True))
+        )
+        frames = [
+            pd.DataFrame(
+                {"axis": name, "unit": unit, "time": self.driven.time, "drive": self.driven.drive[:, k]}
+            )
+            for k, (name, unit) in enumerate(axes)
+        ]
+        return pd.concat(frames, ignore_index=True)
+
+    def summary(self) -> pd.DataFrame:
+        """One row per response axis: median and 90 % interval of the plant at the end, widest half widths of
+        the 90 % bands by kind [`unit`], and the scores of a measured record."""
+        rows = []
+        for band in self.bands:
+            row: dict[str, Any] = {
+                "axis": band.axis,
+                "unit": band.unit,
+                "end": float(band.time[-1]),
+                "value_at_end": float(band.plant[2, -1]),
+                "lower": float(band.plant[0, -1]),
+                "upper": float(band.plant[4, -1]),
+                f"half_width_{POINTWISE}": float(np.max(band.plant[4] - band.plant[0]) / 2),
+                f"half_width_{SIMULTANEOUS}": float(
+                    np.max(band.plant_simultaneous[3] - band.plant_simultaneous[0]) / 2
+                ),
+                "half_width_noisy": float(np.max(band.noisy[4] - band.noisy[0]) / 2),
+                "offset_from": band.offset_from,
+                "grade": self.grade,
+            }
+            if isinstance(self.driven, Record):
+                row |= {
+                    "rmse": band.rmse,
+                    "coverage_50": band.coverage(0.5),
+                    "coverage_90": band.coverage(0.9),
+                }
+            rows.append(row)
+        return pd.DataFrame(rows)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values, without the bands, which `table` holds."""
+        out: dict[str, Any] = plain(
+            {
+                "study": self.study,
+                "drive": self.driven.name,
+                "verdict": self.verdict,
+                "grade": self.grade,
+                "grade_reason": self.grade_reason,
+                "time_unit": self.time_unit,
+                "seed": self.seed,
+                "measured": isinstance(self.driven, Record),
+                "kinds": [POINTWISE, SIMULTANEOUS],
+                "levels": [0.5, 0.9],
+                "axes": self.summary().to_dict("records"),
+                "draws": min(band.draws for band in self.bands),
+                "outside": [one.as_json() for one in self.outside],
+                "scores": self.scores,
+            }
+        )
+        return out
+
+    def save(self, folder: Path | str, **more: Any) -> dict[str, Any]:
+        """Write `predict.json`, with `more` values, and the tables of bands and drives; returns the values.
+
+        InputError when the folder cannot be written to.
+        """
+        values, folder = self.to_json() | more, Path(folder)
+        writable_folder(folder / "tables")
+        for name, table in ((BANDS, self.table()), (DRIVES, self.drives())):
+            save_table(table, folder / "tables" / name)
+        save_json(values, folder / NAME)
+        return values
+
+    def report(self, folder: Path | str) -> Path:
+        """`save`, then the page `predict.html` in the same folder; returns its path."""
+        self.save(folder)
+        # pages read results, and results import no page: it is looked up when wanted
+        page = import_module("lcopa_bayes.report.predict").write_prediction(Path(folder))
+        return Path(page)
+
+    def _repr_html_(self) -> str:
+        return str(self.summary().to_html())
+
+
+def predict(
+    problem: Problem, draws: Draws, driven: Drive | Record | Path | str, *, offset: Level = "fitted"
+) -> Prediction:
+    """Bands for a drive, or for a record nobody has fitted, which is then scored too.
+
+    A path is a record file; without responses it is a drive. `offset` "fitted" adds the offset of the fit
+    records that rest alike to the response of a drive, each draw that of one of them; "zero" leaves the plant
+    alone. InputError for other axes or units than the study's, for a drive that rests where no fit record
+    did, for one too long, and for a record that a fit of the study would refuse.
+    """
+    study = problem.study
+    if isinstance(driven, Path | str):
+        columns = load_columns(Path(driven), responses=False)
+        driven = (
+            record_of(load_columns(Path(driven), study.time_unit)) if columns.measured else drive_of(columns)
+        )
+    if isinstance(driven, Record):
+        driven, predicted = _recorded(problem, draws, driven)
+    else:
+        driven, predicted = _unmeasured(problem, draws, driven, offset)
+    fitted, times = fitted_range(problem), predicted[0].time
+    squared = _squared(draws, fitted.centres(driven, times))
+    grade = draws.grade
+    return Prediction(
+        study.name,
+        driven,
+        tuple(predicted),
+        fitted.outside(driven, times, squared),
+        grade.level,
+        grade.reason,
+        study.time_unit,
+        study.seed,
+    )
+
+
+def fitted_range(problem: Problem) -> FittedRange:
+    """What the fit records of a study cover."""
+    study, scales = problem.study, problem.scales
+    return FittedRange(study.fit, study.drive_axes, scales.span, scales.period, study.time_unit)
+
+
+def _squared(draws: Draws, frequency: Vector) -> Array:
+    """Median magnitude squared of every path, (responses, drives, frequencies)."""
+    magnitude, _ = transfer_function(draws.table, draws.thinned(_WEIGHTS), frequency)
+    return np.asarray(np.median(magnitude, axis=2) ** 2)
+
+
+def _recorded(problem: Problem, draws: Draws, record: Record) -> tuple[Record, list[Band]]:
+    """Bands of a held-out record: what a fit gives that had it from the start."""
+    study = replace(problem.study, held_out=(record,))
+    if problems := unmet(study):
+        raise InputError(problems)
+    (held,) = study.held_out
+    samples, model = problem.simulated(study.held_out)
+    noise = problem.posterior.noise
+    return held, bands(draws, model, samples, noise, held_out=True, seed=problem.study.seed)
+
+
+def _unmeasured(problem: Problem, draws: Draws, drive: Drive, level: Level) -> tuple[Drive, list[Band]]:
+    """Bands of a drive that nobody has measured."""
+    if level not in ("fitted", "zero"):
+        raise InputError(f'`offset` must be "fitted" or "zero"; got {level!r}')
+    study, scales, fitted = problem.study, problem.scales, fitted_range(problem)
+    drive = drive.fitted_to(
+        study.drive_axes, study.time_unit, tuple(fitted.usual_rest), _LEAD * scales.period
+    )
+    if problems := fitted.other_rest(drive.drive[0]):
+        advice = "begin with a row at the study's resting value"
+        raise InputError([f"drive {drive.name!r}: {problem}; {advice}" for problem in problems])
+    times = _times(drive, scales.span, scales.period)
+    gaps = np.concatenate(([1.0], np.diff(times) / scales.period))
+    values, plant = plant_draws(draws, problem.driven(drive, times))
+    noise, out = problem.posterior.noise, []
+    rng, alike = named_rng(study.seed, drive.name), fitted.resting_at(drive.drive[0])
+    for axis, declared in enumerate(study.response_axes):
+        parameters = values[:, [draws.table.at(name, axis) for name in noise.names]]
+        known = _level(draws, values, axis, level, alike, rng)
+        noises = noise.draw(parameters, gaps, rng)
+        nothing = np.full(times.size, np.nan)
+        out.append(band_of((drive.name, declared, False), times, nothing, plant[axis], noises, (*known, 0)))
+    return drive, out
+
+
+def _times(drive: Drive, span: float, period: float) -> Vector:
+    """Times to predict at: the rows where they are sampled as the records are, else a lattice of `period`."""
+    if drive.until == drive.time[-1] and np.diff(drive.time).max(initial=0.0) <= 1.5 * period:
+        return drive.time
+    begin = beginning(drive)
+    last = drive.time[-1] + span if drive.until is None else drive.until
+    # the first change falls on the lattice, which lies between the first row and the end
+    first = begin - np.floor((begin - drive.time[0]) / period + 1e-9) * period
+    count = int(np.floor((last - first) / period + 1e-9)) + 1
+    if count > _MOST:
+        raise InputError(
+            f"drive {drive.name!r}: lasts {count} sampling periods of the study, more than {_MOST}; end it "
+            f"earlier than {drive.time[0] + _MOST * period:.6g} {drive.time_unit}"
+        )
+    return np.asarray(first + period * np.arange(max(count, 2)))
+
+
+def _level(
+    draws: Draws, values: Array, axis: int, level: Level, records: Sequence[int], rng: np.random.Generator
+) -> tuple[Vector, str]:
+    """Offset of a response axis under a new drive for each draw, and where it comes from.
+
+    An offset per record is taken from one of `records`, those that rest as the drive does: of these the
+    level at rest is measured, of others it hangs on a gain times the difference.
+    """
+    table = draws.table
+    places = {
+        table.rows[k].place.second: k for k in table.of_kind("offset") if table.rows[k].place.first == axis
+    }
+    if level == "zero" or not places:
+        return np.zeros(values.shape[0]), "no offset"
+    if -1 in places:
+        return values[:, places[-1]], "shared with the fit records"
+    if len(records) == 1:
+        return values[:, places[records[0]]], "that of the fit record that rests alike"
+    chosen = np.array([places[r] for r in records])[rng.integers(len(records), size=values.shape[0])]
+    picked = np.asarray(values[np.arange(values.shape[0]), chosen])
+    return picked, f"in each draw that of one of the {len(records)} fit records that rest alike"

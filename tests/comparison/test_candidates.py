@@ -1,0 +1,161 @@
+"""Candidates of a study: which there are, what they derive, and what is refused."""
+
+from __future__ import annotations
+
+import pytest
+from small import TWO, record, study
+
+from lcopa_bayes.comparison.candidates import Candidate, candidates_of, derived, known_settings
+from lcopa_bayes.comparison.compare import compare
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.candidatesettings import CandidateSettings
+from lcopa_bayes.data.studyfile import load_candidates
+from lcopa_bayes.inference.assembly import problem_of
+
+
+def named(one: Candidate) -> tuple[str, ...]:
+    return problem_of(one.study).posterior.table.names
+
+
+def made(name: str, source=None) -> Candidate:
+    source = source or study(record())
+    return derived(source, known_settings(name, source))
+
+
+@pytest.mark.parametrize(
+    ("terms", "wanted"),
+    [
+        (1, ["fractional-1", "fractional-2", "first-order", "second-order"]),
+        (2, ["fractional-1", "fractional-2", "first-order", "second-order"]),
+        (3, ["fractional-1", "fractional-2", "fractional-3", "second-order"]),
+        (4, ["study", "fractional-1", "fractional-2", "second-order"]),
+    ],
+)
+def test_a_short_list_for_any_study(terms, wanted):
+    assert [one.name for one in candidates_of(study(record(), terms=terms))] == wanted
+
+
+def test_a_study_with_terms_by_element_stands_for_itself():
+    own = study(record(device=TWO, camera=0.5), terms={"direct": 3, "cross": 2})
+    found = candidates_of(own)
+    assert [one.name for one in found] == ["study", "fractional-1", "fractional-2", "second-order"]
+    assert found[0].study.model == own.model
+    assert [one.terms for one in found] == [3, 1, 2, 2]
+
+
+def test_integer_candidates_have_integer_orders():
+    second = made("second-order")
+    table = problem_of(second.study).posterior.table
+    assert second.integer
+    assert [table.rows[k].value for k in table.of_kind("order")] == [2.0, 1.0]
+    assert not made("fractional-2").integer
+    kept = made("integer-kept", study(record(), terms=3))
+    assert kept.study.model.orders == (2.0, 1.0, 1.0)
+    assert made("first-order").study.model.orders == (1.0,)
+
+
+def test_a_prior_on_an_order_does_not_free_an_integer():
+    own = study(record(), priors={"order_1": ("uniform", {"loc": 0.2, "scale": 1.0})})
+    table = problem_of(made("second-order", own).study).posterior.table
+    assert not any(table.rows[k].free for k in table.of_kind("order"))
+    assert problem_of(made("fractional-1", own).study).posterior.table.rows[2].prior.support == (0.2, 1.2)
+
+
+def test_priors_of_parameters_that_are_gone_are_left_out_and_told():
+    own = study(record(), terms=2, priors={"time_2": 3.0, "delay": 0.5})
+    one = made("fractional-1", own)
+    assert set(one.study.priors) == {"delay"}
+    assert "time_2" in one.notes[0]
+
+
+def test_variants_of_a_two_by_two():
+    own = study(record(device=TWO, camera=0.5), terms=1)
+    assert sum(name.startswith("delay") for name in named(made("fractional-1-delays", own))) == 4
+    assert sum(name.startswith("order") for name in named(made("fractional-1-separate", own))) == 4
+    both = made("fractional-1-separate-delays", own)
+    assert (both.study.model.share, both.study.model.delay) == ("none", "path")
+    for name in ("fractional-1-no-cross", "fractional-1-separate-delays-no-cross"):
+        table = problem_of(made(name, own).study).posterior.table
+        fixed = {row.name: row.value for row in table.rows if not row.free}
+        assert fixed["gain_x_y"] == fixed["gain_y_x"] == 0.0
+        free = {row.name for row in table.rows if row.free and row.kind in ("gain", "time", "order", "delay")}
+        assert not any(name.endswith(("x_y", "y_x")) for name in free)
+    with pytest.raises(InputError, match="cross paths"):
+        made("fractional-1-no-cross")
+
+
+FILE = """
+[compare]
+pick = ["fractional-1", "slow", "flat"]
+[[candidates]]
+name = "slow"
+terms = 2
+noise = "ar1"
+[candidates.priors]
+time_1 = { dist = "loguniform", a = 1.0, b = 100.0 }
+delay = 0.5
+[[candidates]]
+name = "flat"
+orders = [1.5, 1]
+priors = { gain = { dist = "flat" } }
+"""
+
+
+def test_a_file_adds_and_picks(tmp_path):
+    path = tmp_path / "more.toml"
+    path.write_text(FILE)
+    pick, extra = load_candidates(path)
+    found = candidates_of(study(record()), extra, pick)
+    assert [one.name for one in found] == ["fractional-1", "slow", "flat"]
+    slow = problem_of(found[1].study).posterior
+    assert slow.noise.kind == "ar1"
+    assert slow.table.rows[slow.table.names.index("delay")].value == 0.5
+    assert found[2].improper == ("gain",)
+    assert not found[2].integer
+    assert "undefined" in found[2].notes[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('[[candidates]]\nname = "a"\nfit = ["b.csv"]', "same data"),
+        ("[[candidates]]\nterms = 2", "needs a `name`"),
+        ('[[candidates]]\nname = "a/b"', "fit for a folder"),
+        ('[[candidates]]\nname = "a"\nterms = 9', "`terms` must be a whole number"),
+        ('[[candidates]]\nname = "a"\nterm = 2', "did you mean 'terms'"),
+        ('[[candidates]]\nname = "a"\nnoise = "pink"', "`noise` must be one of"),
+        ('[[candidates]]\nname = "a"\npriors = { gain = { dist = "nrm" } }', "unknown distribution"),
+        ('[[candidates]]\nname = "a"\n[[candidates]]\nname = "a"', "2 candidates are named 'a'"),
+        ("[compare]\npick = 3", "`pick` must be a list"),
+        ("[candidate]\nname = 3", "did you mean 'candidates'"),
+        ("", "names no candidate"),
+        ("not toml", "cannot be read as TOML"),
+    ],
+)
+def test_what_is_wrong_in_a_file_is_told(tmp_path, text, said):
+    path = tmp_path / "more.toml"
+    path.write_text(text)
+    with pytest.raises(InputError) as refused:
+        load_candidates(path)
+    assert said in str(refused.value)
+    assert str(path) in str(refused.value)
+
+
+def test_unknown_names_and_single_candidates_are_refused():
+    with pytest.raises(InputError, match="did you mean 'fractional-2'"):
+        candidates_of(study(record()), pick=["fractionl-2", "first-order"])
+    with pytest.raises(InputError, match="1 candidate left"):
+        candidates_of(study(record()), pick=["fractional-1", "study"])  # the same model twice
+    with pytest.raises(InputError, match="no parameter 'gian'"):
+        derived(study(record()), CandidateSettings("a", improper=("gian",)))
+
+
+def test_candidates_of_different_data_are_refused():
+    one, other = made("fractional-1"), made("first-order", study(record(2)))
+    with pytest.raises(InputError, match="different data"):
+        compare([one, other])
+    held = made("first-order", study(record(), held_out=[record(2, name="b")]))
+    with pytest.raises(InputError, match="different data"):
+        compare([one, held])
+    with pytest.raises(InputError, match="two candidates or more"):
+        compare([one])

@@ -1,0 +1,228 @@
+"""The verb `compare` end to end on small records; the claims that read it; measured records."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small import record, study
+
+from lcopa_bayes.cli import main
+from lcopa_bayes.comparison.candidatefit import contender
+from lcopa_bayes.comparison.candidates import candidates_of
+from lcopa_bayes.comparison.compare import compare
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.record import save_record
+from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.paper.claims import judge
+from lcopa_bayes.paper.verdict import Evidence
+from lcopa_bayes.report.compare import write_comparison
+from lcopa_bayes.results.fit import plan_of
+
+FEW = {"ensembles": 2, "walkers": 16, "steps": 600, "thin": 2, "target_ess": 100}
+PICK = ("fractional-1", "first-order")
+RECORDS = Path(os.environ.get("LCOPA_BAYES_DATA", Path(__file__).parents[2] / ".." / "shared")) / "records"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A study of order 0.8 on disk; its second record is held out."""
+    place = tmp_path_factory.mktemp("small")
+    for seed, name in ((1, "a"), (2, "b")):
+        save_record(record(seed, name=name, camera=0.3), place / f"{name}.csv")
+    lines = ["[study]", 'name = "small"', "[records]", 'fit = ["a.csv"]', 'held_out = ["b.csv"]']
+    lines += ["[noise]", 'kind = "white"', "[sampler]", *(f"{key} = {value}" for key, value in FEW.items())]
+    (place / "study.toml").write_text("\n".join(lines))
+    return place
+
+
+@pytest.fixture(scope="module")
+def told(folder) -> dict:
+    out = folder / "run"
+    assert main(["compare", str(folder), "--pick", *PICK, "--out", str(out), "--jobs", "1", "--quiet"]) == 0
+    return json.loads((out / "compare.json").read_text())
+
+
+def test_the_generating_model_is_preferred_and_the_reason_told(told):
+    assert told["preferred"] == "fractional-1"
+    assert told["fractional"]["verdict"] == "warranted"
+    assert told["agreement"]["agree"]
+    first, whole = told["models"]
+    assert first["log_evidence"] - whole["log_evidence"] > 10
+    assert first["probability"] > 0.99
+    assert first["held_out_rmse"]["y"] < whole["held_out_rmse"]["y"]
+    assert first["elpd_difference"] == 0
+    assert first["aic"] < whole["aic"]
+    (order,) = told["order_is_integer"]
+    assert (order["model"], order["parameter"], order["answer"]) == (PICK[0], "order_1", "not an integer")
+
+
+def test_every_score_has_its_error_and_grade(told):
+    for row in told["models"]:
+        assert {"log_evidence_sd", "elpd_sd", "probability_sd", "grade", "log_evidence_grade"} <= set(row)
+        assert [one["factor"] for one in row["prior_widths"]] == [0.5, 2.0]
+        for one in row["prior_widths"]:
+            assert one["log_evidence"] is not None
+            assert one["ess"] > 0
+        kinds = [one["kind"] for one in row["predictions"]]
+        assert kinds == ["held-out record", *["future of the record"] * 4]
+        for one in row["predictions"]:
+            assert one["plausible"]
+            assert (one["in_sample"] is None) == (one["kind"] == "held-out record")
+            assert one["road"] in ("exact", "importance weights", "refit")
+            assert one["monte_carlo_sd"] >= 0
+
+
+def test_flat_directions_shift_the_evidence_by_the_log_of_the_width(told):
+    """Gain, time and delay well inside priors twice as wide: the density falls to half for each."""
+    row = told["models"][0]
+    wide = row["prior_widths"][1]
+    assert wide["log_evidence"] - row["log_evidence"] == pytest.approx(-3 * np.log(2), abs=0.25)
+
+
+def test_a_finished_comparison_is_not_fitted_again(folder, told, capsys):
+    cards = {path: path.stat().st_mtime_ns for path in (folder / "run").rglob("candidate.json")}
+    options = ["--out", str(folder / "run"), "--jobs", "1", "--resume", "--json", "--quiet"]
+    assert main(["compare", str(folder), "--pick", *PICK, *options]) == 0
+    again = json.loads(capsys.readouterr().out)
+    assert again["models"] == told["models"]
+    assert len(cards) == 2
+    assert all(path.stat().st_mtime_ns == when for path, when in cards.items())
+
+
+def test_a_damaged_card_is_refused_not_used(folder, told, tmp_path):
+    place = tmp_path / "candidates" / "fractional-1"
+    place.mkdir(parents=True)
+    (place / "candidate.json").write_text("{")
+    with pytest.raises(InputError, match="damaged"):
+        compare(candidates_of(study(record()), pick=PICK), folder=tmp_path, resume=True)
+
+
+def test_the_page_shows_all_of_it_and_is_drawn_again_the_same(folder, told):
+    path = folder / "run" / "compare.html"
+    page = path.read_text()
+    path.unlink()
+    assert main(["report", str(folder / "run"), "--quiet"]) == 0
+    assert path.read_text() == page
+    assert not re.search(r'(?:src|href)="(?:http|//)', page)
+    assert page.count("<svg") == 3  # evidence, the fitted record, the held-out one
+    for words in (*PICK, "The prior", "Is this order an integer?", "What to heed", "held out"):
+        assert words in page
+
+
+def test_claims_refuse_a_folder_without_a_comparison(tmp_path, capsys):
+    assert main(["claims", "--compare", str(tmp_path), "--out", str(tmp_path)]) == 2
+    assert "compare.json" in capsys.readouterr().err
+
+
+# -- claims ----------------------------------------------------------------------------------------
+
+
+def model(name: str, evidence: float, rmse: float, steady: float, **more: object) -> dict:
+    score = {"record": "a", "axis": "x", "unit": "rad", "rmse": rmse, "samples": 100}
+    metric = {"name": "steady_state[x]", "value": steady, "unit": "rad/rad", "level": 0.9}
+    metric |= {"lower": 0.99999 * steady, "upper": 1.00001 * steady}
+    base = {"name": name, "about": name, "usable": True, "integer": False, "terms": 3, "elpd": None}
+    base |= {"elpd_difference": None, "elpd_difference_sd": None}
+    base |= {"log_evidence": evidence, "log_evidence_sd": 0.1, "fit_scores": [score], "held_out": []}
+    return base | {"step_metrics": [metric]} | more
+
+
+def compared(*, verdict: str = "warranted", answer: str = "not an integer", order: float = 1.8, **change):
+    models = {
+        "three": model("three", 20.0, 1.8e-4, 0.01795),
+        "two": model("two", 10.0, 3e-4, 0.01795, terms=2),
+        "whole": model("whole", 0.0, 1.2e-3, 0.01795, terms=2, integer=True),
+    }
+    for name, values in change.items():
+        models[name] = models[name] | values
+    row = {"model": "three", "parameter": "order_1", "grade": "reliable", "answer": answer}
+    row["estimate"] = {"lower": order - 0.05, "upper": order + 0.05, "level": 0.9}
+    told = {"study": "s", "models": list(models.values()), "order_is_integer": [row], "preferred": "three"}
+    return told | {"fractional": {"verdict": verdict, "sentence": "Said."}}
+
+
+def verdict_of(claim: str, told: dict) -> str:
+    judged = {each.claim.id: each.verdict for each in judge(evidence=Evidence(compare=told))}
+    return judged[claim].kind.value
+
+
+@pytest.mark.parametrize(
+    ("claim", "change"),
+    [
+        ("M1", {"whole": {"fit_scores": [model("", 0, 2e-4, 0)["fit_scores"][0]]}}),
+        ("M1", {"verdict": "not shown"}),
+        ("M4", {"two": {"log_evidence": 19.5}}),
+        ("I5", {"answer": "undecided"}),
+        ("I5", {"order": 1.6}),
+    ],
+)
+def test_another_comparison_gives_another_verdict(claim, change):
+    assert verdict_of(claim, compared()) == "supported"
+    assert verdict_of(claim, compared(**change)) == "contradicted"
+
+
+def test_m2_reads_the_distance_of_the_steady_states():
+    from lcopa_bayes.data.literature import PAPER
+    from lcopa_bayes.paper.comparisonclaims import same_steady_state
+
+    def kind(told: dict) -> str:
+        return same_steady_state(PAPER, told).kind.value
+
+    apart = {"whole": {"step_metrics": model("", 0, 0, 0.0185)["step_metrics"]}}
+    assert kind(compared()) == "supported"
+    assert kind(compared(**apart)) == "contradicted"
+    wide = model("", 0, 0, 0.0185)["step_metrics"][0] | {"lower": 0.017, "upper": 0.02}
+    assert kind(compared(whole={"step_metrics": [wide]})) == "undecided"
+    # Eq. 65 itself speaks against the claim, so the comparison alone cannot bear it out
+    assert verdict_of("M2", compared()) == "contradicted"
+
+
+def test_a_gain_within_its_error_leaves_m4_open():
+    near = compared(two={"log_evidence": 20 - 3.0, "log_evidence_sd": 0.3})
+    assert verdict_of("M4", near) == "undecided"
+
+
+def test_m4_tells_what_prediction_gains_with_its_error():
+    three = {"elpd": 110.0, "elpd_difference": 0.0, "elpd_difference_sd": 0.0}
+    two = {"elpd": 100.0, "elpd_difference": -10.0, "elpd_difference_sd": 4.0}
+    evidence = Evidence(compare=compared(three=three, two=two))
+    how = next(each.verdict.how for each in judge(evidence=evidence) if each.claim.id == "M4")
+    assert "by +10.00 ± 4.00 nats" in how
+
+
+def test_a_comparison_of_an_earlier_version_is_refused_by_the_page(folder, told, tmp_path):
+    old = told | {"models": [{k: v for k, v in row.items() if k != "containment"} for row in told["models"]]}
+    (tmp_path / "compare.json").write_text(json.dumps(old))
+    with pytest.raises(InputError, match="run `compare` again"):
+        write_comparison(tmp_path)
+
+
+def test_a_comparison_samples_as_a_fit_does():
+    """Its grades are those of a fit only with the ensembles and effective draws of one."""
+    for sampler in ({}, {"ensembles": 3, "target_ess": 250}):
+        (one, *_) = candidates_of(study(record(), sampler=sampler), pick=PICK)
+        made = contender(one, None, quick=False, resume=False).candidate
+        own, compared = (plan_of(problem_of(each.study), quick=False) for each in (one, made))
+        assert (compared.ensembles, compared.target_ess) == (own.ensembles, own.target_ess)
+        assert compared.steps == own.steps
+
+
+# -- measured records ------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.measured
+@pytest.mark.skipif(not RECORDS.is_dir(), reason="measured records are absent; set LCOPA_BAYES_DATA")
+def test_one_fractional_term_beats_second_order_on_the_heating_system(tmp_path):
+    out = tmp_path / "heat"
+    words = ["--pick", "fractional-1", "second-order", "--quick", "--quiet", "--out", str(out)]
+    assert main(["compare", str(RECORDS / "heating_system"), *words]) == 0
+    told = json.loads((out / "compare.json").read_text())
+    free, whole = (one["held_out_rmse"]["plate"] for one in told["models"])
+    assert free < 5.0 < whole
+    assert told["fractional"]["verdict"] == "warranted"

@@ -1,0 +1,283 @@
+"""The loop on small campaigns of one axis: a hidden effect is found, a clean one stays clean."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from lcopa_bayes.bench.acquisition import Bench, simulate
+from lcopa_bayes.bench.command import on_off, staircase, step
+from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.data.settings import ModelSettings
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.effectsearch.bandwidening import Widening
+from lcopa_bayes.effectsearch.basefit import base_fit
+from lcopa_bayes.effectsearch.basemodel import BaseModel
+from lcopa_bayes.effectsearch.crossvalidation import Group, log_scores
+from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
+from lcopa_bayes.effectsearch.gaussnewton import Regression
+from lcopa_bayes.effectsearch.heldouteffects import unseen_share
+from lcopa_bayes.effectsearch.loop import loop
+from lcopa_bayes.effectsearch.noisesamples import axis_noise, repeat_pieces
+from lcopa_bayes.effectsearch.summary import drawn, results, words
+from lcopa_bayes.effectsearch.verdict import Found, decide
+from lcopa_bayes.effectsearch.whitening import Whitening
+from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.model.effects.catalogue import catalogue
+from lcopa_bayes.model.effects.effect import UnstableError
+
+NOISE = 5e-3
+NAMES = ("odd_curvature", "even_curvature", "gain_drift", "unmodelled_smooth")
+LIBRARY = [catalogue()[name] for name in NAMES]
+AXIS = (Axis("x", "rad"),)
+
+
+def records(seed, curvature=0.0, quiet=8.0):
+    rng = np.random.default_rng(seed)
+    path = TransferPath(1.0, 1.0, (3.0,), (0.9,), 1.0)
+    device = Device(((path,),), AXIS, AXIS, (0.0,))
+    commands = [
+        on_off(1.0, hold=12.0, at=quiet),
+        on_off(-0.7, hold=9.0, at=quiet),
+        staircase([0.4, 1.0, -0.5, 0.2], hold=6.3, start=quiet),
+        step(0.5, at=quiet),
+        staircase([-0.9, 0.8, 0.3], hold=7.1, start=quiet),
+    ]
+    out = []
+    for number, command in enumerate(commands):
+        taken = simulate(device, Bench(camera=0.2), command, duration=36.0, name=f"r{number}", rng=rng)
+        y = taken.response + curvature * taken.response**3
+        y = y + NOISE * rng.standard_normal(y.shape)
+        out.append(Record(taken.name, taken.time, taken.drive, y, AXIS, AXIS, "ms"))
+    return out
+
+
+def study(seed, curvature=0.0, held_out=1, **changes):
+    made = records(seed, curvature, **changes)
+    fit, apart = made[: len(made) - held_out], made[len(made) - held_out :]
+    return Study("small", None, "ms", seed, tuple(fit), tuple(apart), ModelSettings(offset="shared"))
+
+
+@pytest.fixture(scope="module")
+def clean():
+    return loop(study(1), library=LIBRARY, sample=False, quick=True, as_stated=True)
+
+
+@pytest.fixture(scope="module")
+def bent():
+    return loop(study(2, 0.06), library=LIBRARY, quick=True, as_stated=True)
+
+
+def test_a_clean_campaign_stays_clean(clean):
+    assert clean.verdict.kind == "clean"
+    assert clean.effects == ()
+    assert clean.trace is not None
+    assert clean.trace.p_value > 0.005
+
+
+def test_the_noise_is_measured_before_the_drive_moves(clean):
+    (noise,) = clean.base.noise
+    assert noise.source == "quiet"
+    assert noise.process.sd == pytest.approx(NOISE, rel=4 / np.sqrt(2 * noise.samples))
+
+
+def test_the_hidden_effect_is_named_and_its_size_recovered(bent):
+    assert bent.verdict.kind == "explained"
+    assert [effect.name for effect in bent.effects] == ["odd_curvature"]
+    (effect,) = results(bent)["effects"]
+    (size,) = effect["parameters"]
+    truth = 0.06 * bent.after.state.model.effected.ranges.response[0] ** 2
+    assert size["lower"] - 2 * size["sd"] < truth < size["upper"] + 2 * size["sd"]
+
+
+def test_errors_fall_to_the_noise_floor(bent):
+    told = results(bent)
+    before, after = (told[side]["held_out_rmse_over_noise"]["x"] for side in ("before", "after"))
+    assert after < before
+    assert after < 1.15
+    assert 0.8 < told["after"]["held_out_coverage_90"] < 0.97
+    assert told["after"]["held_out_level_from"] == ["the fit records"]  # one offset for all records
+
+
+def test_what_leaves_is_plain_json_with_grades(bent):
+    told = results(bent)
+    text = json.dumps(told, allow_nan=False)
+    assert '"explained"' in text
+    assert {p["grade"] for p in told["parameters"]} <= {"reliable", "tentative", "unusable"}
+    json.dumps(drawn(bent), allow_nan=False)
+    assert any("odd_curvature" in line for line in words(told))
+
+
+def test_parameters_biased_by_the_effect_are_listed(bent):
+    assert "gain" in {row["name"] for row in results(bent)["moved"]}
+
+
+def test_the_same_seed_gives_the_same_numbers(clean):
+    again = loop(study(1), library=LIBRARY, sample=False, quick=True, as_stated=True)
+    assert results(again) == results(clean)
+
+
+def test_tangents_are_the_derivative_of_the_prediction(bent):
+    model, x = bent.after.state.model, bent.after.state.optimum.x
+    _, tangents = model.tangents(x)
+    for k in range(x.size):
+        shift = np.zeros(x.size)
+        shift[k] = 1e-5
+        numeric = (model.predict(x + shift) - model.predict(x - shift)) / 2e-5
+        np.testing.assert_allclose(tangents[:, k], numeric, atol=2e-4 * np.abs(numeric).max())
+
+
+def test_left_out_scores_are_the_conditional_density_of_the_linear_model():
+    """Two roads: one Gauss-Newton step, or the conditional of one normal density."""
+    rng = np.random.default_rng(8)
+    tangents, prior, data = rng.normal(size=(12, 3)), np.diag([0.5, 2.0, 1.0]), rng.normal(size=12)
+    whole = np.eye(12) + tangents @ prior @ tangents.T
+    mode = SimpleNamespace(
+        jacobian=tangents,
+        settled=np.linalg.solve(whole, data),
+        information=tangents.T @ tangents + np.linalg.inv(prior),
+    )
+    rows, rest = np.arange(4), np.arange(4, 12)
+    gain = whole[np.ix_(rows, rest)] @ np.linalg.inv(whole[np.ix_(rest, rest)])
+    conditional = whole[np.ix_(rows, rows)] - gain @ whole[np.ix_(rest, rows)]
+    miss = data[rows] - gain @ data[rest]
+    direct = -0.5 * miss @ np.linalg.solve(conditional, miss) - 0.5 * np.linalg.slogdet(conditional)[1]
+    assert log_scores(mode, [Group("first", rows)])[0] == pytest.approx(direct, rel=1e-10)
+
+
+def test_without_held_out_records_each_is_left_out_in_turn():
+    found = loop(study(3, held_out=0), library=LIBRARY[:1], sample=False, quick=True, as_stated=True)
+    told = results(found)
+    assert found.left_out
+    assert told["unseen_by"] == "leaving records out in turn"
+    assert len(found.before.unseen) == len(found.study.fit)
+
+
+def test_a_single_record_without_quiet_samples_is_at_most_tentative():
+    made = records(4, quiet=0.2)[2]
+    alone = Study("one", None, "ms", 4, (made,), (), ModelSettings(offset="shared"))
+    found = loop(alone, library=LIBRARY[:1], sample=False, quick=True, as_stated=True)
+    assert found.verdict.confidence == "tentative"
+    assert "too few" in found.base.noise[0].sentence
+    assert "quiet" in results(found)["next_measurement"] or "stretch" in results(found)["next_measurement"]
+
+
+def test_no_effect_is_named_from_a_base_fit_that_failed():
+    made = records(5)
+    rng = np.random.default_rng(5)
+    wild = [replace(r, response=rng.standard_normal(r.response.shape)) for r in made]
+    bad = Study("bad", None, "ms", 5, tuple(wild[:4]), (wild[4],), ModelSettings(offset="shared"))
+    found = loop(bad, library=LIBRARY, sample=False, quick=True, as_stated=True)
+    assert found.verdict.kind == "unexplained"
+    assert found.effects == ()
+    assert "less than half" in found.verdict.sentence
+    json.dumps(results(found), allow_nan=False)
+
+
+def test_an_effect_that_cannot_be_simulated_is_told_not_raised(clean):
+    class Broken(LIBRARY[0]):  # type: ignore[misc,valid-type]
+        def seen(self, y, scene, psi):
+            raise UnstableError(("odd_curvature",), "r0", "it runs away")
+
+    found = loop(study(1), library=[Broken], sample=False, quick=True, as_stated=True)
+    assert found.verdict.kind == "clean"
+    assert "runs away" in results(found)["evidence"]["classes"][0]["failed"]
+
+
+def test_repeats_measure_the_noise():
+    made = records(6)[:1]
+    rng = np.random.default_rng(6)
+    twin = replace(
+        made[0], name="twin", response=made[0].response + NOISE * rng.standard_normal(made[0].response.shape)
+    )
+    posterior = problem_of(
+        Study("twin", None, "ms", 6, (made[0], twin), (), ModelSettings(offset="shared"))
+    ).posterior
+    pieces = repeat_pieces(posterior.samples, 0)
+    assert sum(piece.size for piece in pieces) == np.isfinite(made[0].response).sum()
+    noise = axis_noise(posterior.samples, 0, 0.0, "x")
+    assert noise is not None
+    assert noise.known
+
+
+def test_descent_reaches_the_least_squares_optimum():
+    problem = problem_of(study(7))
+    base = base_fit(BaseModel(problem.posterior), np.random.default_rng(0))
+    slope = base.optimum.jacobian.T @ base.optimum.white
+    step = np.linalg.solve(base.optimum.information, slope)
+    assert slope @ step < 0.1
+    assert base.failed == ""
+    other = Regression(base.model, base.regression.whitening).descend(base.optimum.x + 1e-3)
+    assert other.cost == pytest.approx(base.optimum.cost, abs=0.1)
+
+
+def test_a_plant_with_effects_at_zero_is_the_plant():
+    problem = problem_of(study(7))
+    model = BaseModel(problem.posterior)
+    x = model.coordinates(problem.posterior.table.draw(1, np.random.default_rng(3))[0])
+    extended = ExtendedModel.of(model, x, (next(iter(LIBRARY[0].grid(None))),))
+    np.testing.assert_allclose(extended.predict(np.append(x, 0.0)), model.predict(x), atol=1e-10)
+
+
+def test_bands_are_not_given_outside_the_excited_range(clean):
+    state = clean.before.state
+    wide = Widening.of(state.whitening.samples, state.optimum.residual, state.whitening.noise)
+    samples = state.whitening.samples[0]
+    assert np.isfinite(wide.variance(samples, 0)).all()
+    beyond = replace(samples, record=replace(samples.record, drive=3.0 * samples.record.drive))
+    assert np.isnan(wide.variance(beyond, 0)).any()
+
+
+def test_errors_on_held_out_records_count_while_the_drive_stays_in_range(clean):
+    """Twice the noise before, 1.5 times after; beyond the fitted range the effect may say what it likes."""
+    made = study(1)
+    (record,) = made.held_out
+    made = replace(made, fit=(*made.fit, replace(record, name="again")))  # drives of the whole range
+    score = replace(clean.before.unseen[0], variance=np.zeros_like(clean.before.unseen[0].variance))
+    before = replace(score, predicted=score.observed - 2 * score.noise_sd)
+    after = replace(score, predicted=score.observed - 1.5 * score.noise_sd)
+    state = clean.before.state
+    assert unseen_share(made, [before], [after], state) == pytest.approx(1.25 / 3)
+    assert np.isnan(unseen_share(made, [replace(score, predicted=score.observed)], [after], state))
+    late = record.time > record.time[np.flatnonzero(np.diff(record.drive[:, 0]))[1]]
+    wild = replace(record, drive=np.where(late[:, None], 9.0, record.drive))
+    far = score.time > record.time[late][0]
+    worse = replace(after, predicted=np.where(far, 1e3, after.predicted))
+    changed = replace(made, held_out=(wild,))
+    assert unseen_share(changed, [before], [worse], state) == pytest.approx(1.25 / 3)
+    assert unseen_share(made, [before], [worse], state) > 1.0
+
+
+FOUND = Found("", (), True, 50.0, 3.0, ("a",), (), 48.0, 20.0, "smooth", 1.0, 3.0, "b", 1.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "kind"),
+    [
+        ({}, "explained"),
+        ({"alarmed": False}, "clean"),
+        ({"alarmed": False, "scatter": 50.0}, "disturbance"),
+        ({"alarmed": False, "scatter": 50.0, "missed": 3.0}, "unexplained"),
+        ({"effects": ()}, "unexplained"),
+        ({"disturbances": ("a",)}, "disturbance"),
+        ({"remaining": 40.0, "share": 0.5}, "unexplained"),
+        ({"remaining": 4.0, "share": 0.95}, "explained"),
+        ({"remaining": 40.0, "share": 0.95, "generic": 90.0}, "unexplained"),
+        ({"failed": "the base fit did not converge"}, "unexplained"),
+        ({"unseen": 0.2}, "explained"),
+        ({"unseen": 0.8}, "unexplained"),
+    ],
+)
+def test_the_verdict_follows_from_what_was_found(change, kind):
+    assert decide(replace(FOUND, **change)).kind == kind
+
+
+def test_whitening_of_records_is_that_of_their_parts(clean):
+    state = clean.before.state
+    both = Whitening(state.whitening.samples, state.whitening.noise)
+    part = both.parts[1]
+    alone = both.noise[0].whiten(both.observed[part.rows])
+    np.testing.assert_allclose(both(both.observed)[part.rows], alone)

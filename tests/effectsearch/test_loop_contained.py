@@ -1,0 +1,104 @@
+"""A richer model of the loop is at least as likely as those it contains, wherever its own starts lead."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small import record, study
+
+from lcopa_bayes.bench.command import on_off, staircase
+from lcopa_bayes.effectsearch import basefit, refits, terms
+from lcopa_bayes.effectsearch.gaussnewton import Regression
+from lcopa_bayes.effectsearch.refits import refit
+from lcopa_bayes.model.effects.catalogue import bundled
+
+NOISE = 0.01
+STUDY = study(
+    record(1, command=on_off(1.0, hold=8.0, at=4.0), duration=20.0, noise_sd=NOISE, name="r1"),
+    record(
+        2, command=staircase([0.5, -0.8, 0.3], hold=5.0, start=4.0), duration=20.0, noise_sd=NOISE, name="r2"
+    ),
+    offset="shared",
+)
+PAIR = [bundled()["odd_curvature"](), bundled()["overdrive_pulse"](1.0)]
+
+
+@pytest.fixture(scope="module")
+def base():
+    return terms._based(STUDY)
+
+
+def astray(heeds_near):
+    """A base fit that ends far from the records' plant with two terms, unless it `heeds_near` starts."""
+
+    def fit(model, rng, *, near=()):
+        found = basefit.base_fit(model, rng)
+        if len(model.posterior.table.of_kind("order")) < 2:
+            return found
+        away = found.optimum.x.copy()
+        away[0] += 1.0  # the gain
+        ends = [found.regression.at(away)]
+        ends += [found.regression.descend(start) for start in near if heeds_near]
+        return replace(found, optimum=min(ends, key=lambda one: one.cost))
+
+    return fit
+
+
+@pytest.mark.parametrize("heeds_near", [True, False])
+def test_more_terms_are_at_least_as_likely_as_fewer(base, monkeypatch, heeds_near):
+    """Though the wider fit's own starts lead astray: from the smaller model's optimum, at first or again."""
+    monkeypatch.setattr(terms, "base_fit", astray(heeds_near))
+    lost = terms._based(replace(STUDY, model=replace(STUDY.model, terms=2)), 2)
+    wider = terms._wider(STUDY, base, 2)
+    inner = Regression(base.fit.model, wider.fit.regression.whitening).descend(base.fit.optimum.x)
+    assert wider.fit.optimum.cost <= inner.cost + 0.5
+    assert wider.fit.failed == ""
+    assert wider.start.optimum is wider.fit.optimum
+    assert lost.fit.optimum.cost > inner.cost + 100.0  # the starts do lead astray
+
+
+def test_more_terms_that_stay_less_likely_are_no_base(base, monkeypatch):
+    """Where no start reaches what the smaller model does, the wider one is not used."""
+    monkeypatch.setattr(terms, "base_fit", astray(False))
+    monkeypatch.setattr(Regression, "best", lambda self, starts: self.at(starts[0]))
+    wider = terms._wider(STUDY, base, 2)
+    assert "less likely than that of fewer" in wider.fit.failed
+
+
+def test_starts_of_a_wider_model_are_close_to_the_smaller_one(base):
+    problem = terms.problem_of(replace(STUDY, model=replace(STUDY.model, terms=3)))
+    model = terms.BaseModel(problem.posterior)
+    regression = Regression(model, base.fit.regression.whitening)
+    starts = terms._lifted(model, base, np.random.default_rng(1))
+    low, high = model.bounds
+    assert len(starts) == 6
+    costs = [regression.cost(np.clip(start, low, high)) for start in starts]
+    spread = np.std(np.concatenate([one.values for s in problem.posterior.samples for one in s.axes]))
+    power = 0.5 * problem.posterior.size * (spread / NOISE) ** 2
+    assert min(costs) < base.fit.optimum.cost + 0.01 * power
+
+
+@pytest.mark.parametrize("effect", PAIR, ids=lambda one: one.name)
+def test_a_refit_is_at_least_as_likely_as_without_its_effect(base, effect, monkeypatch):
+    """Though its constants are moved to where it is worse, and under another noise."""
+    state = base.start
+
+    def spoilt(model, x, whitening, names):
+        away = x.copy()
+        away[model.plant_size :] += 3.0
+        away[: model.plant_size] = 0.5 * (away[: model.plant_size] + model.bounds[0][: model.plant_size])
+        return model, np.where(np.isfinite(away), away, x)
+
+    monkeypatch.setattr(refits, "polished", spoilt)
+    made = refit(state.model, state.optimum, state.whitening, [(effect, np.ones(1))], 50.0)
+    assert made.optimum.cost <= state.optimum.cost + 1e-9
+    assert made.taken >= 0.0
+    worse = made.optimum.x.copy()
+    worse[: made.model.plant_size] = made.model.bounds[0][: made.model.plant_size] + 0.1
+    regression = Regression(made.model, made.whitening)
+    stuck = replace(made, optimum=regression.at(np.where(np.isfinite(worse), worse, made.optimum.x)))
+    assert stuck.optimum.cost > made.before.cost + 10.0
+    again = stuck.under(state.whitening)
+    assert again.optimum.cost <= again.before.cost + 1e-9

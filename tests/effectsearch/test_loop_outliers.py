@@ -1,0 +1,77 @@
+"""Samples far outside the noise are told from effects of the device, and left out."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_loop import LIBRARY, NOISE, study
+
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.effectsearch.basefit import base_fit
+from lcopa_bayes.effectsearch.basemodel import BaseModel
+from lcopa_bayes.effectsearch.loop import loop
+from lcopa_bayes.effectsearch.outliers import outlying
+from lcopa_bayes.effectsearch.summary import results
+from lcopa_bayes.effectsearch.verdict import Verdict, beside
+from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.model.effects.catalogue import catalogue
+
+SHARE = 0.03
+
+
+def struck(made: Study, seed: int, *, at_rest: bool = True) -> tuple[Study, list[np.ndarray]]:
+    """The study with a share of its samples ten times the noise away, and which ones."""
+    rng = np.random.default_rng(seed)
+    out, where = [], []
+    for record in made.fit:
+        hit = rng.random(record.time.size) < SHARE
+        if not at_rest:
+            hit &= record.time > record.time[np.flatnonzero(np.diff(record.drive[:, 0]))[0]]
+        y = record.response.copy()
+        y[hit, 0] += 10 * NOISE * rng.choice((-1.0, 1.0), int(hit.sum()))
+        out.append(replace(record, response=y))
+        where.append(hit)
+    return replace(made, fit=tuple(out)), where
+
+
+def fitted(made: Study):
+    return base_fit(BaseModel(problem_of(made).posterior), np.random.default_rng(1), starts=1)
+
+
+def test_outliers_are_found_where_they_are():
+    made, where = struck(study(1), 5)
+    found = outlying(made, fitted(made))
+    assert found is not None
+    pairs = zip(found.study.fit, made.fit, where, strict=True)
+    taken = [(np.isnan(new.response[:, 0]) & ~np.isnan(old.response[:, 0]), hit) for new, old, hit in pairs]
+    hits = sum(int((out & hit).sum()) for out, hit in taken)
+    false = found.count - hits
+    assert hits > 0.9 * sum(int(hit.sum()) for hit in where)
+    assert false <= 3
+    assert 5 < found.width < 15
+    assert found.log_bayes_factor > 50
+
+
+@pytest.mark.parametrize("made", [study(1), study(2, 0.3)], ids=["clean", "bent"])
+def test_noise_and_effects_are_no_outliers(made):
+    assert outlying(made, fitted(made)) is None
+
+
+def test_what_strikes_only_where_the_device_moves_is_left_to_the_trace():
+    made, _ = struck(study(1), 5, at_rest=False)
+    assert outlying(made, fitted(made)) is None
+
+
+def test_an_effect_is_found_beside_outliers():
+    made, _ = struck(study(2, 0.06), 7)
+    found = loop(made, library=[*LIBRARY, catalogue()["outliers"]], sample=False, quick=True, as_stated=True)
+    assert found.names == ("odd_curvature", "outliers")
+    told = results(found)
+    assert told["outliers"]["count"] > 0
+    assert "outliers" in told["sentence"]
+
+
+def test_outliers_alone_are_a_disturbance():
+    said = beside(Verdict("clean", "firm", "Nothing."), "Two samples.")
+    assert (said.kind, said.sentence) == ("disturbance", "Two samples. Nothing.")
+    assert beside(Verdict("unexplained", "firm", "x"), "y").kind == "unexplained"
