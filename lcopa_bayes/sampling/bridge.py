@@ -21,6 +21,8 @@ from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.mixturemoves import learned
 from lcopa_bayes.sampling.ridgemoves import emcee_sampler
+from lcopa_bayes.sampling.sampler import SamplePlan
+from lcopa_bayes.sampling.weightedrun import weighted_run
 
 _EFFECTIVE = 0.5
 """Share of a population that stays effective in one rise."""
@@ -53,8 +55,16 @@ def transferred(
     """Draws of `target` from walkers (ensembles, walkers, dimension) of `source`.
 
     With `jump` in one rise: for posteriors whose supports differ, but little else. Deterministic given
-    `seed`.
+    `seed`. With effects by importance sampling of the target, where its weights are usable.
     """
+    if target.simulation is not None:
+        plan = SamplePlan.of(
+            target.dimension, seed=seed, ensembles=len(positions), walkers=positions.shape[1]
+        )
+        result = weighted_run(target, plan)
+        if result is not None:
+            run, draws = result
+            return Transferred(run.kept()[0], draws.ess, max(quality.rhat for quality in draws.qualities))
     mixture = learned(target, list(positions), seed)
     chains = []
     for number, position in enumerate(positions):
