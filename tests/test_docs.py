@@ -24,6 +24,7 @@ from lcopa_bayes.data.settings import (
 from lcopa_bayes.data.studyfile import load_candidates, load_study
 from lcopa_bayes.identifiability import verdict as audit
 from lcopa_bayes.inference.kinds import KINDS
+from lcopa_bayes.model.effects.catalogue import bundled
 from lcopa_bayes.results import adequacy, discretisation, resonance
 from lcopa_bayes.sampling import convergence, evidence
 from lcopa_bayes.sampling.sampler import SamplePlan
@@ -54,7 +55,8 @@ def rows(text: str, head: str) -> dict[str, list[str]]:
     out: dict[str, list[str]] = {}
     inside = False
     for line in text.splitlines():
-        cells = [cell.strip() for cell in line.strip("|").split("|")] if line.startswith("|") else []
+        parts = re.split(r"(?<!\\)\|", line.strip("|")) if line.startswith("|") else []
+        cells = [cell.strip() for cell in parts]
         if not cells:
             inside = False
         elif cells[0] == head:
@@ -161,6 +163,18 @@ def test_documented_limits_of_grades_are_those_of_the_code():
 def test_documented_verdicts_of_an_audit_are_those_it_may_give():
     told = rows(sections(ROOT / "docs" / "questions.md")["audit"], "verdict")
     assert set(told) == set(audit.Verdict.__args__)
+
+
+def test_every_effect_is_documented_by_its_formula():
+    text = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
+    told: dict[str, list[str]] = {}
+    for part in text.split("\n## "):
+        told |= rows(part, "effect")
+    cards = {name: kind.card for name, kind in bundled().items()}
+    assert set(told) == set(cards)
+    for name, (formula, shared) in told.items():
+        assert formula == "`" + cards[name].formula.replace("|", "\\|") + "`"
+        assert (shared == "per record") == cards[name].per_record
 
 
 def test_readme_lists_the_verbs_of_the_command_line(capsys):
