@@ -11,6 +11,7 @@ from lcopa_bayes.comparison.compare import compare
 from lcopa_bayes.core.files import save_json, writable_folder
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_candidates
+from lcopa_bayes.data.studywriter import write_study
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.summary import drawn, words
 from lcopa_bayes.effectsearch.summary import results as loop_results
@@ -34,6 +35,9 @@ from lcopa_bayes.verbs.outcome import Told, place_of, study_of, with_report
 
 _QUICK = 4
 """How many times fewer draws a quick design takes."""
+
+EXPLAINED = "explained.toml"
+"""The study with what a loop found, beside its results."""
 
 
 def audit_study(options: argparse.Namespace, command: list[str]) -> Told:
@@ -96,6 +100,8 @@ def loop_study(options: argparse.Namespace, command: list[str]) -> Told:
     save_json(provenance(study, command), folder / "provenance.json")
     save_json(drawn(found), folder / "loop_curves.json")
     save_json(values, folder / "loop.json")
+    write_study(found.study, folder / EXPLAINED, note=f"{study.name} with what `loop` found declared.")
+    values |= {"explained": str(folder / EXPLAINED)}
     return with_report(values, write_loop(folder), *words(values))
 
 
