@@ -65,8 +65,8 @@ class CandidateSettings:
     """Effects of the plant by name; None: those of the study."""
     priors: Mapping[str, PriorSettings] = field(default_factory=dict)
     """In place of the study's, by parameter name."""
-    improper: tuple[str, ...] = ()
-    """Parameters whose prior is said to be improper."""
+    improper: tuple[str, ...] = field(default=(), metadata={"key": None})
+    """Parameters whose prior is said to be improper: in a file, by the `dist` of their prior."""
 
     def __post_init__(self) -> None:
         text = isinstance(self.name, str) and self.name.strip(" .")

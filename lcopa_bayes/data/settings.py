@@ -150,7 +150,7 @@ class SamplerSettings:
     target_ess: int = 400
     """Effective sample size [-] at which sampling stops."""
     thin: int | None = None
-    """Steps per kept draw [-]; None: chosen from the autocorrelation time."""
+    """Steps per kept draw [-]; None: 5."""
     method: Method | None = None
     """"auto": importance draws where a cover of the posterior gives enough of them, else ensembles;
     "ensembles": these in any case. None: ensembles where `steps` or `thin` is stated, which concern them
@@ -270,12 +270,18 @@ class PriorSettings:
     __reduce__ = rebuilt
 
 
+def keys_of(kind: type[Any]) -> dict[str, str]:
+    """Field of each key that a table of a study file may have; a field whose key is None has none there."""
+    keys = {field.name: field.metadata.get("key", field.name) for field in dataclasses.fields(kind)}
+    return {key: name for name, key in keys.items() if key is not None}
+
+
 def settings_from(kind: type[S], table: Mapping[str, object], where: str, problems: list[str]) -> S | None:
     """`kind` from a table of a study file; what is wrong joins `problems`, each told after `where`.
 
     None when a value is wrong; an unknown key alone is a problem but leaves the others usable.
     """
-    known = {f.metadata.get("key", f.name): f.name for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    known = keys_of(kind)
     problems += [f"{where}: unknown key {key!r}{nearest(key, known)}" for key in table if key not in known]
     values = {known[key]: tuple(v) if isinstance(v, list) else v for key, v in table.items() if key in known}
     try:
