@@ -206,7 +206,7 @@ def _confirmed(made: Design, chosen: int, where: str, replicas: int, jobs: int) 
         )
         for promise, part in ((made.winner, found[:replicas]), (made.step, found[replicas:]))
     )
-    rng = np.random.default_rng([made.fit.run.plan.seed, 10])
+    rng = np.random.default_rng([made.fit.study.seed, 10])
     factor, low, high = _factor(winner.errors, step.errors, made.determined, rng)
     columns = [made.fit.draws.table.names.index(name) for name in made.names]
     at = made.draws[chosen, columns]

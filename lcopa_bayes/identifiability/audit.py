@@ -27,8 +27,9 @@ from lcopa_bayes.identifiability.verdict import Finding, judged
 from lcopa_bayes.inference.likelihood import Landscape, Peak
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.parameter import Parameter
-from lcopa_bayes.results.fit import Fit
+from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.resonance import unresolved
+from lcopa_bayes.results.sensitivity import sensitivity
 
 _POINTS = 24
 """Prior draws at which symmetries are looked for, besides likely ones."""
@@ -49,7 +50,7 @@ _TRIES = 3
 class Audit:
     """Identifiability of a fitted study."""
 
-    fit: Fit
+    fit: Predictive
     findings: tuple[Finding, ...]
     """One per free parameter, in table order."""
     structure: Structure
@@ -114,9 +115,9 @@ def _structure(found: Structure) -> dict[str, Any]:
     }
 
 
-def audit(fit: Fit, *, jobs: int = 1) -> Audit:
+def audit(fit: Predictive, *, jobs: int = 1) -> Audit:
     """Verdict for every free parameter of a fitted study; profiles are made in `jobs` processes."""
-    posterior, seed = fit.problem.posterior, fit.run.plan.seed
+    posterior, seed = fit.problem.posterior, fit.study.seed
     landscape, rng = Landscape(posterior), np.random.default_rng([seed, 5])
     with threadpool_limits(1):
         prior = prior_draws(landscape, rng)
@@ -138,7 +139,7 @@ def audit(fit: Fit, *, jobs: int = 1) -> Audit:
         printed = printed_structure(points, rng)
         curved = curvature(landscape, peak.values, spread)
         moved = radial(landscape, peak, spread, curved.directions[-1], _RADIUS)
-    believed = beliefs(landscape, fit.draws, spread, fit.sensitivity)
+    believed = beliefs(landscape, fit.draws, spread, sensitivity(fit.draws, posterior))
     rows = [posterior.table.rows[k] for k in landscape.free]
     scales = fit.problem.scales
     fast = unresolved(fit.draws, scales.period)

@@ -9,7 +9,7 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Matrix, Vector, digest_of
 from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
@@ -71,6 +71,11 @@ class Draws:
     def level(self, parameter: str, grade: Grade) -> Level:
         """Level of a number of a parameter graded `grade`, under the limitations that concern it."""
         return limited(grade, [one for one in self.limitations if one.concerns(parameter)]).level
+
+    @cached_property
+    def sha256(self) -> str:
+        """Hash of the draws of the free parameters."""
+        return digest_of(self.values[..., [k for k, row in enumerate(self.table.rows) if row.free]])
 
     @property
     def flat(self) -> Matrix:

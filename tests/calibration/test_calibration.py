@@ -37,7 +37,6 @@ from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.results.discretisation import resolved
 from lcopa_bayes.results.fit import fit, plan_of
-from lcopa_bayes.results.runfolder import save_fit
 
 
 @pytest.fixture(scope="module")
@@ -602,7 +601,7 @@ def test_a_full_disk_leaves_the_store_intact(tmp_path, alone, monkeypatch):
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("fitted")
-    save_fit(fit(STUDY), folder, ["lcopa-bayes"])
+    fit(STUDY).save(folder)
     return folder
 
 

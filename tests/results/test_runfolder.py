@@ -20,9 +20,8 @@ from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.files import save_json, save_table
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.report.savedrun import load_run
+from lcopa_bayes.results.datatree import save_tree, variable_names
 from lcopa_bayes.results.fit import Fit, fit
-from lcopa_bayes.results.runfolder import save_fit, save_posterior, variable_names
-from lcopa_bayes.results.summary import results
 from lcopa_bayes.results.tables import tables
 
 TINY = {"ensembles": 2, "walkers": 16, "steps": 60, "thin": 1, "target_ess": 100}
@@ -38,7 +37,7 @@ def fitted(request) -> Fit:
 @pytest.fixture(scope="module")
 def folder(fitted, tmp_path_factory):
     path = tmp_path_factory.mktemp("run")
-    save_fit(fitted, path, ["lcopa-bayes", "fit"])
+    fitted.save(path)
     return path
 
 
@@ -51,8 +50,8 @@ def test_the_folder_holds_what_was_promised(fitted, folder):
         "tables",
     ]
     assert {p.stem for p in (folder / "tables").iterdir()} == set(tables(fitted))
-    assert json.loads((folder / "results.json").read_text()) == results(fitted) | {"rival": None}
-    assert json.loads((folder / "provenance.json").read_text())["command"] == ["lcopa-bayes", "fit"]
+    assert json.loads((folder / "results.json").read_text()) == fitted.to_json()
+    assert json.loads((folder / "provenance.json").read_text())["fit"]["command"] == ["lcopa_bayes.fit"]
 
 
 def test_tables_read_back(fitted, folder):
@@ -147,9 +146,9 @@ def test_a_failed_save_leaves_no_file(fitted, tmp_path, monkeypatch):
     def fail(*_):
         raise OSError("disk full")
 
-    monkeypatch.setattr("lcopa_bayes.results.runfolder.save_posterior", fail)
+    monkeypatch.setattr("lcopa_bayes.results.fit.save_tree", fail)
     with pytest.raises(InputError, match=r"posterior\.nc: cannot be written \(disk full\)"):
-        save_fit(fitted, tmp_path, [])
+        fitted.save(tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["tables"]
 
 
@@ -166,7 +165,7 @@ def test_names_that_a_netcdf_group_would_split_are_kept_apart(tmp_path):
     axis = Axis("front/left", "rad")
     slashed = Record("a", plain.time, plain.drive, plain.response, (Axis("u/1", "V"),), (axis,), "ms")
     made = fit(study(slashed, sampler=TINY))
-    save_posterior(made, tmp_path / "posterior.nc")
+    save_tree(made.to_datatree(), tmp_path / "posterior.nc")
     with xarray.open_datatree(tmp_path / "posterior.nc", engine="h5netcdf") as read:
         (name,) = read["observed_data"].data_vars
         assert_allclose(read["observed_data"][name], made.bands[0].observed)
@@ -176,8 +175,9 @@ def test_names_that_a_netcdf_group_would_split_are_kept_apart(tmp_path):
 def test_a_record_too_short_for_residual_tests_is_saved_all_the_same(tmp_path):
     short = record(camera=1.5)
     assert short.response.size - np.isnan(short.response).sum() == 8
-    told = save_fit(fit(study(short, sampler=TINY)), tmp_path, [])
-    assert told["residual_tests"] == []
+    made = fit(study(short, sampler=TINY))
+    made.save(tmp_path)
+    assert made.to_json()["residual_tests"] == []
 
 
 def test_names_are_kept_plain_unless_they_collide():
@@ -210,7 +210,7 @@ def test_records_and_axes_with_the_same_joint_name_are_kept_apart(tmp_path):
     ]
     known = {"time_1": 1.5, "order_1": 0.8, "delay": 0.73}
     made = fit(study(*both, sampler=TINY | {"steps": 20}, share="all", offset="shared", priors=known))
-    save_posterior(made, tmp_path / "posterior.nc")
+    save_tree(made.to_datatree(), tmp_path / "posterior.nc")
     with xarray.open_datatree(tmp_path / "posterior.nc", engine="h5netcdf") as read:
         groups = [read[g] for g in ("observed_data", "log_likelihood", "posterior_predictive")]
         for group in groups:
@@ -233,5 +233,5 @@ def test_the_report_finds_parameters_whose_names_hold_a_slash(tmp_path):
         "a", plain.time, plain.drive, np.column_stack([plain.response] * 2), (Axis("u", "V"),), axes, "ms"
     )
     known = {"time_1": 1.5, "order_1": 0.8, "delay": 0.73}
-    save_fit(fit(study(two, sampler=TINY | {"steps": 20}, share="all", priors=known)), tmp_path, [])
+    fit(study(two, sampler=TINY | {"steps": 20}, share="all", priors=known)).save(tmp_path)
     assert "gain_front/left_u" in load_run(tmp_path).draws
