@@ -23,8 +23,8 @@ from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.results.discretisation import discretisation, resolved
 from lcopa_bayes.results.steps import StepCurves, step_curves
-from lcopa_bayes.sampling.draws import Draws, gather
-from lcopa_bayes.sampling.importance import Effort, ImportancePlan, importance, weighted_draws
+from lcopa_bayes.sampling.draws import Draws, gather, weighted_draws
+from lcopa_bayes.sampling.importance import Effort, ImportancePlan, importance
 from lcopa_bayes.sampling.sampler import SamplePlan, sample
 
 RANKED = 99
@@ -210,10 +210,10 @@ class Replication:
             problem = resolved(problem)
         posterior = problem.posterior
         if look is not None and look.good(self.plan.target_ess):
-            draws = weighted_draws(posterior, look, rng, target_ess=self.plan.target_ess)
-            return problem, draws, "importance", look.pareto_k
+            draws = weighted_draws(posterior, look.weighted, rng, target_ess=self.plan.target_ess)
+            return problem, draws, "importance", look.weighted.pareto_k
         draws = gather(posterior, sample(posterior, replace(self.plan, seed=seed)))
-        tried = look.pareto_k if look is not None and np.isfinite(look.pareto_k) else None
+        tried = look.weighted.pareto_k if look is not None and np.isfinite(look.weighted.pareto_k) else None
         return problem, draws, "sampling", tried
 
     def _true(self, posterior: Posterior, truth: Vector, times: Vector) -> list[float]:

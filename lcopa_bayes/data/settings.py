@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from itertools import pairwise
 from types import MappingProxyType
-from typing import Any, Literal, TypeVar, final
+from typing import Any, Literal, TypeVar, final, get_args
 
 import numpy as np
 from scipy import stats
@@ -132,6 +132,10 @@ class NoiseSettings:
         refuse_if(one_of("kind", self.kind, NOISE_KINDS))
 
 
+Method = Literal["auto", "ensembles"]
+"""How a posterior is sampled."""
+
+
 @final
 @dataclass(frozen=True)
 class SamplerSettings:
@@ -147,13 +151,21 @@ class SamplerSettings:
     """Effective sample size [-] at which sampling stops."""
     thin: int | None = None
     """Steps per kept draw [-]; None: chosen from the autocorrelation time."""
+    method: Method | None = None
+    """"auto": importance draws where a cover of the posterior gives enough of them, else ensembles;
+    "ensembles": these in any case. None: ensembles where `steps` or `thin` is stated, which concern them
+    alone, else "auto"."""
 
     def __post_init__(self) -> None:
         least = {"ensembles": 2, "walkers": 4, "steps": 1, "target_ess": 1, "thin": 1}
         chosen = {key: getattr(self, key) for key in least}
         optional = ("walkers", "steps", "thin")
         stated = [key for key in least if not (key in optional and chosen[key] is None)]
-        refuse_if([problem for key in stated for problem in whole_number(key, chosen[key], least[key])])
+        problems = [problem for key in stated for problem in whole_number(key, chosen[key], least[key])]
+        if self.method not in (None, *get_args(Method)):
+            allowed = " or ".join(f'"{name}"' for name in get_args(Method))
+            problems.append(f"method must be {allowed}; got {self.method!r}")
+        refuse_if(problems)
 
 
 @final

@@ -18,7 +18,7 @@ from lcopa_bayes.report.formatting import NONE, figures, interval, percent, to_s
 from lcopa_bayes.report.page import Verdict, write_page
 from lcopa_bayes.report.section import Column, Drawing, Section, Table
 from lcopa_bayes.report.theme import CYCLE, HELD_OUT, NOISE, SEEN, blank, label, look, plain, svg_of
-from lcopa_bayes.results.prediction import KIND
+from lcopa_bayes.results.bands import POINTWISE
 
 _NEAR = 60.0
 """Log evidence below the best that is still shown [nat]."""
@@ -377,5 +377,7 @@ def _caption(rows: Sequence[Mapping[str, Any]], record: str, axis: str, *, held:
         for one in row[key]:
             if (one["record"], one["axis"]) == (record, axis):
                 told.append(f"{row['name']} {figures(one['rmse'])} {one['unit']}")
-    bands = f"the {KIND} 90 % band" + ("s with noise of all" if held else " with noise of the preferred one")
+    bands = f"the {POINTWISE} 90 % band" + (
+        "s with noise of all" if held else " with noise of the preferred one"
+    )
     return f"Medians of the rivals, {bands}, and residuals below. RMSE: {', '.join(told)}."

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
@@ -34,7 +34,7 @@ from lcopa_bayes.results.summary import results, verdict
 from lcopa_bayes.results.tables import tables
 from lcopa_bayes.sampling.crosscheck import CrossCheck
 from lcopa_bayes.sampling.draws import Draws, gather
-from lcopa_bayes.sampling.evidence import Evidence, evidence
+from lcopa_bayes.sampling.evidence import Evidence, evidence_of
 from lcopa_bayes.sampling.nested import NestedPlan, nested
 from lcopa_bayes.sampling.sampler import Run, SamplePlan, sample
 
@@ -140,7 +140,7 @@ def fit(
         starts=starts,
     )
     draws, check = gather(problem.posterior, run), None
-    weighed = evidence(problem.posterior, run.kept()[0], draws.ess, plan.seed)
+    weighed = evidence_of(problem.posterior, run, draws.ess)
     if cross_check:
         wanted = NestedPlan.of(problem.posterior.dimension, seed=plan.seed, quick=quick)
         check = CrossCheck.of(
@@ -192,8 +192,9 @@ def plan_of(problem: Problem, *, quick: bool) -> SamplePlan:
         steps=wanted.steps,
         thin=wanted.thin,
         target_ess=wanted.target_ess,
+        method=wanted.method or ("auto" if wanted.steps is None and wanted.thin is None else "ensembles"),
     )
     if not quick:
         return plan
     steps = max(plan.thin, plan.steps // _QUICK)
-    return SamplePlan(plan.ensembles, plan.walkers, steps, plan.thin, plan.target_ess, plan.seed)
+    return replace(plan, steps=steps)

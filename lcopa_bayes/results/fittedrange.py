@@ -101,7 +101,7 @@ class FittedRange:
         return alike or list(range(len(self.records)))
 
     def other_rest(self, rest: Sequence[float]) -> list[str]:
-        """A problem for every drive axis that rests where no fit record, nor anything between two, did."""
+        """A clause for every drive axis that rests where no fit record, nor anything between two, did."""
         slack = _SLIGHT * (self.high - self.low)
         (least, largest), out = self.rests, []
         for k, axis in enumerate(self.axes):
@@ -109,8 +109,7 @@ class FittedRange:
                 known = f"{least[k]:.6g}" if least[k] == largest[k] else f"{least[k]:.6g} to {largest[k]:.6g}"
                 out.append(
                     f"drive axis {axis.name!r} is at {rest[k]:.6g} {axis.unit} before its first change, but "
-                    f"the study's records rest at {known} {axis.unit}: a response from another "
-                    "resting value was not fitted; begin with a row at the study's resting value"
+                    f"the study's records rest at {known} {axis.unit}"
                 )
         return out
 
@@ -139,15 +138,15 @@ class FittedRange:
                         since,
                         f"Drive {axis.name} runs from {column.min():.4g} to {column.max():.4g} {axis.unit}, "
                         f"in the fit records from {self.low[k]:.4g} to {self.high[k]:.4g} {axis.unit}: from "
-                        f"{since:.4g} {self.time_unit} on the bands rest on the plant being linear beyond.",
+                        f"{since:.4g} {self.time_unit} on the bands rest on a linear plant.",
                     )
                 )
         return out
 
     def _rests(self, driven: Driven) -> list[Outside]:
         return [
-            Outside("rest", "", None, f"{problem[0].upper()}{problem[1:]}.")
-            for problem in self.other_rest(driven.drive[0])
+            Outside("rest", "", None, f"{clause[0].upper()}{clause[1:]}: the bands rest on a linear plant.")
+            for clause in self.other_rest(driven.drive[0])
         ]
 
     def _times(self, driven: Driven, times: Vector) -> list[Outside]:

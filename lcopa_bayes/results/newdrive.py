@@ -250,7 +250,8 @@ def _unmeasured(problem: Problem, draws: Draws, drive: Drive, level: Level) -> t
         study.drive_axes, study.time_unit, tuple(fitted.usual_rest), _LEAD * scales.period
     )
     if problems := fitted.other_rest(drive.drive[0]):
-        raise InputError([f"drive {drive.name!r}: {problem}" for problem in problems])
+        advice = "begin with a row at the study's resting value"
+        raise InputError([f"drive {drive.name!r}: {problem}; {advice}" for problem in problems])
     times = _times(drive, scales.span, scales.period)
     gaps = np.concatenate(([1.0], np.diff(times) / scales.period))
     values, plant = plant_draws(draws, problem.driven(drive, times))

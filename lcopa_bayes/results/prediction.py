@@ -17,8 +17,6 @@ from lcopa_bayes.model.forward import ForwardModel
 from lcopa_bayes.results.bands import LEVELS, POINTWISE, pointwise, simultaneous
 from lcopa_bayes.sampling.draws import Draws
 
-KIND = POINTWISE
-"""Kind of the bands by which samples are counted."""
 BEFORE_DRIVE = "samples before the drive acts"
 """Source of an offset."""
 _CELLS = 2_000_000
@@ -82,7 +80,7 @@ class Band:
             "rmse": self.rmse,
             "coverage_50": self.coverage(LEVELS[0]),
             "coverage_90": self.coverage(LEVELS[1]),
-            "bands": KIND,
+            "bands": POINTWISE,
             "samples": self.time.size,
             "offset_from": self.offset_from,
             "offset_samples": self.offset_samples,

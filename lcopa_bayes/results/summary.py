@@ -129,8 +129,9 @@ def scores(fit: Fit, *, held_out: bool) -> list[dict[str, Any]]:
 
 
 def _sampler(fit: Fit) -> Mapping[str, Any]:
-    plan, ensembles = fit.run.plan, fit.run.ensembles
-    return {
+    plan, ensembles, weighted = fit.run.plan, fit.run.ensembles, fit.run.weighted
+    common = {
+        "method": "ensembles" if weighted is None else "importance draws",
         "ensembles": plan.ensembles,
         "walkers": plan.walkers,
         "steps": ensembles[0].steps,
@@ -142,3 +143,8 @@ def _sampler(fit: Fit) -> Mapping[str, Any]:
         "target_ess": plan.target_ess,
         "seed": plan.seed,
     }
+    if weighted is None:
+        return common
+    for key in ("steps", "most_steps", "thin", "acceptance"):
+        common.pop(key)
+    return {**common, "draws": weighted.count, "pareto_k": weighted.pareto_k, "weights_ess": weighted.ess}

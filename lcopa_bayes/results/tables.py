@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
+from lcopa_bayes.results.bands import SIMULTANEOUS
 from lcopa_bayes.results.summary import results
 from lcopa_bayes.sampling.crosscheck import CrossCheck
 
@@ -54,6 +55,9 @@ def _bands(fit: Fit) -> pd.DataFrame:
         }
         columns |= {f"plant_{q}": row for q, row in zip(_QUANTILE_NAMES, band.plant, strict=True)}
         columns |= {f"noisy_{q}": row for q, row in zip(_QUANTILE_NAMES, band.noisy, strict=True)}
+        for name, ends in (("plant", band.plant_simultaneous), ("noisy", band.noisy_simultaneous)):
+            rows = zip(("05", "25", "75", "95"), ends, strict=True)
+            columns |= {f"{name}_{SIMULTANEOUS}_{q}": row for q, row in rows}
         frames.append(pd.DataFrame(columns))
     return pd.concat(frames, ignore_index=True)
 

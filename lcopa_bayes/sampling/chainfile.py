@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import final
 
 import h5py
 import numpy as np
@@ -12,12 +13,26 @@ import numpy as np
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.files import enduring, write_whole
 from lcopa_bayes.sampling.ensemble import Ensemble
+from lcopa_bayes.sampling.weighted import Weighted
 
+_WEIGHTED = ("coordinates", "log_density", "raw", "log_weights", "sampled")
 _ARRAYS = ("chain", "log_density", "position", "position_log_density", "accepted", "trail")
 
 
-def save_chain(path: Path, ensembles: Sequence[Ensemble], fingerprint: str) -> None:
-    """Write all ensembles; the file of the last save stays intact until this one is complete.
+@final
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """How far a run has come."""
+
+    ensembles: tuple[Ensemble, ...] = ()
+    weighted: Weighted | None = None
+    """Importance draws, the result of a run that has them."""
+    failed: tuple[int, ...] = ()
+    """Rounds after which importance draws were tried without success."""
+
+
+def save_chain(path: Path, chain: Chain, fingerprint: str) -> None:
+    """Write a run as far as it has come; the file of the last save stays intact until this one is complete.
 
     InputError when the file cannot be written, saying whether the rounds before this one are kept.
     """
@@ -25,7 +40,10 @@ def save_chain(path: Path, ensembles: Sequence[Ensemble], fingerprint: str) -> N
     def write(beside: Path) -> None:
         with enduring(beside) as raw, h5py.File(raw, "w") as file:
             file.attrs["fingerprint"] = fingerprint
-            for number, ensemble in enumerate(ensembles):
+            file.attrs["failed"] = np.array(chain.failed, dtype=int)
+            if chain.weighted is not None:
+                _write_weighted(file.create_group("weighted"), chain.weighted)
+            for number, ensemble in enumerate(chain.ensembles):
                 group = file.create_group(f"ensemble_{number}")
                 for name in _ARRAYS:
                     group.create_dataset(name, data=getattr(ensemble, name))
@@ -40,29 +58,71 @@ def save_chain(path: Path, ensembles: Sequence[Ensemble], fingerprint: str) -> N
     try:
         write_whole(path, write)
     except InputError as error:
-        if any(ensemble.steps for ensemble in ensembles) and path.exists():  # not the first save
+        if any(ensemble.steps for ensemble in chain.ensembles) and path.exists():  # not the first save
             kept = "; the rounds before it are kept: the same command with --resume goes on from them"
             raise InputError([problem + kept for problem in error.problems]) from error
         raise
 
 
-def load_chain(path: Path, fingerprint: str) -> tuple[Ensemble, ...]:
-    """Ensembles of an earlier run of the same study and settings; empty when there is no file.
+def load_chain(path: Path, fingerprint: str) -> Chain:
+    """What an earlier run of the same study and settings has; empty when there is no file.
 
     InputError when the file is damaged or belongs to another study, settings or seed.
     """
     if not path.exists():
-        return ()
+        return Chain()
     advice = "leave out --resume to start anew, or choose another --out"
     try:
         with h5py.File(path, "r") as file:
             own = file.attrs["fingerprint"] == fingerprint
-            ensembles = tuple(_ensemble(file[f"ensemble_{number}"]) for number in range(len(file)))
+            count = len(file) - ("weighted" in file)
+            chain = Chain(
+                tuple(_ensemble(file[f"ensemble_{number}"]) for number in range(count)),
+                _read_weighted(file["weighted"]) if "weighted" in file else None,
+                tuple(int(done) for done in file.attrs["failed"]),
+            )
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:  # as h5py meets damage
         raise InputError(f"{path}: not a chain this program wrote, or damaged ({error}); {advice}") from None
     if not own:
         raise InputError(f"{path}: made from other records, settings or seed; {advice}")
-    return ensembles
+    return chain
+
+
+def _write_weighted(group: h5py.Group, weighted: Weighted) -> None:
+    for name in _WEIGHTED:
+        group.create_dataset(name, data=getattr(weighted, name))
+    group.attrs["pareto_k"], group.attrs["count"] = weighted.pareto_k, weighted.count
+    group.attrs["log_evidence"] = [weighted.log_evidence, weighted.log_evidence_sd]
+    group.attrs["logarithmic"] = weighted.logarithmic
+    group.attrs["digest"] = _weighted_digest(weighted)
+
+
+def _read_weighted(group: h5py.Group) -> Weighted:
+    coordinates, log_density, raw, log_weights, sampled = (group[name][()] for name in _WEIGHTED)
+    weighted = Weighted(
+        coordinates,
+        log_density,
+        raw,
+        log_weights,
+        float(group.attrs["pareto_k"]),
+        int(group.attrs["count"]),
+        float(group.attrs["log_evidence"][0]),
+        float(group.attrs["log_evidence"][1]),
+        sampled,
+        tuple(bool(one) for one in group.attrs["logarithmic"]),
+    )
+    if group.attrs["digest"] != _weighted_digest(weighted):
+        raise ValueError(f"{group.name} is not what was written")
+    return weighted
+
+
+def _weighted_digest(weighted: Weighted) -> str:
+    numbers = [weighted.pareto_k, weighted.log_evidence, weighted.log_evidence_sd]
+    held = hashlib.sha256(repr((numbers, weighted.count, weighted.logarithmic)).encode())
+    for name in _WEIGHTED:
+        array = getattr(weighted, name)
+        held.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
+    return held.hexdigest()
 
 
 def _ensemble(group: h5py.Group) -> Ensemble:

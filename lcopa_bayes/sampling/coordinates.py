@@ -7,7 +7,8 @@ a few ellipsoids cover a posterior that is thin and curved in the sampled coordi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import final
 
@@ -36,19 +37,28 @@ class Chart:
         ends = np.array([posterior.table.rows[k].sampled_domain for k in posterior.sampled]).reshape(-1, 2)
         return cls(Terrain.of(posterior), ends[:, 0], ends[:, 1])
 
+    def holding(self, terms: Sequence[int | None]) -> Chart:
+        """The same chart with one term of each element held, or none: a held term keeps its own time, which
+        is charted by its logit between the bounds of its prior."""
+        elements = tuple(
+            element if term is None else element.holding(term)
+            for element, term in zip(self.terrain.elements, terms, strict=True)
+        )
+        return replace(self, terrain=replace(self.terrain, elements=elements))
+
     @cached_property
     def _bounded(self) -> Flags:
         """Columns charted by their logit; times and gains of charted elements follow the shape."""
         bounded = np.isfinite(self.low) & np.isfinite(self.high)
         for element in self.terrain.elements:
-            bounded[element.times] = False
+            bounded[element.following] = False
             bounded[[column for column, _ in element.gains]] = False
         return np.asarray(bounded)
 
     @cached_property
     def _frequencies(self) -> list[Vector]:
         ends = np.log(self.terrain.slowest), np.log(self.terrain.fastest)
-        return [np.exp(np.linspace(*ends, element.terms + 1)) for element in self.terrain.elements]
+        return [np.exp(np.linspace(*ends, element.ratios + 1)) for element in self.terrain.elements]
 
     def charted(self, z: Matrix) -> tuple[Matrix, Vector]:
         """Chart of sampled coordinates (batch, dimension), and log |d chart / d coordinates|, (batch,).
@@ -59,7 +69,7 @@ class Chart:
         y, log_volume = z.copy(), np.zeros(len(z))
         for element, frequencies in zip(self.terrain.elements, self._frequencies, strict=True):
             shape = element.shape(z, frequencies)
-            y[:, element.times] = shape.log_ratios
+            y[:, element.following] = shape.log_ratios
             log_volume += shape.log_volume
             for column, by_logarithm in element.gains:
                 if by_logarithm:
@@ -88,9 +98,10 @@ class Chart:
         exists &= self.terrain.in_order(z)
         for element, frequencies in zip(self.terrain.elements, self._frequencies, strict=True):
             safe = np.where(exists[:, None], z[:, element.orders], 1.0)
-            times = element.log_times(y[:, element.times], safe, frequencies)
+            held = None if element.held is None else np.where(exists, z[:, element.times[element.held]], 0.0)
+            times = element.log_times(y[:, element.following], safe, frequencies, held)
             exists &= np.isfinite(times).all(axis=1)
-            z[:, element.times] = np.where(exists[:, None], times, 0.0)
+            z[:, element.following] = np.where(exists[:, None], times, 0.0)
             level = element.shape(z, frequencies).log_level
             for column, by_logarithm in element.gains:
                 z[:, column] = y[:, column] + level if by_logarithm else y[:, column] * np.exp(level)

@@ -8,8 +8,9 @@ from functools import cached_property
 from typing import final
 
 import numpy as np
+from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector, digest_of
+from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector, digest_of
 from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
@@ -18,6 +19,7 @@ from lcopa_bayes.sampling.convergence import (
     Level,
     Limitation,
     Quality,
+    between,
     limited,
     overall,
     qualities,
@@ -26,6 +28,7 @@ from lcopa_bayes.sampling.convergence import (
 )
 from lcopa_bayes.sampling.modes import Ridges, ridges
 from lcopa_bayes.sampling.sampler import Run, sampled_qualities
+from lcopa_bayes.sampling.weighted import Weighted
 
 _MEASURED = 12_000
 """Draws on which the convergence of the linear parameters is measured."""
@@ -115,16 +118,18 @@ class Draws:
 
 
 def gather(posterior: Posterior, run: Run) -> Draws:
-    """Draws of a run: the kept part, thinned evenly, with the linear parameters drawn exactly."""
+    """Draws of a run with the linear parameters drawn exactly: resampled importance draws, or the kept part
+    of the ensembles, thinned evenly."""
+    if run.weighted is not None and run.chosen is not None:
+        rng = np.random.default_rng(np.random.SeedSequence(run.plan.seed, spawn_key=(1_000,)))
+        return _resampled(posterior, run.weighted, run.chosen, rng, run.plan.target_ess)
     coordinates, log_density = run.kept()
     ensembles, walkers, count, _ = coordinates.shape
     stride = max(1, -(-ensembles * walkers * count // _MEASURED))
     coordinates, log_density = (kept[:, :, ::-1][:, :, ::stride] for kept in (coordinates, log_density))
     rng = np.random.default_rng(np.random.SeedSequence(run.plan.seed, spawn_key=(1_000,)))
     flat = coordinates.reshape(-1, coordinates.shape[-1])
-    chunks = np.array_split(flat, max(1, flat.shape[0] // _CHUNK))
-    values = np.concatenate([posterior.complete(chunk, rng) for chunk in chunks])
-    values = values.reshape(*coordinates.shape[:3], -1)
+    values = _completed(posterior, flat, rng).reshape(*coordinates.shape[:3], -1)
     found = {quality.name: quality for quality in sampled_qualities(posterior, run)}
     if posterior.linear:
         names = [posterior.table.names[k] for k in posterior.linear]
@@ -138,5 +143,82 @@ def gather(posterior: Posterior, run: Run) -> Draws:
     densities = log_density.swapaxes(1, 2).reshape(ensembles, -1)
     picked = np.linspace(0, by_draw.shape[1] - 1, min(_PER_ENSEMBLE, by_draw.shape[1])).astype(int)
     return Draws(
-        posterior.table, by_draw[:, picked], densities[:, picked], ordered, run.plan.target_ess, several
+        posterior.table,
+        by_draw[:, picked],
+        densities[:, picked],
+        ordered,
+        run.plan.target_ess,
+        several,
+        _unconfirmed(run.unconfirmed),
     )
+
+
+def _unconfirmed(parameters: tuple[str, ...]) -> tuple[Limitation, ...]:
+    """That no independent draws confirm the shares of modes of these parameters."""
+    if not parameters:
+        return ()
+    return (
+        Limitation(
+            "tentative",
+            f"modes of {', '.join(parameters)} filled while the ensembles ran, and independent draws of a "
+            "cover could not confirm their shares",
+            "allow more steps, or fix or narrow what the record cannot tell",
+            parameters,
+        ),
+    )
+
+
+def weighted_draws(
+    posterior: Posterior, weighted: Weighted, rng: np.random.Generator, *, target_ess: float
+) -> Draws:
+    """Draws of every parameter from weighted ones, linear parameters drawn exactly, with their grade."""
+    return _resampled(posterior, weighted, weighted.batches(_PER_ENSEMBLE, rng), rng, target_ess)
+
+
+def _resampled(
+    posterior: Posterior, weighted: Weighted, chosen: Index, rng: np.random.Generator, target_ess: float
+) -> Draws:
+    """Draws at positions of weighted ones.
+
+    Parts of the weighted draws stand for the ensembles of a sampler: being independent, they let R-hat and
+    scatter see a mean that hangs on a few draws. Effective sample sizes are those of the weights and of the
+    number of draws together.
+    """
+    values = _completed(posterior, weighted.coordinates[chosen.ravel()], rng)
+    values = values.reshape(*chosen.shape, -1)
+    several, rows = [], posterior.table.rows
+    # an effective size of independent draws joined with the number of those delivered; infinite where fixed
+    centre, tail = (
+        own * chosen.size / (own + chosen.size)
+        for own in (np.minimum(worth, 1e12) for worth in (weighted.centre_ess, weighted.tail_ess))
+    )
+    sizes = {k: (float(centre[at]), float(tail[at])) for at, k in enumerate(posterior.sampled)}
+    linear = (float(min(centre, default=weighted.ess)), float(min(tail, default=weighted.ess)))
+    for at, k in enumerate(posterior.sampled):
+        # draws are in random order: a few of them stand for those of a walker
+        walkers = values[..., k].reshape(len(chosen), -1, 1)
+        found = ridges(rows[k].name, rows[k].unit, walkers, log_scale=rows[k].log_scale)
+        if found.boundaries:
+            by_weights = weighted.share_errors(weighted.sampled[:, at], found.boundaries)
+            several.append(replace(found, errors=np.hypot(found.errors, by_weights)))
+    measured = tuple(
+        with_shares(
+            Quality(
+                row.name,
+                *sizes.get(k, linear),
+                float(array_stats.rhat_nested(values[..., k], np.arange(len(chosen)))),  # type: ignore[no-untyped-call]
+                scatter=between(values[:, None, :, k])[1],
+            ),
+            several,
+        )
+        for k, row in enumerate(rows)
+        if row.free
+    )
+    density = weighted.log_density[chosen]
+    return Draws(posterior.table, values, density, measured, target_ess, tuple(several))
+
+
+def _completed(posterior: Posterior, flat: Matrix, rng: np.random.Generator) -> Matrix:
+    """Table values of sampled coordinates, linear parameters drawn, (draws, rows)."""
+    chunks = np.array_split(flat, max(1, flat.shape[0] // _CHUNK))
+    return np.concatenate([posterior.complete(chunk, rng) for chunk in chunks])

@@ -19,6 +19,7 @@ from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.convergence import Grade, Level
 from lcopa_bayes.sampling.coordinates import Chart
 from lcopa_bayes.sampling.mixture import Mixture, spread_evenly
+from lcopa_bayes.sampling.sampler import Run
 
 _RELIABLE = 0.5
 """Largest standard error of a reliable log evidence or log predictive density: a model comparison turns on a
@@ -52,6 +53,16 @@ class Evidence:
 def known_to(error: float) -> Level:
     """Level of a sum of log densities by its Monte Carlo standard error [nat]; unusable without one."""
     return "reliable" if error <= _RELIABLE else "tentative" if error <= _TENTATIVE else "unusable"
+
+
+def evidence_of(posterior: Posterior, run: Run, ess: float) -> Evidence | None:
+    """Log evidence of a run: the mean weight of importance draws, with that of every batch; or `evidence` of
+    its ensembles, None for a single one. `ess` as there."""
+    found = run.weighted
+    if found is None:
+        return evidence(posterior, run.kept()[0], ess, run.plan.seed)
+    by_batch = [logsumexp(found.raw[part]) - np.log(found.count / len(found.parts)) for part in found.parts]
+    return Evidence(found.log_evidence, found.log_evidence_sd, tuple(map(float, by_batch)))
 
 
 def evidence(posterior: Posterior, coordinates: Array, ess: float, seed: int) -> Evidence | None:

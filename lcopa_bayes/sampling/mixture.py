@@ -40,15 +40,15 @@ class Mixture:
     """Lower Cholesky factors of the scale matrices, (components, dimension, dimension)."""
 
     @classmethod
-    def fitted(cls, points: Matrix, seed: int) -> Mixture:
-        """Fit to points (n, dimension) by expectation maximisation of Gaussians.
+    def fitted(cls, points: Matrix, seed: int, components: int = _COMPONENTS) -> Mixture:
+        """Fit to points (n, dimension) by expectation maximisation of Gaussians, at most `components`.
 
         Deterministic given `seed`. Fewer components are used when there are not ten points per
         dimension for each of them.
         """
         points = spread_evenly(points, _FITTED)
         count, dimension = points.shape
-        components = max(1, min(_COMPONENTS, count // (10 * dimension)))
+        components = max(1, min(components, count // (10 * dimension)))
         shift, spread = points.mean(axis=0), points.std(axis=0)
         spread = np.where(spread > 0, spread, 1.0)
         random = np.random.RandomState(np.random.MT19937(np.random.SeedSequence(seed)))
@@ -65,8 +65,16 @@ class Mixture:
 
     def blended(self, other: Mixture, share: float) -> Mixture:
         """A mixture of both, `share` of it the other."""
+        return self.scaled(1 - share).with_components(other.scaled(share))
+
+    def scaled(self, share: float) -> Mixture:
+        """The same components with weights that are `share` times as large: part of a larger mixture."""
+        return Mixture(share * self.weights, self.means, self.factors)
+
+    def with_components(self, other: Mixture) -> Mixture:
+        """The components of both with their own weights."""
         return Mixture(
-            np.concatenate([(1 - share) * self.weights, share * other.weights]),
+            np.concatenate([self.weights, other.weights]),
             np.concatenate([self.means, other.means]),
             np.concatenate([self.factors, other.factors]),
         )

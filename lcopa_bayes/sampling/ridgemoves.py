@@ -17,8 +17,9 @@ import numpy as np
 from lcopa_bayes.core.arrays import Flags, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.coordinates import Chart
+from lcopa_bayes.sampling.cover import Cover
 from lcopa_bayes.sampling.mixture import Mixture
-from lcopa_bayes.sampling.mixturemoves import MixtureMove, MixtureWalk
+from lcopa_bayes.sampling.mixturemoves import CoverMove, MixtureMove, MixtureWalk
 from lcopa_bayes.sampling.moves import (
     LARGEST_ORDER,
     DifferenceMove,
@@ -33,7 +34,7 @@ from lcopa_bayes.sampling.shapecoordinates import ElementColumns
 _DENSE = 3.0
 """Orders drawn anew are dense at 0: twice a uniform number to this power [-]."""
 _ANEW = 0.3
-"""Share of moves that draw anew from the mixture."""
+"""Share of moves that draw anew, from the mixture or, in equal parts, from it and the cover."""
 _NEARBY = 0.3
 """Share of moves that walk along it."""
 
@@ -191,9 +192,11 @@ class TermRedraw(RidgeMove):
         return proposed, np.where(reached & np.isfinite(factor), factor + thinning, -np.inf)
 
 
-def moves(posterior: Posterior, mixture: Mixture | None = None) -> list[tuple[emcee.moves.Move, float]]:
-    """The moves a posterior is sampled with, and how often each is made; with `mixture` also moves
-    that follow it."""
+def moves(
+    posterior: Posterior, mixture: Mixture | None = None, cover: Cover | None = None
+) -> list[tuple[emcee.moves.Move, float]]:
+    """The moves a posterior is sampled with, and how often each is made; with `mixture`, and `cover`, also
+    moves that follow them."""
     terrain = Terrain.of(posterior)
     local: list[tuple[emcee.moves.Move, float]] = (
         [
@@ -209,8 +212,13 @@ def moves(posterior: Posterior, mixture: Mixture | None = None) -> list[tuple[em
     if mixture is None:
         return local
     chart = Chart.of(posterior)
+    anew: list[tuple[emcee.moves.Move, float]] = (
+        [(MixtureMove(chart, mixture), _ANEW)]
+        if cover is None
+        else [(MixtureMove(chart, mixture), 0.5 * _ANEW), (CoverMove(terrain, cover), 0.5 * _ANEW)]
+    )
     return [
-        (MixtureMove(chart, mixture), _ANEW),
+        *anew,
         (MixtureWalk(chart, mixture), _NEARBY),
         *((move, (1 - _ANEW - _NEARBY) * often) for move, often in local),
     ]
@@ -222,13 +230,14 @@ def walking(
     walkers: int,
     mixture: Mixture | None,
     random: tuple[Any, ...],
+    cover: Cover | None = None,
 ) -> emcee.EnsembleSampler:
     """emcee with these moves, at a state of its generator.
 
     Its own wrapper, which prints what an exception or an interrupt meets, is left out: the caller tells.
     """
     sampler = emcee.EnsembleSampler(
-        walkers, posterior.dimension, log_density, moves=moves(posterior, mixture), vectorize=True
+        walkers, posterior.dimension, log_density, moves=moves(posterior, mixture, cover), vectorize=True
     )
     sampler.log_prob_fn = log_density
     sampler.random_state = random

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
+from math import ceil
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, final
@@ -15,22 +17,19 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from lcopa_bayes.core.arrays import Array, Matrix
+from lcopa_bayes.core.arrays import Array, Index, Matrix
+from lcopa_bayes.data.settings import Method
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.sampling.chainfile import load_chain, save_chain
+from lcopa_bayes.sampling.chainfile import Chain, load_chain, save_chain
 from lcopa_bayes.sampling.convergence import CERTAIN, Quality, drifts, qualities
+from lcopa_bayes.sampling.cover import Cover
+from lcopa_bayes.sampling.coverdraws import Crew, cover_draws
 from lcopa_bayes.sampling.ensemble import Ensemble, advance
 from lcopa_bayes.sampling.knownmodes import around
+from lcopa_bayes.sampling.learning import LEARNING, taught, taught_cover
 from lcopa_bayes.sampling.mixture import Mixture
-from lcopa_bayes.sampling.mixturemoves import learned
 from lcopa_bayes.sampling.modes import Ridges, ridges
-
-LEARNING = 2
-"""Rounds before the mixture is learned from the draws of all ensembles; and again at each doubling."""
-_WIDE = 0.5
-"""Share of the mixture that is learned from the populations on their way from the prior [-]."""
-_KNOWN = 0.2
-"""Share of modes that are known from elsewhere, where there are any [-]."""
+from lcopa_bayes.sampling.weighted import BATCHES, CHAIN, Weighted
 
 _ROUND = 20
 """Draws kept per round and walker."""
@@ -48,6 +47,14 @@ _TREND = 2.0
 [-]: there chance is the less likely reason, and to go on costs little."""
 _THIN = 5
 """Steps per kept draw unless the study says otherwise."""
+_ATTEMPTS, _LONGER = 2, 1.5
+"""Most attempts at importance draws, and how many times as long ensembles have run at the next one [-]."""
+_DELIVERED = 500
+"""Fewest importance draws of a batch that are delivered."""
+_PER_WANTED = 4.0
+"""Delivered draws per effective one that is wanted [-] ..."""
+_SURPLUS = 1.4
+"""... and effective importance draws: 1.4 and 4 times as many are together worth 1.04 times as many."""
 
 
 @final
@@ -67,6 +74,8 @@ class SamplePlan:
     """Effective sample size that ends sampling [draws]."""
     seed: int
     """Root of all randomness of the run."""
+    method: Method = "ensembles"
+    """Importance draws where a cover of the posterior gives them, or ensembles in any case."""
 
     @classmethod
     def of(
@@ -79,6 +88,7 @@ class SamplePlan:
         steps: int | None = None,
         thin: int | None = None,
         target_ess: float = 400,
+        method: Method = "ensembles",
     ) -> SamplePlan:
         """A plan with what is left open chosen from the number of sampled parameters."""
         least = 2 * dimension + 2
@@ -89,6 +99,7 @@ class SamplePlan:
             thin or _THIN,
             target_ess,
             seed,
+            method,
         )
 
 
@@ -99,9 +110,36 @@ class Run:
 
     ensembles: tuple[Ensemble, ...]
     plan: SamplePlan
+    weighted: Weighted | None = None
+    """Importance draws, where a cover of the posterior gave enough of them."""
+    unconfirmed: tuple[str, ...] = ()
+    """Parameters with modes that filled while the ensembles ran, whose shares importance draws could not
+    confirm."""
+
+    @cached_property
+    def chosen(self) -> Index | None:
+        """Positions of resampled importance draws with equal weights, (batches, draws); None without any."""
+        if self.weighted is None:
+            return None
+        rng = np.random.default_rng(np.random.SeedSequence(self.plan.seed, spawn_key=(1_001,)))
+        count = max(_DELIVERED, ceil(_PER_WANTED * self.plan.target_ess / BATCHES))
+        return self.weighted.batches(count + -count % CHAIN, rng)
+
+    @property
+    def visited(self) -> Matrix:
+        """Where the walkers of the ensembles have been in the last three fifths, (points, dimension)."""
+        coordinates = Run(self.ensembles, self.plan).kept()[0]
+        return coordinates.reshape(-1, coordinates.shape[-1])
 
     def kept(self) -> tuple[Array, Array]:
-        """The last three fifths: coordinates (ensembles, walkers, draws, dimension), and log density."""
+        """Draws of equal weight: coordinates (ensembles, walkers, draws, dimension), and log density.
+
+        Of importance draws resampled ones, whose batches stand for ensembles; of ensembles the last three
+        fifths.
+        """
+        if self.weighted is not None and self.chosen is not None:
+            order = self.chosen.reshape(BATCHES, -1, CHAIN)
+            return self.weighted.coordinates[order], self.weighted.log_density[order]
         chain = np.stack([ensemble.chain for ensemble in self.ensembles])
         log_density = np.stack([ensemble.log_density for ensemble in self.ensembles])
         first = 2 * chain.shape[1] // 5
@@ -119,15 +157,21 @@ def sample(
     quiet: bool = True,
     starts: Matrix | None = None,
 ) -> Run:
-    """Sample a posterior: populations tempered from the prior, then rounds of emcee.
+    """Sample a posterior: populations tempered from the prior, then rounds of emcee; and, as the plan allows,
+    importance draws of a cover of where these have been (`coverdraws`), which are the result where their
+    weights converge.
 
-    The draws depend on the arguments alone, not on `jobs` nor on interruptions: with `resume`, a run
-    killed at any moment continues from the last complete round in `chain_file`. `starts`, table values
-    (starts, rows), are modes known from elsewhere, which moves propose too (`knownmodes`); InputError when
-    none lies inside the prior.
+    Where they do not in a posterior of several modes, the ensembles go on and it is tried again. The draws
+    depend on the arguments alone, not on `jobs` nor on interruptions: with `resume`, a run killed at any
+    moment continues from the last complete round in `chain_file`. `starts`, table values (starts, rows), are
+    modes known from elsewhere, which moves propose too (`knownmodes`); InputError when none lies inside the
+    prior.
     """
     known = None if starts is None else around(posterior, starts, plan.seed)
-    ensembles = load_chain(chain_file, fingerprint) if resume and chain_file else ()
+    stored = load_chain(chain_file, fingerprint) if resume and chain_file else Chain()
+    if stored.weighted is not None:
+        return Run(stored.ensembles, plan, stored.weighted)
+    ensembles = stored.ensembles
     rounds = max(2, -(-plan.steps // (_ROUND * plan.thin)))
     done = ensembles[0].steps // (_ROUND * plan.thin) if ensembles else 0
     with (
@@ -136,25 +180,50 @@ def sample(
     ):
         if not ensembles:
             seeds = np.random.SeedSequence(plan.seed).spawn(plan.ensembles)
-            ensembles = tuple(crew(_Birth(plan.walkers, _SWEEPS), seeds))
-            _store(chain_file, ensembles, fingerprint)
+            ensembles = tuple(crew(_Birth(plan.walkers), seeds))
+            _store(chain_file, Chain(ensembles), fingerprint)
         bar.set_description("sampling")
         mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
+        cover = taught_cover(posterior, ensembles, _ROUND, plan.seed)
         hardest = max(ensemble.way for ensemble in ensembles)
         least = max(_LEAST, round(_AS_LONG * hardest / (_ROUND * plan.thin)))
-        while done < rounds and not (done >= least and finished(posterior, Run(ensembles, plan), bar)):
+        failed = stored.failed
+        while True:
+            run, again = Run(ensembles, plan), ceil(_LONGER * failed[-1]) if failed else least
+            if done >= rounds or (done >= again and finished(posterior, run, bar)):
+                weighted = None
+                if plan.method == "auto":
+                    wanted = _SURPLUS * plan.target_ess
+                    weighted = cover_draws(posterior, run.visited, wanted, plan.seed, crew)
+                failed = (*failed, done)
+                last = done >= rounds or len(failed) == _ATTEMPTS or not _filling(posterior, run)
+                if weighted is not None or plan.method == "ensembles" or last:
+                    _store(chain_file, Chain(ensembles, weighted), fingerprint)
+                    doubtful = plan.method == "auto" and weighted is None
+                    return Run(ensembles, plan, weighted, _filling(posterior, run) if doubtful else ())
             if done >= LEARNING and done.bit_count() == 1:
                 mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
-            ensembles = tuple(crew(_Round(plan.thin, mixture), ensembles))
+                cover = taught_cover(posterior, ensembles, _ROUND, plan.seed)
+            ensembles = tuple(crew(_Round(plan.thin, mixture, cover), ensembles))
             done += 1
-            _store(chain_file, ensembles, fingerprint)
+            _store(chain_file, Chain(ensembles, failed=failed), fingerprint)
             bar.update()
-    return Run(ensembles, plan)
 
 
-def _store(chain_file: Path | None, ensembles: Sequence[Ensemble], fingerprint: str) -> None:
+def _filling(posterior: Posterior, run: Run) -> tuple[str, ...]:
+    """Sampled parameters with several modes that drift over the whole run with certainty."""
+    whole = _sampled_values(posterior, run, kept=False)
+    return tuple(
+        found.parameter
+        for column, found in enumerate(_sampled_ridges(posterior, run))
+        if found.boundaries
+        and any(abs(apart) > CERTAIN * error for apart, error, _ in drifts(whole[..., column]))
+    )
+
+
+def _store(chain_file: Path | None, chain: Chain, fingerprint: str) -> None:
     if chain_file:
-        save_chain(chain_file, ensembles, fingerprint)
+        save_chain(chain_file, chain, fingerprint)
 
 
 def finished(posterior: Posterior, run: Run, bar: tqdm[Any] | None = None) -> bool:
@@ -224,10 +293,9 @@ class _Birth:
     """Task: a new ensemble of a seed."""
 
     walkers: int
-    sweeps: int
 
     def __call__(self, posterior: Posterior, seed: np.random.SeedSequence) -> Ensemble:
-        return Ensemble.born(posterior, self.walkers, self.sweeps, seed)
+        return Ensemble.born(posterior, self.walkers, _SWEEPS, seed)
 
 
 @final
@@ -237,16 +305,14 @@ class _Round:
 
     thin: int
     mixture: Mixture | None
+    cover: Cover | None
 
     def __call__(self, posterior: Posterior, ensemble: Ensemble) -> Ensemble:
-        return advance(posterior, ensemble, _ROUND, self.thin, self.mixture)
-
-
-_Crew = Callable[[Callable[[Posterior, Any], Ensemble], Sequence[Any]], Iterable[Ensemble]]
+        return advance(posterior, ensemble, _ROUND, self.thin, self.mixture, self.cover)
 
 
 @contextmanager
-def _crew(posterior: Posterior, jobs: int) -> Iterator[_Crew]:
+def _crew(posterior: Posterior, jobs: int) -> Iterator[Crew]:
     """A map of a task over its inputs, in this process or in `jobs` others."""
     if jobs <= 1:
         with threadpool_limits(1):
@@ -269,28 +335,6 @@ def _take_up(posterior: Posterior) -> None:
     _posterior = posterior
 
 
-def _perform(task: Callable[[Posterior, Any], Ensemble], given: Any) -> Ensemble:
+def _perform(task: Callable[[Posterior, Any], Any], given: Any) -> Any:
     assert _posterior is not None
     return task(_posterior, given)
-
-
-def taught(
-    posterior: Posterior, ensembles: Sequence[Ensemble], per_round: int, seed: int, known: Mixture | None
-) -> Mixture:
-    """The mixture that moves follow: learned from the later half of the draws at the last power of two,
-    and in part from the populations on their way from the prior, which saw modes that few walkers stand
-    on; blended with the modes `known` from elsewhere.
-
-    `per_round` draws are kept of each walker in a round. A function of the chains alone, so that a resumed
-    run learns the same; learning thins out, as the ergodicity of adaptive sampling asks (Roberts and
-    Rosenthal 2007, J. Appl. Probab. 44).
-    """
-    wide = learned(posterior, [ensemble.trail for ensemble in ensembles], seed).levelled()
-    done = ensembles[0].chain.shape[0] // per_round
-    if done < LEARNING:
-        found = wide
-    else:
-        lesson = per_round << (done.bit_length() - 1)
-        own = learned(posterior, [ensemble.chain[lesson // 2 : lesson] for ensemble in ensembles], seed)
-        found = own.levelled().blended(wide, _WIDE)
-    return found if known is None else found.blended(known, _KNOWN)

@@ -27,9 +27,9 @@ HELD = record(2, command=on_off(-0.7, hold=4.0, at=1.3), name="held")
 STEPS = Drive.steps(u=[(0.35, 0.8), (5.0, 0.1)], until=11.0)
 
 
-def uncertain(prepared, count=2000, **spread):
+def uncertain(prepared, count=2000, seed=4, **spread):
     """Draws about the truth with a given spread of some parameters."""
-    table, rng = prepared.posterior.table, np.random.default_rng(4)
+    table, rng = prepared.posterior.table, np.random.default_rng(seed)
     values = np.tile(row_values(table, TRUTH), (count, 1))
     for name, sd in spread.items():
         values[:, table.names.index(name)] += sd * rng.standard_normal(count)
@@ -72,24 +72,28 @@ def test_bands_are_the_quantiles_of_offset_and_noise():
     assert_allclose(alone.plant[2], band.plant[2] - TRUTH["offset"], atol=0.01)
 
 
-def test_new_noise_lies_in_the_simultaneous_band_as_often_as_said():
-    """Curves drawn anew from the posterior, whole: 50 and 90 % of them lie within throughout."""
+def test_whole_new_curves_lie_in_the_bands_as_often_as_said():
+    """Curves of parameters and noise that are drawn anew, with the plant simulated on its own."""
     prepared = problem(record(camera=0.2))
-    values = uncertain(prepared, count=6000, offset=0.1, gain=0.2, delay=0.1)
-    (band,) = predict(prepared, values, STEPS).bands
-    fresh = replace(STEPS, name="another stream of random numbers")
-    inside = []
-    rng = np.random.default_rng(8)
-    offset = values.flat[:, values.table.names.index("offset")]
-    drive = predict(prepared, values, fresh).driven
-    curves = responses(values.table, prepared.driven(drive, band.time), values.flat[::3][:2000])[0][0]
-    curves = curves + offset[::3][:2000, None] + TRUTH["sigma"] * rng.standard_normal(curves.shape)
-    for low, high in ((1, 2), (0, 3)):
-        ends = band.noisy_simultaneous
-        inside.append(((curves >= ends[low]) & (curves <= ends[high])).all(axis=1).mean())
+    spread = {"offset": 0.1, "gain": 0.2, "delay": 0.1}
+    result = predict(prepared, uncertain(prepared, **spread), STEPS)
+    (band,) = result.bands
+    fresh = uncertain(prepared, seed=9, **spread)
+    plant = responses(fresh.table, prepared.driven(result.driven, band.time), fresh.flat)[0][0]
+    plant = plant + fresh.flat[:, fresh.table.names.index("offset"), None]
+    noisy = plant + TRUTH["sigma"] * np.random.default_rng(8).standard_normal(plant.shape)
     # 1000 draws size the band and 2000 test it
-    for got, level in zip(inside, (0.5, 0.9), strict=True):
-        assert abs(got - level) < 4 * np.sqrt(level * (1 - level) * (1 / 1000 + 1 / 2000))
+    for curves, ends, quantiles in (
+        (plant, band.plant_simultaneous, band.plant),
+        (noisy, band.noisy_simultaneous, band.noisy),
+    ):
+        for level, k in ((0.5, 1), (0.9, 0)):
+            whole = ((curves >= ends[k]) & (curves <= ends[3 - k])).all(axis=1).mean()
+            spot = ((curves >= quantiles[k]) & (curves <= quantiles[4 - k])).mean()
+            error = np.sqrt(level * (1 - level) * (1 / 1000 + 1 / 2000))
+            assert abs(whole - level) < 4 * error
+            assert abs(spot - level) < 4 * error
+        assert ((curves >= quantiles[0]) & (curves <= quantiles[4])).all(axis=1).mean() < 0.85
 
 
 def test_offsets_of_several_records_are_drawn_from_all_of_them():
@@ -136,6 +140,35 @@ def test_a_drive_that_the_records_hold_is_inside_and_a_scaled_longer_faster_one_
     kinds = {one.kind: one for one in predict(prepared, draws, rapid).outside}
     assert set(kinds) == {"frequency"}
     assert "drive u brings" in kinds["frequency"].sentence
+
+
+@pytest.mark.parametrize(("frequency", "marked"), [(0.15, False), (2.0, True)])
+def test_frequencies_are_marked_where_the_records_hold_less_than_a_hundredth(frequency, marked):
+    """In a band of width ``b f`` a step of 1 V over T holds ``b / (pi^2 f)``, a sinusoid of 1 V ``T / 2``.
+
+    Their ratio ``pi^2 f T / (2 b)`` is 21 and 280 here at b = 0.38.
+    """
+    prepared = problem(record(camera=0.2))
+    time = np.arange(0.0, 11.0, 0.02)
+    wave = Drive.of_arrays(time, u=np.sin(2 * np.pi * frequency * time), time_unit="ms")
+    kinds = {one.kind for one in predict(prepared, uncertain(prepared), wave).outside}
+    assert ("frequency" in kinds) == marked
+
+
+def test_noise_between_rows_that_are_closer_than_samples_is_correlated_by_their_distance():
+    prepared = problem(record(camera=0.2), noise="ar1")
+    table = prepared.posterior.table
+    values = np.tile(row_values(table, TRUTH | {"rho": 0.8}), (2000, 1))
+    time = np.arange(0.0, 4.0, 0.02)
+    drive = Drive.of_arrays(time, u=np.zeros(time.size), time_unit="ms")
+    (band,) = predict(prepared, draws_of(table, values), drive).bands
+    rng, link = np.random.default_rng(3), 0.8 ** (0.02 / prepared.scales.period)
+    noise = rng.standard_normal((4000, time.size))
+    for k in range(1, time.size):
+        noise[:, k] = link * noise[:, k - 1] + np.sqrt(1 - link**2) * noise[:, k]
+    exact = TRUTH["sigma"] * np.quantile(np.abs(noise).max(axis=1), 0.9)
+    half = (band.noisy_simultaneous[3] - band.noisy_simultaneous[0]).mean() / 2
+    assert half == pytest.approx(exact, rel=0.05)
 
 
 def test_the_energy_of_a_drive_over_all_frequencies_is_that_over_all_times():
@@ -225,6 +258,13 @@ def test_a_record_that_a_fit_would_refuse_is_not_scored(alone):
         alone.score(replace(HELD, name="step"))
     with pytest.raises(InputError, match="s"):
         alone.score(replace(HELD, time_unit="s"))
+
+
+def test_a_record_from_another_rest_is_scored_and_marked(alone):
+    high = record(8, command=step(0.4, at=2.0, rest=0.5), name="high")
+    result = alone.predict(high)
+    assert [one.kind for one in result.outside] == ["rest"]
+    assert "is at 0.5 V before its first change" in result.verdict
 
 
 def test_a_file_without_responses_cannot_be_scored(alone, tmp_path):

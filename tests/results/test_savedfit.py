@@ -19,7 +19,7 @@ from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.data.studycopy import study_from_json, study_to_json
 from lcopa_bayes.results.fit import Fit, fit
 from lcopa_bayes.results.provenance import fingerprint, settings_of
-from lcopa_bayes.results.savedfit import load_fit
+from lcopa_bayes.results.savedfit import fit_to_json, load_fit
 
 TINY = {"ensembles": 2, "walkers": 16, "steps": 60, "thin": 1, "target_ess": 100}
 HELD = record(3, command=on_off(-0.7, hold=4.0, at=1.3), camera=0.3, name="held")
@@ -139,6 +139,16 @@ def test_another_version_another_fit_and_other_contents_are_refused(folder, fitt
         with pytest.raises(InputError, match=words) as raised:
             load_fit(altered(folder, tmp_path / str(number), **changes))
         assert len(raised.value.problems) == 1
+
+
+def test_narrower_blocks_are_kept(folder, fitted, tmp_path):
+    finer = fitted.problem.refined(3)
+    again = load_fit(altered(folder, tmp_path, **fit_to_json(finer, fitted.draws)))
+    assert again.problem.refinement == finer.refinement
+    some = fitted.draws.flat[:3]
+    density = [one.posterior.joint_log_likelihood(some) for one in (again.problem, finer, fitted.problem)]
+    assert_array_equal(density[0], density[1])
+    assert np.abs(density[0] - density[2]).max() > 1e-9
 
 
 def test_the_copy_has_the_fingerprint_of_the_study(fitted, folder):

@@ -13,7 +13,7 @@ from small import Toy, problem, record, same_quantiles
 
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.results.fit import plan_of
-from lcopa_bayes.sampling.draws import gather
+from lcopa_bayes.sampling.draws import gather, weighted_draws
 from lcopa_bayes.sampling.evidence import evidence
 from lcopa_bayes.sampling.importance import (
     Effort,
@@ -21,10 +21,9 @@ from lcopa_bayes.sampling.importance import (
     ImportancePlan,
     first_look,
     importance,
-    tail_smoothed,
-    weighted_draws,
 )
 from lcopa_bayes.sampling.sampler import sample
+from lcopa_bayes.sampling.weighted import Weighted, tail_smoothed
 
 WIDE = ("norm", {"loc": 0.0, "scale": 10.0})
 
@@ -37,7 +36,7 @@ def optimum(centre, sd) -> Optimum:
 
 def moments(found: Importance) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean, its standard error, and covariance under the weights."""
-    weights, z = np.exp(found.log_weights), found.coordinates
+    weights, z = np.exp(found.weighted.log_weights), found.weighted.coordinates
     mean = weights @ z
     covariance = (weights[:, None] * (z - mean)).T @ (z - mean)
     return mean, np.sqrt(np.square(weights) @ np.square(z - mean)), covariance
@@ -61,9 +60,9 @@ def test_a_gaussian_has_its_moments_and_its_evidence(rng, start):
     mean, error, covariance = moments(found)
     assert found.good(400)
     assert np.abs((mean - middle) / error).max() < 4
-    assert_allclose(covariance, exact, atol=6 * np.sqrt(np.diag(exact).max() / found.ess), rtol=0.15)
+    assert_allclose(covariance, exact, atol=6 * np.sqrt(np.diag(exact).max() / found.weighted.ess), rtol=0.15)
     marginal = stats.multivariate_normal(np.zeros(3), likelihood + 100 * np.eye(3)).logpdf(centre)
-    assert abs(found.log_evidence - marginal) < 4 * found.log_evidence_sd < 0.1
+    assert abs(found.weighted.log_evidence - marginal) < 4 * found.weighted.log_evidence_sd < 0.1
 
 
 def test_a_bent_posterior_agrees_with_quadrature(rng):
@@ -83,7 +82,11 @@ def test_a_bent_posterior_agrees_with_quadrature(rng):
     share = np.exp(density - logsumexp(density))
     mean, error, _ = moments(found)
     assert found.good(400)
-    assert abs(found.log_evidence - logsumexp(density) - cell) < 4 * found.log_evidence_sd < 0.2
+    assert (
+        abs(found.weighted.log_evidence - logsumexp(density) - cell)
+        < 4 * found.weighted.log_evidence_sd
+        < 0.2
+    )
     assert np.abs((mean - share @ grid) / error).max() < 4
 
 
@@ -93,14 +96,16 @@ def test_it_agrees_with_the_ensembles_on_a_study():
     found = first_look(posterior, np.random.default_rng(3))
     assert found is not None
     assert found.good(400)
-    look = weighted_draws(posterior, found, np.random.default_rng(4), target_ess=400)
+    look = weighted_draws(posterior, found.weighted, np.random.default_rng(4), target_ess=400)
     assert look.grade.level == "reliable"
     run = sample(posterior, plan_of(made, quick=False))
     chains = gather(posterior, run)
     assert same_quantiles(look, chains)
     weighed = evidence(posterior, run.kept()[0], chains.ess, 1)
     assert weighed is not None
-    assert abs(found.log_evidence - weighed.value) < 4 * np.hypot(found.log_evidence_sd, weighed.sd)
+    assert abs(found.weighted.log_evidence - weighed.value) < 4 * np.hypot(
+        found.weighted.log_evidence_sd, weighed.sd
+    )
 
 
 # -- what must be seen -----------------------------------------------------------------------------
@@ -124,8 +129,8 @@ def test_a_second_mode_that_no_start_met_is_seen_or_reached(apart):
     wrong = []
     for seed in range(6):
         found = importance(two_modes(apart), [optimum([-apart / 2, 0], 1.0)], np.random.default_rng(seed))
-        share = np.exp(found.log_weights) @ (found.coordinates[:, 0] > 0)
-        wrong.append(found.good(400) and abs(share - 0.5) > 4 * 0.5 / np.sqrt(found.ess))
+        share = np.exp(found.weighted.log_weights) @ (found.weighted.coordinates[:, 0] > 0)
+        wrong.append(found.good(400) and abs(share - 0.5) > 4 * 0.5 / np.sqrt(found.weighted.ess))
     assert not any(wrong)
 
 
@@ -135,24 +140,24 @@ def test_without_adaptation_a_second_mode_shows_in_k():
         importance(two_modes(7.0), [optimum([-3.5, 0], 1.0)], np.random.default_rng(seed), plan)
         for seed in range(4)
     ]
-    assert all(one.pareto_k > 0.7 for one in found)
+    assert all(one.weighted.pareto_k > 0.7 for one in found)
     assert not any(one.good(1) for one in found)
 
 
 def test_two_modes_that_were_met_have_their_shares(rng):
     found = importance(two_modes(40.0), [optimum([-20, 0], 1.0), optimum([20, 0], 1.0)], rng)
-    share = np.exp(found.log_weights) @ (found.coordinates[:, 0] > 0)
+    share = np.exp(found.weighted.log_weights) @ (found.weighted.coordinates[:, 0] > 0)
     assert found.modes == 2
     assert found.good(400)
-    assert abs(share - 0.5) < 4 * 0.5 / np.sqrt(found.ess)
+    assert abs(share - 0.5) < 4 * 0.5 / np.sqrt(found.weighted.ess)
 
 
 def test_where_nothing_has_a_density_nothing_is_good(rng):
     toy = Toy(lambda z: np.full(len(z), -np.inf), {"a": WIDE, "b": WIDE})
     found = importance(toy, [optimum([0.0, 0.0], 1.0)], rng)
-    assert found.pareto_k == np.inf
+    assert found.weighted.pareto_k == np.inf
     assert not found.good(0)
-    assert found.log_evidence == -np.inf
+    assert found.weighted.log_evidence == -np.inf
 
 
 # -- weights ---------------------------------------------------------------------------------------
@@ -180,7 +185,8 @@ def test_weights_without_a_tail():
 
 def test_resampling_takes_each_draw_as_often_as_its_weight(rng):
     weights = rng.dirichlet(np.ones(50))
-    found = Importance(np.zeros((50, 1)), np.zeros(50), np.log(weights), 0.0, 30.0, 0.0, 0.0, 1, 0)
+    zeros = np.zeros((50, 1)), np.zeros(50), np.zeros(50)
+    found = Weighted(*zeros, np.log(weights), 0.0, 50, 0.0, 0.0, np.zeros((50, 1)), (False,))
     counts = np.bincount(found.resampled(1000, rng), minlength=50)
     assert np.abs(counts - 1000 * weights).max() < 1 + 1e-9
     part = found.resampled(200, rng, part=slice(10, 20))
@@ -194,10 +200,10 @@ def test_the_same_randomness_gives_the_same_draws():
     one, other = (first_look(posterior, np.random.default_rng(7)) for _ in range(2))
     assert one is not None
     assert other is not None
-    assert_array_equal(one.coordinates, other.coordinates)
-    assert one.pareto_k == other.pareto_k
-    inside = np.isfinite(one.log_density)
-    assert_allclose(posterior.log_density(one.coordinates[inside]), one.log_density[inside], rtol=1e-9)
+    assert_array_equal(one.weighted.coordinates, other.weighted.coordinates)
+    own = one.weighted
+    assert own.pareto_k == other.weighted.pareto_k
+    assert_allclose(posterior.log_density(own.coordinates), own.log_density, rtol=1e-9)
     assert one.good(400)
-    assert not replace(one, ess=0.39 * one.log_weights.size).good(400)
-    assert not replace(one, pareto_k=0.71).good(400)
+    assert not replace(one, weighted=replace(own, count=round(own.ess / 0.39))).good(400)
+    assert not replace(one, weighted=replace(own, pareto_k=0.71)).good(400)

@@ -14,7 +14,7 @@ from small import ONE, TRUTH, TWO, Toy, problem, record
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling import sampler
-from lcopa_bayes.sampling.chainfile import load_chain, save_chain
+from lcopa_bayes.sampling.chainfile import Chain, load_chain, save_chain
 from lcopa_bayes.sampling.convergence import qualities
 from lcopa_bayes.sampling.draws import gather
 from lcopa_bayes.sampling.ensemble import Ensemble, advance
@@ -91,7 +91,7 @@ def test_a_killed_run_resumes_to_the_same_draws(tmp_path, monkeypatch, uninterru
         patch.setattr(sampler, "save_chain", killed)
         with pytest.raises(KeyboardInterrupt):
             sample(POSTERIOR, plan(), chain_file=path, fingerprint="it")
-    steps = {e.steps for e in load_chain(path, "it")}
+    steps = {e.steps for e in load_chain(path, "it").ensembles}
     assert steps < {k * ROUND for k in range(4)}  # whole rounds, and not all of them
     assert_same(uninterrupted, sample(POSTERIOR, plan(), chain_file=path, fingerprint="it", resume=True))
     assert [p.name for p in tmp_path.iterdir()] == ["chain.h5"]
@@ -102,21 +102,21 @@ def test_a_finished_run_resumes_to_itself_and_without_resume_starts_anew(tmp_pat
     sample(POSTERIOR, plan(steps=2 * ROUND), chain_file=path, fingerprint="it")
     again = sample(POSTERIOR, plan(steps=2 * ROUND), chain_file=path, fingerprint="it", resume=True)
     assert again.ensembles[0].steps == 2 * ROUND
-    assert_same(again, Run(load_chain(path, "it"), plan()))
+    assert_same(again, Run(load_chain(path, "it").ensembles, plan()))
     sample(POSTERIOR, plan(steps=2 * ROUND, seed=9), chain_file=path, fingerprint="other")
-    assert not np.array_equal(load_chain(path, "other")[0].chain, again.ensembles[0].chain)
+    assert not np.array_equal(load_chain(path, "other").ensembles[0].chain, again.ensembles[0].chain)
 
 
 def stored(run: Run, path: Path) -> bytes:
-    save_chain(path, run.ensembles, "it")
+    save_chain(path, Chain(run.ensembles), "it")
     return path.read_bytes()
 
 
 def test_a_chain_reads_back_exactly(tmp_path, uninterrupted):
     path = tmp_path / "chain.h5"
     stored(uninterrupted, path)
-    assert_same(uninterrupted, Run(load_chain(path, "it"), plan()))
-    assert load_chain(tmp_path / "none.h5", "it") == ()
+    assert_same(uninterrupted, Run(load_chain(path, "it").ensembles, plan()))
+    assert load_chain(tmp_path / "none.h5", "it").ensembles == ()
 
 
 def test_a_foreign_chain_is_refused(tmp_path, uninterrupted):
@@ -156,7 +156,7 @@ def test_flipped_bits_are_noticed_or_harmless(tmp_path, uninterrupted):
         damaged[at] ^= 0xFF
         path.write_bytes(bytes(damaged))
         try:
-            assert_array_equal(load_chain(path, "it")[0].chain, uninterrupted.ensembles[0].chain)
+            assert_array_equal(load_chain(path, "it").ensembles[0].chain, uninterrupted.ensembles[0].chain)
         except InputError:
             noticed += 1
     assert noticed > 20

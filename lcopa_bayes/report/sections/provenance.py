@@ -11,6 +11,9 @@ from lcopa_bayes.report.savedrun import SavedRun
 from lcopa_bayes.report.section import Column, Section, Table
 
 _WORDS = {
+    "draws": "draws of the cover",
+    "pareto_k": "Pareto k of the weights [-]",
+    "weights_ess": "effective sample size of the weights [draws]",
     "steps": "steps taken",
     "most_steps": "steps allowed",
     "thin": "one step kept of",

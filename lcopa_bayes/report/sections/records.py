@@ -14,7 +14,7 @@ from lcopa_bayes.report.formatting import figures, percent
 from lcopa_bayes.report.savedrun import SavedRun
 from lcopa_bayes.report.section import Column, Drawing, Section, Table
 from lcopa_bayes.report.theme import BAND, CYCLE, HELD_OUT, NOISE, SEEN, blank, label, plain, svg_of
-from lcopa_bayes.results.prediction import KIND
+from lcopa_bayes.results.bands import POINTWISE
 
 _BANDS = (
     ("noisy_05", "noisy_95", NOISE, 0.30, "90 % with noise"),
@@ -47,7 +47,7 @@ def section(run: SavedRun) -> Section:
         "Data and bands",
         (
             "The plant bands hold the response without noise, the grey band the samples themselves. "
-            f"Bands are {KIND}: each holds at every time by itself, and a whole curve leaves it more often. "
+            f"Bands are {POINTWISE}: each holds at every time by itself; a whole curve leaves it more often. "
             "A model that is right has about 50 and 90 % of the samples in its bands with noise.",
         ),
         tuple(drawings),
@@ -117,7 +117,7 @@ def _caption(score: Mapping[str, Any], record: str, axis: str, size: int, *, hel
     if score:
         parts.append(
             f"RMSE {figures(score['rmse'])} {score['unit']}; {percent(score['coverage_90'])} of the "
-            f"{score['samples']} samples lie in the {KIND} 90 % band with noise, "
+            f"{score['samples']} samples lie in the {POINTWISE} 90 % band with noise, "
             f"{percent(score['coverage_50'])} in the 50 % band. Offset: {score['offset_from']}."
         )
     return " ".join([*parts, *filter(None, [said(size)])])
@@ -150,7 +150,7 @@ def _scores(run: SavedRun) -> Table:
     return Table(
         columns,
         rows,
-        f"RMSE is against the median of the plant; coverage is by the {KIND} bands with noise. Where an "
+        f"RMSE is against the median of the plant; coverage is by the {POINTWISE} bands with noise. Where an "
         "offset comes from all samples of a held-out record, a constant error of it cannot show in its "
         "scores.",
     )

@@ -13,7 +13,7 @@ from lcopa_bayes.report.formatting import NOT_REACHED, OPEN, figures, interval, 
 from lcopa_bayes.report.savedrun import SavedRun
 from lcopa_bayes.report.section import Column, Drawing, Section, Table
 from lcopa_bayes.report.theme import BAND, STEADY, grid, plain, svg_of
-from lcopa_bayes.results.prediction import KIND
+from lcopa_bayes.results.bands import POINTWISE
 
 _PER_FIGURE = 6
 """Paths on one figure."""
@@ -35,7 +35,7 @@ def section(run: SavedRun) -> Section:
     pages = [paths[k : k + _PER_FIGURE] for k in range(0, len(paths), _PER_FIGURE)]
     caption = (
         "Response of the plant to a unit step at time 0, over the longest record: median, "
-        f"{KIND} 50 and 90 % bands. Dashed: median and 90 % interval of the steady state it tends to."
+        f"{POINTWISE} 50 and 90 % bands. Dashed: median and 90 % interval of the steady state it tends to."
     )
     drawings = tuple(
         Drawing(f"step_{number:02d}", _drawn(run, curves, page), caption)

@@ -1,0 +1,87 @@
+"""Importance draws from a cover of where ensembles have been.
+
+Ensembles that share a way of starting can agree while a mode that is hard to reach still fills in all of
+them alike. Independent draws of a cover fitted to what they visited, weighted by the posterior, have shares
+and means of their own, whose errors are known from the weights. They are the better result where the weights
+converge in the whole and in each tail and mode by itself; where they do not, ensembles go on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from math import ceil
+from typing import Any, final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.sampling.cover import Cover
+from lcopa_bayes.sampling.weighted import Weighted
+
+_COMPONENTS = 60
+"""Components of the cover."""
+_PILOT = 20_000
+"""First draws, which tell how many are needed."""
+_MOST = 320_000
+"""Most draws."""
+_SPARE = 1.15
+"""Factor on the number of draws that those so far say are needed [-]."""
+_PART = 500
+"""Fewest draws of a task."""
+_TASKS = 8
+"""Most tasks."""
+
+Crew = Callable[[Callable[[Posterior, Any], Any], Sequence[Any]], Iterable[Any]]
+"""A map of a task over its inputs, in this process or in others."""
+
+
+@final
+@dataclass(frozen=True)
+class _Density:
+    """Task: log density of points."""
+
+    def __call__(self, posterior: Posterior, z: Matrix) -> Vector:
+        return posterior.log_density(z)
+
+
+def cover_draws(
+    posterior: Posterior, visited: Matrix, wanted: float, seed: int, crew: Crew
+) -> Weighted | None:
+    """Weighted draws worth `wanted` effective ones for the centre, the tails and the shares of modes of every
+    sampled parameter, from a cover of the points `visited` (n, dimension); None where no number of draws in
+    reach gives them or the weights do not converge.
+
+    Deterministic given the arguments; FloatingPointError where the density is NaN.
+    """
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(6_000,)))
+    cover = Cover.fitted(posterior, visited, seed, _COMPONENTS)
+    drawn: list[tuple[Matrix, Vector, Vector]] = []
+    count, wanted_count = 0, _PILOT
+    while wanted_count <= _MOST:
+        drawn.append(_drawn(posterior, cover, wanted_count - count, rng, crew))
+        count = wanted_count
+        z, density, raw = (np.concatenate(part) for part in zip(*drawn, strict=True))
+        found = Weighted.of(posterior, z, density, raw, count, smooth=False)
+        worth = found.smallest_ess(rng)
+        if worth >= wanted:
+            return found
+        needed = ceil(_SPARE * count * wanted / worth)
+        if count >= 2 * _PILOT and needed > 2 * _MOST:
+            return None
+        wanted_count = min(max(needed, 2 * count), 4 * count)
+    return None
+
+
+def _drawn(
+    posterior: Posterior, cover: Cover, count: int, rng: np.random.Generator, crew: Crew
+) -> tuple[Matrix, Vector, Vector]:
+    """`count` draws of a cover, those that no chart or no prior has left out: coordinates, log density and
+    log weight."""
+    z = rng.permutation(cover.draw(count, rng))
+    parts = np.array_split(z, max(1, min(_TASKS, len(z) // _PART)))
+    density = np.concatenate(list(crew(_Density(), parts)))
+    inside = np.isfinite(density)
+    z, density = z[inside], density[inside]
+    return z, density, density + posterior.table.log_permutations - cover.log_density(z)

@@ -1,0 +1,198 @@
+"""Weighted draws of a posterior: independent draws of a proposal with importance weights.
+
+Weights are smoothed by a generalised Pareto distribution, whose shape k tells whether averages over them
+converge (Vehtari, Simpson, Gelman, Yao and Gabry 2024, JMLR 25). As the draws are independent the error of
+every average is known from the weights themselves (Owen 2013, Monte Carlo theory, methods and examples, 9).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from math import sqrt
+from typing import final
+
+import numpy as np
+from scipy.special import logsumexp
+from scipy.stats import norm
+
+from lcopa_bayes.core.arrays import Index, Matrix, Vector
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.sampling.importanceweights import effective, smoothed
+from lcopa_bayes.sampling.modes import ridges
+
+BATCHES = 4
+"""Independent parts of weighted draws, compared as ensembles are."""
+CHAIN = 8
+"""Resampled draws that stand for those of one walker."""
+_TAILS = (0.05, 0.95)
+"""Quantiles whose error counts."""
+_LOOKED_AT = 4_000
+"""Resampled draws by which modes are found."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Weighted:
+    """Independent draws with weights; those without density are counted only."""
+
+    coordinates: Matrix
+    """Sampled coordinates, exchangeable terms by decreasing order, (draws, dimension)."""
+    log_density: Vector
+    """Log posterior density, as `Posterior.log_density`, (draws,) [nat]."""
+    raw: Vector
+    """Log of the posterior density over that of the proposal, (draws,) [nat]."""
+    log_weights: Vector
+    """Normalised, and Pareto-smoothed where asked for, (draws,) [nat]."""
+    pareto_k: float
+    """Shape of the weights' tail [-]; infinite where too few draws have any weight."""
+    count: int
+    """Draws of the proposal, those without density included."""
+    log_evidence: float
+    """Log of the integral of prior times likelihood [nat]."""
+    log_evidence_sd: float
+    """Standard error [nat]."""
+    sampled: Matrix
+    """Values of the sampled parameters, (draws, parameters)."""
+    logarithmic: tuple[bool, ...]
+    """Whether modes of a sampled parameter are looked for in its logarithm."""
+
+    @classmethod
+    def of(
+        cls,
+        posterior: Posterior,
+        coordinates: Matrix,
+        log_density: Vector,
+        raw: Vector,
+        count: int,
+        *,
+        smooth: bool,
+    ) -> Weighted:
+        """Weights of the draws that have a density, out of `count`; `log_density` without permutations.
+
+        Smoothing reduces the scatter of weights that have one tail, and biases those of a proposal that
+        covers one mode less well than another.
+        """
+        padded = np.concatenate([raw, np.full(count - len(raw), -np.inf)])
+        log_weights, k = tail_smoothed(padded)
+        if not smooth and raw.size:
+            log_weights = padded - logsumexp(raw)
+        log_evidence, error = -np.inf, np.inf
+        if raw.size:
+            log_evidence = float(logsumexp(raw) - np.log(count))
+            error = float(np.std(np.exp(padded - log_evidence)) / np.sqrt(count))
+        rows = [posterior.table.rows[k] for k in posterior.sampled]
+        return cls(
+            coordinates,
+            log_density,
+            raw,
+            log_weights[: len(raw)],
+            k,
+            count,
+            log_evidence,
+            error,
+            posterior.values(coordinates)[:, posterior.sampled],
+            tuple(row.log_scale for row in rows),
+        )
+
+    @cached_property
+    def ess(self) -> float:
+        """Effective number of draws whatever is averaged, ``1 / sum w^2`` [draws]."""
+        return effective(self.log_weights) if self.log_weights.size else 0.0
+
+    @cached_property
+    def centre_ess(self) -> Vector:
+        """Effective sample size for the mean of each sampled parameter's normal scores, (parameters,)."""
+        weights, out = np.exp(self.log_weights), []
+        for column in self.sampled.T:
+            rank = np.argsort(column, kind="stable")
+            below = np.empty(column.size)
+            below[rank] = np.cumsum(weights[rank]) - 0.5 * weights[rank]
+            out.append(_worth(norm.ppf(np.clip(below, 1e-9, 1 - 1e-9)), weights))
+        return np.array(out)
+
+    @cached_property
+    def tail_ess(self) -> Vector:
+        """The smaller effective sample size of the 5 and the 95 % quantile, (parameters,)."""
+        weights, out = np.exp(self.log_weights), []
+        for column in self.sampled.T:
+            rank = np.argsort(column, kind="stable")
+            beyond = np.cumsum(weights[rank])
+            ends = column[rank][np.minimum(np.searchsorted(beyond, _TAILS), column.size - 1)]
+            out.append(min(_worth((column <= end).astype(float), weights) for end in ends))
+        return np.array(out)
+
+    def smallest_ess(self, rng: np.random.Generator) -> float:
+        """Smallest effective sample size of a centre, a tail or a mode's share [draws]."""
+        if not self.log_weights.size:
+            return 0.0
+        chosen = self.resampled(_LOOKED_AT, rng).reshape(BATCHES, -1, CHAIN)
+        worth = [*self.centre_ess, *self.tail_ess]
+        for column, logarithmic in zip(self.sampled.T, self.logarithmic, strict=True):
+            found = ridges("", "", column[chosen], log_scale=logarithmic)
+            worth += self.share_ess(column, found.boundaries)
+        return float(np.min(worth))
+
+    def share_ess(self, column: Vector, boundaries: Sequence[float]) -> list[float]:
+        """Effective sample size for the shares of the modes of a parameter [draws]; none without
+        boundaries."""
+        if not boundaries:
+            return []
+        mode, weights = np.searchsorted(boundaries, column), np.exp(self.log_weights)
+        return [_worth((mode == k).astype(float), weights) for k in range(len(boundaries) + 1)]
+
+    def share_errors(self, column: Vector, boundaries: Sequence[float]) -> Matrix:
+        """Standard errors of the shares of the modes of a parameter by the weights, (batches, modes) [-]."""
+        mode, out = np.searchsorted(boundaries, column), []
+        for part in self.parts:
+            weights = np.exp(self.log_weights[part] - logsumexp(self.log_weights[part]))
+            inside = [(mode[part] == k).astype(float) for k in range(len(boundaries) + 1)]
+            out.append([np.sqrt(weights**2 @ (own - weights @ own) ** 2) for own in inside])
+        return np.array(out)
+
+    @property
+    def parts(self) -> tuple[slice, ...]:
+        """Parts of the draws that are independent of each other."""
+        size = self.log_weights.size
+        return tuple(slice(k * size // BATCHES, (k + 1) * size // BATCHES) for k in range(BATCHES))
+
+    def resampled(self, count: int, rng: np.random.Generator, *, part: slice = slice(None)) -> Index:
+        """Positions of `count` draws with equal weights, in random order, by systematic resampling of a
+        `part` of the draws."""
+        log_weights = self.log_weights[part]
+        share = np.cumsum(np.exp(log_weights - log_weights.max()))
+        at = (rng.random() + np.arange(count)) / count
+        chosen = np.minimum(np.searchsorted(share / share[-1], at), share.size - 1)
+        return np.asarray(rng.permutation(np.arange(self.log_weights.size)[part][chosen]))
+
+    def batches(self, count: int, rng: np.random.Generator) -> Index:
+        """Positions of resampled draws, `count` of every part, (batches, count)."""
+        return np.stack([self.resampled(count, rng, part=part) for part in self.parts])
+
+
+def tail_smoothed(log_weights: Vector) -> tuple[Vector, float]:
+    """Normalised log weights with a smoothed tail, and its Pareto k; log weights of -inf are allowed.
+
+    k is infinite, and nothing is smoothed, where so few weights are positive that there is no tail to fit.
+    """
+    positive = np.count_nonzero(np.isfinite(log_weights))
+    if positive <= max(3 * np.sqrt(log_weights.size) + 1, log_weights.size // 5):
+        return log_weights - (logsumexp(log_weights) if positive else 0.0), np.inf
+    return smoothed(log_weights)
+
+
+def _worth(values: Vector, weights: Vector) -> float:
+    """Number of independent draws that would know the mean as well as normalised weights do; infinite where
+    nothing varies.
+
+    The variance of the mean is itself an average, which few draws may dominate: n of them know it to
+    ``sqrt(2 / n)``, and by twice that it is taken larger.
+    """
+    apart = (values - weights @ values) ** 2
+    terms = weights**2 * apart
+    variance, error = float(weights @ apart), float(terms.sum())
+    if error == 0.0:
+        return np.inf
+    dominating = error**2 / float(terms @ terms)
+    return variance / error / (1 + 2 * sqrt(2 / dominating))
