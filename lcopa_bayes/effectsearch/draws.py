@@ -12,7 +12,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.core.estimate import Estimate
-from lcopa_bayes.core.parallel import crew
+from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.effectsearch.density import LoopDensity
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.proposals import Counted, Jump, Walk, learnt
@@ -123,10 +123,10 @@ def sample_loop(density: LoopDensity, seed: int, *, jobs: int = 1, quick: bool =
     names = [unit_of(density.state.model, int(k))[0] for k in density.sampled]
     surrogate = Surrogate.of(density)
     law = learnt(surrogate, surrogate.centre, surrogate.root, np.random.RandomState([seed, 22]))
-    with crew(min(jobs, ENSEMBLES)) as mapped:
-        runs = list(mapped(_begun, [(surrogate, law, seed, number) for number in range(ENSEMBLES)]))
+    with workers(None, jobs=min(jobs, ENSEMBLES)) as crew:
+        runs = list(crew.each(_begun, [(surrogate, law, seed, number) for number in range(ENSEMBLES)]))
         while True:
-            runs = list(mapped(_continued, [(surrogate, law, run) for run in runs]))
+            runs = list(crew.each(_continued, [(surrogate, law, run) for run in runs]))
             whole = np.stack([run.chain for run in runs])
             chains = settled(whole)
             found, taken, kept = qualities(names, chains), whole.shape[2], chains.shape[2]
@@ -166,7 +166,7 @@ class _Run:
     """Proposals accepted in the chain."""
 
 
-def _begun(task: tuple[Surrogate, Jump, int, int]) -> _Run:
+def _begun(shared: None, task: tuple[Surrogate, Jump, int, int]) -> _Run:
     """An ensemble after its burn-in, in which its jump and the shares of its moves are learnt."""
     surrogate, law, seed, number = task
     density, k = surrogate.density, law.centre.size
@@ -187,7 +187,7 @@ def _begun(task: tuple[Surrogate, Jump, int, int]) -> _Run:
     return _Run(state, jump, (share, both - share), *empty, 0)
 
 
-def _continued(task: tuple[Surrogate, Jump, _Run]) -> _Run:
+def _continued(shared: None, task: tuple[Surrogate, Jump, _Run]) -> _Run:
     """The ensemble with further draws."""
     surrogate, law, run = task
     sampler, _, _ = _sampler(surrogate, law, run)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterator
 from dataclasses import dataclass
 from math import isfinite
 from typing import Any, final
@@ -14,7 +14,7 @@ from lcopa_bayes.bench.acquisition import Bench as VirtualBench
 from lcopa_bayes.bench.acquisition import truth
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.core.estimate import LEVEL, plain
-from lcopa_bayes.core.parallel import crew
+from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.experiments.design import LINEAR, Design
 from lcopa_bayes.experiments.information import Bench
 from lcopa_bayes.experiments.refit import Trial, device_of
@@ -213,12 +213,12 @@ def _confirmed(made: Design, chosen: int, where: str, replicas: int, jobs: int) 
     return Confirmation(where, made.names, made.determined, at, winner, step, factor, low, high)
 
 
-def _performed(tasks: list[Trial], jobs: int) -> Iterable[tuple[Vector, Flags]]:
-    with crew(jobs) as mapped:
-        yield from mapped(_perform, tasks)
+def _performed(tasks: list[Trial], jobs: int) -> Iterator[tuple[Vector, Flags]]:
+    with workers(None, jobs=jobs) as crew:
+        yield from crew.each(_perform, tasks)
 
 
-def _perform(task: Trial) -> tuple[Vector, Flags]:
+def _perform(_: None, task: Trial) -> tuple[Vector, Flags]:
     return task()
 
 

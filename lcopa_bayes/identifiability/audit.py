@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
 from typing import Any, final
 
 import numpy as np
@@ -13,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.identifiability.contraction import Known, beliefs, known_best, prior_draws, prior_spread
 from lcopa_bayes.identifiability.curvature import Curvature, curvature
 from lcopa_bayes.identifiability.delays import Delays, delays
@@ -195,28 +194,11 @@ class _Task:
         return profile(landscape, self.k, self.peak, self.witnesses, self.step)
 
 
-def _performed(landscape: Landscape, tasks: Sequence[_Task], jobs: int) -> Iterable[Profile]:
-    """Profiles in the order of the tasks, from this process or from others; the same either way."""
-    if min(jobs, len(tasks)) <= 1:
-        with threadpool_limits(1):
-            yield from (task(landscape) for task in tasks)
-        return
-    with ProcessPoolExecutor(
-        jobs, mp_context=get_context("spawn"), initializer=_take_up, initargs=(landscape,)
-    ) as pool:
-        yield from pool.map(_perform, tasks)
+def _performed(landscape: Landscape, tasks: Sequence[_Task], jobs: int) -> Iterator[Profile]:
+    """Profiles in the order of the tasks."""
+    with workers(landscape, jobs=min(jobs, len(tasks))) as crew:
+        yield from crew.each(_perform, tasks)
 
 
-_landscape: Landscape | None = None
-"""What a worker process profiles; set once when the process starts."""
-
-
-def _take_up(landscape: Landscape) -> None:
-    global _landscape
-    threadpool_limits(1)
-    _landscape = landscape
-
-
-def _perform(task: _Task) -> Profile:
-    assert _landscape is not None
-    return task(_landscape)
+def _perform(landscape: Landscape, task: _Task) -> Profile:
+    return task(landscape)

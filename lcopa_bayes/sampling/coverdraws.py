@@ -8,14 +8,14 @@ converge in the whole and in each tail and mode by itself; where they do not, en
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from math import ceil
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.parallel import Workers
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.cover import Cover
 from lcopa_bayes.sampling.weighted import Weighted
@@ -33,9 +33,6 @@ _PART = 500
 _TASKS = 8
 """Most tasks."""
 
-Crew = Callable[[Callable[[Posterior, Any], Any], Sequence[Any]], Iterable[Any]]
-"""A map of a task over its inputs, in this process or in others."""
-
 
 @final
 @dataclass(frozen=True)
@@ -47,7 +44,7 @@ class _Density:
 
 
 def cover_draws(
-    posterior: Posterior, visited: Matrix, wanted: float, seed: int, crew: Crew
+    posterior: Posterior, visited: Matrix, wanted: float, seed: int, crew: Workers[Posterior]
 ) -> Weighted | None:
     """Weighted draws worth `wanted` effective ones for the centre, the tails and the shares of modes of every
     sampled parameter, from a cover of the points `visited` (n, dimension); None where no number of draws in
@@ -75,13 +72,13 @@ def cover_draws(
 
 
 def _drawn(
-    posterior: Posterior, cover: Cover, count: int, rng: np.random.Generator, crew: Crew
+    posterior: Posterior, cover: Cover, count: int, rng: np.random.Generator, crew: Workers[Posterior]
 ) -> tuple[Matrix, Vector, Vector]:
     """`count` draws of a cover, those that no chart or no prior has left out: coordinates, log density and
     log weight."""
     z = rng.permutation(cover.draw(count, rng))
     parts = np.array_split(z, max(1, min(_TASKS, len(z) // _PART)))
-    density = np.concatenate(list(crew(_Density(), parts)))
+    density = np.concatenate(list(crew.each(_Density(), parts)))
     inside = np.isfinite(density)
     z, density = z[inside], density[inside]
     return z, density, density + posterior.table.log_permutations - cover.log_density(z)
