@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,7 +15,13 @@ from lcopa_bayes.bench.command import Command, on_off, step
 from lcopa_bayes.bench.device import Device, TransferPath
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.data.record import Axis, Record
-from lcopa_bayes.data.settings import ModelSettings, NoiseSettings, PriorSettings, SamplerSettings
+from lcopa_bayes.data.settings import (
+    EffectsSettings,
+    ModelSettings,
+    NoiseSettings,
+    PriorSettings,
+    SamplerSettings,
+)
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.parameter import Parameter, Place
@@ -185,3 +192,37 @@ def check_page(path: Path) -> str:
     ids = re.findall(r'\bid="([^"]+)"', page)
     assert len(ids) == len(set(ids))
     return page
+
+
+def with_effect(
+    base: Study, use: Sequence[str], truth: Mapping[str, float], *, seed: int = 3
+) -> tuple[Study, Vector]:
+    """The study with its responses made anew by a plant with effects, and its table values.
+
+    `truth` is by name of a parameter or by its kind; white noise of its ``sigma``. What the effects count
+    deflections in is stated, so that it does not follow the noise.
+    """
+    made = problem_of(replace(base, effects=EffectsSettings(use=tuple(use))))
+    posterior, ranges = made.posterior, made.ranges
+    assert posterior.simulation is not None
+    assert ranges is not None
+    values = np.array(
+        [truth.get(row.name, truth.get(row.kind, row.value)) for row in posterior.table.rows], dtype=float
+    )
+    assert np.isfinite(values).all()
+    rng, records = np.random.default_rng(seed), []
+    for r, (each, clean) in enumerate(
+        zip(base.fit, posterior.simulation.responses(values[None]), strict=True)
+    ):
+        response, rows = each.response.copy(), np.isfinite(each.response).any(axis=1)
+        for axis in range(response.shape[1]):
+            level = posterior.table.offset(values[None], axis, r)[0]
+            noise = truth["sigma"] * rng.standard_normal(int(rows.sum()))
+            response[rows, axis] = clean[axis, 0] + level + noise
+        records.append(replace(each, response=response))
+    stated = EffectsSettings(
+        use=tuple(use),
+        deflection=dict(zip(ranges.names, ranges.response.tolist(), strict=True)),
+        speed=ranges.speed,
+    )
+    return replace(base, fit=tuple(records), effects=stated), values

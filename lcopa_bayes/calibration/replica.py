@@ -22,7 +22,7 @@ from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.results.discretisation import discretisation, resolved
-from lcopa_bayes.results.steps import StepCurves, step_curves
+from lcopa_bayes.results.steps import StepCurves, curves_of, step_curves
 from lcopa_bayes.sampling.draws import Draws, gather, weighted_draws
 from lcopa_bayes.sampling.importance import Effort, ImportancePlan, importance
 from lcopa_bayes.sampling.sampler import SamplePlan, sample
@@ -195,7 +195,7 @@ class Replication:
         Where truths are drawn only the samples change: table and priors stay those a truth comes from. A
         stated truth has no such prior, and default priors are derived from the new records, as a fit does.
         """
-        study = replace(self.problem.study, fit=records)
+        study = replace(self.problem.study, fit=records, effects=self.problem.stated_effects)
         if self.truths.fixed:
             return problem_of(study)
         samples = tuple(Samples.of(record, self.problem.scales.period) for record in records)
@@ -223,8 +223,27 @@ class Replication:
     def _true(self, posterior: Posterior, truth: Vector, times: Vector) -> list[float]:
         """True value of each quantity; step responses by the bench."""
         table = posterior.table
+        if posterior.simulation is not None:
+            return self._true_with_effects(posterior, truth, times)
         device = device_of(table, truth, 0, time_unit=self.problem.study.time_unit)
         steps = [path.step_response(times) for row in device.paths for path in row]
+        parameters = [value for value, row in zip(truth, table.rows, strict=True) if row.free]
+        return [
+            *map(float, parameters),
+            *map(float, np.concatenate(steps)),
+            float(posterior.joint_log_likelihood(truth[None])[0]),
+        ]
+
+    def _true_with_effects(self, posterior: Posterior, truth: Vector, times: Vector) -> list[float]:
+        """The same where the plant has effects, which no device of the bench has: steps by the model."""
+        table = posterior.table
+        curves = curves_of(table, truth[None], self.problem.scales.span)
+        at = [int(np.abs(curves.time - moment).argmin()) for moment in times]
+        steps = [
+            curves.gains[0, i, j] * curves.normalised[k][0, at]
+            for i, row in enumerate(curves.curve_of)
+            for j, k in enumerate(row)
+        ]
         parameters = [value for value, row in zip(truth, table.rows, strict=True) if row.free]
         return [
             *map(float, parameters),
@@ -245,7 +264,7 @@ class Replication:
         parameters = [draws.flat[:, k] for k, row in enumerate(table.rows) if row.free]
         steps = [
             curves.gains[:, i, j] * curves.normalised[unit][:, k]
-            for i, row in enumerate(table.layout.unit_of)
+            for i, row in enumerate(curves.curve_of)
             for j, unit in enumerate(row)
             for k in at
         ]

@@ -12,7 +12,11 @@ from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.model.effects.effect import UnstableError
 from lcopa_bayes.results.prediction import responses
+
+_FINER = 4
+"""How many times narrower the blocks are on which effects are simulated [-]."""
 
 
 def command_of(record: Record) -> Command:
@@ -52,15 +56,31 @@ def _path(gain: float, delay: float, times: Vector, orders: Vector) -> TransferP
 def exact_responses(problem: Problem, truth: Vector) -> list[Matrix]:
     """Responses of every fit record at its sample times without noise, (samples, axes) [response unit].
 
-    Accuracy: that of `Device.response`; what the bench cannot do so accurately raises its error.
+    Accuracy: that of `Device.response`; what the bench cannot do so accurately raises its error. With
+    effects, which a device does not have, by the model on blocks four times narrower; UnstableError where
+    there is no bounded response.
     """
     study, posterior = problem.study, problem.posterior
+    if posterior.simulation is not None:
+        return _simulated(problem.refined(_FINER), truth)
     return [
         device_of(posterior.table, truth, r, time_unit=study.time_unit).response(
             command_of(samples.record), samples.times, exposure=study.model.exposure
         )
         for r, samples in enumerate(posterior.samples)
     ]
+
+
+def _simulated(problem: Problem, truth: Vector) -> list[Matrix]:
+    posterior, values = problem.posterior, truth[None]
+    out = []
+    for r, one in enumerate(responses(posterior.table, posterior.model, values)):
+        name = posterior.samples[r].record.name
+        if not np.isfinite(one).all():
+            raise UnstableError(problem.study.effects.use, name, "no bounded response at this truth")
+        levels = [posterior.table.offset(values, axis, r)[0] for axis in range(one.shape[0])]
+        out.append(one[:, 0].T + levels)
+    return out
 
 
 def measured(

@@ -11,8 +11,8 @@ from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.data.candidatesettings import CandidateSettings
 from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.data.study import Study
+from lcopa_bayes.inference.assembly import table_of
 from lcopa_bayes.inference.defaultpriors import Scales
-from lcopa_bayes.inference.parameters import parameter_table
 from lcopa_bayes.model.layout import Layout
 
 STUDY = "study"
@@ -23,6 +23,7 @@ VARIANTS: Mapping[str, str] = {
     "separate": "an element of its own for every path",
     "delays": "a delay of its own for every path",
     "no-cross": "no cross paths",
+    "no-effects": "no effects",
 }
 """What may follow the name of a known candidate, after a hyphen."""
 _MOST = 3
@@ -79,6 +80,7 @@ def known_settings(name: str, study: Study) -> CandidateSettings:
         )
     told |= {"share": "none"} if "separate" in variants else {}
     told |= {"delay": "path"} if "delays" in variants else {}
+    told |= {"effects": ()} if "no-effects" in variants else {}
     return CandidateSettings(name, cross="no-cross" not in variants, **told)  # type: ignore[arg-type]
 
 
@@ -89,7 +91,13 @@ def derived(study: Study, settings: CandidateSettings) -> Candidate:
     fixed: dict[str, PriorSettings] = {}
     if not settings.cross:
         model, fixed = _uncrossed(study, settings.name, model)
-    made = replace(study, model=model, noise=settings.noise_settings(study.noise), priors={})
+    made = replace(
+        study,
+        model=model,
+        noise=settings.noise_settings(study.noise),
+        effects=settings.effects_settings(study.effects),
+        priors={},
+    )
     names = _names(made)
     priors = dict(study.priors)
     if model.orders != "free":
@@ -107,9 +115,10 @@ def derived(study: Study, settings: CandidateSettings) -> Candidate:
             "default prior in its place"
         )
     made = replace(made, priors=priors | dict(settings.priors) | fixed)
-    return Candidate(
-        settings.name, made, _about(study, model, settings.cross), tuple(notes), settings.improper
-    )
+    about = _about(study, model, settings.cross)
+    if study.effects.use or made.effects.use:
+        about += f", {', '.join(made.effects.use) or 'no effects'}"
+    return Candidate(settings.name, made, about, tuple(notes), settings.improper)
 
 
 def candidates_of(
@@ -158,6 +167,8 @@ def of_studies(studies: Sequence[Study]) -> tuple[Candidate, ...]:
 def _short_list(study: Study) -> list[str]:
     """A few candidates that ask how many terms, and whether fractional ones."""
     model, most = study.model, _most_terms(study.model)
+    if study.effects.use:
+        return [STUDY, f"{STUDY}-no-effects"]
     plain = model.orders == "free" and not isinstance(model.terms, Mapping) and most <= _MOST
     own = [] if plain else [STUDY]
     upto = 2 if own else min(max(most, 2), _MOST)
@@ -171,9 +182,10 @@ def _most_terms(model: ModelSettings) -> int:
 
 def _same(one: Candidate, other: Candidate) -> bool:
     """Whether two candidates are one model."""
-    return (one.study.model, one.study.noise, dict(one.study.priors), one.improper) == (
+    return (one.study.model, one.study.noise, one.study.effects, dict(one.study.priors), one.improper) == (
         other.study.model,
         other.study.noise,
+        other.study.effects,
         dict(other.study.priors),
         other.improper,
     )
@@ -182,15 +194,8 @@ def _same(one: Candidate, other: Candidate) -> bool:
 def _names(study: Study) -> tuple[str, ...]:
     """Names of the parameters a study without priors of its own has."""
     layout = Layout.of(study.drive_axes, study.response_axes, study.model)
-    return parameter_table(
-        layout,
-        Scales.of(study.fit),
-        [record.name for record in study.fit],
-        time_unit=study.time_unit,
-        model=study.model,
-        noise=study.noise.kind,
-        priors={},
-    ).names
+    names = table_of(study, layout, Scales.of(study.fit))[2].names
+    return (*names, *{name.partition("[")[0] for name in names if "[" in name})
 
 
 def _uncrossed(

@@ -40,7 +40,7 @@ def linear_densities(
     assert isinstance(noise, GaussianNoise)
     observed = samples.axes[axis]
     last = int(np.count_nonzero(observed.index < part.until))
-    units = known.model.unit_responses(known.table.dynamics(values))
+    units = known.responses(values)
     equations, _, _ = known.equations(axis, values, units)
     stacked, extra = _columns(known, part, samples, model, values, axis)
     white, _ = noise.whiten(stacked[..., :last], known.noise_parameters(values, axis), observed.gaps[:last])
@@ -72,13 +72,9 @@ def _columns(
     r, posterior = part.record, known
     if part.kind == "held-out record":
         r = len(known.samples)
-        experiments = (*known.model.experiments, *model.experiments)
-        posterior = replace(
-            known,
-            model=ForwardModel(known.model.layout, experiments),
-            samples=(*known.samples, samples),
-        )
-    observed, units = samples.axes[axis], model.unit_responses(known.table.dynamics(values))[0]
+        posterior = replace(known, model=known.model.joined(model), samples=(*known.samples, samples))
+    observed = samples.axes[axis]
+    units = replace(posterior, model=model).responses(values)[0]
     mean, sd = known.scaled[axis]
     block = known.blocks[axis]
     centre = values.copy()

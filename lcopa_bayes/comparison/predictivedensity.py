@@ -155,7 +155,7 @@ def left_out_weights(
 
 
 def _one(model: ForwardModel, number: int) -> ForwardModel:
-    return ForwardModel(model.layout, (model.experiments[number],))
+    return model.only(number)
 
 
 def _walkers(fit: Fit) -> Array:

@@ -45,6 +45,10 @@ class Workers(ABC, Generic[S]):
         """Results in the order in which they are finished. Where a task could not be carried out, `failed`
         gives its result; without it the error is raised."""
 
+    def map(self, function: Callable[[T], R], inputs: Sequence[T]) -> Iterator[R]:
+        """Results of a function that needs nothing shared, in the order of the inputs."""
+        return self.each(_Alone(function), inputs)
+
 
 @contextmanager
 def workers(shared: S, *, jobs: int = 1, dask: str | None = None) -> Iterator[Workers[S]]:
@@ -164,6 +168,17 @@ def _cluster(shared: S, address: str) -> Iterator[_Cluster[S]]:
             yield _Cluster(client, shared)
     except distributed.client.FutureCancelledError as error:
         raise InputError(f"--dask {address}: the scheduler was lost ({error}); {_ADVICE}") from None
+
+
+@final
+class _Alone(Generic[T, R]):
+    """Task: a function of the input alone."""
+
+    def __init__(self, function: Callable[[T], R]) -> None:
+        self._function = function
+
+    def __call__(self, shared: object, one: T) -> R:
+        return self._function(one)
 
 
 def _same(shared: S) -> S:

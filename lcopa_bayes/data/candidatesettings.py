@@ -9,7 +9,14 @@ from typing import Any, Literal, final
 
 from lcopa_bayes.core.checks import file_names, one_of, rebuilt, refuse_if
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.settings import NOISE_KINDS, ModelSettings, NoiseSettings, PriorSettings, settings_from
+from lcopa_bayes.data.settings import (
+    NOISE_KINDS,
+    EffectsSettings,
+    ModelSettings,
+    NoiseSettings,
+    PriorSettings,
+    settings_from,
+)
 
 IMPROPER = frozenset({"flat", "improper", "jeffreys"})
 """Words for a prior that is no distribution."""
@@ -54,6 +61,8 @@ class CandidateSettings:
     """Noise model."""
     cross: bool = True
     """Whether a drive moves other axes than its own."""
+    effects: tuple[str, ...] | None = None
+    """Effects of the plant by name; None: those of the study."""
     priors: Mapping[str, PriorSettings] = field(default_factory=dict)
     """In place of the study's, by parameter name."""
     improper: tuple[str, ...] = ()
@@ -63,6 +72,11 @@ class CandidateSettings:
         text = isinstance(self.name, str) and self.name.strip(" .")
         bad = not text or any(mark in self.name for mark in "/\\\0\n")
         problems = [f"`name` must be text fit for a folder; got {self.name!r}"] if bad else []
+        if self.effects is not None:
+            try:
+                EffectsSettings(use=self.effects)
+            except InputError as error:
+                problems += [problem.replace("`use`", "`effects`") for problem in error.problems]
         if not isinstance(self.cross, bool):
             problems.append(f"`cross` must be true or false; got {self.cross!r}")
         if self.noise is not None:
@@ -93,6 +107,10 @@ class CandidateSettings:
             delay=self.delay or own.delay,
             offset=self.offset or own.offset,
         )
+
+    def effects_settings(self, own: EffectsSettings) -> EffectsSettings:
+        """Settings of the effects."""
+        return own if self.effects is None else replace(own, use=self.effects)
 
     def noise_settings(self, own: NoiseSettings) -> NoiseSettings:
         """Settings of the noise."""

@@ -154,7 +154,8 @@ class SamplerSettings:
     method: Method | None = None
     """"auto": importance draws where a cover of the posterior gives enough of them, else ensembles;
     "ensembles": these in any case. None: ensembles where `steps` or `thin` is stated, which concern them
-    alone, else "auto"."""
+    alone, else "auto". Where the plant has effects "auto" is importance sampling around the optima, and
+    ensembles only where its weights fail."""
 
     def __post_init__(self) -> None:
         least = {"ensembles": 2, "walkers": 4, "steps": 1, "target_ess": 1, "thin": 1}
@@ -175,10 +176,38 @@ class EffectsSettings:
 
     add: tuple[str, ...] = ()
     """Effects of the user's own, ``file.py:Class``, relative to the study file."""
+    use: tuple[str, ...] = ()
+    """Effects that the plant has, by name; that they exist is checked where the axes are known."""
+    deflection: Mapping[str, float] = field(default_factory=dict)
+    """Largest deflection of a response axis by its name, ymax of the effects' formulas [response unit]; of
+    the axes left out it is derived from the fit records."""
+    speed: float | None = None
+    """Time to half of a step response, delay excluded [time unit]; None: derived from the fit records."""
 
     def __post_init__(self) -> None:
+        problems: list[str] = []
+        for key, value in (("add", self.add), ("use", self.use)):
+            if not isinstance(value, tuple):
+                problems.append(f"`{key}` must be a list of texts; got {value!r}")
+        if problems:
+            raise InputError(problems)
         wrong = [one for one in self.add if not (isinstance(one, str) and ".py:" in one)]
-        refuse_if([f'`add` must list "file.py:Class"; got {one!r}' for one in wrong])
+        problems += [f'`add` must list "file.py:Class"; got {one!r}' for one in wrong]
+        problems += [f"`use` must list names; got {one!r}" for one in self.use if not isinstance(one, str)]
+        if not isinstance(self.deflection, Mapping):
+            problems.append(f"`deflection` must be a table such as {{ x = 0.03 }}; got {self.deflection!r}")
+        else:
+            problems += [
+                f"`deflection.{axis}` must be a number above 0; got {value!r}"
+                for axis, value in self.deflection.items()
+                if not (is_number(value) and value > 0)
+            ]
+            object.__setattr__(self, "deflection", MappingProxyType(dict(self.deflection)))
+        if self.speed is not None and not (is_number(self.speed) and self.speed > 0):
+            problems.append(f"`speed` must be a time above 0; got {self.speed!r}")
+        refuse_if(problems)
+
+    __reduce__ = rebuilt
 
 
 @cache

@@ -13,8 +13,14 @@ from lcopa_bayes.core.estimate import LEVEL
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.basefit import BaseFit
-from lcopa_bayes.effectsearch.density import LoopDensity
-from lcopa_bayes.effectsearch.draws import LoopDraws, sample_loop, unit_of
+from lcopa_bayes.effectsearch.explained import (
+    coordinates_of,
+    declarable,
+    estimate_name,
+    explained_draws,
+    explained_study,
+    unit_of,
+)
 from lcopa_bayes.effectsearch.heldouteffects import missed, unseen_share
 from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
 from lcopa_bayes.effectsearch.outliers import Outlying, outlying
@@ -27,6 +33,7 @@ from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.effect import Effect
 from lcopa_bayes.sampling.convergence import Grade
+from lcopa_bayes.sampling.draws import Draws
 
 Z90 = 1.6448536269514722
 """Half width of a central 90 % interval of a normal distribution [sd]."""
@@ -67,8 +74,8 @@ class Loop:
 
     cautions: tuple[str, ...] = ()
     """What limits the verdict."""
-    draws: LoopDraws | None = None
-    """Draws of base plus effects; None when none were asked for."""
+    draws: Draws | None = None
+    """Draws of the explained study; None when none were asked for, or none could be had."""
     outliers: Outlying | None = None
     """Samples left out before anything was traced; None without any."""
 
@@ -90,7 +97,8 @@ class Loop:
         """A coordinate of the final model with unit, 90 % interval and grade."""
         state = self.after.state
         if self.draws is not None:
-            return self.draws.estimate(k).as_json()
+            name = estimate_name(state.model, self.draws, k)
+            return next(one for one in self.draws.estimates() if one.name == name).as_json()
         name, unit, factor = unit_of(state.model, k)
         middle, sd = float(state.optimum.x[k]) * factor, float(np.sqrt(state.covariance[k, k])) * factor
         return {
@@ -109,8 +117,8 @@ class Loop:
 
     @property
     def study(self) -> Study:
-        """The study."""
-        return self.problem.study
+        """The study with the effects that were found declared: what a fit, an audit or a comparison takes."""
+        return explained_study(self.problem.study, self.after.state.model)
 
     @property
     def trace(self) -> Trace | None:
@@ -199,10 +207,11 @@ def _looped(
     if verdict.kind == "unexplained" or last.alarmed:  # something significant remains
         white, residual = last_state.whitening, last_state.optimum.residual
         last_state = replace(last_state, widening=Widening.of(white.samples, residual, white.noise))
-    if sample:
-        quiet = float(sum(base.noise_samples))
-        sampled = sample_loop(LoopDensity(last_state, quiet), study.seed, jobs=jobs, quick=quick)
-        last_state = replace(last_state, covariance=sampled.covariance)
+    if sample and declarable(study, last_state.model.effects):
+        sampled = explained_draws(explained_study(problem.study, last_state.model), jobs=jobs, quick=quick)
+    if sampled is not None:
+        covariance = np.cov(coordinates_of(last_state.model, sampled).T)
+        last_state = replace(last_state, covariance=np.asarray(covariance))
     return Loop(
         problem,
         base,

@@ -25,10 +25,10 @@ _NEAREST = 4
 
 def results(found: Loop) -> dict[str, Any]:
     """Every number of the loop; `None` is open or undefined."""
-    trace, unit = found.trace, found.study.time_unit
+    trace, unit = found.trace, found.problem.study.time_unit
     chances = trace.probabilities if trace else {}
     told: dict[str, Any] = {
-        "study": found.study.name,
+        "study": found.problem.study.name,
         "verdict": found.verdict.kind,
         "confidence": found.verdict.confidence,
         "sentence": found.verdict.sentence,
@@ -50,13 +50,13 @@ def results(found: Loop) -> dict[str, Any]:
                 "source": one.source,
                 "sentence": one.sentence,
             }
-            for axis, one in zip(found.study.response_axes, found.base.noise, strict=True)
+            for axis, one in zip(found.problem.study.response_axes, found.base.noise, strict=True)
         ],
         "effects": _effects(found, chances),
         "outliers": _outliers(found),
         "before": side(found.before, found),
         "after": side(found.after, found),
-        "unseen_by": in_turn(len(found.study.fit)) if found.left_out else "held-out records",
+        "unseen_by": in_turn(len(found.problem.study.fit)) if found.left_out else "held-out records",
         "survival": {one.name: one.survival for one in trace.traced} if trace else {},
         "invisible": [one.name for one in trace.traced if one.survival < SEEN] if trace else [],
         "evidence": _evidence(found),
@@ -64,12 +64,11 @@ def results(found: Loop) -> dict[str, Any]:
         "moved": moved(found),
         "next_measurement": next_measurement(found),
         "parameters": [found.estimate(k) for k in range(found.after.state.model.plant_size)],
-        "acceptance": found.draws.acceptance if found.draws else None,
         "residual": {
             when: [{"name": view.name, "axis": view.axis, "sentence": view.sentence} for view in shown]
             for when, shown in _views(found).items()
         },
-        "seed": found.study.seed,
+        "seed": found.problem.study.seed,
     }
     values: dict[str, Any] = plain(told)
     return values
@@ -83,13 +82,13 @@ def drawn(found: Loop) -> dict[str, Any]:
 
 
 def _views(found: Loop) -> dict[str, list[View]]:
-    unit = found.study.time_unit
+    unit = found.problem.study.time_unit
     return {"before": views(found.before.state, unit), "after": views(found.after.state, unit)}
 
 
 def side(one: Side, found: Loop) -> dict[str, Any]:
     """Errors before or after, pooled per axis and for each record."""
-    axes = [axis.name for axis in found.study.response_axes]
+    axes = [axis.name for axis in found.problem.study.response_axes]
     noise = {score.axis: score.noise_sd for score in one.fit}
     fit = {axis: pooled_rmse(one.fit, axis) for axis in axes}
     unseen = {axis: pooled_rmse(one.unseen, axis) for axis in axes}

@@ -215,10 +215,10 @@ def _confirmed(made: Design, chosen: int, where: str, replicas: int, jobs: int) 
 
 def _performed(tasks: list[Trial], jobs: int) -> Iterator[tuple[Vector, Flags]]:
     with workers(None, jobs=jobs) as crew:
-        yield from crew.each(_perform, tasks)
+        yield from crew.map(_perform, tasks)
 
 
-def _perform(_: None, task: Trial) -> tuple[Vector, Flags]:
+def _perform(task: Trial) -> tuple[Vector, Flags]:
     return task()
 
 

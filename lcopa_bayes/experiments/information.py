@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import ceil
 from typing import NamedTuple, final
@@ -14,15 +14,21 @@ from lcopa_bayes.bench.command import Command
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.data.drive import Drive
 from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.effectslopes import effect_slopes
+from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.noise import GaussianNoise, Student
+from lcopa_bayes.inference.simulation import Simulation
+from lcopa_bayes.model.effects.declared import Declared
+from lcopa_bayes.model.forward import Experiment, ForwardModel
 from lcopa_bayes.model.grid import Mesh
+from lcopa_bayes.model.layout import Layout
 from lcopa_bayes.model.powerseries import Circle
 from lcopa_bayes.model.stepresponse import StepResponse, step_response
 from lcopa_bayes.model.superposition import Superposition, blocks_of, phases
 
 _NOTHING = 1e-11
 """Share of a slope that is not constant below which a resting response makes up for all of it [-]."""
-_PLANT = ("gain", "time", "order", "delay")
+_PLANT = ("gain", "time", "order", "delay", *COEFFICIENTS, *CONSTANTS)
 
 
 class Prepared(NamedTuple):
@@ -55,7 +61,9 @@ class Bench:
     def columns(self) -> tuple[int, ...]:
         """Table positions of the free plant parameters, offsets left out."""
         rows = self.problem.posterior.table.rows
-        return tuple(k for k, row in enumerate(rows) if row.free and row.kind in _PLANT)
+        return tuple(
+            k for k, row in enumerate(rows) if row.free and row.kind in _PLANT and "[" not in row.name
+        )
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -110,8 +118,14 @@ class Bench:
         return out
 
     def slopes(self, values: Vector, elements: Sequence[Prepared], command: Command) -> list[Matrix]:
-        """White derivatives of every response axis, each (parameters, samples)."""
+        """White derivatives of every response axis, each (parameters, samples).
+
+        With effects by `inference.effectslopes`; what differs from record to record is left out.
+        UnstableError where there is no bounded response.
+        """
         table = self.problem.posterior.table
+        if table.effects is not None:
+            return self._with_effects(table.effects, values, command)
         units = [
             self._unit(values, elements[unit.element], unit.delay, _drive(command, unit.drive))
             for unit in table.layout.units
@@ -130,6 +144,17 @@ class Bench:
                 rows[table.at("delay", delay)] += values[at] * unit[1 + 2 * terms]
             out.append(self._whitened(rows[list(self.columns)], values, axis))
         return out
+
+    def _with_effects(self, effects: Declared, values: Vector, command: Command) -> list[Matrix]:
+        table = self.problem.posterior.table
+        model = effected_model(table.layout, effects, command, self.mesh, self.sample_times)
+        slopes = effect_slopes(Simulation(table, model), values)[0]
+        logs = table.of_kind("time")
+        slopes[..., logs] *= values[logs]
+        return [
+            self._whitened(slopes[:, axis, list(self.columns)].T, values, axis)
+            for axis in range(slopes.shape[1])
+        ]
 
     def _unit(self, values: Vector, element: Prepared, slot: int, drive: Drive) -> Matrix:
         """A unit response and its slopes in log times, orders and delay, (2 terms + 2, samples)."""
@@ -164,6 +189,16 @@ class Bench:
         before, after = (np.linalg.norm(part, axis=1) for part in (white[:-1], left))
         left[after <= _NOTHING * before] = 0.0  # what is left of a constant is rounding
         return np.asarray(left)
+
+
+def effected_model(
+    layout: Layout, effects: Declared, command: Command, mesh: Mesh, times: Vector
+) -> ForwardModel:
+    """Model of one record under a command, with effects and without what differs from record to record."""
+    drives = tuple(_drive(command, axis) for axis in range(len(layout.drives)))
+    experiment = Experiment("next", mesh, drives, command.rest)
+    over = replace(effects, epochs=np.zeros(1), times=(times,), fitted=(None,))
+    return ForwardModel(layout, (experiment,), over)
 
 
 def _drive(command: Command, axis: int) -> Drive:

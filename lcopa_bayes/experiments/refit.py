@@ -6,16 +6,20 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
+from lcopa_bayes.bench.command import Command
 from lcopa_bayes.bench.device import Device, TransferPath
-from lcopa_bayes.core.arrays import Flags, Vector
-from lcopa_bayes.data.record import Record
+from lcopa_bayes.core.arrays import Flags, Matrix, Vector
+from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import PriorSettings
-from lcopa_bayes.experiments.information import Bench
+from lcopa_bayes.experiments.information import Bench, effected_model
 from lcopa_bayes.inference.assembly import Problem, problem_of
-from lcopa_bayes.inference.leastsquares import LeastSquares, apart
+from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.inference.simulation import Simulation
+from lcopa_bayes.model.grid import Mesh
 
 _SAME = 1e-9
 """Orders closer than this are one term [-]."""
@@ -46,9 +50,49 @@ class Trial:
         return _errors(problem, again, found, values, self.names), _leaning(again, found, self.names)
 
 
-def device_of(problem: Problem, values: Vector) -> Device:
+@final
+@dataclass(frozen=True, eq=False)
+class EffectedDevice:
+    """A plant with effects, simulated by the model itself: no device of the virtual bench has them."""
+
+    problem: Problem
+    values: Vector
+    """Table values, (rows,)."""
+
+    @property
+    def drive_axes(self) -> tuple[Axis, ...]:
+        """Axes of the drive."""
+        return self.problem.study.drive_axes
+
+    @property
+    def response_axes(self) -> tuple[Axis, ...]:
+        """Axes of the response."""
+        return self.problem.study.response_axes
+
+    @property
+    def time_unit(self) -> str:
+        """Unit of all times."""
+        return self.problem.study.time_unit
+
+    def response(self, command: Command, time: ArrayLike, *, exposure: float = 0.0) -> Matrix:
+        """Responses at `time`, (times, axes) [response unit], on blocks as narrow as those of the fit."""
+        times: Vector = np.asarray(time, dtype=float)
+        table, posterior = self.problem.posterior.table, self.problem.posterior
+        assert table.effects is not None
+        step = min(one.mesh.lattice.step for one in posterior.model.experiments)
+        blocks = max(2, round(float(times[-1]) / step))
+        mesh = Mesh.of_samples(times, 0.0, blocks=blocks, exposure=exposure)
+        model = effected_model(table.layout, table.effects, command, mesh, times)
+        moved = Simulation(table, model).responses(self.values[None])[0][:, 0].T
+        levels = [table.offset(self.values[None], i, 0)[0] for i in range(moved.shape[1])]
+        return np.asarray(moved + levels)
+
+
+def device_of(problem: Problem, values: Vector) -> Device | EffectedDevice:
     """The plant of table values as a device of the virtual bench; terms of equal orders are added up."""
     table, study = problem.posterior.table, problem.study
+    if table.effects is not None:
+        return EffectedDevice(problem, values)
     gains = table.gains(values[None])[0]
     rows = []
     for i in range(len(table.layout.responses)):
@@ -92,7 +136,7 @@ def refit(problem: Problem, record: Record, bench: Bench) -> Problem:
     study, table = problem.study, problem.posterior.table
     priors = {}
     for row in table.rows:
-        if row.kind != "offset":
+        if row.kind != "offset" and "[" not in row.name:
             prior = row.prior
             priors[row.name] = (
                 PriorSettings(row.name, fixed=row.value)
@@ -100,7 +144,9 @@ def refit(problem: Problem, record: Record, bench: Bench) -> Problem:
                 else PriorSettings(row.name, dist=prior.dist, parameters=prior.parameters)
             )
     model = replace(study.model, blocks=bench.blocks, orders="free", terms=_terms(table))
-    return problem_of(replace(study, fit=(record,), held_out=(), model=model, priors=priors))
+    effects = problem.stated_effects
+    alone = replace(study, fit=(record,), held_out=(), model=model, priors=priors, effects=effects)
+    return problem_of(alone)
 
 
 def _terms(table: ParameterTable) -> int | dict[str, int]:
@@ -115,8 +161,8 @@ def _moved(before: Problem, problem: Problem, values: Vector) -> Vector:
     for k, row in enumerate(new.rows):
         if row.kind == "offset":
             out[k] = old.offset(values[None], row.place.first, 0)[0] if row.free else row.value
-        else:
-            out[k] = values[old.names.index(row.name)]
+        else:  # what differs from record to record is nothing on this one
+            out[k] = values[old.names.index(row.name)] if row.name in old.names else 0.0
     return out
 
 
@@ -130,7 +176,7 @@ def _solve(problem: Problem, start: Vector) -> Vector:
     low, high = least.bounds
     near = np.clip(least.coordinates(start), low, high)  # a start only
     found = least_squares(
-        *apart(lambda x: least.residual(x, start), near),
+        *least.functions(start, near),
         bounds=(low, high),
         x_scale="jac",
         ftol=_CONVERGED,

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, final
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.core.arrays import Matrix
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.identifiability.contraction import Known, beliefs, known_best, prior_draws, prior_spread
@@ -19,13 +19,14 @@ from lcopa_bayes.identifiability.printedform import printed_structure
 from lcopa_bayes.identifiability.profile import Profile
 from lcopa_bayes.identifiability.profilepath import profile
 from lcopa_bayes.identifiability.radial import Radial, radial
-from lcopa_bayes.identifiability.sensitivities import sensitivities
-from lcopa_bayes.identifiability.symmetries import Structure, exchanges, structure
+from lcopa_bayes.identifiability.sensitivities import Sensitivities, sensitivities
+from lcopa_bayes.identifiability.symmetries import DIFFERENCED, TOLERANCES, Structure, exchanges, structure
 from lcopa_bayes.identifiability.tolerance import Tolerance
 from lcopa_bayes.identifiability.verdict import Finding, judged
 from lcopa_bayes.inference.likelihood import Landscape, Peak
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.parameter import Parameter
+from lcopa_bayes.model.effects.effect import UnstableError
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.resonance import unresolved
 from lcopa_bayes.results.sensitivity import sensitivity
@@ -128,12 +129,13 @@ def audit(fit: Predictive, *, jobs: int = 1) -> Audit:
         peak = max((landscape.climb(v) for v in starts), key=lambda found: found.log_likelihood)
         known = known_best(fit.draws, prior, fit.problem.scales.span, time_unit=fit.study.time_unit)
     profiles, peak = _profiles(landscape, peak, np.concatenate([thinned, optima]), jobs)
-    points = (
-        [sensitivities(landscape, v) for v in (*prior[:_POINTS], *likely)] if landscape.least.columns else []
-    )
+    points = _points(landscape, (*prior[:_POINTS], *likely)) if landscape.least.columns else []
     symmetric, curved, moved, printed = Structure((), 0, 0, True, np.empty(0)), None, None, None
     if points:
-        symmetric = structure(points[0].names, [p.relative() for p in points], [p.values for p in points])
+        tolerances = TOLERANCES if posterior.simulation is None else DIFFERENCED
+        symmetric = structure(
+            points[0].names, [p.relative() for p in points], [p.values for p in points], tolerances=tolerances
+        )
         symmetric = replace(symmetric, symmetries=(*symmetric.symmetries, *exchanges(posterior.table)))
         printed = printed_structure(points, rng)
         curved = curvature(landscape, peak.values, spread)
@@ -151,6 +153,20 @@ def audit(fit: Predictive, *, jobs: int = 1) -> Audit:
     )
     apart = delays(fit.study, posterior.table, peak.values)
     return Audit(fit, findings, symmetric, printed, curved, moved, known, apart, peak)
+
+
+def _points(landscape: Landscape, values: Iterable[Vector]) -> list[Sensitivities]:
+    """Sensitivities at table values; where effects leave no bounded response, or one of them vanishes, there
+    are none."""
+    out = []
+    for each in values:
+        try:
+            point = sensitivities(landscape, each)
+        except UnstableError:
+            continue
+        if landscape.posterior.simulation is None or (point.values != 0).all():
+            out.append(point)
+    return out
 
 
 def _flat(row: Parameter) -> bool:

@@ -158,7 +158,7 @@ def _slopes(draws: Draws, curves: StepCurves, time_unit: str) -> list[Estimate]:
     layout, step, out = draws.table.layout, float(curves.time[0]), []
     for i, response in enumerate(layout.responses):
         for j, drive in enumerate(layout.drives):
-            curve = curves.normalised[layout.unit_of[i][j]]
+            curve = curves.normalised[curves.curve_of[i][j]]
             steepest = np.diff(curve, axis=1, prepend=0.0).max(axis=1) / step
             path = layout.path_name(i, j) or response.name
             unit = f"{response.unit}/{drive.unit}/{time_unit}"

@@ -19,6 +19,8 @@ TOLERANCES = (1e-9, 1e-10, 1e-11)
 """Singular values, relative to the largest, below which a direction counts as blind [-]; a symmetry is
 called one only when all of them give the same rank: those of true ones are below 1e-12, while those of
 directions that are merely stiff spread over all decades."""
+DIFFERENCED = (3e-5, 1e-5, 3e-6)
+"""The same for slopes that are differences, which are good to 1e-6 [-]."""
 _CONSTANT = 1e-4
 """Entries of a null vector that differ less between points count as the same [-]."""
 _PROPORTIONAL = 1e-7

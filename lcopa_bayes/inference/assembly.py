@@ -6,15 +6,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import final
 
+import numpy as np
+
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.record import Driven, Record
+from lcopa_bayes.data.settings import EffectsSettings
 from lcopa_bayes.data.study import Study
+from lcopa_bayes.inference.declared import declared, effect_rows, noise_of, record_ranges, unused, used_kinds
 from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.noise import NOISES
 from lcopa_bayes.inference.observations import Samples
-from lcopa_bayes.inference.parameters import parameter_table
+from lcopa_bayes.inference.parameters import ParameterTable, parameter_table
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.model.effects.effect import Effect, Ranges, ScatterEffect
 from lcopa_bayes.model.forward import ForwardModel, forward_model
 from lcopa_bayes.model.layout import Layout
 
@@ -29,16 +34,32 @@ class Problem:
     scales: Scales
     refinement: int = 1
     """Blocks are narrower by this factor than the study's settings make them [-]."""
+    kinds: tuple[type[Effect], ...] = ()
+    """Effects of the study."""
+    ranges: Ranges | None = None
+    """Their scales; None without any."""
 
     def simulated(self, records: Sequence[Record]) -> tuple[tuple[Samples, ...], ForwardModel]:
         """Samples of other records of the same axes, and the model that simulates them."""
         layout, period = self.posterior.table.layout, self.scales.period
-        return prepared(self.study, layout, records, period, refinement=self.refinement)
+        samples, model = prepared(self.study, layout, records, period, refinement=self.refinement)
+        if self.ranges is None:
+            return samples, model
+        return samples, replace(model, effects=declared(self.study, self.kinds, self.ranges, records))
+
+    @property
+    def stated_effects(self) -> EffectsSettings:
+        """The study's effects with their scales stated, so that other records do not change these."""
+        if self.ranges is None:
+            return self.study.effects
+        told = dict(zip(self.ranges.names, self.ranges.response.tolist(), strict=True))
+        return replace(self.study.effects, deflection=told, speed=self.ranges.speed)
 
     def driven(self, drive: Driven, times: Vector) -> ForwardModel:
-        """The model that simulates a drive, read at `times` [time unit]."""
+        """The model that simulates a drive, read at `times` [time unit], in the middle of the campaign."""
         wanted, layout = self.study.model, self.posterior.table.layout
-        return forward_model(
+        own = self.posterior.table.effects
+        model = forward_model(
             layout,
             [drive],
             [times],
@@ -46,6 +67,9 @@ class Problem:
             exposure=wanted.exposure,
             refinement=self.refinement,
         )
+        if own is None:
+            return model
+        return replace(model, effects=replace(own, epochs=np.zeros(1), times=(times,), fitted=(None,)))
 
     def refined(self, factor: int) -> Problem:
         """The same problem on blocks narrower by a further factor."""
@@ -55,20 +79,14 @@ class Problem:
 
 
 def problem_of(study: Study) -> Problem:
-    """Posterior of a study; InputError when model, priors and records do not fit together."""
+    """Posterior of a study; InputError when model, effects, priors and records do not fit together."""
     layout = Layout.of(study.drive_axes, study.response_axes, study.model)
     scales = Scales.of(study.fit)
-    table = parameter_table(
-        layout,
-        scales,
-        [record.name for record in study.fit],
-        time_unit=study.time_unit,
-        model=study.model,
-        noise=study.noise.kind,
-        priors=study.priors,
-    )
+    kinds, ranges, table = table_of(study, layout, scales)
     samples, model = prepared(study, layout, study.fit, scales.period)
-    posterior = Posterior(table, model, samples, NOISES[study.noise.kind]())
+    if ranges is not None:
+        model = replace(model, effects=declared(study, kinds, ranges, study.fit))
+    posterior = Posterior(table, model, samples, NOISES[noise_of(kinds, study.noise.kind)]())
     free = sum(row.free for row in table.rows)
     if posterior.size < free:
         raise InputError(
@@ -78,7 +96,35 @@ def problem_of(study: Study) -> Problem:
     if posterior.dimension == 0:
         raise InputError(f"{study.name}: every parameter is fixed or linear; leave at least one free")
     table.log_support  # noqa: B018 - raises when no prior mass has decreasing orders
-    return Problem(study, posterior, scales)
+    return Problem(study, posterior, scales, kinds=kinds, ranges=ranges)
+
+
+def table_of(
+    study: Study, layout: Layout, scales: Scales
+) -> tuple[tuple[type[Effect], ...], Ranges | None, ParameterTable]:
+    """Effects of a study, their scales, and its parameter table; InputError with all that is wrong."""
+    kinds, problems = used_kinds(study, layout)
+    ranges = record_ranges(study, layout, scales) if kinds and not problems else None
+    records = [record.name for record in study.fit]
+    foreign = {key: said for key in study.priors if (said := unused(key, study)) is not None}
+    scatter = [kind.card.name for kind in kinds if issubclass(kind, ScatterEffect)]
+    named = {name: prior for name, prior in study.priors.items() if name not in foreign}
+    if problems:  # the parameters of effects are not known: their priors are not judged
+        named = {name: prior for name, prior in named.items() if "." not in name}
+    table = parameter_table(
+        layout,
+        scales,
+        records,
+        time_unit=study.time_unit,
+        model=study.model,
+        noise=noise_of(kinds, study.noise.kind),
+        priors=named,
+        effects=declared(study, kinds, ranges, ()) if ranges else None,
+        effect_rows=effect_rows(kinds, ranges, records, layout, study.time_unit) if ranges else (),
+        noise_effect=scatter[0] if scatter else "",
+        problems=[*problems, *foreign.values()],
+    )
+    return kinds, ranges, table
 
 
 def prepared(

@@ -41,6 +41,10 @@ class Kind:
         return f"{'[' if self.zero else '('}{self.low:g}, {self.high:g}{']' if self.closed else ')'}"
 
 
+COEFFICIENTS = ("coefficient", "magnitude")
+"""Kinds of what an effect estimates; it vanishes where they are 0."""
+CONSTANTS = ("constant", "fraction", "choice")
+"""Kinds of the internal constants of effects."""
 KINDS: Mapping[str, Kind] = MappingProxyType(
     {
         kind.name: kind
@@ -55,6 +59,12 @@ KINDS: Mapping[str, Kind] = MappingProxyType(
             # near 1 the logit and the logarithm of the noise scale trade off along a straight line
             Kind("rho", low=0.0, high=1.0, scale="logit", noise="shape", zero=True),
             Kind("nu", low=0.0, scale="log", noise="shape"),
+            # of effects: what they estimate, of either sign or not, and their internal constants
+            Kind("coefficient"),
+            Kind("magnitude", low=0.0, zero=True),
+            Kind("constant", low=0.0, scale="log"),
+            Kind("fraction", low=0.0, high=1.0, closed=True, zero=True),
+            Kind("choice", low=0.0, high=1.0, closed=True, zero=True),
         )
     }
 )

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import final
@@ -12,12 +12,18 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.inference.effectslopes import effect_slopes
 from lcopa_bayes.inference.noise import GaussianNoise, White
 from lcopa_bayes.inference.noisefit import NoiseFit
-from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.observations import Observed
+from lcopa_bayes.inference.posterior import Posterior, bounded
 
 _EDGE = 1e-6
 """Distance kept from the ends of a parameter's domain, relative to the domain or to 1."""
+_NORMAL = ("norm", "halfnorm")
+"""Priors whose logarithm is a square."""
+_EVALUATIONS = 30
+"""Most responses with effects that a descent takes [-]."""
 _TAIL = 1e-9
 """Prior mass beyond either end of the search on a logarithmic scale [-]."""
 
@@ -33,6 +39,8 @@ class LeastSquares:
     """
 
     posterior: Posterior
+    exact: bool = True
+    """Whether slopes of the plant are those with the effects in place."""
 
     @cached_property
     def columns(self) -> list[int]:
@@ -91,22 +99,61 @@ class LeastSquares:
             out[k] = np.exp(x[position]) if rows[k].log_scale else x[position]
         return out
 
+    def misfit(self, x: Vector, template: Vector) -> Vector:
+        """The residual of `residual` alone; infinite where effects leave no bounded response."""
+        posterior, table = self.posterior, self.posterior.table
+        raw = self.values(x, template)
+        values = table.sorted_with_source(raw[None], every=True)[0]
+        units, parts = posterior.responses(values), []
+        if posterior.simulation is not None and not bounded(units)[0]:
+            return np.full(posterior.size + len(self._prior_rows(raw)[1]), np.inf)
+        for r, samples in enumerate(posterior.samples):
+            for axis, observed in enumerate(samples.axes):
+                misfit = -posterior.residual(axis, r, observed, values, units[r])
+                parts.append(self._whiten(misfit, values, axis, observed.gaps)[0])
+        return np.concatenate([*parts, self._prior_rows(raw)[1]])
+
     def residual(self, x: Vector, template: Vector) -> tuple[Vector, Matrix]:
         """Whitened residual (model minus data, then prior rows) and its exact Jacobian in `x`.
 
-        `template` (rows,) gives fixed values and noise parameters.
+        `template` (rows,) gives fixed values and noise parameters. With effects slopes are those of
+        `effectslopes`; UnstableError where these leave no bounded response.
         """
         posterior, table = self.posterior, self.posterior.table
         raw = self.values(x, template)
         values, source = table.sorted_with_source(raw[None], every=True)
         jacobian = np.zeros((posterior.size, len(table.rows)))
         parts, start = [], 0
+        blocks = self._plain(values) if posterior.simulation is None else self._effected(values)
+        for axis, observed, block, misfit in blocks:
+            stop = start + observed.values.size
+            stacked = np.concatenate([block.T, misfit[None]])
+            white = self._whiten(stacked, values, axis, observed.gaps)
+            jacobian[start:stop] = white[:-1].T
+            parts.append(white[-1])
+            start = stop
+        jacobian = jacobian[:, source[0]]  # derivatives by sorted position -> by search coordinate
+        for k in self.columns:  # time slopes are in the logarithm already, other log scales are not
+            row = table.rows[k]
+            if row.log_scale and row.kind != "time":
+                jacobian[:, k] *= raw[k]
+            elif row.kind == "time" and not row.log_scale:
+                jacobian[:, k] /= raw[k]
+        rows, prior = self._prior_rows(raw)
+        return (
+            np.concatenate([*parts, prior]),
+            np.concatenate([jacobian, rows])[:, self.columns],
+        )
+
+    def _plain(self, values: Matrix) -> Iterator[tuple[int, Observed, Matrix, Vector]]:
+        """Response axis, samples, slopes in the table's rows (times in their logarithms) and misfit (model
+        minus data) of every axis of every record, of the plant without effects."""
+        posterior, table = self.posterior, self.posterior.table
         slopes = posterior.model.unit_slopes(table.dynamics(values))
         for r, samples in enumerate(posterior.samples):
             units, unit_slopes = slopes[r]
             for axis, observed in enumerate(samples.axes):
-                stop = start + observed.values.size
-                block = jacobian[start:stop]
+                block = np.zeros((observed.values.size, len(table.rows)))
                 misfit = -posterior.residual(axis, r, observed, values, units)[0]
                 for k in posterior.acting[axis]:
                     column = posterior.column(k, axis, r, observed, units)
@@ -121,23 +168,20 @@ class LeastSquares:
                         block[:, table.at("time", element, i)] += slope[i]
                         block[:, table.at("order", element, i)] += slope[terms + i]
                     block[:, table.at("delay", delay)] += slope[2 * terms]
-                stacked = np.concatenate([block.T, misfit[None]])
-                white = self._whiten(stacked, values, axis, observed.gaps)
-                jacobian[start:stop] = white[:-1].T
-                parts.append(white[-1])
-                start = stop
-        jacobian = jacobian[:, source[0]]  # derivatives by sorted position -> by search coordinate
-        for k in self.columns:  # time slopes are in the logarithm already, other log scales are not
-            row = table.rows[k]
-            if row.log_scale and row.kind != "time":
-                jacobian[:, k] *= raw[k]
-            elif row.kind == "time" and not row.log_scale:
-                jacobian[:, k] /= raw[k]
-        rows, prior = self._prior_rows(raw)
-        return (
-            np.concatenate([*parts, prior]),
-            np.concatenate([jacobian, rows])[:, self.columns],
-        )
+                yield axis, observed, block, misfit
+
+    def _effected(self, values: Matrix) -> Iterator[tuple[int, Observed, Matrix, Vector]]:
+        """The same with effects."""
+        posterior, table = self.posterior, self.posterior.table
+        assert posterior.simulation is not None
+        units = posterior.responses(values)
+        slopes = effect_slopes(posterior.simulation, values[0], exact=self.exact)
+        times = table.of_kind("time")
+        for r, samples in enumerate(posterior.samples):
+            slopes[r][..., times] *= values[0, times]
+            for axis, observed in enumerate(samples.axes):
+                misfit = -posterior.residual(axis, r, observed, values, units[r])[0]
+                yield axis, observed, slopes[r][observed.index, axis], misfit
 
     def _whiten(self, columns: Matrix, values: Matrix, axis: int, gaps: Vector) -> Matrix:
         noise = self.posterior.noise if isinstance(self.posterior.noise, GaussianNoise) else White()
@@ -151,8 +195,11 @@ class LeastSquares:
         rows, prior = [], []
         for k in self.columns:
             row = table.rows[k]
-            if row.prior is not None and row.prior.dist == "norm" and not row.log_scale:
+            normal = row.prior is not None and row.prior.dist in _NORMAL and not row.log_scale
+            if row.prior is not None and normal:
                 mean, sd = row.prior.frozen.mean(), row.prior.frozen.std()
+                if row.prior.dist == "halfnorm":  # its density falls from its lower end
+                    mean, sd = row.prior.support[0], row.prior.parameters.get("scale", 1.0)
                 unit = np.zeros(len(table.rows))
                 unit[k] = 1 / sd
                 rows.append(unit)
@@ -160,22 +207,38 @@ class LeastSquares:
         return np.array(rows).reshape(-1, len(table.rows)), np.array(prior)
 
     def solve(self, values: Vector) -> tuple[Vector, Matrix]:
-        """From a start to a local minimum: table values and the Jacobian there."""
+        """From a start to a local minimum: table values and the Jacobian there.
+
+        With effects first by slopes of the plant alone. UnstableError where these leave no bounded response
+        at the start.
+        """
+        if self.exact and self.posterior.simulation is not None:
+            values = replace(self, exact=False).solve(values)[0]
         low, high = self.bounds_around(values)
         start = np.clip(self.coordinates(values), low, high)
         found = least_squares(
-            *apart(lambda x: self.residual(x, values), start),
+            *self.functions(values, start),
             bounds=(low, high),
             x_scale="jac",
-            max_nfev=100,
+            max_nfev=100 if self.posterior.simulation is None else _EVALUATIONS,
         )
         solution = self.posterior.table.canonical(self.values(found.x, values)[None])[0]
         return solution, np.asarray(found.jac)
 
+    def functions(
+        self, values: Vector, start: Vector
+    ) -> tuple[Callable[[Vector], Vector], Vector, Callable[[Vector], Matrix]]:
+        """Residual, start and Jacobian as `scipy.optimize.least_squares` takes them; fixed values and noise
+        parameters from `values`. With effects slopes cost most: they are taken only where they are asked for.
+        """
+        if self.posterior.simulation is None:
+            return apart(lambda x: self.residual(x, values), start)
+        return lambda x: self.misfit(x, values), start, lambda x: self.residual(x, values)[1]
+
     def noise_fits(self, values: Vector) -> list[NoiseFit]:
         """Posterior of the noise parameters of each response axis given the residual of a plant."""
         posterior, table = self.posterior, self.posterior.table
-        units = posterior.model.unit_responses(table.dynamics(values[None]))
+        units = posterior.responses(values[None])
         return [
             NoiseFit(
                 posterior.noise,

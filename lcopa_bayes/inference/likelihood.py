@@ -140,13 +140,19 @@ class Landscape:
         ends = np.array([self.search(least.columns[p]) for p in moving]).T
         whole = least.coordinates(values)
 
-        def both(x: Vector) -> tuple[Vector, Matrix]:
+        def both(x: Vector, *, slopes: bool = True) -> tuple[Vector, Matrix]:
             at = whole.copy()
             at[moving] = x
-            return self.rows(at, values, moving)
+            return self.rows(at, values, moving, slopes=slopes)
 
+        start = np.clip(whole[moving], *ends)  # a start only
+        functions = apart(both, start)
+        if self.posterior.simulation is not None:  # slopes cost most
+            if not np.isfinite(both(start, slopes=False)[0]).all():
+                return values
+            functions = (lambda x: both(x, slopes=False)[0]), start, lambda x: both(x)[1]
         found = least_squares(
-            *apart(both, np.clip(whole[moving], *ends)),  # a start only
+            *functions,
             bounds=(ends[0], ends[1]),
             x_scale="jac",
             max_nfev=most,
@@ -160,16 +166,23 @@ class Landscape:
         own = held is not None and table.rows[held].kind in ("time", "order")
         return raw if own else np.asarray(table.canonical(raw[None])[0])
 
-    def rows(self, x: Vector, template: Vector, moving: Sequence[int]) -> tuple[Vector, Matrix]:
-        """Whitened residual without priors, with rows that keep orders decreasing."""
+    def rows(
+        self, x: Vector, template: Vector, moving: Sequence[int], *, slopes: bool = True
+    ) -> tuple[Vector, Matrix]:
+        """Whitened residual without priors, with rows that keep orders decreasing; without `slopes` the
+        Jacobian is that of these rows alone."""
         least, table = self.least, self.posterior.table
-        residual, jacobian = least.residual(x, template)
+        if slopes:
+            residual, jacobian = least.residual(x, template)
+        else:
+            residual = least.misfit(x, template)
+            jacobian = np.zeros((residual.size, len(least.columns)))
         residual, jacobian = residual[: self.posterior.size], jacobian[: self.posterior.size]
         if "nu" in self.posterior.noise.names:  # as in expectation maximisation of Student noise
             weight = np.sqrt(self._student_weights(residual, template))
             residual, jacobian = residual * weight, jacobian * weight[:, None]
         values = least.values(x, template)
-        walls, slopes = [], []
+        walls, steep = [], []
         for element, slot in enumerate(table.layout.elements):
             orders = [table.at("order", element, term) for term in range(slot.terms)]
             for upper, lower in pairwise(orders):
@@ -179,10 +192,10 @@ class Landscape:
                         scale = values[k] if table.rows[k].log_scale else 1.0
                         row[least.columns.index(k)] = sign * _STIFFNESS * scale
                 walls.append(_STIFFNESS * max(excess, 0.0))
-                slopes.append(row)
+                steep.append(row)
         if walls:
             residual = np.concatenate([residual, walls])
-            jacobian = np.concatenate([jacobian, slopes])
+            jacobian = np.concatenate([jacobian, steep])
         return residual, jacobian[:, moving]
 
     def _student_weights(self, standard: Vector, values: Vector) -> Vector:
@@ -200,7 +213,7 @@ class Landscape:
         """The noise parameters that maximise the likelihood of the residual of `values`."""
         posterior, table, out = self.posterior, self.posterior.table, values.copy()
         canonical = table.canonical(values[None])
-        units = posterior.model.unit_responses(table.dynamics(canonical))
+        units = posterior.responses(canonical)
         for axis in range(len(table.layout.responses)):
             rows = [table.at(name, axis) for name in posterior.noise.names]
             moving = [k for k in rows if table.rows[k].free and k != held]

@@ -14,6 +14,7 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Flags, Matrix, Vector
+from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 
@@ -25,6 +26,8 @@ _HARDLY = 0.1
 """White part over the correlated one that hardly shows [-]."""
 _BECOMES = frozenset({("white", "ar1"), ("white", "student"), ("white", "white+ar1"), ("ar1", "white+ar1")})
 """Noise models, of which the second can become the first."""
+_HARDLY_ACTS = 1e-3
+"""Size of a coefficient that cannot be negative where it should vanish [prior standard deviation]."""
 _FAST_ORDERS = (0.5, 1.0)
 """Orders of such a term where they are free [-]: above 1 a fast term is not resolved."""
 Slots = tuple[tuple[int, ...], ...]
@@ -56,7 +59,7 @@ class _Lift:
         if free[0] <= free[1] or axes[0] != axes[1]:
             return None
         out = np.full((len(values), len(self.large.rows)), np.nan)
-        parts = (self._gains, self._elements, self._delays, self._levels)
+        parts = (self._gains, self._elements, self._delays, self._levels, self._effects)
         if not all(part(values, out) for part in parts) or not self._noise(values, out, target):
             return None
         for k, row in enumerate(self.large.rows):
@@ -118,6 +121,22 @@ class _Lift:
                 source = next(k for place, k in theirs.items() if place[0] == axis)  # the only record's
             out[:, k] = 0.0 if source is None else values[:, source]
         return not theirs or bool(own)
+
+    def _effects(self, values: Matrix, out: Matrix) -> bool:
+        """Effects of the smaller model keep their numbers; one that it lacks vanishes, or nearly so."""
+        own = {
+            row.name: k for k, row in enumerate(self.small.rows) if row.kind in (*COEFFICIENTS, *CONSTANTS)
+        }
+        for k, row in enumerate(self.large.rows):
+            if row.name in own:
+                out[:, k] = values[:, own.pop(row.name)]
+            elif row.kind in CONSTANTS:
+                out[:, k] = row.value if row.prior is None else row.draw(len(out), self.rng)
+            elif row.kind == "magnitude" and row.prior is not None:
+                out[:, k] = _HARDLY_ACTS * float(row.prior.frozen.std())
+            elif row.kind in COEFFICIENTS:
+                out[:, k] = 0.0 if row.free else row.value
+        return not own
 
     def _noise(self, values: Matrix, out: Matrix, target: Posterior) -> bool:
         if (self.small_noise, self.large_noise) not in _BECOMES and self.small_noise != self.large_noise:

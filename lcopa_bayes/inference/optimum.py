@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.inference.effectstarts import effect_starts
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.model.effects.effect import UnstableError
 
 _SCREENED = 1024
 """Prior draws whose misfit is looked at."""
@@ -34,9 +37,13 @@ def find_optima(posterior: Posterior, rng: np.random.Generator, *, starts: int =
     """Local optima from the best of many prior draws, best first, duplicates removed.
 
     Screening and a first solve treat the residual as nearly white; a second solve uses the noise model with
-    its parameters estimated from the first residual.
+    its parameters estimated from the first residual. With effects the plant alone is searched first, and its
+    best optima are the starts (`with_effects`).
     """
-    table, problem = posterior.table, LeastSquares(posterior)
+    table = posterior.table
+    if posterior.simulation is not None:
+        alone = find_optima(posterior.without_effects, rng, starts=starts)
+        return _kept(posterior, _descended(posterior, effect_starts(posterior, alone, rng)))
     drawn = table.draw(_SCREENED, rng)
     for axis, scale in enumerate(_spread(posterior)):
         for name, value in posterior.noise.nearly_white(0.05 * scale).items():
@@ -46,16 +53,29 @@ def find_optima(posterior: Posterior, rng: np.random.Generator, *, starts: int =
     if np.isnan(likelihood).any():
         posterior.log_density(posterior.coordinates(drawn[np.isnan(likelihood)]))  # raises and says where
     chosen = drawn[np.argsort(-likelihood, kind="stable")]
-    optima: list[Optimum] = []
-    for values in _distinct(posterior, chosen, starts):
+    return _kept(posterior, _descended(posterior, _distinct(posterior, chosen, starts)))
+
+
+def _descended(posterior: Posterior, starts: Sequence[Vector]) -> list[Optimum]:
+    """Optima from table values; a start from which effects leave no bounded response gives none."""
+    problem, optima = LeastSquares(posterior), []
+    for values in starts:
         values = posterior.complete(posterior.coordinates(values[None]), None)[0]
-        for _ in range(2):
-            values, _ = problem.solve(values)
-            values = problem.with_noise(values)
+        try:
+            for _ in range(2):
+                values, _ = problem.solve(values)
+                values = problem.with_noise(values)
+        except UnstableError:
+            continue
         # at the solution itself: its terms may stand in another order than the search left them in, and the
         # noise is that of its own residual
         _, jacobian = problem.residual(problem.coordinates(values), values)
         optima.append(_describe(posterior, problem, values, jacobian))
+    return optima
+
+
+def _kept(posterior: Posterior, optima: list[Optimum]) -> tuple[Optimum, ...]:
+    """Optima of positive density, best first, duplicates removed."""
     optima.sort(key=lambda optimum: -optimum.log_density)
     kept: list[Optimum] = []
     for optimum in optima:

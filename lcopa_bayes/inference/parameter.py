@@ -22,7 +22,8 @@ _REJECTION = 0.1
 
 class Place(NamedTuple):
     """Where a parameter enters: (response, drive) for gains, (element, term) for times and orders,
-    (slot, 0) for delays, (response, record or -1 for all) for offsets, (response, 0) for noise."""
+    (slot, 0) for delays, (response, record or -1 for all) for offsets, (response, 0) for noise,
+    (effect, position) for coefficients and for constants of effects."""
 
     first: int
     second: int
@@ -43,11 +44,18 @@ class Parameter:
     """Fixed value, in `unit`."""
     default: bool = True
     """Whether the prior is the default one."""
+    adds_to: int | None = None
+    """Response axis that a coefficient of an effect adds to in proportion, whatever the plant; else None."""
 
     @property
     def declared(self) -> Kind:
         """What all parameters of this kind have in common."""
         return KINDS[self.kind]
+
+    @property
+    def response(self) -> int:
+        """Response axis of what enters linearly: gains, offsets and coefficients that only add."""
+        return self.place.first if self.adds_to is None else self.adds_to
 
     @property
     def noise(self) -> bool:
@@ -118,6 +126,10 @@ class Parameter:
         """What is wrong with the prior or the fixed value for this kind of parameter."""
         zero, where = self.declared.zero, self.declared.interval
         where += "" if self.unit == "-" else f" {self.unit}"
+        if self.kind == "choice":
+            if self.prior is None and self.value in (0.0, 1.0):
+                return []
+            return [f"[priors] {self.name}: a choice is fixed at 0 (no) or 1 (yes)"]
         if self.prior is None:
             fits = bool(self.declared.contains(np.array(self.value))) or (zero and self.value == 0)
             return [] if fits else [f"[priors] {self.name} = {self.value:g}: must lie in {where}"]

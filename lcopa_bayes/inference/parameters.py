@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import lgamma, log
 from typing import final
@@ -14,10 +14,11 @@ from lcopa_bayes.core.arrays import Array, Flags, Index, Matrix, Vector
 from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.inference.defaultpriors import Scales
-from lcopa_bayes.inference.kinds import KINDS
+from lcopa_bayes.inference.kinds import COEFFICIENTS, KINDS
 from lcopa_bayes.inference.noise import NOISES
 from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.priors import Prior
+from lcopa_bayes.model.effects.declared import Declared
 from lcopa_bayes.model.forward import Dynamics
 from lcopa_bayes.model.layout import Layout
 
@@ -36,6 +37,8 @@ class ParameterTable:
     rows: tuple[Parameter, ...]
     resolution: float = 0.0
     """Shortest time constant of a term of order above 1 under default priors [time unit]."""
+    effects: Declared | None = None
+    """Effects whose parameters are among the rows, over no record; None without any."""
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -204,8 +207,16 @@ def parameter_table(
     model: ModelSettings,
     noise: str,
     priors: Mapping[str, PriorSettings],
+    effects: Declared | None = None,
+    effect_rows: Sequence[Parameter] = (),
+    noise_effect: str = "",
+    problems: Sequence[str] = (),
 ) -> ParameterTable:
-    """Table of a study; InputError when a prior names no parameter or has no mass in its domain."""
+    """Table of a study; InputError when a prior names no parameter or has no mass in its domain.
+
+    `effect_rows` are the parameters of its `effects`, `noise_effect` the name of an effect that gives the
+    noise its shape; `problems` found before join those found here.
+    """
     rows: list[Parameter] = []
 
     def add(kind: str, place: tuple[int, int], suffix: str, unit: str, prior: Prior) -> None:
@@ -235,12 +246,15 @@ def parameter_table(
         for name, prior in NOISES[noise].priors(scales, i).items():
             unit = response.unit if KINDS[name].noise == "scale" else "-"
             add(name, (i, 0), layout.response_name(i), unit, prior)
+            if noise_effect and KINDS[name].noise == "shape":
+                rows[-1] = replace(rows[-1], name=f"{noise_effect}.{rows[-1].name}")
+    rows += effect_rows
     names = [row.name for row in rows]
     if len(set(names)) < len(names):
         twice = ", ".join(sorted({name for name in names if names.count(name) > 1}))
         raise InputError(f"{twice}: axes and records together name two parameters alike; rename a record")
     rows = _fix_orders(rows, layout, model)
-    return ParameterTable(layout, tuple(_with_priors(rows, priors)), scales.resolution)
+    return ParameterTable(layout, tuple(_with_priors(rows, priors, problems)), scales.resolution, effects)
 
 
 def _fix_orders(rows: list[Parameter], layout: Layout, model: ModelSettings) -> list[Parameter]:
@@ -253,30 +267,37 @@ def _fix_orders(rows: list[Parameter], layout: Layout, model: ModelSettings) -> 
             f"have {', '.join(str(slot.terms) for slot in layout.elements)} term(s); give one order per term"
         )
     return [
-        Parameter(row.name, row.unit, row.kind, row.place, None, float(model.orders[row.place.second]))
-        if row.kind == "order"
-        else row
+        replace(row, prior=None, value=float(model.orders[row.place.second])) if row.kind == "order" else row
         for row in rows
     ]
 
 
-def _with_priors(rows: list[Parameter], priors: Mapping[str, PriorSettings]) -> list[Parameter]:
-    """The study's priors and fixed values in place of the defaults."""
-    names = {row.name for row in rows}
+def _with_priors(
+    rows: list[Parameter], priors: Mapping[str, PriorSettings], before: Sequence[str]
+) -> list[Parameter]:
+    """The study's priors and fixed values in place of the defaults.
+
+    A coefficient that every record has may be given a prior for all of them, by its name without the record.
+    """
+    stems = {row.name: row.name.partition("[")[0] for row in rows if row.kind in COEFFICIENTS}
+    names = {row.name for row in rows} | set(stems.values())
     problems = [
-        f"[priors] {key}: this model has no such parameter{nearest(key, names)}"
-        for key in priors
-        if key not in names
+        *before,
+        *(
+            f"[priors] {key}: this model has no such parameter{nearest(key, names)}"
+            for key in priors
+            if key not in names
+        ),
     ]
     out = []
     for row in rows:
-        setting = priors.get(row.name)
+        setting = priors.get(row.name, priors.get(stems.get(row.name, row.name)))
         if setting is None:
             out.append(row)
             continue
         prior = None if setting.dist is None else Prior(setting.dist, setting.parameters)
         value = np.nan if setting.fixed is None else setting.fixed
-        out.append(Parameter(row.name, row.unit, row.kind, row.place, prior, value, default=False))
+        out.append(replace(row, prior=prior, value=value, default=False))
         problems += out[-1].problems
     if problems:
         raise InputError(problems)

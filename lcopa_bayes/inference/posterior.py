@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import final
+from typing import TypeAlias, final
 
 import numpy as np
 from scipy.special import expit, log_expit, logit
 
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
+from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.linear import NormalEquations
 from lcopa_bayes.inference.noise import GaussianNoise, Noise
 from lcopa_bayes.inference.observations import Observed, Samples
 from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.inference.simulation import Simulated, Simulation
 from lcopa_bayes.model.forward import ForwardModel
 
 _LOG_2PI = float(np.log(2 * np.pi))
+Units: TypeAlias = "Array | Simulated"
+"""Responses of one record that linear parameters scale."""
 _PORTION = 64
 """Parameter sets evaluated at once: what one portion holds stays in the processor's cache."""
 
@@ -29,21 +33,36 @@ class Posterior:
     """Log density of the sampled coordinates, a batch at a time.
 
     Gains and offsets with normal priors enter linearly: under Gaussian noise they are integrated out
-    exactly and drawn afterwards (`complete`). The remaining free parameters are sampled, some by
-    their logarithm (`Parameter.log_scale`).
+    exactly and drawn afterwards (`complete`); with effects (`ForwardModel.effects`) those that still do. The
+    remaining free parameters are sampled, some by their logarithm (`Parameter.log_scale`).
     """
 
     table: ParameterTable
     model: ForwardModel
     samples: tuple[Samples, ...]
     noise: Noise
+    surrogate: Callable[[Matrix], Sequence[Simulated]] | None = None
+    """What stands for the responses of a plant with effects; None: they are simulated."""
 
     @cached_property
     def linear(self) -> tuple[int, ...]:
         """Table positions of the parameters that are integrated out."""
         if not isinstance(self.noise, GaussianNoise):
             return ()
-        return tuple(k for k, row in enumerate(self.table.rows) if _is_linear(row))
+        return tuple(k for k, row in enumerate(self.table.rows) if self._is_linear(k, row))
+
+    @cached_property
+    def simulation(self) -> Simulation | None:
+        """The model with effects; None without."""
+        return None if self.model.effects is None else Simulation(self.table, self.model)
+
+    def responses(self, values: Matrix) -> Sequence[Units]:
+        """Unit responses of every fit record at canonical values, or with effects what stands for them."""
+        if self.surrogate is not None:
+            return self.surrogate(values)
+        if self.simulation is not None:
+            return self.simulation(values)
+        return self.model.unit_responses(self.table.dynamics(values))
 
     @cached_property
     def sampled(self) -> tuple[int, ...]:
@@ -123,7 +142,7 @@ class Posterior:
         if values.shape[0] > _PORTION:
             portions = (values[k : k + _PORTION] for k in range(0, values.shape[0], _PORTION))
             return np.concatenate([self.log_likelihood(portion) for portion in portions])
-        units = self.model.unit_responses(self.table.dynamics(values))
+        units = self.responses(values)
         total = np.zeros(values.shape[0])
         for axis in range(len(self.table.layout.responses)):
             if isinstance(self.noise, GaussianNoise):
@@ -134,6 +153,8 @@ class Posterior:
                     residual = self.residual(axis, r, samples.axes[axis], values, units[r])
                     noise = self.noise_parameters(values, axis)
                     total += self.noise.pointwise(residual, noise, samples.axes[axis].gaps).sum(axis=1)
+        if self.simulation is not None:  # without a bounded response nothing is likely
+            total[~bounded(units)] = -np.inf
         return total
 
     def noise_parameters(self, values: Matrix, axis: int) -> Matrix:
@@ -148,7 +169,7 @@ class Posterior:
         values = self.values(coordinates)
         if not self.linear:
             return values
-        units = self.model.unit_responses(self.table.dynamics(values))
+        units = self.responses(values)
         for axis in range(len(self.table.layout.responses)):
             equations, _, _ = self.equations(axis, values, units)
             block = self.blocks[axis]
@@ -159,8 +180,8 @@ class Posterior:
 
     def pointwise(self, values: Matrix) -> list[list[Matrix]]:
         """Log likelihood of each sample given those before it, [record][axis] (batch, n)."""
-        units = self.model.unit_responses(self.table.dynamics(values))
-        return [
+        units = self.responses(values)
+        out = [
             [
                 self.noise.pointwise(
                     self.residual(axis, r, observed, values, units[r]),
@@ -171,6 +192,10 @@ class Posterior:
             ]
             for r, samples in enumerate(self.samples)
         ]
+        if self.simulation is not None:
+            for density in (axis for record in out for axis in record):
+                density[~bounded(units)] = -np.inf
+        return out
 
     def joint_log_likelihood(self, values: Matrix) -> Vector:
         """Log likelihood of canonical values, linear parameters included, (batch,) [nat]."""
@@ -184,7 +209,7 @@ class Posterior:
     def blocks(self) -> list[list[int]]:
         """Linear parameters of each response axis."""
         axes = range(len(self.table.layout.responses))
-        return [[k for k in self.linear if self.table.rows[k].place.first == axis] for axis in axes]
+        return [[k for k in self.linear if self.table.rows[k].response == axis] for axis in axes]
 
     def _moments(self, block: Sequence[int]) -> tuple[Vector, Vector]:
         """Prior means and standard deviations of linear parameters."""
@@ -197,7 +222,9 @@ class Posterior:
         """Prior means and standard deviations of the linear parameters of each response axis."""
         return [self._moments(block) for block in self.blocks]
 
-    def equations(self, axis: int, values: Matrix, units: list[Array]) -> tuple[NormalEquations, Vector, int]:
+    def equations(
+        self, axis: int, values: Matrix, units: Sequence[Units]
+    ) -> tuple[NormalEquations, Vector, int]:
         """Normal equations of a response axis, sum of log innovation sd, and number of samples."""
         assert isinstance(self.noise, GaussianNoise)
         batch, block = values.shape[0], self.blocks[axis]
@@ -224,11 +251,14 @@ class Posterior:
             count += observed.values.size
         return equations, log_scale, count
 
-    def column(self, k: int, axis: int, r: int, observed: Observed, units: Array) -> Array | None:
+    def column(self, k: int, axis: int, r: int, observed: Observed, units: Units) -> Array | None:
         """What a unit of a linear parameter adds to a record; None where it does not act."""
         row = self.table.rows[k]
         if row.kind == "offset":
             return np.ones((1, observed.values.size)) if row.place.second in (-1, r) else None
+        if isinstance(units, Simulated):
+            whole = units.columns.get(k)
+            return None if whole is None else whole[:, observed.chosen]
         drive = row.place.second
         rest = self.model.experiments[r].rest[drive]
         if not self.model.experiments[r].drives[drive].moves:
@@ -236,9 +266,11 @@ class Posterior:
         unit = units[self.table.layout.unit_of[axis][drive]][:, observed.chosen]
         return np.asarray(unit + rest) if rest != 0.0 else unit
 
-    def residual(self, axis: int, r: int, observed: Observed, values: Matrix, units: Array) -> Matrix:
+    def residual(self, axis: int, r: int, observed: Observed, values: Matrix, units: Units) -> Matrix:
         """Observed minus modelled, (batch, n) [response unit]."""
         out = np.tile(observed.values, (values.shape[0], 1))
+        if isinstance(units, Simulated):
+            out -= units.base[axis][:, observed.chosen]
         for k in self.acting[axis]:
             column = self.column(k, axis, r, observed, units) if values[:, k].any() else None
             if column is not None:
@@ -247,11 +279,26 @@ class Posterior:
 
     @cached_property
     def acting(self) -> list[list[int]]:
-        """Gains and offsets of each response axis."""
+        """Gains and offsets of each response axis; with effects what they leave linear."""
         acting = self.table.of_kind("gain") + self.table.of_kind("offset")
+        if self.simulation is not None:
+            acting = [*sorted(self.simulation.scaled), *self.table.of_kind("offset")]
         axes = range(len(self.table.layout.responses))
-        return [[k for k in acting if self.table.rows[k].place.first == axis] for axis in axes]
+        return [[k for k in acting if self.table.rows[k].response == axis] for axis in axes]
+
+    def _is_linear(self, k: int, row: Parameter) -> bool:
+        scaled = row.kind == "gain" if self.simulation is None else k in self.simulation.scaled
+        return (scaled or row.kind == "offset") and row.prior is not None and row.prior.dist == "norm"
+
+    @cached_property
+    def without_effects(self) -> Posterior:
+        """The same of the plant alone; the noise stays."""
+        rows = tuple(row for row in self.table.rows if row.kind not in (*COEFFICIENTS, *CONSTANTS))
+        table = replace(self.table, rows=rows, effects=None)
+        return replace(self, table=table, model=self.model.plain, surrogate=None)
 
 
-def _is_linear(row: Parameter) -> bool:
-    return row.kind in ("gain", "offset") and row.prior is not None and row.prior.dist == "norm"
+def bounded(units: Sequence[Units]) -> Flags:
+    """Plants with a bounded response, (batch,), of responses with effects."""
+    out: Flags = np.all([one.bounded for one in units if isinstance(one, Simulated)], axis=0)
+    return out

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from lcopa_bayes.model.layout import Layout
 from lcopa_bayes.model.powerseries import Circle
 from lcopa_bayes.model.stepresponse import StepResponse, step_response
 from lcopa_bayes.model.superposition import Phase, Superposition, blocks_of, phases
+
+if TYPE_CHECKING:
+    from lcopa_bayes.model.effects.declared import Declared
 
 _CELLS = 3 << 13
 """Plants times blocks times viscous terms evaluated at once. Larger temporaries go back to the operating
@@ -108,6 +111,25 @@ class ForwardModel:
 
     layout: Layout
     experiments: tuple[Experiment, ...]
+    effects: Declared | None = None
+    """Effects of the plant; unit responses are those of the plant without."""
+
+    def only(self, *records: int) -> ForwardModel:
+        """The same model of some of the records."""
+        own = None if self.effects is None else self.effects.only(records)
+        return ForwardModel(self.layout, tuple(self.experiments[r] for r in records), own)
+
+    def joined(self, other: ForwardModel) -> ForwardModel:
+        """The same model of the records of both."""
+        own = None
+        if self.effects is not None and other.effects is not None:
+            own = self.effects.joined(other.effects)
+        return ForwardModel(self.layout, (*self.experiments, *other.experiments), own)
+
+    @property
+    def plain(self) -> ForwardModel:
+        """The same model without effects."""
+        return self if self.effects is None else replace(self, effects=None)
 
     def unit_responses(self, dynamics: Dynamics, known: StepResponses | None = None) -> list[Array]:
         """Deviation from rest per unit gain, for each experiment (units, batch, samples) [drive unit].

@@ -182,7 +182,7 @@ class Superposition:
         """Spectrum of the jumps of a phase."""
         train = np.zeros(self.circle.n)
         inside = phase.blocks < self.circle.n
-        train[phase.blocks[inside]] = phase.jumps[inside]
+        np.add.at(train, phase.blocks[inside], phase.jumps[inside])  # two changes may share a block
         return self.circle.spectrum(train)
 
     def _add_on_lattice(

@@ -37,6 +37,7 @@ from lcopa_bayes.sampling.draws import Draws, gather
 from lcopa_bayes.sampling.evidence import Evidence, evidence_of
 from lcopa_bayes.sampling.nested import NestedPlan, nested
 from lcopa_bayes.sampling.sampler import Run, SamplePlan, sample
+from lcopa_bayes.sampling.weightedrun import weighted_run
 
 if TYPE_CHECKING:
     from lcopa_bayes.results.integerrival import Rival
@@ -113,7 +114,9 @@ def fit(
 ) -> Fit:
     """Sample the posterior of a study and derive what it predicts.
 
-    `starts`, table values (starts, rows), are modes known from elsewhere that sampling proposes too.
+    `starts`, table values (starts, rows), are modes known from elsewhere that sampling proposes too. A plant
+    with effects is sampled by importance around its optima (`weightedrun`) where the method is "auto" and its
+    weights hold.
 
     With `folder`, sampling is stored there in `chain.h5` and `resume` goes on from it; the result is
     the same as without interruption. With `cross_check` the posterior is also sampled by nested sampling,
@@ -129,17 +132,23 @@ def fit(
         writable_folder(folder)
     problem = resolved(problem)
     plan = plan_of(problem, quick=quick)
-    run = sample(
-        problem.posterior,
-        plan,
-        jobs=jobs,
-        chain_file=folder / "chain.h5" if folder else None,
-        fingerprint=fingerprint(study, plan) + ("" if starts is None else digest_of(starts)),
-        resume=resume,
-        quiet=quiet,
-        starts=starts,
-    )
-    draws, check = gather(problem.posterior, run), None
+    effective = problem.posterior.simulation is not None and plan.method == "auto"
+    found = weighted_run(problem.posterior, plan, jobs=jobs, quick=quick) if effective else None
+    if found is not None:
+        run, draws = found
+    else:
+        run = sample(
+            problem.posterior,
+            plan,
+            jobs=jobs,
+            chain_file=folder / "chain.h5" if folder else None,
+            fingerprint=fingerprint(study, plan) + ("" if starts is None else digest_of(starts)),
+            resume=resume,
+            quiet=quiet,
+            starts=starts,
+        )
+        draws = gather(problem.posterior, run)
+    check = None
     weighed = evidence_of(problem.posterior, run, draws.ess)
     if cross_check:
         wanted = NestedPlan.of(problem.posterior.dimension, seed=plan.seed, quick=quick)

@@ -13,6 +13,7 @@ from lcopa_bayes.data.record import Axis
 from lcopa_bayes.inference.noise import GaussianNoise, Noise
 from lcopa_bayes.inference.observations import Observed, Samples
 from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.inference.simulation import Simulation
 from lcopa_bayes.model.forward import ForwardModel
 from lcopa_bayes.results.bands import LEVELS, POINTWISE, pointwise, simultaneous
 from lcopa_bayes.sampling.draws import Draws
@@ -23,6 +24,8 @@ _CELLS = 2_000_000
 """Draws times samples behind the bands of one axis of one record."""
 _FEWEST = 200
 """Draws behind a band at least."""
+_WITH_EFFECTS = 1000
+"""Draws behind a band at most where the plant has effects, which take a simulation each."""
 _SWEEPS = 20
 """Sweeps after which a Gibbs chain of a level has forgotten its start [-]: 1e-6 of it is left at nu = 1."""
 
@@ -89,7 +92,13 @@ class Band:
 
 
 def responses(table: ParameterTable, model: ForwardModel, values: Matrix) -> list[Array]:
-    """Plant responses without offsets, per experiment (axes, batch, samples) [response unit]."""
+    """Plant responses without offsets, per experiment (axes, batch, samples) [response unit].
+
+    With effects NaN for plants without a bounded response; what differs from record to record is 0 on records
+    that were not fitted.
+    """
+    if model.effects is not None:
+        return Simulation(table, model).responses(values)
     gains, layout, out = table.gains(values), table.layout, []
     unit_responses = model.unit_responses(table.dynamics(values))
     for experiment, units in zip(model.experiments, unit_responses, strict=True):
@@ -115,22 +124,30 @@ def bands(
     `model` simulates the records of `samples` at their sample times. An offset per record is not
     known for a held-out record: it is taken from the samples before the drive can have acted, else
     from the record itself (integrated out given its samples), and the band says which and from how many.
+    Effects that differ from record to record count as noise on a held-out record, as large as on the others.
     What is drawn depends on `seed` and the record's name alone, not on the other records.
     """
     out = []
     for r, record in enumerate(samples):
         rng = named_rng(seed, record.record.name)
-        values, plant = plant_draws(draws, ForwardModel(model.layout, (model.experiments[r],)))
+        alone = model.only(r)
+        values, plant = plant_draws(draws, alone)
+        disturbed = plant
+        if held_out and alone.effects is not None and alone.effects.per_record:
+            disturbed = Simulation(draws.table, alone).disturbed(values, rng)[0]
         for axis, observed in enumerate(record.axes):
             if observed.values.size == 0:
                 continue
             response = plant[axis][:, observed.index]
+            seen = response if disturbed is plant else disturbed[axis][:, observed.index]
             offset = offset_draws(
-                draws.table, values, axis, r, record, response, noise, held_out=held_out, rng=rng
+                draws.table, values, axis, r, record, seen, noise, held_out=held_out, rng=rng
             )
             parameters = values[:, [draws.table.at(name, axis) for name in noise.names]]
             times = record.times[observed.index]
             noises = noise.draw(parameters, observed.gaps, rng)
+            if disturbed is not plant:
+                noises += seen - response
             one = (record.record.name, record.record.response_axes[axis], held_out)
             out.append(band_of(one, times, observed.values, response, noises, offset))
     return out
@@ -145,7 +162,8 @@ def plant_draws(draws: Draws, model: ForwardModel) -> tuple[Matrix, Array]:
     """Table values behind the bands of a model's one experiment, (draws, rows), and the plant's responses
     without offsets, (axes, draws, samples) [response unit]."""
     size = model.experiments[0].mesh.reading.samples
-    values = draws.thinned(max(_FEWEST, _CELLS // size))
+    most = max(_FEWEST, _CELLS // size)
+    values = draws.thinned(most if model.effects is None else min(most, _WITH_EFFECTS))
     parts = np.array_split(values, max(1, values.shape[0] * size // _CELLS * 4))
     return values, np.concatenate([responses(draws.table, model, part)[0] for part in parts], axis=1)
 

@@ -46,6 +46,7 @@ def settings_of(study: Study) -> dict[str, Any]:
         "priors": {name: _flat(prior) for name, prior in study.priors.items()},
         "noise": _flat(study.noise),
         "sampler": _flat(study.sampler),
+        "effects": _flat(study.effects),
     }
 
 

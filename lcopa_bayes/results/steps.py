@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -12,9 +12,10 @@ from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.data.drive import Drive
 from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.inference.simulation import Simulation
 from lcopa_bayes.model.forward import Experiment, ForwardModel
 from lcopa_bayes.model.grid import Mesh
-from lcopa_bayes.model.layout import Layout
+from lcopa_bayes.model.layout import Layout, Unit
 from lcopa_bayes.sampling.convergence import Limitation
 from lcopa_bayes.sampling.draws import Draws
 
@@ -22,6 +23,14 @@ _POINTS = 1000
 """Samples of the step response."""
 _DRAWS = 1000
 """Draws behind the metrics."""
+_EFFECT_DRAWS = 250
+"""The same with effects, which take a simulation each."""
+_AWAY = 1e6
+"""A response without bounds, over its steady value [-]."""
+_STATIC = 1e-60
+"""Time constant of a plant that follows at once [time unit]."""
+_SETTLED_SPANS = 200.0
+"""Time after which what effects add has settled, in spans of the record [-]."""
 _LATER = 4.0
 """Time after the record over which a response must stay where it settled, in spans of the record [-]: a fast
 mode that crosses the steady value at the record's end has left it again long before."""
@@ -41,19 +50,69 @@ class StepCurves:
     time: Vector
     """(n,) [time unit]."""
     normalised: Array
-    """Response over its steady value, (units, draws, n) [-]; steady is 1 by construction."""
+    """Response over its steady value, (curves, draws, n) [-]; steady is 1 by construction."""
     gains: Array
     """Steady response per unit step, (draws, responses, drives) [response unit / drive unit]."""
     delays: Matrix
     """(draws, delay slots) [time unit]."""
+    curve_of: tuple[tuple[int, ...], ...]
+    """Curve of each path, [response][drive]."""
+    values: Matrix
+    """Table values of the draws, (draws, rows)."""
 
 
 def step_curves(draws: Draws, span: float) -> StepCurves:
-    """Unit step responses of posterior draws over `span` [time unit]."""
-    values = draws.thinned(_DRAWS)
+    """Unit step responses of posterior draws over `span` [time unit].
+
+    With effects the step is as high as the largest drive of the records, and the response is divided by it;
+    draws without a bounded response are left out.
+    """
+    count = _DRAWS if draws.table.effects is None else _EFFECT_DRAWS
+    return curves_of(draws.table, draws.thinned(count), span)
+
+
+def curves_of(table: ParameterTable, values: Matrix, span: float) -> StepCurves:
+    """`step_curves` at table values (draws, rows)."""
     time = span * np.arange(1, _POINTS + 1) / _POINTS
-    units = _unit_steps(draws.table, values, time)
-    return StepCurves(time, units, draws.table.gains(values), draws.table.dynamics(values).delays)
+    if table.effects is not None:
+        return _with_effects(table, values, time)
+    units, delays = _unit_steps(table, values, time), table.dynamics(values).delays
+    return StepCurves(time, units, table.gains(values), delays, table.layout.unit_of, values)
+
+
+def _with_effects(table: ParameterTable, values: Matrix, time: Vector) -> StepCurves:
+    """Curves of every path by simulation, over the static response of the plant with its effects."""
+    moved = _effect_steps(table, values, time)
+    still = values.copy()
+    still[:, table.of_kind("time")] = _STATIC
+    still[:, table.of_kind("delay")] = 0.0
+    level = _effect_steps(table, still, time[-1] * np.linspace(0.5, 1.0, 16) * _SETTLED_SPANS)[..., -1]
+    kept = np.isfinite(moved).all(axis=(0, 2)) & np.isfinite(level).all(axis=0)
+    values, moved, level = values[kept], moved[:, kept], level[:, kept]
+    shape = (len(table.layout.responses), len(table.layout.drives))
+    whole = np.where(level == 0.0, 1.0, level)[..., None]
+    normalised = np.where(level[..., None] == 0.0, 1.0, moved / whole)
+    paths = tuple(tuple(i * shape[1] + j for j in range(shape[1])) for i in range(shape[0]))
+    gains = level.T.reshape(-1, *shape)
+    return StepCurves(time, normalised, gains, table.dynamics(values).delays, paths, values)
+
+
+def _effect_steps(table: ParameterTable, values: Matrix, time: Vector) -> Array:
+    """Responses to a step of each drive at time 0 over its height, (paths, draws, n) [response unit / drive
+    unit]; NaN where there is no bounded one."""
+    told = table.effects
+    assert told is not None
+    heights, experiments = told.ranges.drive, []
+    for j, height in enumerate(heights):
+        step = Drive(np.zeros(1), np.array([float(height)]))
+        drives = tuple(step if j == k else Drive(np.empty(0), np.empty(0)) for k in range(heights.size))
+        experiments.append(Experiment("step", Mesh.of_samples(time, 0.0), drives, np.zeros(heights.size)))
+    count = len(experiments)
+    over = replace(told, epochs=np.zeros(count), times=(time,) * count, fitted=(None,) * count)
+    model = ForwardModel(table.layout, tuple(experiments), over)
+    read = Simulation(table, model).responses(values)
+    by_drive = [one / height for one, height in zip(read, heights, strict=True)]
+    return np.concatenate(list(np.stack(by_drive, axis=1)))
 
 
 def _unit_steps(table: ParameterTable, values: Matrix, time: Vector) -> Array:
@@ -74,7 +133,8 @@ def too_fast(draws: Draws, curves: StepCurves, period: float) -> list[Limitation
     """
     table = draws.table
     out: list[Limitation] = []
-    for k, unit in enumerate(table.layout.units):
+    for unit in table.layout.units:
+        k = _curve_of(table.layout, curves, unit)
         reached = curves.normalised[k] / curves.normalised[k][:, -1:]
         rise = _difference(crossing(curves.time, reached, 0.9), crossing(curves.time, reached, 0.1))
         names = tuple(
@@ -93,6 +153,13 @@ def too_fast(draws: Draws, curves: StepCurves, period: float) -> list[Limitation
                 )
             )
     return out
+
+
+def _curve_of(layout: Layout, curves: StepCurves, unit: Unit) -> int:
+    """A curve of the first path that a unit response belongs to."""
+    paths = ((i, j) for i, row in enumerate(layout.unit_of) for j, k in enumerate(row))
+    i, j = next((i, j) for i, j in paths if layout.units[layout.unit_of[i][j]] == unit)
+    return curves.curve_of[i][j]
 
 
 def crossing(time: Vector, curves: Matrix, level: float) -> Vector:
@@ -153,7 +220,7 @@ def step_metrics(draws: Draws, curves: StepCurves, *, time_unit: str) -> list[Es
     out: list[Estimate] = []
     end = float(curves.time[-1])
     after = end * (1 + _LATER * np.arange(1, _LATER_POINTS + 1) / _LATER_POINTS)
-    later = _unit_steps(draws.table, draws.thinned(_DRAWS), after)
+    later = _later(draws.table, curves, after)
     time = np.concatenate((curves.time, after))
 
     def add(name: str, unit: str, values: Vector, note: str = "") -> None:
@@ -161,7 +228,7 @@ def step_metrics(draws: Draws, curves: StepCurves, *, time_unit: str) -> list[Es
 
     for i, response in enumerate(layout.responses):
         for j, drive in enumerate(layout.drives):
-            k = layout.unit_of[i][j]
+            k = curves.curve_of[i][j]
             curve, whole = curves.normalised[k], np.concatenate((curves.normalised[k], later[k]), axis=1)
             gain, unit = curves.gains[:, i, j], f"{response.unit}/{drive.unit}"
             path = layout.path_name(i, j) or response.name
@@ -183,6 +250,16 @@ def step_metrics(draws: Draws, curves: StepCurves, *, time_unit: str) -> list[Es
             add(f"steady_state[{path}]", unit, gain, note)
     out.extend(_crosstalk(layout, curves, ess=ess, grade=grade))
     return out
+
+
+def _later(table: ParameterTable, curves: StepCurves, time: Vector) -> Array:
+    """The curves at later times; far away where there is no bounded response."""
+    if table.effects is None:
+        return _unit_steps(table, curves.values, time)
+    level = np.concatenate([curves.gains[:, i].T for i in range(curves.gains.shape[1])])[..., None]
+    moved = _effect_steps(table, curves.values, time)
+    moved = np.where(level == 0.0, 1.0, moved / np.where(level == 0.0, 1.0, level))
+    return np.where(np.isfinite(moved), moved, _AWAY)
 
 
 def share_unsettled(curve: Matrix) -> float:

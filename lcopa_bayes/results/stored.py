@@ -58,7 +58,8 @@ class StoredResult(Result):
                 self.fit.save(path)
             for name, text in self.texts.items():
                 writable_folder((path / name).parent)
-                write_text(path / name, text)
+                if not ((path / name).is_file() and (path / name).read_text(encoding="utf-8") == text):
+                    write_text(path / name, text)
             save_json(self.values, path / self.file)
             add_origin(path, self.verb, self.origin)
         return path

@@ -134,7 +134,7 @@ def _step_response(fit: Fit) -> pd.DataFrame:
     layout, curves, frames = fit.draws.table.layout, fit.curves, []
     for i, response in enumerate(layout.responses):
         for j, drive in enumerate(layout.drives):
-            response_curve = curves.gains[:, i, j, None] * curves.normalised[layout.unit_of[i][j]]
+            response_curve = curves.gains[:, i, j, None] * curves.normalised[curves.curve_of[i][j]]
             rows = np.quantile(response_curve, (0.05, 0.25, 0.5, 0.75, 0.95), axis=0)
             steady = np.quantile(curves.gains[:, i, j], (0.05, 0.5, 0.95))
             columns = {

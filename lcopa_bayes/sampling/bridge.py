@@ -21,6 +21,8 @@ from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.mixturemoves import learned
 from lcopa_bayes.sampling.ridgemoves import walking
+from lcopa_bayes.sampling.sampler import SamplePlan
+from lcopa_bayes.sampling.weightedrun import weighted_run
 
 _EFFECTIVE = 0.5
 """Share of a population that stays effective in one rise."""
@@ -51,8 +53,16 @@ def carried(source: Posterior, target: Posterior, positions: Array, seed: int, *
     """Draws of `target` from walkers (ensembles, walkers, dimension) of `source`.
 
     With `jump` in one rise: for posteriors whose supports differ, but little else. Deterministic given
-    `seed`.
+    `seed`. With effects by importance sampling of the target, where its weights are usable.
     """
+    if target.simulation is not None:
+        plan = SamplePlan.of(
+            target.dimension, seed=seed, ensembles=len(positions), walkers=positions.shape[1]
+        )
+        found = weighted_run(target, plan)
+        if found is not None:
+            run, draws = found
+            return Carried(run.kept()[0], draws.ess, max(quality.rhat for quality in draws.qualities))
     mixture = learned(target, list(positions), seed)
     chains = []
     for number, position in enumerate(positions):

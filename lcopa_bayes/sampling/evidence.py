@@ -8,8 +8,9 @@ populations that have not found the same hills.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 import numpy as np
 from scipy.special import logsumexp
@@ -28,6 +29,10 @@ _TENTATIVE = 2.0
 """Above it the ensembles tell different stories [nat]."""
 _BRIDGED = 3_000
 """Draws of each side of a bridge."""
+_PORTION = 256
+"""Draws whose density one process computes at once."""
+Mapped = Callable[..., Iterable[Any]]
+"""A map of a function over tasks, here or in other processes."""
 _SETTLED = 1e-10
 """Change of the log ratio at which the iteration of a bridge stops [nat]."""
 
@@ -120,11 +125,21 @@ def _relative_variance(log_terms: Vector) -> float:
     return float(np.var(terms) / np.mean(terms) ** 2)
 
 
-def charted_density(posterior: Posterior, chart: Chart, y: Matrix) -> Vector:
-    """Log posterior density of charted coordinates, (batch,); -inf where the chart has no point."""
+def charted_density(posterior: Posterior, chart: Chart, y: Matrix, mapped: Mapped = map) -> Vector:
+    """Log posterior density of charted coordinates, (batch,); -inf where the chart has no point.
+
+    `mapped` does portions of a batch, here or in other processes.
+    """
     z, exists = chart.uncharted(y)
     out = np.full(len(y), -np.inf)
     if exists.any():
         _, log_volume = chart.charted(z[exists])
-        out[exists] = posterior.log_density(z[exists]) + posterior.table.log_permutations - log_volume
+        density = posterior.log_density(z[exists]) if mapped is map else spread(posterior, z[exists], mapped)
+        out[exists] = density + posterior.table.log_permutations - log_volume
     return out
+
+
+def spread(posterior: Posterior, z: Matrix, mapped: Mapped) -> Vector:
+    """Log density of sampled coordinates portion by portion, (batch,)."""
+    portions = np.array_split(z, max(1, len(z) // _PORTION))
+    return np.concatenate(list(mapped(posterior.log_density, portions)))

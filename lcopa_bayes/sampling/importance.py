@@ -23,7 +23,7 @@ from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.inference.optimum import Optimum, find_optima
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.coordinates import Chart
-from lcopa_bayes.sampling.evidence import charted_density
+from lcopa_bayes.sampling.evidence import Mapped, charted_density
 from lcopa_bayes.sampling.importanceweights import effective, usable_k
 from lcopa_bayes.sampling.proposal import Seen, around, fitted, split, weighty
 from lcopa_bayes.sampling.weighted import Weighted, tail_smoothed
@@ -81,14 +81,17 @@ class Importance:
 
 
 def first_look(
-    posterior: Posterior, rng: np.random.Generator, plan: ImportancePlan = ImportancePlan()
+    posterior: Posterior,
+    rng: np.random.Generator,
+    plan: ImportancePlan = ImportancePlan(),
+    mapped: Mapped = map,
 ) -> Importance | None:
     """Optima of a posterior from several starts, and importance sampling around them.
 
     None where no start led to an optimum of positive density.
     """
     optima = find_optima(posterior, rng, starts=plan.starts)
-    return importance(posterior, optima, rng, plan) if optima else None
+    return importance(posterior, optima, rng, plan, mapped) if optima else None
 
 
 def importance(
@@ -96,8 +99,9 @@ def importance(
     optima: Sequence[Optimum],
     rng: np.random.Generator,
     plan: ImportancePlan = ImportancePlan(),
+    mapped: Mapped = map,
 ) -> Importance:
-    """Importance sampling around given optima, one or more.
+    """Importance sampling around given optima, one or more; `mapped` spreads the density over processes.
 
     FloatingPointError where the density is NaN.
     """
@@ -110,7 +114,7 @@ def importance(
             core = split(core, rng)
         for _ in range(effort.rounds):
             y = proposal.draw(effort.learning, rng)
-            seen = seen.joined(proposal, y, charted_density(posterior, chart, y))
+            seen = seen.joined(proposal, y, charted_density(posterior, chart, y, mapped))
             log_weights = seen.log_weights()
             if np.isneginf(log_weights).all():
                 break
@@ -119,7 +123,7 @@ def importance(
             if k <= _LIGHT and effective(own) > LEAST_EFFICIENCY * effort.learning:
                 break
         y = proposal.draw(effort.draws, rng)
-        density = charted_density(posterior, chart, y)
+        density = charted_density(posterior, chart, y, mapped)
         found = _weighed(posterior, chart, y, density, density - proposal.log_density(y))
         if found.good(plan.wanted):
             break

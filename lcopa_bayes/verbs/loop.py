@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import final
 
 import pandas as pd
 
 from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.data.studyfile import load_study
+from lcopa_bayes.data.studywriter import write_study
 from lcopa_bayes.effectsearch.loop import loop as searched
 from lcopa_bayes.effectsearch.summary import drawn, results, words
 from lcopa_bayes.results.provenance import provenance
@@ -20,12 +23,18 @@ from lcopa_bayes.verbs.sources import FitLike, study_of
 
 CURVES = "loop_curves.json"
 """File of the residuals and views that the page draws."""
+EXPLAINED = "explained.toml"
+"""File of the study with what a loop found."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class LoopResult(StoredResult):
     """What the model of a study lacks."""
+
+    study: Study | None = None
+    """The study with the effects that were found declared, named as the study and ``-explained``: what `fit`,
+    `audit` and `compare` take."""
 
     verb, file, beside = "loop", "loop.json", (CURVES,)
 
@@ -47,6 +56,21 @@ class LoopResult(StoredResult):
             for one in effect["parameters"]
         ]
         return pd.DataFrame(rows, columns=pd.Index([*columns, "confused_with"]))
+
+    def save(self, folder: Path | str) -> Path:
+        """Write the result into a run folder, with `explained.toml`, the study of what was found, and its
+        records; returns the folder. InputError as `StoredResult.save`."""
+        with opened(folder, self.origin) as path:
+            if self.study is not None:
+                write_study(
+                    self.study, path / EXPLAINED, note=f"{self.values['study']} with what `loop` found."
+                )
+            return super().save(path)
+
+    @classmethod
+    def load(cls, folder: Path) -> LoopResult:
+        """The result in a run folder; InputError when it is not there or cannot be read."""
+        return replace(super().load(folder), study=load_study(folder / EXPLAINED))
 
     def __str__(self) -> str:
         return "\n".join(words(dict(self.values)))
@@ -72,7 +96,8 @@ def loop(
     with nullcontext() if folder is None else opened(folder, origin):
         found = searched(wanted, jobs=jobs, quick=quick, as_stated=as_stated)
         curves = json.dumps(plain(drawn(found)), indent=1, allow_nan=False) + "\n"
-        result = LoopResult(results(found), origin, {CURVES: curves})
+        values = results(found) | {"explained": EXPLAINED}
+        result = LoopResult(values, origin, {CURVES: curves}, study=found.study)
         if folder is not None:
             result.save(folder)
     return result

@@ -12,13 +12,9 @@ from small import U, Y, path, problem, record
 
 from lcopa_bayes.bench.command import staircase
 from lcopa_bayes.bench.device import Device
-from lcopa_bayes.effectsearch import draws
 from lcopa_bayes.effectsearch.autoregression import Autoregression
 from lcopa_bayes.effectsearch.basemodel import BaseModel
-from lcopa_bayes.effectsearch.density import LoopDensity
-from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.gaussnewton import Regression
-from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.summary import moved
 from lcopa_bayes.effectsearch.whitening import Whitening
 
@@ -125,39 +121,6 @@ def test_terms_stay_resolved_wherever_a_descent_begins(start):
         if model.supported(inside[None], every=False)[0]:
             step = np.clip(inside + rng.standard_normal(6), *model.bounds_about(inside))
             assert model.supported(step[None], every=False)[0]
-
-
-def density(pair: tuple[BaseModel, Regression], start: np.ndarray) -> LoopDensity:
-    model, regression = pair
-    optimum = regression.descend(start)
-    extended = ExtendedModel.of(model, optimum.x)
-    return LoopDensity(State(extended, optimum, regression.whitening, optimum.covariance), 1e8)
-
-
-def test_the_density_ends_where_orders_cease_to_decrease():
-    """Terms that can be exchanged are counted once; others have no density in another sequence."""
-    for pair, alike in ((LIKE, True), (DIFFERENT, False)):
-        start = np.array([2.0, np.log(2.0), 1.2, np.log(15.0), 0.8, 0.5])
-        target = density(pair, start)
-        here = target.state.optimum.x
-        exchanged = here[[0, 3, 4, 1, 2, 5]]
-        assert np.isfinite(target(here))
-        assert target(exchanged) == -np.inf
-        anywhere = target.log_priors(np.stack([here, exchanged]), ordered=False)
-        assert np.isfinite(anywhere[1]) == alike
-        if alike:
-            assert anywhere[1] == pytest.approx(anywhere[0])
-
-
-def test_draws_are_reported_by_decreasing_order(monkeypatch):
-    """From an optimum that was reached in the other sequence; few steps: only the sequence is looked at."""
-    monkeypatch.setattr(draws, "_STEPS", 10)
-    monkeypatch.setattr(draws, "_LONGER", 1.0)
-    drawn = draws.sample_loop(density(LIKE, SWAPPED), 3)
-    assert (drawn.flat[:, FIRST] >= drawn.flat[:, SECOND]).all()
-    named = [drawn.estimate(k) for k in (FIRST, SECOND)]
-    assert [one.name for one in named] == ["order_1", "order_2"]
-    assert named[0].value > named[1].value
 
 
 def test_shifts_are_those_of_the_reported_numbers():

@@ -164,6 +164,7 @@ def settled_of(made, curves, k):
         normalised=curves.normalised[:, [k, k]],
         gains=curves.gains[[k, k]],
         delays=curves.delays[[k, k]],
+        values=curves.values[[k, k]],
     )
     told = {metric.name: metric for metric in step_metrics(alone, one, time_unit="ms")}
     return told["settling_2[y]"].value

@@ -25,6 +25,8 @@ SLOW = 3.0
 class Broken:
     """A forward model that gives NaN for slow plants, from its `sound`-th evaluation on."""
 
+    effects = None
+
     def __init__(self, inner: ForwardModel, sound: int) -> None:
         self.inner, self.sound = inner, sound
         self.layout, self.experiments = inner.layout, inner.experiments

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import ClassVar, Self, final
 
 import numpy as np
@@ -12,6 +13,7 @@ from lcopa_bayes.data.drive import Drive, sorted_jumps
 from lcopa_bayes.model.effects.effect import (
     Card,
     Coefficient,
+    Constant,
     DriveEffect,
     Ranges,
     Scene,
@@ -28,6 +30,7 @@ class OverdrivePulse(DriveEffect):
     """Length of the pulse [time unit]."""
 
     linear = True
+    units = MappingProxyType({"frame": "time"})
     card: ClassVar[Card] = Card(
         name="overdrive_pulse",
         place="drive",
@@ -66,6 +69,8 @@ class RefreshHold(DriveEffect):
     phase: float
     """First refresh after time 0 over the period [-]."""
 
+    units = MappingProxyType({"refresh": "time"})
+    fractions = frozenset({"phase"})
     card: ClassVar[Card] = Card(
         name="refresh_hold",
         place="drive",
@@ -81,6 +86,12 @@ class RefreshHold(DriveEffect):
         return tuple(
             cls(count * ranges.period, phase) for count in (5, 10, 20) for phase in (0.0, 0.25, 0.5, 0.75)
         )
+
+    @classmethod
+    def internal(cls, ranges: Ranges) -> tuple[Constant, ...]:
+        """Any phase."""
+        refresh, phase = super().internal(ranges)
+        return refresh, replace(phase, high=1.0)
 
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
         """w [-]."""

@@ -27,6 +27,7 @@ _SHARP = 3e-4
 class CubicStiffness(ForceEffect):
     """Restoring force that hardens (c > 0) or softens with the deflection."""
 
+    batched = True
     card: ClassVar[Card] = Card(
         name="cubic_stiffness",
         place="plant",
@@ -50,6 +51,7 @@ class CubicStiffness(ForceEffect):
 class RiseFallAsymmetry(ForceEffect):
     """Viscosity that differs between motion away from rest and back."""
 
+    batched = True
     card: ClassVar[Card] = Card(
         name="rise_fall_asymmetry",
         place="plant",
@@ -75,6 +77,7 @@ class RiseFallAsymmetry(ForceEffect):
 class LevelDependentSpeed(ForceEffect):
     """Viscosity that falls (e > 0) with the deflection."""
 
+    batched = True
     card: ClassVar[Card] = Card(
         name="level_dependent_speed",
         place="plant",
@@ -101,6 +104,7 @@ class Overflow(ForceEffect):
     level: float
     """Where the further loss begins, over the largest deflection [-]."""
 
+    batched = True
     card: ClassVar[Card] = Card(
         name="overflow",
         place="plant",

@@ -13,9 +13,10 @@ Deflection always means the response without its offset, so that it is 0 at zero
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Any, ClassVar, Self, final
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields
+from types import MappingProxyType
+from typing import Any, ClassVar, Literal, Self, final
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
 from lcopa_bayes.data.drive import Drive
@@ -78,6 +79,24 @@ class Coefficient:
     """Standard deviation of its prior, normal or, when `one_signed`, half-normal [`unit`]."""
     one_signed: bool = False
     """Whether only values of 0 or more make sense."""
+    axis: int | None = None
+    """Response axis it acts on; None when it acts on several."""
+
+
+@final
+@dataclass(frozen=True)
+class Constant:
+    """One internal constant of an effect and where its default prior reaches."""
+
+    name: str
+    unit: str
+    """"-", "time", "response" or "1/time"."""
+    low: float
+    """Smallest value that is tried [`unit`]."""
+    high: float
+    """Largest value that is tried; equal to `low` where it is fixed unless a study gives a prior [`unit`]."""
+    kind: Literal["constant", "fraction", "choice"]
+    """Positive, of any magnitude; a share from 0 to 1; or no (0) and yes (1)."""
 
 
 @final
@@ -140,11 +159,41 @@ class Effect(ABC):
     linear: ClassVar[bool] = False
     """Whether what it adds, where it acts, is proportional to its coefficients: one difference is then
     enough for a slope."""
+    affine: ClassVar[bool] = True
+    """Whether every response axis stays linear in the gains of its own paths."""
+    additive: ClassVar[bool] = False
+    """Whether what it adds depends on time alone, not on the plant or its drive."""
+    units: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    """Units of the internal constants that have one."""
+    fractions: ClassVar[frozenset[str]] = frozenset()
+    """Internal constants that lie between 0 and 1."""
 
     @classmethod
     def grid(cls, ranges: Ranges) -> tuple[Self, ...]:
         """Instances with the internal constants worth trying; one when there are none to try."""
         return (cls(),)
+
+    @classmethod
+    def internal(cls, ranges: Ranges) -> tuple[Constant, ...]:
+        """Internal constants, in the order of the fields; they reach from end to end of `grid`, and what has
+        a default value is fixed there."""
+        listed, out = cls.grid(ranges), []
+        for field in fields(cls):  # type: ignore[arg-type]
+            values = [getattr(one, field.name) for one in listed]
+            if isinstance(values[0], bool):
+                out.append(Constant(field.name, "-", 0.0, 0.0, "choice"))
+                continue
+            low, high = (min(values), max(values)) if field.default is MISSING else (field.default,) * 2
+            kind: Literal["constant", "fraction"] = "fraction" if field.name in cls.fractions else "constant"
+            unit = cls.units.get(field.name, "-")
+            out.append(Constant(field.name, unit, float(low), float(high), kind))
+        return tuple(out)
+
+    @classmethod
+    def with_constants(cls, ranges: Ranges, values: Sequence[float]) -> Self:
+        """The instance with internal constants as numbers, in the order of `internal`."""
+        told = cls.internal(ranges)
+        return cls(*(bool(v) if one.kind == "choice" else v for one, v in zip(told, values, strict=True)))
 
     @abstractmethod
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
@@ -187,6 +236,11 @@ class ElementEffect(Effect):
 class ForceEffect(Effect):
     """Changes the balance of forces in the direct paths: ``y + viscous(y) = v(f, y)`` instead of ``= f``."""
 
+    affine = False
+    batched: ClassVar[bool] = False
+    """Whether `force` takes many plants at once, an axis of each per row: coefficients, constants and the
+    column of `Ranges` then have a value per row, (rows, 1), and no axis sees another."""
+
     @abstractmethod
     def force(self, f: Matrix, y: Matrix, rate: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """Effective force v on each direct path, (axes, blocks) [response unit].
@@ -217,6 +271,8 @@ class ParallelEffect(Effect):
 class ReadoutEffect(Effect):
     """Acts on the deflection at the sample times."""
 
+    affine = False
+
     @abstractmethod
     def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """Deflection as read, (samples, axes) [response unit], from the one before."""
@@ -224,6 +280,10 @@ class ReadoutEffect(Effect):
 
 class ScatterEffect(Effect):
     """Changes the distribution of the noise and not the mean: its signature is 0."""
+
+    noise: ClassVar[str]
+    """Noise model that takes the place of the study's; the parameters it has beside a scale are those of the
+    effect."""
 
 
 def single(name: str, scale: float, unit: str = "-", *, one_signed: bool = False) -> tuple[Coefficient, ...]:
@@ -236,7 +296,9 @@ def per_axis(
 ) -> tuple[Coefficient, ...]:
     """Coefficients [response unit] for every axis in turn; their scale is a `part` of its deflection."""
     return tuple(
-        Coefficient(f"{name}_{axis}" if ranges.axes > 1 else name, "response", part * float(size), one_signed)
-        for axis, size in zip(ranges.names, ranges.response, strict=True)
+        Coefficient(
+            f"{name}_{axis}" if ranges.axes > 1 else name, "response", part * float(size), one_signed, number
+        )
+        for number, (axis, size) in enumerate(zip(ranges.names, ranges.response, strict=True))
         for name in names
     )

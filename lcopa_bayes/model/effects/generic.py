@@ -59,6 +59,7 @@ class UnmodelledLinear(ParallelEffect):
 class UnmodelledSmooth(ParallelEffect):
     """Any slow addition to a record, whatever the drive does."""
 
+    additive = True
     card: ClassVar[Card] = Card(
         name="unmodelled_smooth",
         place="generic",

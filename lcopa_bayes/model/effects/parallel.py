@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import ClassVar, Self, final
 
 import numpy as np
@@ -34,6 +35,7 @@ class IonCreep(ParallelEffect):
     time: float
     """Ti [time unit]."""
 
+    units = MappingProxyType({"time": "time"})
     card: ClassVar[Card] = Card(
         name="ion_creep",
         place="plant",
@@ -72,6 +74,7 @@ class Backflow(ParallelEffect):
     rising: bool
     """Whether it follows rising instead of falling changes."""
 
+    units = MappingProxyType({"time": "time"})
     card: ClassVar[Card] = Card(
         name="backflow",
         place="plant",
@@ -117,6 +120,8 @@ class ExtraMode(ParallelEffect):
     damping: float
     """zeta [-], below 1."""
 
+    units = MappingProxyType({"frequency": "1/time"})
+    fractions = frozenset({"damping"})
     card: ClassVar[Card] = Card(
         name="extra_mode",
         place="plant",
@@ -164,6 +169,7 @@ class MissingCrossPath(ParallelEffect):
     time: float
     """T [time unit]."""
 
+    units = MappingProxyType({"time": "time"})
     card: ClassVar[Card] = Card(
         name="missing_cross_path",
         place="plant",

@@ -64,16 +64,20 @@ def linear(
     model: ForwardModel, scenes: Sequence[Scene], plant: Plant, known: StepResponses | None = None
 ) -> list[Moved]:
     """Every record of the linear plant, by the forward model; `known` as there."""
-    out = []
-    for scene, units in zip(scenes, model.unit_responses(plant.dynamics, known), strict=True):
-        rows = [
-            np.sum(
-                [plant.gains[i, j] * (scene.rest[j] + units[unit, 0]) for j, unit in enumerate(row)], axis=0
-            )
-            for i, row in enumerate(model.layout.unit_of)
-        ]
-        out.append(Moved(scene, np.stack(rows, axis=1)))
-    return out
+    responses = model.unit_responses(plant.dynamics, known)
+    return [
+        Moved(scene, deflections(model.layout, scene, plant.gains, units[:, 0]))
+        for scene, units in zip(scenes, responses, strict=True)
+    ]
+
+
+def deflections(layout: Layout, scene: Scene, gains: Matrix, units: Matrix) -> Matrix:
+    """Deflections of a linear plant, (samples, axes), from its unit responses, (units, samples)."""
+    rows = [
+        np.sum([gains[i, j] * (scene.rest[j] + units[unit]) for j, unit in enumerate(row)], axis=0)
+        for i, row in enumerate(layout.unit_of)
+    ]
+    return np.stack(rows, axis=1)
 
 
 def passed(

@@ -29,6 +29,7 @@ class GainDrift(ReadoutEffect):
     """Deflection that changes in size through the campaign."""
 
     linear = True
+    affine = True
     card: ClassVar[Card] = Card(
         name="gain_drift",
         place="noise",
@@ -105,6 +106,7 @@ class TriggerJitter(DriveEffect):
 class PointingOffset(ParallelEffect):
     """A record whose response is shifted as a whole."""
 
+    additive = True
     card: ClassVar[Card] = Card(
         name="pointing_offset",
         place="noise",
@@ -130,6 +132,7 @@ class PointingOffset(ParallelEffect):
 class PointingDrift(ParallelEffect):
     """A record whose response drifts."""
 
+    additive = True
     card: ClassVar[Card] = Card(
         name="pointing_drift",
         place="noise",
@@ -157,6 +160,7 @@ class PointingDrift(ParallelEffect):
 class Outliers(ScatterEffect):
     """Noise with heavy tails: Student's t instead of the normal distribution."""
 
+    noise = "student"
     card: ClassVar[Card] = Card(
         name="outliers",
         place="noise",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import ClassVar, Self, final
 
 import numpy as np
@@ -40,6 +41,8 @@ class Vibration(ParallelEffect):
     frequency: float
     """[cycles per time unit]."""
 
+    additive = True
+    units = MappingProxyType({"frequency": "1/time"})
     card: ClassVar[Card] = Card(
         name="vibration",
         place="noise",
@@ -75,6 +78,7 @@ class Flicker(ReadoutEffect):
     """[cycles per time unit]."""
 
     linear = True
+    units = MappingProxyType({"frequency": "1/time"})
     card: ClassVar[Card] = Card(
         name="flicker",
         place="noise",

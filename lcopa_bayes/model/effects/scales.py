@@ -10,15 +10,15 @@ from lcopa_bayes.core.arrays import Index, Vector
 from lcopa_bayes.model.effects.effect import Ranges
 from lcopa_bayes.model.effects.passage import Plant
 from lcopa_bayes.model.forward import Experiment, ForwardModel
+from lcopa_bayes.model.layout import Layout
 from lcopa_bayes.model.powerseries import Circle
 from lcopa_bayes.model.transfer import transfer
 
 _BLOCKS = 2048
 
 
-def own_drives(model: ForwardModel) -> Index:
+def own_drives(layout: Layout) -> Index:
     """Drive that each response axis belongs to: by name, else by position."""
-    layout = model.layout
     own = [layout.own_response(j) for j in range(len(layout.drives))]
     last = len(layout.drives) - 1
     return np.array([own.index(i) if i in own else min(i, last) for i in range(len(layout.responses))])
@@ -31,7 +31,7 @@ def ranges_of(model: ForwardModel, plant: Plant, times: Sequence[Vector]) -> Ran
     any, those of responses in proportion to what their own drives hold, so that one coefficient says the
     same of every axis, however far the records drove each. `times` are the sample times of every record.
     """
-    direct = own_drives(model)
+    direct = own_drives(model.layout)
     seen = np.max([_largest(experiment) for experiment in model.experiments], axis=0)
     drive = _of_unit(seen, [axis.unit for axis in model.layout.drives])
     units = model.unit_responses(plant.dynamics)

@@ -1,0 +1,349 @@
+"""Responses of a batch of plants with effects, split into what the table's linear parameters scale.
+
+Where every response axis stays linear in its gains, a record is ``base + sum gain_ij column_ij``, and gains
+can be integrated out as without effects; otherwise the base holds the gains too. So it is with coefficients
+that only add a fixed shape in time. Each plant is simulated by itself (`model.effects.simulator`); without an
+effect before the reading all share one call of the forward model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple, final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Array, Flags, Index, Matrix, Vector
+from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
+from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.model.effects.batchpassage import BatchPassage
+from lcopa_bayes.model.effects.declared import Declared
+from lcopa_bayes.model.effects.effect import (
+    DriveEffect,
+    Effect,
+    ForceEffect,
+    ParallelEffect,
+    ReadoutEffect,
+    Scene,
+    UnstableError,
+)
+from lcopa_bayes.model.effects.passage import Moved, Plant, deflections
+from lcopa_bayes.model.effects.simulator import Simulator
+from lcopa_bayes.model.forward import ForwardModel
+
+
+class Simulated(NamedTuple):
+    """One record under a batch of plants."""
+
+    base: Array
+    """Response with all `columns` left out, (axes, batch, samples) [response unit]."""
+    columns: Mapping[int, Matrix]
+    """What a unit of a table row adds to its response axis, (batch, samples); none for what does not act."""
+    bounded: Flags
+    """Plants that have a bounded response, (batch,); the others are 0 throughout."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """The model of a table with the effects of a forward model."""
+
+    table: ParameterTable
+    model: ForwardModel
+
+    @property
+    def declared(self) -> Declared:
+        """The effects."""
+        assert self.model.effects is not None
+        return self.model.effects
+
+    @cached_property
+    def scaled(self) -> frozenset[int]:
+        """Rows that have a column: gains where responses are linear in them, coefficients that only add."""
+        rows = self.table.rows
+        gains = self.table.of_kind("gain") if self.declared.affine else []
+        return frozenset([*gains, *(k for k, row in enumerate(rows) if row.adds_to is not None)])
+
+    @cached_property
+    def coefficients(self) -> list[list[int]]:
+        """Table rows of the coefficients of each effect, those of one record after those of another."""
+        return self._rows(COEFFICIENTS)
+
+    @cached_property
+    def constants(self) -> list[list[int]]:
+        """Table rows of the internal constants of each effect."""
+        return self._rows(CONSTANTS)
+
+    def _rows(self, kinds: tuple[str, ...]) -> list[list[int]]:
+        rows = self.table.rows
+        out = []
+        for e in range(len(self.declared.kinds)):
+            mine = [k for k, row in enumerate(rows) if row.kind in kinds and row.place.first == e]
+            out.append(sorted(mine, key=lambda k: rows[k].place.second))
+        return out
+
+    def effects(self, values: Vector) -> tuple[Effect, ...]:
+        """The effects with the internal constants of table values, (rows,)."""
+        ranges = self.declared.ranges
+        return tuple(
+            kind.with_constants(ranges, values[rows].tolist())
+            for kind, rows in zip(self.declared.kinds, self.constants, strict=True)
+        )
+
+    def psi(self, values: Vector) -> Vector:
+        """Coefficients as a simulator of this model's records takes them; those of another record are 0."""
+        parts = []
+        for e, (kind, rows) in enumerate(zip(self.declared.kinds, self.coefficients, strict=True)):
+            if not kind.card.per_record:
+                parts.append(values[rows])
+                continue
+            count = self._counts[e]
+            for place in self.declared.fitted:
+                own = [] if place is None else rows[place * count : (place + 1) * count]
+                parts.append(values[own] if own else np.zeros(count))
+        return np.concatenate(parts) if parts else np.empty(0)
+
+    @cached_property
+    def _counts(self) -> list[int]:
+        """Coefficients of each effect, or of one record of it [-]."""
+        ranges = self.declared.ranges
+        instances = (
+            kind.with_constants(ranges, [one.low for one in kind.internal(ranges)])
+            for kind in self.declared.kinds
+        )
+        return [len(instance.coefficients(ranges)) for instance in instances]
+
+    def simulator(self, effects: tuple[Effect, ...]) -> Simulator:
+        """What simulates one plant with these effects."""
+        told = self.declared
+        return Simulator(self.model.plain, effects, told.ranges, told.epochs, told.times)
+
+    def plant(self, values: Vector) -> Plant:
+        """The plant of canonical table values, (rows,), without offsets."""
+        batch = values[None]
+        offsets = np.zeros((len(self.model.experiments), len(self.table.layout.responses)))
+        return Plant(self.table.gains(batch)[0], self.table.dynamics(batch), offsets)
+
+    def __call__(self, values: Matrix) -> list[Simulated]:
+        """Every record at canonical table values, (batch, rows)."""
+        told, batch, layout = self.declared, len(values), self.table.layout
+        shared = None
+        if not (told.bending or told.commanding):
+            shared = self.model.plain.unit_responses(self.table.dynamics(values))
+        sizes = [times.size for times in told.times]
+        bounded = np.ones(batch, dtype=bool)
+        out = [
+            Simulated(
+                np.zeros((len(layout.responses), batch, n)),
+                {k: np.zeros((batch, n)) for k in self.scaled if self._acts(k, r)},
+                bounded,
+            )
+            for r, n in enumerate(sizes)
+        ]
+        effects, simulator = None, None
+        left = np.arange(batch)
+        if told.forced:
+            left = self._forced(values, out)
+        elif self._scales_commands(values):
+            left = self._commanded(values, out)
+        for b in left.tolist():
+            row = values[b]
+            own = self.effects(row)
+            if simulator is None or own != effects:
+                effects, simulator = own, self.simulator(own)
+            units = None if shared is None else [each[:, b] for each in shared]
+            try:
+                self._one(simulator, row, units, b, out)
+            except UnstableError:
+                bounded[b] = False
+                for record in out:
+                    for each in (*record.base, *record.columns.values()):
+                        each[b] = 0.0
+        return out
+
+    def responses(self, values: Matrix) -> list[Array]:
+        """Responses without offsets, per record (axes, batch, samples) [response unit]; NaN where there is no
+        bounded one."""
+        out = []
+        for record in self(values):
+            total = record.base.copy()
+            for k, column in record.columns.items():
+                total[self.table.rows[k].response] += values[:, k, None] * column
+            total[:, ~record.bounded] = np.nan
+            out.append(total)
+        return out
+
+    def disturbed(self, values: Matrix, rng: np.random.Generator) -> list[Array]:
+        """`responses` of one other record, whose own coefficients are unknown.
+
+        They are drawn as large as those of the fit records: normal about 0, of their root mean square.
+        """
+        told, out = self.declared, values.copy()
+        for kind, rows, count in zip(told.kinds, self.coefficients, self._counts, strict=True):
+            if kind.card.per_record:
+                fitted = values[:, rows].reshape(len(values), -1, count)
+                size = np.sqrt(np.mean(fitted**2, axis=1))
+                out[:, rows[:count]] = size * rng.standard_normal(size.shape)
+        own = replace(self.model, effects=replace(told, fitted=(0,) * len(told.fitted)))
+        return Simulation(self.table, own).responses(out)
+
+    def _acts(self, k: int, r: int) -> bool:
+        """Whether a scaled row acts on a record."""
+        row = self.table.rows[k]
+        if row.kind == "gain":
+            experiment = self.model.experiments[r]
+            drive = row.place.second
+            return experiment.drives[drive].moves or experiment.rest[drive] != 0.0
+        return self.declared.fitted[r] == row.place.second // self._counts[row.place.first]
+
+    def _forced(self, values: Matrix, out: list[Simulated]) -> Index:
+        """Write the responses of plants under forces, all at once; returns those that ask for more."""
+        told, layout, table = self.declared, self.table.layout, self.table
+        axes, gains, dynamics = len(layout.responses), table.gains(values), table.dynamics(values)
+        forces = []
+        for kind, rows, constants in zip(told.kinds, self.coefficients, self.constants, strict=True):
+            if issubclass(kind, ForceEffect):
+                psi = np.repeat(values[:, rows].T, axes, axis=1)[..., None]
+                own = [np.repeat(values[:, k], axes)[:, None] for k in constants]
+                forces.append((kind(*(c if np.ptp(c) else float(c[0, 0]) for c in own)), psi))
+        simulator = self.simulator(self.effects(values[0]))
+        done = np.ones(len(values), dtype=bool)
+        for r, units in enumerate(self.model.plain.unit_responses(dynamics)):
+            scene = simulator.scene(r, self.plant(values[0]))
+            change, found = BatchPassage(self.model, r, scene, gains, dynamics).change(forces)
+            done &= found
+            for i, row in enumerate(layout.unit_of):
+                for j, unit in enumerate(row):
+                    out[r].base[i] += gains[:, i, j, None] * (scene.rest[j] + units[unit])
+            out[r].base[...] += change
+        if len(forces) < len(told.kinds):
+            for b in np.flatnonzero(done).tolist():
+                simulator = self.simulator(self.effects(values[b]))
+                self._finished(simulator, values[b], b, out)
+        return np.flatnonzero(~done)
+
+    def _scales_commands(self, values: Matrix) -> bool:
+        """Whether all plants share one effect on the commands that is proportional to its coefficient, and
+        nothing else acts but on what is read."""
+        drive = [k for k in self.declared.kinds if issubclass(k, DriveEffect)]
+        if len(drive) != 1 or self.declared.bending or not drive[0].linear or drive[0].card.per_record:
+            return False
+        e = self.declared.kinds.index(drive[0])
+        others = [k for k in self.declared.kinds if k is not drive[0]]
+        read = all(issubclass(k, ReadoutEffect) and not k.affine for k in others)
+        same = not np.ptp(values[:, self.constants[e]], axis=0).any()
+        return read and same and len(self.coefficients[e]) == 1
+
+    def _commanded(self, values: Matrix, out: list[Simulated]) -> Index:
+        """Write the responses of plants under commands that change in proportion to one coefficient."""
+        layout, gains = self.table.layout, self.table.gains(values)
+        dynamics = self.table.dynamics(values)
+        e = next(k for k, kind in enumerate(self.declared.kinds) if issubclass(kind, DriveEffect))
+        unit, at = values[0].copy(), self.coefficients[e][0]
+        unit[[k for rows in self.coefficients for k in rows]] = 0.0
+        unit[at] = 1.0
+        simulator = self.simulator(self.effects(values[0]))
+        there = simulator.driven(simulator.scenes(self.plant(unit), self.psi(unit)))
+        plain, size = self.model.plain, values[:, at, None]
+        if not _as_exact(plain, there):
+            return np.arange(len(values))
+        pairs = zip(plain.unit_responses(dynamics), there.unit_responses(dynamics), strict=True)
+        for r, (before, after) in enumerate(pairs):
+            rests = plain.experiments[r].rest, there.experiments[r].rest
+            for i, row in enumerate(layout.unit_of):
+                for j, u in enumerate(row):
+                    column = rests[0][j] + before[u]
+                    column += size * (rests[1][j] + after[u] - column)
+                    k = self.table.at("gain", i, j)
+                    if not self.declared.affine:
+                        out[r].base[i] += gains[:, i, j, None] * column
+                    elif k in out[r].columns:
+                        out[r].columns[k][...] = column
+        if len(self.declared.kinds) > 1:
+            for b, row in enumerate(values):
+                self._finished(self.simulator(self.effects(row)), row, b, out)
+        return np.arange(0)
+
+    def _finished(self, simulator: Simulator, row: Vector, b: int, out: list[Simulated]) -> None:
+        """What comes after the reading, on responses of one plant that are there already."""
+        plant, psi = self.plant(row), self.psi(self._without_scaled(row))
+        scenes = simulator.scenes(plant, psi)
+        moved = [Moved(scene, record.base[:, b].T) for scene, record in zip(scenes, out, strict=True)]
+        for record, y in zip(out, simulator.finished(moved, psi), strict=True):
+            record.base[:, b] = y.T
+        self._added(simulator, plant, b, out)
+
+    def _without_scaled(self, row: Vector) -> Vector:
+        """Table values with the coefficients that have a column at 0."""
+        still = row.copy()
+        still[[k for k in self.scaled if self.table.rows[k].kind != "gain"]] = 0.0
+        return still
+
+    def _one(
+        self, simulator: Simulator, row: Vector, units: list[Matrix] | None, b: int, out: list[Simulated]
+    ) -> None:
+        """Write one plant's responses."""
+        plant, psi = self.plant(row), self.psi(self._without_scaled(row))
+        if units is None and not self.declared.bending:
+            driven = simulator.driven(simulator.scenes(plant, psi))
+            units = [each[:, 0] for each in driven.unit_responses(plant.dynamics)]
+        if not self.declared.affine:
+            for record, y in zip(out, self._read(simulator, plant, psi, units), strict=True):
+                record.base[:, b] = y.T
+        else:
+            zero = replace(plant, gains=np.zeros_like(plant.gains))
+            scenes = simulator.scenes(zero, psi)
+            rest = [Moved(scene, np.zeros((scene.times.size, len(plant.gains)))) for scene in scenes]
+            base = simulator.finished(rest, psi)
+            for record, y in zip(out, base, strict=True):
+                record.base[:, b] = y.T
+            for j in range(plant.gains.shape[1]):
+                gains = np.zeros_like(plant.gains)
+                gains[:, j] = 1.0
+                read = self._read(simulator, replace(plant, gains=gains), psi, units)
+                for record, y, nothing in zip(out, read, base, strict=True):
+                    for i in range(gains.shape[0]):
+                        k = self.table.at("gain", i, j)
+                        if k in record.columns:
+                            record.columns[k][b] = (y - nothing)[:, i]
+        self._added(simulator, plant, b, out)
+
+    def _read(
+        self, simulator: Simulator, plant: Plant, psi: Vector, units: list[Matrix] | None
+    ) -> list[Matrix]:
+        """Deflections of one plant as read, per record (samples, axes)."""
+        if units is None:
+            return simulator.finished(simulator.moved(plant, psi), psi)
+        scenes = simulator.scenes(plant, psi)
+        moved = [
+            Moved(scene, deflections(self.table.layout, scene, plant.gains, each))
+            for scene, each in zip(scenes, units, strict=True)
+        ]
+        return simulator.finished(moved, psi)
+
+    def _added(self, simulator: Simulator, plant: Plant, b: int, out: list[Simulated]) -> None:
+        """Columns of the coefficients that only add."""
+        for e, rows in enumerate(self.coefficients):
+            effect = simulator.effects[e]
+            if not (isinstance(effect, ParallelEffect) and effect.additive) or rows[0] not in self.scaled:
+                continue
+            count = self._counts[e]
+            for r, place in enumerate(self.declared.fitted):
+                if place is None:
+                    continue
+                scene: Scene = simulator.scene(r, plant)
+                for k in range(count):
+                    unit = np.zeros(count)
+                    unit[k] = 1.0
+                    at = rows[place * count + k]
+                    out[r].columns[at][b] = effect.added(scene, unit)[:, self.table.rows[at].response]
+
+
+def _as_exact(before: ForwardModel, after: ForwardModel) -> bool:
+    """Whether more changes of a drive are simulated as exactly: too many phases are shared out to blocks."""
+    pairs = zip(before.experiments, after.experiments, strict=True)
+    return all(
+        len(a) <= len(b) for one, other in pairs for a, b in zip(one.phases, other.phases, strict=True)
+    )

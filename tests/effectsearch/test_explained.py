@@ -1,0 +1,103 @@
+"""The loop closes: what it found is a study, and a fit of it gives the numbers it reported."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_loop import LIBRARY, study
+
+from lcopa_bayes.cli import main
+from lcopa_bayes.data.studyfile import load_study
+from lcopa_bayes.data.studywriter import write_study
+from lcopa_bayes.effectsearch.explained import coordinates_of, explained_study
+from lcopa_bayes.effectsearch.loop import Loop, loop
+from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.model.effects.commands import OverdrivePulse
+from lcopa_bayes.model.effects.ripples import Vibration
+from lcopa_bayes.results.fit import Fit, fit
+
+
+@pytest.fixture(scope="module")
+def bent() -> Loop:
+    return loop(study(1, curvature=0.08), library=LIBRARY, quick=True, as_stated=True)
+
+
+@pytest.fixture(scope="module")
+def again(bent: Loop, tmp_path_factory: pytest.TempPathFactory) -> Fit:
+    path = tmp_path_factory.mktemp("run") / "explained.toml"
+    write_study(bent.study, path)
+    return fit(load_study(path), quick=True)
+
+
+def test_a_fit_of_the_explained_study_gives_the_numbers_of_the_loop(bent: Loop, again: Fit):
+    told = {one.name: one for one in again.draws.estimates()}
+    model = bent.after.state.model
+    assert bent.names == ("odd_curvature",)
+    for k in range(len(model.names)):
+        own = bent.estimate(k)
+        assert own["value"] == pytest.approx(told[own["name"]].value, rel=1e-9), own["name"]
+        assert own["upper"] == pytest.approx(told[own["name"]].upper, rel=1e-9), own["name"]
+
+
+def test_it_agrees_with_the_descent_of_the_loop(bent: Loop):
+    """Another noise model and a linearisation: within half a standard deviation of each other."""
+    state = bent.after.state
+    assert bent.draws is not None
+    drawn = coordinates_of(state.model, bent.draws)
+    apart = (np.median(drawn, axis=0) - state.optimum.x) / drawn.std(axis=0)
+    assert np.abs(apart).max() < 0.5
+    size = np.sqrt(np.diag(state.optimum.covariance)) / drawn.std(axis=0)
+    assert size.min() > 0.7
+    assert size.max() < 1.4
+
+
+def test_the_truth_lies_within(again: Fit):
+    """``y + 0.08 y^3`` in units of the largest deflection."""
+    assert again.problem.ranges is not None
+    scale = again.problem.ranges.response[0]
+    (own,) = [one for one in again.draws.estimates() if one.name == "odd_curvature.c"]
+    assert abs(own.value - 0.08 * scale**2) < 4 * own.sd
+
+
+def test_held_out_records_are_predicted_to_the_noise(again: Fit):
+    (band,) = [one for one in again.bands if one.held_out]
+    assert band.rmse < 1.2 * 5e-3
+    assert 0.8 < band.coverage(0.9) <= 1.0
+
+
+def test_constants_are_held_where_the_loop_left_them(bent: Loop):
+    """And coefficients of single records share a prior; an explained study is not explained twice."""
+    state = bent.after.state
+    model = state.model.having(OverdrivePulse(1.25), Vibration(0.21))
+    made = explained_study(bent.problem.study, model)
+    assert made.effects.use == ("overdrive_pulse", "vibration")
+    table = problem_of(made).posterior.table
+    rows = {row.name: row for row in table.rows}
+    assert rows["overdrive_pulse.frame"].value == 1.25
+    assert rows["vibration.frequency"].value == 0.21
+    scale = 0.005 * model.effected.ranges.response[0]
+    assert rows["vibration.a[r2]"].prior.parameters["scale"] == pytest.approx(scale)  # type: ignore[union-attr]
+    assert explained_study(made, model).name == made.name == "small-explained"
+
+
+def test_a_clean_loop_leaves_the_study_as_it_was(bent: Loop):
+    made = explained_study(bent.problem.study, bent.before.state.model)
+    assert made.effects == bent.problem.study.effects
+    assert problem_of(made).posterior.simulation is None
+
+
+def test_the_command_writes_it(tmp_path: Path):
+    """From the command line: the study it ends with lies beside its results and can be loaded."""
+    source = study(2, curvature=0.08, held_out=1)
+    (tmp_path / "in").mkdir()
+    write_study(replace(source, name="made"), tmp_path / "in" / "study.toml")
+    arguments = ["loop", str(tmp_path / "in"), "--out", str(tmp_path / "run"), "--quick", "--jobs", "1"]
+    assert main([*arguments, "--quiet", "--as-stated"]) == 0
+    told = json.loads((tmp_path / "run" / "loop.json").read_text())
+    made = load_study(tmp_path / "run" / "explained.toml")
+    assert list(made.effects.use) == [one["name"] for one in told["effects"]]
+    assert len(made.held_out) == 1
