@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import arviz_base
+import arviz_stats
 import numpy as np
 import pandas as pd
 import pytest
@@ -82,6 +83,10 @@ def test_posterior_has_the_arviz_groups(fitted, folder):
             "posterior_predictive",
             "observed_data",
             "constant_data",
+            "prior",
+            "prior_predictive",
+            "predictions",
+            "predictions_constant_data",
         }
         free = [row.name for row in fitted.draws.table.rows if row.free]
         assert "delay" not in free
@@ -95,8 +100,30 @@ def test_posterior_has_the_arviz_groups(fitted, folder):
         assert_array_equal(read["posterior"]["gain"], fitted.draws.values[..., 0])
         assert_array_equal(read["sample_stats"]["lp"], fitted.draws.log_density)
         assert_allclose(read["observed_data"]["a_y"], PAIR[0].response[~np.isnan(PAIR[0].response[:, 0]), 0])
-        assert_allclose(read["constant_data"]["b_y_time"], PAIR[1].time[~np.isnan(PAIR[1].response[:, 0])])
+        assert_allclose(read["observed_data"]["b_y_time"], PAIR[1].time[~np.isnan(PAIR[1].response[:, 0])])
         assert read.attrs["grade"] == fitted.draws.grade.level
+        assert read.attrs["seed"] == fitted.study.seed
+        assert json.loads(read.attrs["settings"])["sampler"]["walkers"] == 16
+        assert read["log_likelihood"]["a_y"].dims == ("chain", "draw", "a_y_time")
+        assert read["observed_data"]["a_y"].attrs["units"] == "rad"
+        assert list(read["constant_data"].coords["record"].to_numpy()) == ["a", "b"]
+        assert_array_equal(read["constant_data"]["a_drive"].sel(drive="u").to_numpy(), PAIR[0].drive[:, 0])
+        assert_array_equal(read["constant_data"]["a_drive_time"], PAIR[0].time)
+        # held-out records: the same draws as the bands'
+        held = [band for band in fitted.bands if band.held_out]
+        assert_allclose(
+            np.quantile(read["predictions"]["held_y"].to_numpy()[0], 0.95, axis=0),
+            held[0].noisy[4],
+            atol=1e-5,
+        )
+        assert_array_equal(read["predictions_constant_data"]["held_y"], held[0].observed)
+        # the prior as it is drawn, and wider than what the records leave of it
+        assert read["prior"]["time_1"].shape == (1, 200)
+        assert read["prior"]["time_1"].attrs["units"] == "ms"
+        assert set(read["prior_predictive"].data_vars) == {"a_y", "b_y"}
+        spread = [float(read[group]["a_y"].std()) for group in ("prior_predictive", "posterior_predictive")]
+        assert spread[0] > spread[1]
+        assert arviz_stats.summary(read, var_names=["time_1"], fmt="wide").shape[0] == 1
         predictive = np.median(read["posterior_predictive"]["a_y"], axis=(0, 1))
         width = fitted.bands[0].noisy[4] - fitted.bands[0].noisy[0]
         assert np.all(np.abs(predictive - fitted.bands[0].noisy[2]) < 0.2 * width)
@@ -169,7 +196,7 @@ def test_names_that_a_netcdf_group_would_split_are_kept_apart(tmp_path):
     with xarray.open_datatree(tmp_path / "posterior.nc", engine="h5netcdf") as read:
         (name,) = read["observed_data"].data_vars
         assert_allclose(read["observed_data"][name], made.bands[0].observed)
-        assert len(read.children) == 7
+        assert len(read.children) == 9
 
 
 def test_a_record_too_short_for_residual_tests_is_saved_all_the_same(tmp_path):
@@ -223,7 +250,7 @@ def test_records_and_axes_with_the_same_joint_name_are_kept_apart(tmp_path):
             }
         seen = ~np.isnan(response[:, 1])
         assert_array_equal(read["observed_data"]["a_b_c_2"], response[seen, 1] + 0.01)
-        assert read["constant_data"]["a_b_c_2_time"].attrs["record"] == "a"
+        assert read["observed_data"]["a_b_c_2"].attrs["record"] == "a"
 
 
 def test_the_report_finds_parameters_whose_names_hold_a_slash(tmp_path):
