@@ -80,7 +80,9 @@ class Record:
     response: Matrix
     """(n, n_responses) in the units of `response_axes`; NaN is a sample that was not taken."""
     drive_axes: tuple[Axis, ...]
+    """Name and unit of each column of `drive`."""
     response_axes: tuple[Axis, ...]
+    """Name and unit of each column of `response`."""
     time_unit: str
     """One of `TIME_UNITS`."""
 
@@ -222,7 +224,10 @@ def columns_of(
 
 
 def load_record(path: Path, time_unit: str | None = None) -> Record:
-    """Read a record from CSV or Parquet; see `load_columns` for units, accuracy and what is refused."""
+    """Read a record from the CSV or Parquet file at `path`; times come out in `time_unit`, by default its own.
+
+    InputError with everything wrong in the file; see `load_columns` for that and for accuracy.
+    """
     return record_of(load_columns(path, time_unit))
 
 

@@ -158,7 +158,7 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
 
 
 def load_study(source: Path | Sequence[Path], *, held_out: Sequence[Path] = ()) -> Study:
-    """The study in a folder or study file, or a study of default settings made from record files.
+    """The study in the folder or study file `source`, or one of default settings made from record files.
 
     The time unit is the one the study file states, else that of the first fit record; records in other units
     are converted. From record files the name is the first stems joined by ``-`` and the seed 0. `held_out`

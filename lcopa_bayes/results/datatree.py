@@ -142,7 +142,7 @@ def _describe(tree: DataTree, fit: Fit, variables: Mapping[int, str], series: Se
                     node[name].attrs |= {"record": record, "axis": axis, **more}
         for coordinate in node.coords:
             if str(coordinate).endswith("_time"):
-                node[coordinate].attrs["units"] = study.time_unit
+                node[str(coordinate)].attrs["units"] = study.time_unit
     for group, records in (("constant_data", study.fit), ("predictions_constant_data", study.held_out)):
         if group in tree.children:
             tree[group].coords["record"] = [record.name for record in records]

@@ -49,16 +49,24 @@ _QUICK = 4
 @final
 @dataclass(frozen=True, eq=False)
 class Fit(Predictive):
-    """A fitted study."""
+    """A fitted study: draws of its posterior, what it predicts, and how far both can be trusted."""
 
     problem: Problem
+    """The study prepared for inference, with blocks as narrow as its records need."""
     run: Run
+    """Ensembles or weighted draws, as sampling left them."""
     draws: Draws
+    """Posterior draws, (ensembles, draws, parameters) in the unit of each, with their grade."""
     bands: tuple[Band, ...]
+    """50 and 90 % bands of every response axis of every record, fitted ones first [response unit]."""
     residuals: tuple[Residual, ...]
+    """What the median prediction leaves of each of these [response unit], tested for whiteness."""
     curves: StepCurves
+    """Unit step responses of every path over the longest record, at each draw."""
     metrics: tuple[Estimate, ...]
+    """Rise, delay, settling [time unit], overshoot [-] and levels [response unit] of every path."""
     sensitivity: tuple[Sensitivity, ...]
+    """How far each parameter's median moves with the power of prior or likelihood [posterior sd]."""
     evidence: Evidence | None
     """None for a single ensemble, which cannot tell its error."""
     discretisation: Discretisation

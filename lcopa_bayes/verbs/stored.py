@@ -24,7 +24,7 @@ _KINDS: Mapping[str, type[StoredResult]] = {
 
 
 def load_result(folder: Path | str, verb: str | None = None) -> Result:
-    """The result in a run folder: that of `verb`, by default the last one written there.
+    """The result in the run folder `folder`: that of `verb`, by default the last one written there.
 
     It has the table, values, draws and pages that it had when it was made. InputError when there is no such
     result, or its files are missing, cut short or of another version.
