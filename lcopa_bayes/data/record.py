@@ -224,7 +224,8 @@ def columns_of(
 
 
 def load_record(path: Path, time_unit: str | None = None) -> Record:
-    """Read a record from the CSV or Parquet file at `path`; times come out in `time_unit`, by default its own.
+    """Read a record from the CSV or Parquet file at `path`; times come out in `time_unit`, by default its
+    own.
 
     InputError with everything wrong in the file; see `load_columns` for that and for accuracy.
     """

@@ -57,8 +57,11 @@ class Prediction(Result):
     grade: str
     """Grade of the fit."""
     grade_reason: str
+    """Why it has this grade."""
     time_unit: str
+    """Unit of every time."""
     seed: int
+    """Seed of the noise and of the offsets that are drawn."""
     origin: Mapping[str, Any]
     """Provenance: command, seed, settings, hashes of records and draws, versions."""
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, final
+from typing import final
 
 import numpy as np
 from scipy.special import logsumexp
@@ -27,8 +27,6 @@ _DIVISIONS = 2
 """Divisions of the points among charts."""
 _NEGLIGIBLE = 0.02
 """Charts that explain a smaller share of the points are left out [-]."""
-_LEVELLED = 0.5
-"""Share of the weights that is equal in a levelled cover [-]."""
 _MOST_CHARTS = 16
 """Most charts that are tried; elements beyond hold no term."""
 _WIDER, _DEFENSIVE = 1.6, 0.25
@@ -88,18 +86,7 @@ class Cover:
             mixtures.append(wide.scaled(share))
         return cls(tuple(charts[k] for k in kept), tuple(mixtures))
 
-    def levelled(self) -> Cover:
-        """The same components, in part with equal weights, so that a small mode is tried more often."""
-        count = sum(mixture.weights.size for mixture in self.mixtures)
-        return Cover(
-            self.charts,
-            tuple(
-                Mixture((1 - _LEVELLED) * mixture.weights + _LEVELLED / count, mixture.means, mixture.factors)
-                for mixture in self.mixtures
-            ),
-        )
-
-    def draw(self, count: int, rng: Any) -> Matrix:
+    def draw(self, count: int, rng: np.random.Generator) -> Matrix:
         """Independent draws of the sampled coordinates, chart by chart; fewer than `count` where a chart
         has no point."""
         shares = np.array([mixture.weights.sum() for mixture in self.mixtures])

@@ -10,7 +10,6 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.sampling.cover import Cover
 from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.ridgemoves import walking
 from lcopa_bayes.sampling.tempering import temper
@@ -71,15 +70,14 @@ def advance(
     draws: int,
     thin: int,
     mixture: Mixture | None = None,
-    cover: Cover | None = None,
 ) -> Ensemble:
     """The ensemble after ``draws * thin`` more steps, every `thin`-th of them kept.
 
-    With `mixture`, and `cover`, some moves follow them. Deterministic: the same ensemble advanced twice gives
+    With `mixture` some moves follow it. Deterministic: the same ensemble advanced twice gives
     the same draws, in whatever process.
     """
     walkers = ensemble.position.shape[0]
-    sampler = walking(posterior, posterior.log_density, walkers, mixture, ensemble.random, cover)
+    sampler = walking(posterior, posterior.log_density, walkers, mixture, ensemble.random)
     state = emcee.State(ensemble.position, log_prob=ensemble.position_log_density)
     last = sampler.run_mcmc(state, draws, thin_by=thin, skip_initial_state_check=True)
     return Ensemble(

@@ -4,30 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
-from lcopa_bayes.core.arrays import Array
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.sampling.cover import Cover
 from lcopa_bayes.sampling.ensemble import Ensemble
 from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.mixturemoves import learned
 
 LEARNING = 2
-"""Rounds before the mixture is learned from the draws of all ensembles; and again at each doubling."""
-_WIDE = 0.5
-"""Share of the mixture that is learned from the populations on their way from the prior [-]."""
+"""Rounds before the mixture is learned from the draws of all ensembles."""
+_WIDE = 1.0
+"""Share of the mixture that is learned from the populations on their way from the prior, times rounds [-]."""
 _KNOWN = 0.2
 """Share of modes that are known from elsewhere, where there are any [-]."""
 
-_COMPONENTS = 40
-"""Components of the cover that is learned."""
+
+def due(done: int) -> bool:
+    """Whether the mixture is learned again after so many rounds: 2, 3, ... 8, then 10, 12, 14, 16, 20, ...
+
+    Often at first, for a mode that few walkers have met gains components each time; then ever more rarely.
+    """
+    return done >= LEARNING and done % (1 << max(0, done.bit_length() - 3)) == 0
 
 
 def taught(
     posterior: Posterior, ensembles: Sequence[Ensemble], per_round: int, seed: int, known: Mixture | None
 ) -> Mixture:
-    """The mixture that moves follow: learned from the later half of the draws at the last power of two,
+    """The mixture that moves follow: learned from the later half of the draws when it was last due,
     and in part from the populations on their way from the prior, which saw modes that few walkers stand
     on; blended with the modes `known` from elsewhere.
 
@@ -36,26 +37,13 @@ def taught(
     Rosenthal 2007, J. Appl. Probab. 44).
     """
     wide = learned(posterior, [ensemble.trail for ensemble in ensembles], seed).levelled()
-    lesson = _lesson(ensembles, per_round)
-    found = learned(posterior, lesson, seed).levelled().blended(wide, _WIDE) if lesson else wide
+    last = ensembles[0].chain.shape[0] // per_round
+    while last and not due(last):
+        last -= 1
+    if last == 0:
+        found = wide
+    else:
+        first, end = per_round * last // 2, per_round * last
+        own = learned(posterior, [ensemble.chain[first:end] for ensemble in ensembles], seed)
+        found = own.levelled().blended(wide, _WIDE / last)
     return found if known is None else found.blended(known, _KNOWN)
-
-
-def taught_cover(
-    posterior: Posterior, ensembles: Sequence[Ensemble], per_round: int, seed: int
-) -> Cover | None:
-    """A levelled cover of the same draws that `taught` learns from; None before there are any."""
-    lesson = _lesson(ensembles, per_round)
-    if not lesson:
-        return None
-    pooled = np.concatenate([chain.reshape(-1, posterior.dimension) for chain in lesson])
-    return Cover.fitted(posterior, pooled, seed, _COMPONENTS).levelled()
-
-
-def _lesson(ensembles: Sequence[Ensemble], per_round: int) -> list[Array]:
-    """The later half of the draws at the last power of two of rounds, by ensemble; none before `LEARNING`."""
-    done = ensembles[0].chain.shape[0] // per_round
-    if done < LEARNING:
-        return []
-    last = per_round << (done.bit_length() - 1)
-    return [ensemble.chain[last // 2 : last] for ensemble in ensembles]

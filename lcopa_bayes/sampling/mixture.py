@@ -15,9 +15,9 @@ from sklearn.mixture import GaussianMixture
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 
-_COMPONENTS = 20
+_COMPONENTS = 40
 """Most components of a mixture."""
-_FITTED = 6_000
+_FITTED = 8_000
 """Most points a mixture is fitted to."""
 FREEDOM = 5.0
 """Degrees of freedom of the components: tails heavy enough to cover what the fit has not seen [-]."""

@@ -10,9 +10,8 @@ import numpy as np
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.coordinates import Chart
-from lcopa_bayes.sampling.cover import Cover
 from lcopa_bayes.sampling.mixture import Mixture
-from lcopa_bayes.sampling.moves import PopulationMove, Terrain, scales
+from lcopa_bayes.sampling.moves import PopulationMove, scales
 
 
 def learned(posterior: Posterior, chains: Sequence[Array], seed: int) -> Mixture:
@@ -48,25 +47,6 @@ class MixtureMove(PopulationMove):
     def _log_density(self, z: Matrix) -> Vector:
         y, log_volume = self.chart.charted(z)
         return self.mixture.log_density(y) + log_volume
-
-
-@final
-class CoverMove(PopulationMove):
-    """Independence proposals from a cover, which is fixed while it is used."""
-
-    def __init__(self, terrain: Terrain, cover: Cover) -> None:
-        super().__init__(terrain)
-        self.cover = cover
-
-    def proposal(self, here: Matrix, others: Matrix, random: Any) -> tuple[Matrix, Vector]:
-        """See `PopulationMove.proposal`."""
-        drawn = self.cover.draw(len(here), random)
-        rows = random.permutation(len(here))[: len(drawn)]
-        proposed, factor = here.copy(), np.full(len(here), -np.inf)
-        proposed[rows] = drawn
-        with np.errstate(invalid="ignore"):
-            factor[rows] = self.cover.log_density(here[rows]) - self.cover.log_density(drawn)
-        return proposed, np.where(np.isfinite(factor), factor, -np.inf)
 
 
 @final

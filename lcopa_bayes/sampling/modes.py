@@ -213,4 +213,5 @@ def _certainty(chains: Matrix, top: float, bottom: float, width: float) -> float
     """``DEPTH f(top) - f(bottom)`` of the smoothed density over its Monte Carlo error [-]."""
     kernel = DEPTH * np.exp(-0.5 * ((chains - top) / width) ** 2)
     kernel -= np.exp(-0.5 * ((chains - bottom) / width) ** 2)
-    return float(kernel.mean()) / _batch_error(kernel)
+    error = _batch_error(kernel)
+    return float(kernel.mean()) / error if error > 0 else 0.0  # no draw is near either: nothing is certain

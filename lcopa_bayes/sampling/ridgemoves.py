@@ -17,9 +17,8 @@ import numpy as np
 from lcopa_bayes.core.arrays import Flags, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.coordinates import Chart
-from lcopa_bayes.sampling.cover import Cover
 from lcopa_bayes.sampling.mixture import Mixture
-from lcopa_bayes.sampling.mixturemoves import CoverMove, MixtureMove, MixtureWalk
+from lcopa_bayes.sampling.mixturemoves import MixtureMove, MixtureWalk
 from lcopa_bayes.sampling.moves import (
     LARGEST_ORDER,
     DifferenceMove,
@@ -34,7 +33,7 @@ from lcopa_bayes.sampling.shapecoordinates import ElementColumns
 _DENSE = 3.0
 """Orders drawn anew are dense at 0: twice a uniform number to this power [-]."""
 _ANEW = 0.3
-"""Share of moves that draw anew, from the mixture or, in equal parts, from it and the cover."""
+"""Share of moves that draw anew from the mixture."""
 _NEARBY = 0.3
 """Share of moves that walk along it."""
 
@@ -192,11 +191,9 @@ class TermRedraw(RidgeMove):
         return proposed, np.where(reached & np.isfinite(factor), factor + thinning, -np.inf)
 
 
-def moves(
-    posterior: Posterior, mixture: Mixture | None = None, cover: Cover | None = None
-) -> list[tuple[emcee.moves.Move, float]]:
-    """The moves a posterior is sampled with, and how often each is made; with `mixture`, and `cover`, also
-    moves that follow them."""
+def moves(posterior: Posterior, mixture: Mixture | None = None) -> list[tuple[emcee.moves.Move, float]]:
+    """The moves a posterior is sampled with, and how often each is made; with `mixture` also moves
+    that follow it."""
     terrain = Terrain.of(posterior)
     local: list[tuple[emcee.moves.Move, float]] = (
         [
@@ -212,13 +209,8 @@ def moves(
     if mixture is None:
         return local
     chart = Chart.of(posterior)
-    anew: list[tuple[emcee.moves.Move, float]] = (
-        [(MixtureMove(chart, mixture), _ANEW)]
-        if cover is None
-        else [(MixtureMove(chart, mixture), 0.5 * _ANEW), (CoverMove(terrain, cover), 0.5 * _ANEW)]
-    )
     return [
-        *anew,
+        (MixtureMove(chart, mixture), _ANEW),
         (MixtureWalk(chart, mixture), _NEARBY),
         *((move, (1 - _ANEW - _NEARBY) * often) for move, often in local),
     ]
@@ -230,14 +222,13 @@ def walking(
     walkers: int,
     mixture: Mixture | None,
     random: tuple[Any, ...],
-    cover: Cover | None = None,
 ) -> emcee.EnsembleSampler:
     """emcee with these moves, at a state of its generator.
 
     Its own wrapper, which prints what an exception or an interrupt meets, is left out: the caller tells.
     """
     sampler = emcee.EnsembleSampler(
-        walkers, posterior.dimension, log_density, moves=moves(posterior, mixture, cover), vectorize=True
+        walkers, posterior.dimension, log_density, moves=moves(posterior, mixture), vectorize=True
     )
     sampler.log_prob_fn = log_density
     sampler.random_state = random

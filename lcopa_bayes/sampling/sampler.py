@@ -18,11 +18,10 @@ from lcopa_bayes.data.settings import Method
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.chainfile import Chain, load_chain, save_chain
 from lcopa_bayes.sampling.convergence import CERTAIN, Quality, drifts, qualities
-from lcopa_bayes.sampling.cover import Cover
 from lcopa_bayes.sampling.coverdraws import cover_draws
 from lcopa_bayes.sampling.ensemble import Ensemble, advance
 from lcopa_bayes.sampling.knownmodes import around
-from lcopa_bayes.sampling.learning import LEARNING, taught, taught_cover
+from lcopa_bayes.sampling.learning import due, taught
 from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.modes import Ridges, ridges
 from lcopa_bayes.sampling.weighted import BATCHES, CHAIN, Weighted
@@ -180,7 +179,6 @@ def sample(
             _store(chain_file, Chain(ensembles), fingerprint)
         bar.set_description("sampling")
         mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
-        cover = taught_cover(posterior, ensembles, _ROUND, plan.seed)
         hardest = max(ensemble.way for ensemble in ensembles)
         least = max(_LEAST, round(_AS_LONG * hardest / (_ROUND * plan.thin)))
         failed = stored.failed
@@ -197,10 +195,9 @@ def sample(
                     _store(chain_file, Chain(ensembles, weighted), fingerprint)
                     doubtful = plan.method == "auto" and weighted is None
                     return Run(ensembles, plan, weighted, _filling(posterior, run) if doubtful else ())
-            if done >= LEARNING and done.bit_count() == 1:
+            if due(done):
                 mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
-                cover = taught_cover(posterior, ensembles, _ROUND, plan.seed)
-            ensembles = tuple(crew.each(_Round(plan.thin, mixture, cover), ensembles))
+            ensembles = tuple(crew.each(_Round(plan.thin, mixture), ensembles))
             done += 1
             _store(chain_file, Chain(ensembles, failed=failed), fingerprint)
             bar.update()
@@ -301,7 +298,6 @@ class _Round:
 
     thin: int
     mixture: Mixture | None
-    cover: Cover | None
 
     def __call__(self, posterior: Posterior, ensemble: Ensemble) -> Ensemble:
-        return advance(posterior, ensemble, _ROUND, self.thin, self.mixture, self.cover)
+        return advance(posterior, ensemble, _ROUND, self.thin, self.mixture)

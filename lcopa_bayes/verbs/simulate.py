@@ -95,7 +95,8 @@ class Simulation:
 
 
 def simulate(campaign: Path | str, *, seed: int | None = None) -> Simulation:
-    """Measure the campaign file `campaign` on the virtual bench, by numerics that share nothing with the forward model.
+    """Measure the campaign file `campaign` on the virtual bench, by numerics that share nothing with the
+    forward model.
 
     `seed` stands in place of the campaign's. InputError with everything wrong in the file.
     """

@@ -83,7 +83,7 @@ def test_the_cover_is_a_normalised_density_of_a_posterior_with_elements(rng):
     points = posterior.coordinates(posterior.table.draw(3_000, rng))
     points = posterior.coordinates(posterior.values(points))
     one = Cover.fitted(posterior, points, 1, 12)
-    other = Cover.fitted(posterior, points[::2], 2, 6).levelled()
+    other = Cover.fitted(posterior, points[::2], 2, 6)
     assert len(one.charts) > 1
     z = one.draw(20_000, rng)
     log_one, log_other = one.log_density(z), other.log_density(z)
