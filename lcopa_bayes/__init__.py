@@ -1,1 +1,72 @@
-"""Posteriors for systems with memory, delay and coupled axes, and what the data cannot say."""
+"""Posteriors, identifiability and model criticism for coupled fractional-order systems with delay.
+
+import lcopa_bayes as lb
+
+study = lb.load_study("studies/paper-step")
+fit = lb.fit(study, jobs=2)
+fit.summary()
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lcopa_bayes.core.errors import InputError as InputError
+    from lcopa_bayes.data.drives import Drive as Drive
+    from lcopa_bayes.data.record import Record as Record
+    from lcopa_bayes.data.record import load_record as load_record
+    from lcopa_bayes.data.study import Study as Study
+    from lcopa_bayes.data.studyfile import load_study as load_study
+    from lcopa_bayes.results.fit import Fit as Fit
+    from lcopa_bayes.results.frequency import FrequencyResponse as FrequencyResponse
+    from lcopa_bayes.results.newdrive import Prediction as Prediction
+    from lcopa_bayes.results.savedfit import SavedFit as SavedFit
+    from lcopa_bayes.verbs.audit import AuditResult as AuditResult
+    from lcopa_bayes.verbs.audit import audit as audit
+    from lcopa_bayes.verbs.calibrate import CalibrationResult as CalibrationResult
+    from lcopa_bayes.verbs.calibrate import calibrate as calibrate
+    from lcopa_bayes.verbs.compare import Comparison as Comparison
+    from lcopa_bayes.verbs.compare import compare as compare
+    from lcopa_bayes.verbs.design import DesignResult as DesignResult
+    from lcopa_bayes.verbs.design import design as design
+    from lcopa_bayes.verbs.fit import fit as fit
+    from lcopa_bayes.verbs.loop import LoopResult as LoopResult
+    from lcopa_bayes.verbs.loop import loop as loop
+    from lcopa_bayes.verbs.simulate import Simulation as Simulation
+    from lcopa_bayes.verbs.simulate import simulate as simulate
+    from lcopa_bayes.verbs.stored import load_result as load_result
+
+_PLACES = {
+    "core.errors": ("InputError",),
+    "data.drives": ("Drive",),
+    "data.record": ("Record", "load_record"),
+    "data.study": ("Study",),
+    "data.studyfile": ("load_study",),
+    "results.fit": ("Fit",),
+    "results.frequency": ("FrequencyResponse",),
+    "results.newdrive": ("Prediction",),
+    "results.savedfit": ("SavedFit",),
+    "verbs.audit": ("AuditResult", "audit"),
+    "verbs.calibrate": ("CalibrationResult", "calibrate"),
+    "verbs.compare": ("Comparison", "compare"),
+    "verbs.design": ("DesignResult", "design"),
+    "verbs.fit": ("fit",),
+    "verbs.loop": ("LoopResult", "loop"),
+    "verbs.simulate": ("Simulation", "simulate"),
+    "verbs.stored": ("load_result",),
+}
+"""Where the public names stand; a module is imported when one of its names is first used."""
+_OF = {name: place for place, names in _PLACES.items() for name in names}
+__all__ = sorted(_OF)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_OF[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_OF})

@@ -1,33 +1,71 @@
-"""The command line: `lcopa-bayes VERB STUDY_OR_CSVS [options]`."""
+"""The command line: `lcopa-bayes VERB ...`; every verb is a public function and its options."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol, final
 
 import lcopa_bayes
+
+# verbs are imported when they are carried out, so that help and refusals come at once
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.optics.cell import Field
-from lcopa_bayes.paper.intervals import Scan
-from lcopa_bayes.verbs import papers, questions, runs
-from lcopa_bayes.verbs.outcome import Told
+from lcopa_bayes.verbs import choices
+from lcopa_bayes.verbs.choices import RUNS
+
+if TYPE_CHECKING:
+    from lcopa_bayes.paper.intervals import Scan
+    from lcopa_bayes.verbs.sources import FitLike
 
 USAGE_ERROR = 2
 """Exit code for input that cannot be used."""
 INTERRUPTED = 130
 """Exit code after an interrupt from the keyboard."""
+PUBLISHED = Path("reports")
+"""Where a checkout of the package keeps the audits and comparisons that its claims rest on."""
+BUNDLED = ("paper-step-x", "paper-step")
+"""Studies of records like the paper's, whose run folders hold evidence on its claims."""
+
+
+class Reported(Protocol):
+    """A result with values and a page."""
+
+    def to_json(self) -> dict[str, Any]: ...  # noqa: D102
+    def report(self, folder: Path | str) -> Path: ...  # noqa: D102
+
+
+@final
+@dataclass(frozen=True)
+class Outcome:
+    """What a verb prints."""
+
+    values: Mapping[str, Any]
+    """With ``--json``."""
+    text: str
+    """For a reader."""
+
+
+@final
+@dataclass(frozen=True)
+class Verb:
+    """A verb of the command line."""
+
+    text: str
+    """What it does, in a line."""
+    options: Callable[[argparse.ArgumentParser], None]
+    carry_out: Callable[[argparse.Namespace], Outcome]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one verb; returns the exit code."""
+    """Carry out one verb; returns the exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    options = _parser().parse_args(given)
+    options = _parser(given[:1]).parse_args(given)
     try:
-        told = options.verb(options, ["lcopa-bayes", *given])
+        outcome = _carried_out(options, ["lcopa-bayes", *given])
     except InputError as error:
         for problem in error.problems:
             print(f"error: {problem}", file=sys.stderr)
@@ -39,216 +77,285 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("interrupted; the same command with --resume goes on where it stopped", file=sys.stderr)
         return INTERRUPTED
     if options.json:
-        print(json.dumps(told.values, allow_nan=False))
+        print(json.dumps(outcome.values, allow_nan=False))
     elif not options.quiet:
-        print("\n".join(told.words))
+        print(outcome.text)
     return 0
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="lcopa-bayes",
-        description=lcopa_bayes.__doc__,
-    )
-    verb = parser.add_subparsers(required=True, metavar="VERB")
-    told = argparse.ArgumentParser(add_help=False)
-    told.add_argument("--quiet", action="store_true", help="no progress, no closing words")
-    told.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+def _carried_out(options: argparse.Namespace, command: Sequence[str]) -> Outcome:
+    from lcopa_bayes.results.provenance import commanded
 
-    def add(name: str, does: Callable[..., Told], parents: list[Any], text: str) -> Any:
-        made = verb.add_parser(name, parents=[*parents, told], help=text, description=text)
-        made.set_defaults(verb=does)
-        return made
+    with commanded(command):
+        return VERBS[options.verb].carry_out(options)
 
-    study, sampled = _study_options(), _sampler_options()
-    checked = _check_options()
-    add("run", runs.run, [study, sampled, checked], "all stages the study names, then the report")
-    add("fit", runs.fit_study, [study, sampled, checked], "posterior, bands and step metrics, with a report")
-    add(
-        "audit", questions.audit_study, [study, sampled], "what the records determine, parameter by parameter"
-    )
-    _design_options(add("design", questions.design_study, [study, sampled], "which drive to measure next"))
-    compared = add(
-        "compare",
-        questions.compare_study,
-        [study, sampled],
-        "integer against fractional orders, number of terms",
-    )
-    compared.add_argument(
-        "--candidates", type=Path, metavar="FILE", help="[compare] and [[candidates]] (TOML)"
-    )
-    compared.add_argument("--pick", nargs="+", metavar="NAME", help="candidates by name")
-    looped = add(
-        "loop", questions.loop_study, [study, sampled], "what the model lacks: residual, effect, errors after"
-    )
-    looped.add_argument(
-        "--as-stated", action="store_true", help="keep the number of viscous terms the study states"
-    )
-    _calibrate_options(
-        add(
-            "calibrate",
-            runs.calibrate_study,
-            [_study_options("reports/calibration/<study>"), sampled],
-            "simulation-based calibration and coverage of the whole inference of a study, with a report",
-        )
-    )
-    _identify_options(
-        add("identify", papers.identify_study, [study], "the paper's own least-squares scan, with a report")
-    )
-    _optics_options(
-        add("optics", papers.optics, [], "far field, director, the chain from volts to angle, with figures")
-    )
-    claims = add("claims", papers.claims, [], "the paper's claims, each with a computed verdict")
-    claims.add_argument("--out", type=Path, default=Path("reports/claims"), help="folder for the page")
-    claims.add_argument(
-        "--audit",
-        type=Path,
-        nargs="+",
-        metavar="RUNFOLDER",
-        help="run folders of audits, to decide I1-I6 (default: those of the bundled studies)",
-    )
-    claims.add_argument(
-        "--compare",
-        type=Path,
-        metavar="RUNFOLDER",
-        help="run folder of a comparison, to decide M1, M2, M4 and I5 (default: of a bundled study)",
-    )
-    predicted = add("predict", runs.predict, [], "bands for a drive nobody has measured, by a finished fit")
-    predicted.add_argument("folder", type=Path, metavar="RUNFOLDER", help="run folder of a fit")
-    predicted.add_argument(
-        "drive", type=Path, help="record file without responses; with responses it is scored too"
-    )
-    predicted.add_argument("--out", type=Path, help="folder (default: RUNFOLDER/predict/<drive>)")
-    predicted.add_argument(
-        "--offset",
-        choices=["fitted", "zero"],
-        default="fitted",
-        help="add the offset of the fit records to the response, or none",
-    )
-    report = add("report", runs.report, [], "render the report of a run folder again")
-    report.add_argument("folder", type=Path, help="run folder")
-    bench = add("simulate", runs.simulate, [], "measure a campaign file on the virtual bench")
-    bench.add_argument("campaign", type=Path, help="campaign file (TOML)")
-    bench.add_argument("--out", type=Path, required=True, help="folder for the records and their study")
-    bench.add_argument("--seed", type=int, help="seed in place of the campaign's")
-    bench.add_argument("--overwrite", action="store_true", help="replace records that are there")
+
+def _parser(wanted: Sequence[str]) -> argparse.ArgumentParser:
+    """All verbs, with the options of the one that is wanted."""
+    parser = argparse.ArgumentParser(prog="lcopa-bayes", description=lcopa_bayes.__doc__)
+    verbs = parser.add_subparsers(required=True, metavar="VERB", dest="verb")
+    for name, verb in VERBS.items():
+        own = verbs.add_parser(name, help=verb.text, description=verb.text)
+        own.add_argument("--quiet", action="store_true", help="no progress, no closing words")
+        own.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+        if name in wanted:
+            verb.options(own)
     return parser
 
 
-def _study_options(out: str = "reports/<study>") -> argparse.ArgumentParser:
-    study = argparse.ArgumentParser(add_help=False)
-    study.add_argument("source", nargs="+", type=Path, help="study folder or file, or record files")
-    study.add_argument("--held-out", nargs="+", type=Path, default=[], help="records not to fit")
-    study.add_argument("--out", type=Path, help=f"run folder (default: {out})")
-    study.add_argument("--seed", type=int, help="seed in place of the study's")
-    study.add_argument("--jobs", type=int, default=None, help="processes (default: all cores)")
-    return study
+def _reported(result: Reported, folder: Path) -> Outcome:
+    """What a verb prints of a result, with the page it wrote."""
+    page = result.report(folder)
+    return Outcome(result.to_json() | {"report": str(page)}, f"{result}\n\nreport: {page}")
 
 
-def _sampler_options() -> argparse.ArgumentParser:
-    sampled = argparse.ArgumentParser(add_help=False)
-    sampled.add_argument("--resume", action="store_true", help="go on with an interrupted run")
-    sampled.add_argument("--quick", action="store_true", help="a quarter of the steps")
-    return sampled
+def _source(options: argparse.Namespace) -> FitLike:
+    """The study asked for, with the seed of the command line if one is given, or a finished fit."""
+    from lcopa_bayes.data.studyfile import load_study
+    from lcopa_bayes.verbs.sources import finished
 
-
-def _check_options() -> argparse.ArgumentParser:
-    checked = argparse.ArgumentParser(add_help=False)
-    checked.add_argument(
-        "--cross-check",
-        action="store_true",
-        help="sample by a second, independent method too; where they disagree, grades are lowered",
-    )
-    return checked
-
-
-def _design_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--time", type=float, help="bench time [time unit of the study] (default: 40 spans)")
-    parser.add_argument("--repeats", type=int, default=1, help="records to take (default: 1)")
-    parser.add_argument(
-        "--amplitude", type=float, help="largest deviation from rest [drive unit] (default: the records')"
-    )
-    parser.add_argument("--refresh", type=float, help="time between drive changes (default: 10 samples)")
-    parser.add_argument("--with-prior", action="store_true", help="count the priors as information")
-
-
-def _calibrate_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--replicas", type=int, default=100, help="simulated studies (default: 100)")
-    parser.add_argument(
-        "--around",
-        type=Path,
-        metavar="RUNFOLDER",
-        help="draw truths from the posterior of a fit, not the prior",
-    )
-    parser.add_argument(
-        "--truth",
-        nargs="+",
-        default=[],
-        metavar="NAME=VALUE",
-        help="true values in every replica, or LOW:HIGH to draw them from, in the units of the study",
-    )
-    parser.add_argument(
-        "--engine",
-        choices=["importance", "sampling"],
-        default="importance",
-        help="importance sampling, the ensembles where it does not hold; or always the ensembles",
-    )
-    parser.add_argument(
-        "--dask", metavar="ADDRESS", help="scheduler of a Dask cluster that does the replicas"
-    )
-
-
-def _identify_options(parser: argparse.ArgumentParser) -> None:
-    plan = Scan()
-    for name, which in (("alpha", "largest"), ("beta", "second"), ("gamma", "third")):
-        parser.add_argument(
-            f"--{name}",
-            nargs=2,
-            type=float,
-            metavar=("LOW", "HIGH"),
-            help=f"scanned interval of the {which} order, within (0, 2]",
+    made = finished(options.source)
+    if made is None:
+        study = load_study(options.source, held_out=options.held_out)
+        return study if options.seed is None else study.with_seed(options.seed)
+    if options.held_out or options.seed is not None:
+        raise InputError(
+            f"{options.source[0]}: is the run folder of a finished fit, which --held-out and --seed do not "
+            "change; score a record with `predict`, or name the study to fit it again"
         )
-    parser.add_argument(
-        "--delay",
-        nargs=2,
-        type=float,
-        metavar=("LOW", "HIGH"),
-        help="scanned interval of the delay [time unit of the study]",
-    )
-    parser.add_argument("--order-step", type=float, default=plan.order_step, help="spacing of scanned orders")
-    parser.add_argument("--any-delay", action="store_true", help="refine the delay below a whole block")
-    parser.add_argument(
-        "--stiffness",
-        nargs="+",
-        type=float,
-        default=plan.stiffness,
-        help="values of k; the first is reported",
-    )
-    parser.add_argument("--rounds", type=int, default=plan.rounds, help="refinements around the best")
-    parser.add_argument("--posterior", type=Path, help="run folder of a fit, to show its intervals beside")
+    return made
 
 
-def _optics_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", type=Path, default=Path("reports/optics"), help="folder for the page")
-    parser.add_argument("--elements", type=int, help="elements along an axis (default: the paper's 32)")
-    parser.add_argument("--pitch", type=float, help="distance of elements [m] (default: 1.2 wavelengths)")
-    parser.add_argument("--wavelength", type=float, help="wavelength [m] (default: the paper's 1064e-9)")
-    parser.add_argument(
-        "--fill-factor", type=float, default=1.0, help="element width over pitch, for the lobe table"
+def _folder(options: argparse.Namespace, source: FitLike, *inside: str) -> Path:
+    """The run folder: as asked for, that of the finished fit, else by the name of the study."""
+    from lcopa_bayes.results.savedfit import SavedFit
+    from lcopa_bayes.verbs.sources import study_of
+
+    if options.out is not None:
+        return Path(options.out)
+    return source.folder if isinstance(source, SavedFit) else RUNS.joinpath(*inside, study_of(source).name)
+
+
+def _jobs(options: argparse.Namespace) -> int:
+    from lcopa_bayes.core.parallel import cores
+
+    return options.jobs or cores()
+
+
+def _fit(options: argparse.Namespace, *, stages: bool = False) -> Outcome:
+    from lcopa_bayes.verbs.fit import fit
+    from lcopa_bayes.verbs.sources import study_of
+
+    study = study_of(_source(options))
+    folder = _folder(options, study)
+    result = fit(
+        study,
+        folder=folder,
+        jobs=_jobs(options),
+        cross_check=options.cross_check,
+        rival=stages and "rival" in study.stages,
+        **_sampling(options),
     )
-    parser.add_argument(
-        "--targets", nargs="+", type=float, metavar="DEG", help="steering angles [deg] (default: Fig. 3)"
+    return _reported(result, folder)
+
+
+def _run(options: argparse.Namespace) -> Outcome:
+    return _fit(options, stages=True)
+
+
+def _sampling(options: argparse.Namespace) -> dict[str, bool]:
+    return {key: getattr(options, key) for key in ("resume", "quick", "quiet")}
+
+
+def _audit(options: argparse.Namespace) -> Outcome:
+    from lcopa_bayes.verbs.audit import audit
+
+    source = _source(options)
+    folder = _folder(options, source)
+    return _reported(audit(source, folder=folder, jobs=_jobs(options), **_sampling(options)), folder)
+
+
+def _design(options: argparse.Namespace) -> Outcome:
+    from lcopa_bayes.verbs.design import design
+
+    source = _source(options)
+    folder = _folder(options, source)
+    result = design(
+        source,
+        bench_time=options.time,
+        repeats=options.repeats,
+        amplitude=options.amplitude,
+        refresh=options.refresh,
+        with_prior=options.with_prior,
+        folder=folder,
+        jobs=_jobs(options),
+        **_sampling(options),
     )
-    parser.add_argument(
-        "--voltages", nargs="+", type=float, metavar="V", default=[1.0, 2.0, 3.0, 4.0, 5.0], help="[V]"
+    return _reported(result, folder)
+
+
+def _compare(options: argparse.Namespace) -> Outcome:
+    from lcopa_bayes.verbs.compare import compare
+
+    source = _source(options)
+    folder = _folder(options, source)
+    result = compare(
+        source,
+        options.pick,
+        described=options.candidates or (),
+        folder=folder,
+        jobs=_jobs(options),
+        **_sampling(options),
     )
-    parser.add_argument("--pretilt", type=float, default=0.0, help="tilt at the plates [rad]")
-    parser.add_argument(
-        "--field",
-        choices=[field.value for field in Field],
-        default=Field.UNIFORM.value,
-        help="how the voltage spreads over the cell",
+    return _reported(result, folder)
+
+
+def _loop(options: argparse.Namespace) -> Outcome:
+    from lcopa_bayes.verbs.loop import loop
+
+    source = _source(options)
+    folder = _folder(options, source)
+    result = loop(
+        source, as_stated=options.as_stated, folder=folder, jobs=_jobs(options), quick=options.quick
     )
+    return _reported(result, folder)
+
+
+def _calibrate(options: argparse.Namespace) -> Outcome:
+    from lcopa_bayes.calibration.truths import stated_values
+    from lcopa_bayes.verbs.calibrate import calibrate
+    from lcopa_bayes.verbs.sources import study_of
+
+    study = study_of(_source(options))
+    folder = _folder(options, study, "calibration")
+    result = calibrate(
+        study,
+        replicas=options.replicas,
+        around=options.around,
+        truth=stated_values(options.truth),
+        engine=options.engine,
+        dask=options.dask,
+        folder=folder,
+        jobs=_jobs(options),
+        **_sampling(options),
+    )
+    return _reported(result, folder)
+
+
+def _predict(options: argparse.Namespace) -> Outcome:
+    from lcopa_bayes.results.savedfit import load_fit
+
+    result = load_fit(options.folder).predict(options.drive, offset=options.offset)
+    return _reported(result, options.out or options.folder / "predict" / options.drive.stem)
+
+
+def _identify(options: argparse.Namespace) -> Outcome:
+    from lcopa_bayes.verbs.papers import identify
+
+    source = _source(options)
+    folder = _folder(options, source)
+    result = identify(
+        source,
+        scan=_scan(options),
+        posterior=options.posterior,
+        folder=folder,
+        jobs=_jobs(options),
+        quiet=options.quiet,
+    )
+    return _reported(result, folder)
+
+
+def _optics(options: argparse.Namespace) -> Outcome:
+    from lcopa_bayes.paper.opticsplan import OpticsPlan
+    from lcopa_bayes.verbs.papers import optics
+
+    plan = OpticsPlan.of(
+        elements=options.elements,
+        pitch=options.pitch,
+        wavelength=options.wavelength,
+        fill_factor=options.fill_factor,
+        targets_deg=options.targets,
+        voltages=options.voltages,
+        pretilt=options.pretilt,
+        field=options.field,
+    )
+    return _reported(optics(plan), options.out)
+
+
+def _claims(options: argparse.Namespace) -> Outcome:
+    from lcopa_bayes.verbs.papers import claims
+
+    audits = options.audit if options.audit is not None else _bundled("audit.json")
+    comparison = options.compare or next(reversed(_bundled("compare.json")), None)
+    return _reported(claims(audits=audits, comparison=comparison), options.out)
+
+
+def _bundled(file: str) -> list[Path]:
+    """Run folders of the bundled studies that hold a file, one's own before the published ones."""
+    places = ([RUNS / name, PUBLISHED / name] for name in BUNDLED)
+    found = (next((place for place in each if (place / file).is_file()), None) for each in places)
+    return [place for place in found if place is not None]
+
+
+def _report(options: argparse.Namespace) -> Outcome:
+    from lcopa_bayes.results.runfolder import origins
+    from lcopa_bayes.verbs.stored import load_result
+
+    verbs = list(origins(options.folder))
+    results = [load_result(options.folder, verb) for verb in verbs] or [load_result(options.folder)]
+    pages = [str(result.report(options.folder)) for result in results]
+    return Outcome({"pages": pages, "report": pages[0]}, "\n".join(f"report: {page}" for page in pages))
+
+
+def _simulate(options: argparse.Namespace) -> Outcome:
+    from lcopa_bayes.verbs.simulate import simulate
+
+    made = simulate(options.campaign, seed=options.seed)
+    paths = made.save(options.out, overwrite=options.overwrite)
+    verdict = f"{len(made.records)} records in {options.out}"
+    return Outcome({"verdict": verdict, "files": [str(path) for path in paths]}, verdict)
+
+
+def _scan(options: argparse.Namespace) -> Scan:
+    """The scan of the command line; an order without an interval is scanned up to the one above it."""
+    from lcopa_bayes.paper.intervals import Interval, Scan
+
+    given: Sequence[Sequence[float] | None] = (options.alpha, options.beta, options.gamma)
+    orders: list[Interval] = []
+    for ends in given:
+        top = orders[-1].high if orders else 2.0
+        # an interval that ends below the smallest scanned order leaves nothing below it but itself
+        orders.append(Interval(*ends) if ends else Interval(min(options.order_step, top), top))
+    return Scan(
+        orders=tuple(orders) if any(given) else None,
+        order_step=options.order_step,
+        delay=Interval(*options.delay) if options.delay else None,
+        whole_blocks=not options.any_delay,
+        stiffness=tuple(options.stiffness),
+        rounds=options.rounds,
+    )
+
+
+VERBS: Mapping[str, Verb] = {
+    "run": Verb("all stages the study names, then the report", choices.fit, _run),
+    "fit": Verb("posterior, bands and step metrics, with a report", choices.fit, _fit),
+    "audit": Verb("what the records determine, parameter by parameter", choices.sampled, _audit),
+    "design": Verb("which drive to measure next", choices.design, _design),
+    "compare": Verb("integer against fractional orders, number of terms", choices.compare, _compare),
+    "loop": Verb("what the model lacks: residual, effect, errors after", choices.loop, _loop),
+    "calibrate": Verb(
+        "simulation-based calibration and coverage of the whole inference of a study, with a report",
+        choices.calibrate,
+        _calibrate,
+    ),
+    "predict": Verb("bands for a drive nobody has measured, by a finished fit", choices.predict, _predict),
+    "identify": Verb("the paper's own least-squares scan, with a report", choices.identify, _identify),
+    "optics": Verb("far field, director, chain from volts to angle, with figures", choices.optics, _optics),
+    "claims": Verb("the paper's claims, each with a computed verdict", choices.claims, _claims),
+    "report": Verb("render the pages of a run folder again", choices.report, _report),
+    "simulate": Verb("measure a campaign file on the virtual bench", choices.simulate, _simulate),
+}
+"""Every verb by name, in the order of the help."""
 
 
 if __name__ == "__main__":

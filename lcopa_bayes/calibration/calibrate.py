@@ -13,9 +13,9 @@ from tqdm import tqdm
 from lcopa_bayes.calibration.replica import ENGINES, Engine, Failure, Outcome, Replication
 from lcopa_bayes.calibration.store import Store
 from lcopa_bayes.calibration.truths import Stated, Truths, truths_around, truths_stated
-from lcopa_bayes.calibration.workers import crew
 from lcopa_bayes.core.checks import one_of, refuse_if, whole_number
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.results.fit import plan_of
@@ -79,7 +79,7 @@ def calibrate(
     plan = plan_of(problem, quick=quick)
     plan = replace(plan, target_ess=min(plan.target_ess, ENOUGH))
     replication = Replication(problem, plan, truths, engine)
-    with crew(replication, jobs=min(jobs, replicas), dask=dask) as perform:
+    with workers(replication, jobs=min(jobs, replicas), dask=dask) as crew:
         store = Store.within(folder, replication) if folder is not None else None
         done = store.load(replicas) if store and resume else {}
         if store and not resume:
@@ -90,7 +90,7 @@ def calibrate(
         with tqdm(
             total=replicas, initial=len(done), unit="replica", disable=quiet, desc="calibrating"
         ) as bar:
-            for outcome in perform(missing) if missing else ():
+            for outcome in crew.finished(_attempt, missing, replication.lost) if missing else ():
                 if isinstance(outcome, Failure):
                     failures.append(outcome)
                 else:
@@ -107,3 +107,7 @@ def calibrate(
             f"{failures[0].replica} with seed {failures[0].seed}, ended in {failures[0].error}"
         )
     return Calibration(replication, tuple(done[number] for number in sorted(done)), tuple(failures))
+
+
+def _attempt(replication: Replication, number: int) -> Outcome | Failure:
+    return replication.attempt(number)

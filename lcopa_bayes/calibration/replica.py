@@ -143,7 +143,11 @@ class Replication:
             with threadpool_limits(1):
                 return self(number)
         except Exception as error:
-            return Failure(number, self.seed_of(number), f"{type(error).__name__}: {error}")
+            return self.lost(number, error)
+
+    def lost(self, number: int, error: BaseException) -> Failure:
+        """A replica that could not be done, and what was raised."""
+        return Failure(number, self.seed_of(number), f"{type(error).__name__}: {error}")
 
     def __call__(self, number: int) -> Outcome:
         """Draw, simulate, infer, rank."""

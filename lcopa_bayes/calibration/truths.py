@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeAlias, final
@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 
 from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.checks import refuse_if
 from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.inference.parameters import ParameterTable
 
@@ -138,3 +139,25 @@ def truths_around(folder: Path, table: ParameterTable) -> Truths:
         raise InputError([*sorted(problems), f"{folder}: {advice}"])
     pool.setflags(write=False)
     return Truths(table, pool, str(folder), grade)
+
+
+def stated_values(words: Sequence[str]) -> dict[str, Stated]:
+    """Values by name from words such as ``delay=1.0``, or ranges such as ``delay=0.9:1.1``; InputError where
+    a word is neither or a name occurs twice."""
+    out: dict[str, Stated] = {}
+    problems = []
+    for word in words:
+        name, _, value = word.partition("=")
+        try:
+            ends = [float(end) for end in value.split(":")]
+        except ValueError:
+            ends = []
+        sound = len(ends) in (1, 2) and bool(np.isfinite(ends).all()) and ends == sorted(ends)
+        if not (name and sound) or name in out:
+            problems.append(f"--truth {word}: give NAME=VALUE or NAME=LOW:HIGH in numbers, each name once")
+        elif len(ends) == 1:
+            out[name] = ends[0]
+        else:
+            out[name] = (ends[0], ends[1])
+    refuse_if(problems)
+    return out

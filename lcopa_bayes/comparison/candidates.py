@@ -152,6 +152,18 @@ def candidates_of(
     return tuple(distinct)
 
 
+def of_studies(studies: Sequence[Study]) -> tuple[Candidate, ...]:
+    """Studies of the same records as candidates, called by their names, with a number where these repeat."""
+    names = [study.name for study in studies]
+    called = [
+        name if names.count(name) == 1 else f"{name}-{number}" for number, name in enumerate(names, start=1)
+    ]
+    return tuple(
+        Candidate(name, study, _about(study, study.model, True), (), ())
+        for name, study in zip(called, studies, strict=True)
+    )
+
+
 def _short_list(study: Study) -> list[str]:
     """A few candidates that ask how many terms, and whether fractional ones."""
     model, most = study.model, _most_terms(study.model)

@@ -3,15 +3,10 @@
 from __future__ import annotations
 
 import re
-import signal
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from lcopa_bayes.comparison.candidatefit import Contender, contender
@@ -20,6 +15,7 @@ from lcopa_bayes.comparison.containment import Check
 from lcopa_bayes.comparison.judgement import judged
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.files import writable_folder
+from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.inference.assembly import problem_of
 
 
@@ -134,26 +130,9 @@ def _same_data(one: Candidate, other: Candidate) -> bool:
 def _performed(tasks: Sequence[Contender | Check], jobs: int) -> Iterator[Mapping[str, Any]]:
     """Cards as they are finished, the largest model begun first."""
     ranked = sorted(tasks, key=lambda task: -problem_of(task.candidate.study).posterior.dimension)
-    if min(jobs, len(tasks)) <= 1:
-        yield from (task() for task in ranked)
-        return
-    pool = ProcessPoolExecutor(min(jobs, len(tasks)), mp_context=get_context("spawn"), initializer=_take_up)
-    try:
-        for future in as_completed([pool.submit(_perform, task) for task in ranked]):
-            yield future.result()
-    except BrokenProcessPool:
-        raise InputError(
-            "a worker process ended, perhaps for want of memory; what was finished is stored, go on with "
-            "--resume"
-        ) from None
-    finally:
-        pool.shutdown(cancel_futures=True)
+    with workers(None, jobs=min(jobs, len(tasks))) as crew:
+        yield from crew.finished(_perform, ranked)
 
 
-def _take_up() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # an interrupt ends a worker without a word
-    threadpool_limits(1)
-
-
-def _perform(task: Contender | Check) -> Mapping[str, Any]:
+def _perform(_: None, task: Contender | Check) -> Mapping[str, Any]:
     return task()

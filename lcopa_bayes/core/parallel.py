@@ -1,36 +1,80 @@
-"""Processes: how many this one may run, and independent tasks done in several of one thread each."""
+"""Workers: independent tasks done in this process, in several of one thread each, or on a Dask cluster."""
 
 from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import get_context
-from typing import Any
+from importlib import import_module
+from multiprocessing import parent_process
+from multiprocessing.context import SpawnContext, SpawnProcess
+from threading import Thread
+from typing import Any, Generic, TypeVar, final
 
 from threadpoolctl import threadpool_limits
 
+from lcopa_bayes.core.errors import InputError
+
+S = TypeVar("S")
+T = TypeVar("T")
+R = TypeVar("R")
+CONNECT = 5.0
+"""Time a Dask scheduler has to answer [s]."""
+_ADVICE = "what was finished is stored; go on with --resume"
+
+
+class Workers(ABC, Generic[S]):
+    """What does tasks `task(shared, one)`; the results do not depend on who it is."""
+
+    @abstractmethod
+    def each(self, task: Callable[[S, T], R], inputs: Sequence[T]) -> Iterator[R]:
+        """Results in the order of the inputs."""
+
+    @abstractmethod
+    def finished(
+        self,
+        task: Callable[[S, T], R],
+        inputs: Sequence[T],
+        failed: Callable[[T, BaseException], R] | None = None,
+    ) -> Iterator[R]:
+        """Results in the order in which they are finished. Where a task could not be carried out, `failed`
+        gives its result; without it the error is raised."""
+
+    def map(self, function: Callable[[T], R], inputs: Sequence[T]) -> Iterator[R]:
+        """Results of a function that needs nothing shared, in the order of the inputs."""
+        return self.each(_Alone(function), inputs)
+
 
 @contextmanager
-def crew(workers: int) -> Iterator[Callable[..., Iterable[Any]]]:
-    """A map of a function over tasks, in order and as they are done, by that many processes where there are
-    several."""
-    if workers <= 1:
+def workers(shared: S, *, jobs: int = 1, dask: str | None = None) -> Iterator[Workers[S]]:
+    """Workers that share a value: `jobs` processes of one thread each, this one alone where `jobs` is 1, or
+    those of the Dask cluster at the address `dask`.
+
+    Processes end with this one, however it ends, and do not run the main script again, so that a script needs
+    no main guard. InputError when there is no such cluster, and when a worker or the cluster is lost.
+    """
+    if dask is not None:
+        with _cluster(shared, dask) as cluster:
+            yield cluster
+    elif jobs <= 1:
         with threadpool_limits(1):
-            yield map
-        return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_ready) as pool:
-        yield pool.map
-
-
-def _ready() -> None:
-    import numpy  # noqa: F401 - its threads can only be limited once they are there
-    import scipy.linalg  # noqa: F401
-
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # an interrupt ends a worker without a word
-    threadpool_limits(1)
+            yield _Here(shared)
+    else:
+        pool = ProcessPoolExecutor(jobs, mp_context=_Context(), initializer=_take_up, initargs=(shared,))
+        try:
+            yield _Processes(pool)
+        except BrokenProcessPool:
+            raise InputError(
+                f"a worker process ended, perhaps for want of memory, or because it was given what the main "
+                f"script itself defines, which belongs in a module; {_ADVICE}"
+            ) from None
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def cores() -> int:
@@ -38,3 +82,151 @@ def cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+@final
+class _Here(Workers[S]):
+    """This process."""
+
+    def __init__(self, shared: S) -> None:
+        self._shared = shared
+
+    def each(self, task: Callable[[S, T], R], inputs: Sequence[T]) -> Iterator[R]:
+        return (task(self._shared, one) for one in inputs)
+
+    def finished(
+        self,
+        task: Callable[[S, T], R],
+        inputs: Sequence[T],
+        failed: Callable[[T, BaseException], R] | None = None,
+    ) -> Iterator[R]:
+        return self.each(task, inputs)
+
+
+@final
+class _Processes(Workers[S]):
+    """Other processes on this machine."""
+
+    def __init__(self, pool: ProcessPoolExecutor) -> None:
+        self._pool = pool
+
+    def each(self, task: Callable[[S, T], R], inputs: Sequence[T]) -> Iterator[R]:
+        return self._pool.map(_perform, [task] * len(inputs), inputs)
+
+    def finished(
+        self,
+        task: Callable[[S, T], R],
+        inputs: Sequence[T],
+        failed: Callable[[T, BaseException], R] | None = None,
+    ) -> Iterator[R]:
+        for future in as_completed([self._pool.submit(_perform, task, one) for one in inputs]):
+            yield future.result()
+
+
+@final
+class _Cluster(Workers[S]):
+    """The workers of a Dask scheduler."""
+
+    def __init__(self, client: Any, shared: S) -> None:
+        # sent once; a worker that needs it takes it from another
+        self._client, self._shared = client, client.submit(_same, shared, pure=False)
+
+    def each(self, task: Callable[[S, T], R], inputs: Sequence[T]) -> Iterator[R]:
+        futures = [self._client.submit(task, self._shared, one, pure=False) for one in inputs]
+        return (future.result() for future in futures)
+
+    def finished(
+        self,
+        task: Callable[[S, T], R],
+        inputs: Sequence[T],
+        failed: Callable[[T, BaseException], R] | None = None,
+    ) -> Iterator[R]:
+        futures = {self._client.submit(task, self._shared, one, pure=False): one for one in inputs}
+        as_finished = import_module("distributed").as_completed
+        for future in as_finished(futures, loop=self._client.loop):
+            if future.status == "error" and failed is not None:
+                yield failed(futures[future], future.exception())
+            else:
+                yield future.result()
+
+
+@contextmanager
+def _cluster(shared: S, address: str) -> Iterator[_Cluster[S]]:
+    try:
+        distributed = import_module("distributed")
+    except ImportError:
+        raise InputError("--dask needs the package distributed: pip install 'lcopa-bayes[dask]'") from None
+    try:
+        client = distributed.Client(address, timeout=CONNECT, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"--dask {address}: no Dask scheduler answers there ({error}); "
+            "start one with `dask scheduler`, and give the address it prints, such as tcp://host:8786"
+        ) from None
+    try:
+        with client:
+            yield _Cluster(client, shared)
+    except distributed.client.FutureCancelledError as error:
+        raise InputError(f"--dask {address}: the scheduler was lost ({error}); {_ADVICE}") from None
+
+
+@final
+class _Alone(Generic[T, R]):
+    """Task: a function of the input alone."""
+
+    def __init__(self, function: Callable[[T], R]) -> None:
+        self._function = function
+
+    def __call__(self, shared: object, one: T) -> R:
+        return self._function(one)
+
+
+def _same(shared: S) -> S:
+    return shared
+
+
+class _Process(SpawnProcess):
+    """A process that does not import the main script: a script without a main guard would run in it anew."""
+
+    def start(self) -> None:
+        """Start it, with the main script out of sight meanwhile."""
+        main = vars(sys.modules["__main__"])
+        seen: dict[str, Any] = {key: main.pop(key) for key in ("__spec__", "__file__") if key in main}
+        main["__spec__"] = None
+        try:
+            super().start()
+        finally:
+            main.update(seen)
+
+
+class _Context(SpawnContext):
+    """How worker processes are started."""
+
+    Process = _Process
+
+
+_shared: Any = None
+"""What the tasks of this worker process share; set once when it starts."""
+
+
+def _take_up(shared: object) -> None:
+    global _shared
+    import numpy  # noqa: F401 - its threads can only be limited once they are there
+    import scipy.linalg  # noqa: F401
+
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # an interrupt ends a worker without a word
+    threadpool_limits(1)
+    _shared = shared
+    Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End this worker when the process that started it has ended."""
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _perform(task: Callable[[Any, T], R], one: T) -> R:
+    return task(_shared, one)

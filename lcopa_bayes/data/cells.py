@@ -76,8 +76,8 @@ def _csv_cells(path: Path) -> CellTable:
     return table
 
 
-def _parquet_cells(path: Path) -> CellTable:
-    frame = pd.read_parquet(path)
+def frame_cells(frame: pd.DataFrame, path: Path) -> CellTable:
+    """The cells of a frame as text, called `path` in messages; rows are counted from 1."""
 
     def text(value: object) -> str:
         gone = value is None or value is pd.NA or (isinstance(value, float) and math.isnan(value))
@@ -97,7 +97,7 @@ def read_cells(path: Path) -> CellTable:
             refuse(path, f"no such file{nearest(path.name, beside)}")
         if path.suffix.lower() not in SUFFIXES or not path.is_file():
             refuse(path, f"is not a record; expected a file ending in {' or '.join(SUFFIXES)}")
-        return _csv_cells(path) if path.suffix.lower() == ".csv" else _parquet_cells(path)
+        return _csv_cells(path) if path.suffix.lower() == ".csv" else frame_cells(pd.read_parquet(path), path)
     except InputError:
         raise
     except (OSError, ValueError, NotImplementedError) as error:

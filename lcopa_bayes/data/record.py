@@ -9,18 +9,19 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, final
+from typing import Protocol, TypeAlias, final
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
 from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.core.files import write_whole
-from lcopa_bayes.data.cells import FORM, SUFFIXES, CellTable, read_cells, refuse
+from lcopa_bayes.data.cells import FORM, SUFFIXES, CellTable, frame_cells, read_cells, refuse
 
 TIME_UNITS = {"s": 0, "ms": -3, "us": -6}
 """Each time unit as a power of ten of a second."""
@@ -79,7 +80,9 @@ class Record:
     response: Matrix
     """(n, n_responses) in the units of `response_axes`; NaN is a sample that was not taken."""
     drive_axes: tuple[Axis, ...]
+    """Name and unit of each column of `drive`."""
     response_axes: tuple[Axis, ...]
+    """Name and unit of each column of `response`."""
     time_unit: str
     """One of `TIME_UNITS`."""
 
@@ -185,7 +188,11 @@ def load_columns(path: Path, time_unit: str | None = None, *, responses: bool = 
     """
     if time_unit is not None and time_unit not in TIME_UNITS:
         raise InputError(f"unknown time unit {time_unit!r}{nearest(time_unit, TIME_UNITS)}")
-    table = read_cells(Path(path))
+    return _columns(read_cells(Path(path)), time_unit, responses=responses)
+
+
+def _columns(table: CellTable, time_unit: str | None, *, responses: bool) -> Columns:
+    """Columns of a table's cells; InputError with everything wrong in them."""
     n_rows = len(table.rows) if not table.problems else 2  # rows of another length are told already
     given, axes = _roles(table, _ROLES if responses else _ROLES[:2])
     values = {role: [_numbers(table, j, missing=role == "response") for j in axes[role]] for role in _ROLES}
@@ -195,9 +202,9 @@ def load_columns(path: Path, time_unit: str | None = None, *, responses: bool = 
         told = [f"{table.place(column, i + 1)}: {time[i + 1]} {rule} {time[i]}; sort the rows" for i in late]
         table.tell(told, table.place(column))
     if n_rows < 2:
-        table.problems.append(f"{path}: has {n_rows} row(s) of data; a record needs two or more")
+        table.problems.append(f"{table.path}: has {n_rows} row(s) of data; a record needs two or more")
     if responses and not table.problems and np.isnan(values["response"]).all():
-        table.problems.append(f"{path}: no response column holds a sample; a record needs one or more")
+        table.problems.append(f"{table.path}: no response column holds a sample; a record needs one or more")
     if table.problems:
         raise InputError(table.problems)
     wanted = time_unit or given
@@ -209,8 +216,19 @@ def load_columns(path: Path, time_unit: str | None = None, *, responses: bool = 
     return Columns(table.path.stem, time, drive, response, *both, wanted)
 
 
+def columns_of(
+    frame: pd.DataFrame, name: str, time_unit: str | None = None, *, responses: bool = True
+) -> Columns:
+    """`load_columns` of a frame whose columns are named as those of a file; `name` stands for the file."""
+    return replace(_columns(frame_cells(frame, Path(name)), time_unit, responses=responses), name=name)
+
+
 def load_record(path: Path, time_unit: str | None = None) -> Record:
-    """Read a record from CSV or Parquet; see `load_columns` for units, accuracy and what is refused."""
+    """Read a record from the CSV or Parquet file at `path`; times come out in `time_unit`, by default its
+    own.
+
+    InputError with everything wrong in the file; see `load_columns` for that and for accuracy.
+    """
     return record_of(load_columns(path, time_unit))
 
 
@@ -218,6 +236,56 @@ def record_of(columns: Columns) -> Record:
     """Record of a file's columns; InputError where these make none."""
     arrays = (columns.time, columns.drive, columns.response)
     return Record(columns.name, *arrays, columns.drive_axes, columns.response_axes, columns.time_unit)
+
+
+RecordLike: TypeAlias = Record | Path | str | pd.DataFrame | Mapping[str, ArrayLike]
+"""A record, a record file, or a frame or arrays whose columns are named as those of a file."""
+
+
+def records_of(
+    given: RecordLike | Iterable[RecordLike], time_unit: str | None = None, *, called: str = "record"
+) -> tuple[Record, ...]:
+    """Records of files, frames, arrays or records themselves, with times in `time_unit` or their own.
+
+    Frames and arrays have columns ``time_<unit>``, ``drive_<axis>_<unit>`` and ``response_<axis>_<unit>``,
+    each (n,), NaN where a response was not sampled; their name is the frame's ``attrs["name"]``, else
+    `called` and a number from 1. InputError with everything wrong in all of them.
+    """
+    out: list[Record] = []
+    problems: list[str] = []
+    for number, one in enumerate(several(given), start=1):
+        try:
+            out.append(_record_of_any(one, time_unit, f"{called}-{number}"))
+        except InputError as error:
+            problems += error.problems
+    if problems:
+        raise InputError(problems)
+    return tuple(out)
+
+
+def several(given: RecordLike | Iterable[RecordLike]) -> list[RecordLike]:
+    """What stands for records as a list, also where it is one."""
+    return [given] if isinstance(given, Record | Path | str | pd.DataFrame | Mapping) else list(given)
+
+
+def _record_of_any(one: RecordLike, time_unit: str | None, name: str) -> Record:
+    if isinstance(one, Record):
+        if time_unit in (None, one.time_unit):
+            return one
+        return replace(
+            one, time=in_time_unit(one.time, one.time_unit, str(time_unit)), time_unit=str(time_unit)
+        )
+    if isinstance(one, Path | str):
+        return load_record(Path(one), time_unit)
+    try:
+        frame = one if isinstance(one, pd.DataFrame) else pd.DataFrame(dict(one))
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"{name}: expected a record, a path, a frame or a mapping of arrays of one length, such as "
+            f"{{'time_ms': ..., 'drive_x_rad': ..., 'response_x_rad': ...}} ({error})"
+        ) from None
+    stated = str(frame.attrs.get("name", name))
+    return record_of(columns_of(frame, stated, time_unit))
 
 
 def save_record(record: Record, path: Path) -> None:

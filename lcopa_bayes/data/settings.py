@@ -292,3 +292,21 @@ def settings_from(kind: type[S], table: Mapping[str, object], where: str, proble
                 problem = problem.replace(f"`{name}`", f"`{key}`")
             problems.append(f"{where}: {problem}")
         return None
+
+
+def prior_settings(table: Mapping[str, Any], where: str, problems: list[str]) -> dict[str, PriorSettings]:
+    """Priors by parameter name from values to fix, tables with `dist`, or settings; what is wrong joins
+    `problems`."""
+    priors = {}
+    for name, value in table.items():
+        try:
+            if isinstance(value, PriorSettings):
+                priors[name] = value
+            elif isinstance(value, Mapping):
+                parameters = {key: number for key, number in value.items() if key != "dist"}
+                priors[name] = PriorSettings(name, dist=value.get("dist"), parameters=parameters)
+            else:
+                priors[name] = PriorSettings(name, fixed=value)
+        except InputError as error:
+            problems += [f"{where}: {problem}" for problem in error.problems]
+    return priors

@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from types import MappingProxyType
-from typing import final
+from typing import Any, TypeVar, final
 
 import numpy as np
 
 from lcopa_bayes.core.checks import rebuilt
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.candidatesettings import CandidateSettings, CompareSettings
-from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.data.record import Axis, Record, RecordLike, records_of, several
 from lcopa_bayes.data.settings import (
     STAGES,
     EffectsSettings,
+    HeadingSettings,
     ModelSettings,
     NoiseSettings,
     PriorSettings,
     SamplerSettings,
+    prior_settings,
+    settings_from,
 )
 
 DEFAULT_STAGES: Mapping[str, Mapping[str, object]] = MappingProxyType(
@@ -30,49 +33,109 @@ DEFAULT_STAGES: Mapping[str, Mapping[str, object]] = MappingProxyType(
 
 
 @final
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Study:
     """Records and settings of one study; every record has the axes of the first, in its order.
 
-    Raises InputError with every problem unless the records have distinct names, one time unit and the
-    same axes, and those to fit can tell something about the dynamics: a drive changes before a sample.
+    ``Study(fit=["on.csv", frame], held_out=[record], terms=3, priors={"delay": 5.0})`` is the study that a
+    study file with these keys describes: records are `Record`, paths, frames or arrays (`records_of`), tables
+    of settings are their keys and values. Raises InputError with every problem unless the records have
+    distinct names, one time unit and the same axes, those to fit can tell something about the dynamics (a
+    drive changes before a sample), and every setting is known and allowed.
     """
 
     name: str
+    """Also the name of the run folder; by default the names of the fit records joined by ``-``."""
     folder: Path | None
-    """Where the study file is; None when the study was made from record files alone."""
+    """Where the study file is; None when the study was made from records alone."""
     time_unit: str
-    """Unit of every time in the records, priors and results."""
+    """Unit of every time in the records, priors and results; by default that of the first fit record."""
     seed: int
+    """Seed of every random number."""
     fit: tuple[Record, ...]
-    held_out: tuple[Record, ...] = ()
-    model: ModelSettings = field(default_factory=ModelSettings)
-    priors: Mapping[str, PriorSettings] = field(default_factory=dict)
+    """Records to fit."""
+    held_out: tuple[Record, ...]
+    """Records the fit never sees."""
+    model: ModelSettings
+    """Elements, orders, delays and offsets."""
+    priors: Mapping[str, PriorSettings]
     """By parameter name."""
-    noise: NoiseSettings = field(default_factory=NoiseSettings)
-    sampler: SamplerSettings = field(default_factory=SamplerSettings)
-    stages: Mapping[str, Mapping[str, object]] = field(default_factory=lambda: DEFAULT_STAGES)
+    noise: NoiseSettings
+    """Kind of noise."""
+    sampler: SamplerSettings
+    """How long to sample."""
+    stages: Mapping[str, Mapping[str, object]]
     """Settings of every stage to run, by name."""
-    inputs: Mapping[str, str] = field(default_factory=dict)
+    inputs: Mapping[str, str]
     """SHA-256 of each input file, by file name."""
-    compare: CompareSettings = field(default_factory=CompareSettings)
-    candidates: tuple[CandidateSettings, ...] = ()
+    compare: CompareSettings
+    """How candidates are compared."""
+    candidates: tuple[CandidateSettings, ...]
     """Models to compare besides those any study has."""
-    effects: EffectsSettings = field(default_factory=EffectsSettings)
+    effects: EffectsSettings
+    """Effects of the plant beyond its linear elements."""
 
-    def __post_init__(self) -> None:
-        records = (*self.fit, *self.held_out)
-        problems = together(self.fit, self.held_out)
-        problems += [
-            f"record {r.name!r} is in {r.time_unit}" for r in records if r.time_unit != self.time_unit
-        ]
-        if problems or not self.fit:
-            raise InputError(problems or ["a study needs one or more records to fit"])
-        for key in ("fit", "held_out"):
-            object.__setattr__(self, key, tuple(_in_order(r, self.fit[0]) for r in getattr(self, key)))
-        locked = {name: MappingProxyType(dict(settings)) for name, settings in self.stages.items()}
-        for key, mapping in (("priors", self.priors), ("stages", locked), ("inputs", self.inputs)):
-            object.__setattr__(self, key, MappingProxyType(dict(mapping)))
+    def __init__(
+        self,
+        name: str | None = None,
+        folder: Path | None = None,
+        time_unit: str | None = None,
+        seed: int = 0,
+        fit: RecordLike | Iterable[RecordLike] = (),
+        held_out: RecordLike | Iterable[RecordLike] = (),
+        model: ModelSettings | Mapping[str, object] | None = None,
+        priors: Mapping[str, Any] | None = None,
+        noise: NoiseSettings | Mapping[str, object] | None = None,
+        sampler: SamplerSettings | Mapping[str, object] | None = None,
+        stages: Mapping[str, Mapping[str, object]] = DEFAULT_STAGES,
+        inputs: Mapping[str, str] | None = None,
+        compare: CompareSettings | None = None,
+        candidates: tuple[CandidateSettings, ...] = (),
+        effects: EffectsSettings | Mapping[str, object] | None = None,
+        *,
+        terms: int | Mapping[str, int] | None = None,
+    ) -> None:
+        problems: list[str] = []
+        fitted, apart = _records(fit, held_out, time_unit, problems)
+        if terms is not None:
+            model = (
+                replace(model, terms=terms)
+                if isinstance(model, ModelSettings)
+                else {**(model or {}), "terms": terms}
+            )
+        settings: dict[str, Any] = {
+            "model": _settings(ModelSettings, model, "model", problems),
+            "noise": _settings(NoiseSettings, noise, "noise", problems),
+            "sampler": _settings(SamplerSettings, sampler, "sampler", problems),
+            "effects": _settings(EffectsSettings, effects, "effects", problems),
+            "priors": prior_settings(priors or {}, "priors", problems),
+        }
+        HeadingSettings(name or None, None, seed)
+        if problems:
+            raise InputError(problems)
+        if not fitted:
+            raise InputError("a study needs one or more records to fit")
+        unit = time_unit or fitted[0].time_unit
+        records = (*fitted, *apart)
+        problems = together(fitted, apart)
+        problems += [f"record {r.name!r} is in {r.time_unit}" for r in records if r.time_unit != unit]
+        if problems:
+            raise InputError(problems)
+        settings |= {
+            "name": name or default_name(fitted),
+            "folder": folder,
+            "time_unit": unit,
+            "seed": seed,
+            "fit": tuple(_in_order(r, fitted[0]) for r in fitted),
+            "held_out": tuple(_in_order(r, fitted[0]) for r in apart),
+            "stages": {key: MappingProxyType(dict(value)) for key, value in stages.items()},
+            "inputs": inputs or {},
+            "compare": compare or CompareSettings(),
+            "candidates": candidates,
+        }
+        for key, value in settings.items():
+            locked = MappingProxyType(dict(value)) if isinstance(value, Mapping) else value
+            object.__setattr__(self, key, locked)
 
     @property
     def drive_axes(self) -> tuple[Axis, ...]:
@@ -89,6 +152,44 @@ class Study:
         return replace(self, seed=seed)
 
     __reduce__ = rebuilt
+
+
+def default_name(fit: Sequence[Record]) -> str:
+    """Name of a study made from records: the first names joined by ``-``; it becomes that of a folder."""
+    more = [f"and-{len(fit) - 3}-more"] if len(fit) > 3 else []
+    return "-".join([record.name for record in fit[:3]] + more)
+
+
+def _records(
+    fit: RecordLike | Iterable[RecordLike],
+    held_out: RecordLike | Iterable[RecordLike],
+    time_unit: str | None,
+    problems: list[str],
+) -> tuple[tuple[Record, ...], tuple[Record, ...]]:
+    """Records to fit and held out; those read here come in one time unit. What is wrong joins `problems`."""
+    out: list[tuple[Record, ...]] = []
+    for given, called in ((several(fit), "record"), (several(held_out), "held-out")):
+        try:
+            read = records_of(given, called=called)
+        except InputError as error:
+            problems += error.problems
+            read = ()
+        unit = time_unit or next((record.time_unit for role in (*out, read) for record in role), None)
+        as_given = read and all(isinstance(one, Record) for one in given)
+        out.append(read if as_given else records_of(read, unit))
+    return out[0], out[1]
+
+
+S = TypeVar("S")
+
+
+def _settings(
+    kind: type[S], given: S | Mapping[str, object] | None, where: str, problems: list[str]
+) -> S | None:
+    """Settings as given, or of their keys; None when a value is wrong, which joins `problems`."""
+    if isinstance(given, kind):
+        return given
+    return settings_from(kind, given or {}, f"`{where}`", problems)  # type: ignore[arg-type]
 
 
 def _axes(record: Record, role: str) -> dict[str, Axis]:

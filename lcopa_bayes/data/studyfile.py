@@ -19,9 +19,9 @@ from lcopa_bayes.data.settings import (
     HeadingSettings,
     ModelSettings,
     NoiseSettings,
-    PriorSettings,
     RecordsSettings,
     SamplerSettings,
+    prior_settings,
     settings_from,
 )
 from lcopa_bayes.data.study import DEFAULT_STAGES, Study, together
@@ -96,20 +96,6 @@ def _stages(table: object, where: str, problems: list[str]) -> dict[str, Mapping
     }
 
 
-def _priors(table: Mapping[str, Any], where: str, problems: list[str]) -> dict[str, PriorSettings]:
-    priors = {}
-    for name, value in table.items():
-        try:
-            if isinstance(value, dict):
-                parameters = {key: number for key, number in value.items() if key != "dist"}
-                priors[name] = PriorSettings(name, dist=value.get("dist"), parameters=parameters)
-            else:
-                priors[name] = PriorSettings(name, fixed=value)
-        except InputError as error:
-            problems += [f"{where}: {problem}" for problem in error.problems]
-    return priors
-
-
 def _from_file(path: Path, held_out: list[Path]) -> Study:
     document, folder = _document(path), path.parent
     problems = [
@@ -135,7 +121,7 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
     effects = (
         settings_from(EffectsSettings, tables["effects"], where["effects"], problems) or EffectsSettings()
     )
-    priors = _priors(tables["priors"], where["priors"], problems)
+    priors = prior_settings(tables["priors"], where["priors"], problems)
     stages = _stages(tables["stages"], where["stages"], problems)
     compare, candidates = compare_settings(document, str(path), problems)
     fit, apart = [], held_out
@@ -172,7 +158,7 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
 
 
 def load_study(source: Path | Sequence[Path], *, held_out: Sequence[Path] = ()) -> Study:
-    """The study in a folder or study file, or a study of default settings made from record files.
+    """The study in the folder or study file `source`, or one of default settings made from record files.
 
     The time unit is the one the study file states, else that of the first fit record; records in other units
     are converted. From record files the name is the first stems joined by ``-`` and the seed 0. `held_out`
@@ -190,9 +176,7 @@ def load_study(source: Path | Sequence[Path], *, held_out: Sequence[Path] = ()) 
     if problems:
         raise InputError(problems)
     fit, kept = tuple(records["fit"]), tuple(records["held_out"])
-    more = [f"and-{len(fit) - 3}-more"] if len(fit) > 3 else []  # the name becomes that of a folder
-    name = "-".join([record.name for record in fit[:3]] + more)
-    return Study(name, None, fit[0].time_unit, 0, fit, kept, inputs=_hashes([*sources, *apart]))
+    return Study(fit=fit, held_out=kept, inputs=_hashes([*sources, *apart]))
 
 
 def load_candidates(path: Path) -> tuple[tuple[str, ...] | None, tuple[CandidateSettings, ...]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterator
 from dataclasses import dataclass
 from math import isfinite
 from typing import Any, final
@@ -14,7 +14,7 @@ from lcopa_bayes.bench.acquisition import Bench as VirtualBench
 from lcopa_bayes.bench.acquisition import truth
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.core.estimate import LEVEL, plain
-from lcopa_bayes.core.parallel import crew
+from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.experiments.design import LINEAR, Design
 from lcopa_bayes.experiments.information import Bench
 from lcopa_bayes.experiments.refit import Trial, device_of
@@ -206,16 +206,16 @@ def _confirmed(made: Design, chosen: int, where: str, replicas: int, jobs: int) 
         )
         for promise, part in ((made.winner, found[:replicas]), (made.step, found[replicas:]))
     )
-    rng = np.random.default_rng([made.fit.run.plan.seed, 10])
+    rng = np.random.default_rng([made.fit.study.seed, 10])
     factor, low, high = _factor(winner.errors, step.errors, made.determined, rng)
     columns = [made.fit.draws.table.names.index(name) for name in made.names]
     at = made.draws[chosen, columns]
     return Confirmation(where, made.names, made.determined, at, winner, step, factor, low, high)
 
 
-def _performed(tasks: list[Trial], jobs: int) -> Iterable[tuple[Vector, Flags]]:
-    with crew(jobs) as mapped:
-        yield from mapped(_perform, tasks)
+def _performed(tasks: list[Trial], jobs: int) -> Iterator[tuple[Vector, Flags]]:
+    with workers(None, jobs=jobs) as crew:
+        yield from crew.map(_perform, tasks)
 
 
 def _perform(task: Trial) -> tuple[Vector, Flags]:

@@ -19,7 +19,7 @@ from lcopa_bayes.identifiability.contraction import prior_draws, prior_spread
 from lcopa_bayes.identifiability.symmetries import Structure, structure
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.likelihood import Landscape
-from lcopa_bayes.results.fit import Fit
+from lcopa_bayes.results.predictive import Predictive
 
 DRAWS = 24
 """Draws of the posterior that are averaged over."""
@@ -39,7 +39,7 @@ _PRIOR_POINTS = 12
 class Design:
     """Promises of every drive at every bench time tried."""
 
-    fit: Fit
+    fit: Predictive
     limits: Limits
     repeats: int
     time: float
@@ -181,7 +181,7 @@ def checked(
 
 
 def design(
-    fit: Fit,
+    fit: Predictive,
     *,
     time: float | None = None,
     repeats: int = 1,
@@ -202,7 +202,7 @@ def design(
     first = Bench(problem, times[0], limits.period)
     averaged = fit.draws.thinned(draws)
     landscape = Landscape(problem.posterior)
-    rng = np.random.default_rng([fit.run.plan.seed, 7])
+    rng = np.random.default_rng([fit.study.seed, 7])
     believed = prior_draws(landscape, rng)
     known = prior_spread(landscape, believed)[list(first.columns)] if with_prior else None
     tried = []

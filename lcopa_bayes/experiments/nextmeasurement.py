@@ -8,13 +8,13 @@ from typing import Any
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.experiments.design import design
-from lcopa_bayes.results.fit import Fit
+from lcopa_bayes.results.predictive import Predictive
 
 _DRAWS = 8
 """Draws averaged over: enough to rank drives."""
 
 
-def next_measurement(fit: Fit, parameters: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+def next_measurement(fit: Predictive, parameters: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     """The drive to play next and, per parameter that is not identified, the best drive for it.
 
     `parameters`: rows of an audit with `name` and `verdict`. None when every one is identified. Bounds are

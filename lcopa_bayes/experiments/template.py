@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from lcopa_bayes.bench.command import Command
-from lcopa_bayes.core.files import write_text
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.experiments.limits import Limits
 
 
-def write_template(study: Study, limits: Limits, command: Command, time: float, path: Path) -> Path:
-    """Write a record table of a drive for `time` [time unit] with empty responses; returns its path.
+def template(study: Study, limits: Limits, command: Command, time: float) -> str:
+    """A record table (CSV) of a drive for `time` [time unit] with empty responses.
 
     One row a camera period before time 0 under the resting drive, then one per camera sample; drives change
-    only at rows. Filled in, the file is a record of the study. InputError when it cannot be written.
+    only at rows. Filled in, the file is a record of the study.
     """
     ticks = np.arange(-1, max(2, round(time / limits.period)))
     at = np.round(limits.period * ticks, 9)
@@ -29,5 +26,4 @@ def write_template(study: Study, limits: Limits, command: Command, time: float, 
         ",".join(repr(float(value)) for value in (moment, *levels)) + empty
         for moment, levels in zip(at, drive, strict=True)
     ]
-    write_text(path, "\n".join([",".join(heads), *rows]) + "\n")
-    return path
+    return "\n".join([",".join(heads), *rows]) + "\n"

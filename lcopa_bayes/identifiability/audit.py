@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
 from typing import Any, final
 
 import numpy as np
@@ -13,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.identifiability.contraction import Known, beliefs, known_best, prior_draws, prior_spread
 from lcopa_bayes.identifiability.curvature import Curvature, curvature
 from lcopa_bayes.identifiability.delays import Delays, delays
@@ -28,8 +27,9 @@ from lcopa_bayes.inference.likelihood import Landscape, Peak
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.model.effects.effect import UnstableError
-from lcopa_bayes.results.fit import Fit
+from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.resonance import unresolved
+from lcopa_bayes.results.sensitivity import sensitivity
 
 _POINTS = 24
 """Prior draws at which symmetries are sought, besides likely ones."""
@@ -50,7 +50,7 @@ _TRIES = 3
 class Audit:
     """Identifiability of a fitted study."""
 
-    fit: Fit
+    fit: Predictive
     findings: tuple[Finding, ...]
     """One per free parameter, in table order."""
     structure: Structure
@@ -115,9 +115,9 @@ def _structure(structure: Structure) -> dict[str, Any]:
     }
 
 
-def audit(fit: Fit, *, jobs: int = 1) -> Audit:
+def audit(fit: Predictive, *, jobs: int = 1) -> Audit:
     """Verdict for every free parameter of a fitted study; profiles are calculated in `jobs` processes."""
-    posterior, seed = fit.problem.posterior, fit.run.plan.seed
+    posterior, seed = fit.problem.posterior, fit.study.seed
     landscape, rng = Landscape(posterior), np.random.default_rng([seed, 5])
     with threadpool_limits(1):
         prior = prior_draws(landscape, rng)
@@ -140,7 +140,7 @@ def audit(fit: Fit, *, jobs: int = 1) -> Audit:
         printed = printed_structure(points, rng)
         curved = curvature(landscape, peak.values, spread)
         moved = radial(landscape, peak, spread, curved.directions[-1], _RADIUS)
-    believed = beliefs(landscape, fit.draws, spread, fit.sensitivity)
+    believed = beliefs(landscape, fit.draws, spread, sensitivity(fit.draws, posterior))
     rows = [posterior.table.rows[k] for k in landscape.free]
     scales = fit.problem.scales
     fast = unresolved(fit.draws, scales.period)
@@ -210,28 +210,11 @@ class _Task:
         return profile(landscape, self.k, self.peak, self.witnesses, self.step)
 
 
-def _performed(landscape: Landscape, tasks: Sequence[_Task], jobs: int) -> Iterable[Profile]:
-    """Profiles in the order of the tasks, from this process or from others, with the same result."""
-    if min(jobs, len(tasks)) <= 1:
-        with threadpool_limits(1):
-            yield from (task(landscape) for task in tasks)
-        return
-    with ProcessPoolExecutor(
-        jobs, mp_context=get_context("spawn"), initializer=_take_up, initargs=(landscape,)
-    ) as pool:
-        yield from pool.map(_perform, tasks)
+def _performed(landscape: Landscape, tasks: Sequence[_Task], jobs: int) -> Iterator[Profile]:
+    """Profiles in the order of the tasks."""
+    with workers(landscape, jobs=min(jobs, len(tasks))) as crew:
+        yield from crew.each(_perform, tasks)
 
 
-_landscape: Landscape | None = None
-"""What a worker process profiles; set once when the process starts."""
-
-
-def _take_up(landscape: Landscape) -> None:
-    global _landscape
-    threadpool_limits(1)
-    _landscape = landscape
-
-
-def _perform(task: _Task) -> Profile:
-    assert _landscape is not None
-    return task(_landscape)
+def _perform(landscape: Landscape, task: _Task) -> Profile:
+    return task(landscape)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
 from typing import Any, final
 
 import numpy as np
@@ -14,6 +12,7 @@ from tqdm import tqdm
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.paper.equation import Convention, PathModel, equation_rmse, least_squares, output_rmse
 from lcopa_bayes.paper.intervals import Interval, Scan
@@ -85,11 +84,13 @@ def identify(
     if jobs <= 1 or len(paths) == 1:
         with tqdm(total=0, unit="candidate", disable=quiet) as bar:
             return tuple(_identify(study, data, plan, bar) for data in paths)
-    workers = min(jobs, len(paths))
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        count = len(paths)
-        identified = pool.map(_identify, [study] * count, paths, [plan] * count)
-        return tuple(tqdm(identified, total=count, unit="path", disable=quiet))
+    with workers((study, plan), jobs=min(jobs, len(paths))) as crew:
+        identified = crew.each(_identified, paths)
+        return tuple(tqdm(identified, total=len(paths), unit="path", disable=quiet))
+
+
+def _identified(shared: tuple[Study, Scan], data: PathData) -> Identification:
+    return _identify(shared[0], data, shared[1])
 
 
 def scannable(study: Study, plan: Scan | None = None) -> tuple[PathData, ...]:

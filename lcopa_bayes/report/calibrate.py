@@ -28,14 +28,6 @@ _NEEDS = (
 )
 
 
-def is_calibration(folder: Path) -> bool:
-    """Whether a run folder is that of a calibration."""
-    try:
-        return "rank_corridor" in json.loads((folder / "results.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError, TypeError):
-        return False
-
-
 def write_calibration(folder: Path) -> Path:
     """`report.html` with coverage, ranks and grades; returns its path. InputError when keys are missing."""
     results: Mapping[str, Any] = json.loads((folder / "results.json").read_text(encoding="utf-8"))

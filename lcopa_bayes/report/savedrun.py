@@ -16,6 +16,7 @@ import xarray as xr
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
+from lcopa_bayes.results.runfolder import ORIGINS
 
 _BAND = ("05", "25", "50", "75", "95")
 _WORDS = ("record", "axis", "unit", "name", "path", "prior", "from")
@@ -62,6 +63,7 @@ class SavedRun:
 
     results: Mapping[str, Any]
     provenance: Mapping[str, Any]
+    """Of the fit."""
     tables: Mapping[str, pd.DataFrame]
     draws: Mapping[str, Matrix]
     """Draws of each free parameter, (ensembles, draws), in the parameter's unit."""
@@ -105,7 +107,13 @@ def load_run(folder: Path) -> SavedRun:
         raise InputError(f"{folder}: there is no such run folder; give the folder `fit` wrote")
     problems: list[str] = []
     results = _json(folder / "results.json", _RESULTS, problems)
-    provenance = _json(folder / "provenance.json", _PROVENANCE, problems)
+    origin = _json(folder / ORIGINS, ("fit",), problems).get("fit", {})
+    problems += [
+        f"{folder / ORIGINS}: the key {key!r} of the fit is missing; run `fit` again with this version of "
+        "lcopa-bayes"
+        for key in _PROVENANCE
+        if origin and key not in origin
+    ]
     wanted = {**_TABLES, **(_CHECK_TABLES if results.get("cross_check") else {})}
     tables = {
         name: _table(folder / "tables" / f"{name}.csv", needs, problems) for name, needs in wanted.items()
@@ -120,7 +128,7 @@ def load_run(folder: Path) -> SavedRun:
         ]
     if problems:
         raise InputError(problems)
-    return SavedRun(results, provenance, tables, draws)
+    return SavedRun(results, origin, tables, draws)
 
 
 def _missing(path: Path) -> str:

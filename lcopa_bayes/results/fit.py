@@ -2,34 +2,45 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
+from xarray import DataTree
 
-from lcopa_bayes.core.arrays import Matrix
+from lcopa_bayes.core.arrays import Matrix, digest_of
 from lcopa_bayes.core.checks import refuse_if
 from lcopa_bayes.core.estimate import Estimate
-from lcopa_bayes.core.files import writable_folder
+from lcopa_bayes.core.files import save_json, save_table, writable_folder, write_text, write_whole
 from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.results.adequacy import limitations
+from lcopa_bayes.results.datatree import POSTERIOR, posterior_tree, save_tree
 from lcopa_bayes.results.discretisation import Discretisation, discretisation, resolved
 from lcopa_bayes.results.frequency import FrequencyResponse, frequency_response
 from lcopa_bayes.results.prediction import Band, bands
 from lcopa_bayes.results.predictive import Predictive
-from lcopa_bayes.results.provenance import digest_of, fingerprint
+from lcopa_bayes.results.provenance import fingerprint, provenance
 from lcopa_bayes.results.residuals import Residual, residuals
+from lcopa_bayes.results.runfolder import add_origin, opened
+from lcopa_bayes.results.savedfit import NAME as SAVED
+from lcopa_bayes.results.savedfit import fit_to_json
 from lcopa_bayes.results.sensitivity import Sensitivity, sensitivity
 from lcopa_bayes.results.steps import StepCurves, step_curves, step_metrics, too_fast
+from lcopa_bayes.results.summary import results, verdict
+from lcopa_bayes.results.tables import tables
 from lcopa_bayes.sampling.crosscheck import CrossCheck
 from lcopa_bayes.sampling.draws import Draws, gather
 from lcopa_bayes.sampling.evidence import Evidence, evidence_of
 from lcopa_bayes.sampling.nested import NestedPlan, nested
 from lcopa_bayes.sampling.sampler import Run, SamplePlan, sample
 from lcopa_bayes.sampling.weightedrun import weighted_run
+
+if TYPE_CHECKING:
+    from lcopa_bayes.results.integerrival import Rival
 
 _QUICK = 4
 """How many times fewer steps a quick fit takes."""
@@ -38,16 +49,24 @@ _QUICK = 4
 @final
 @dataclass(frozen=True, eq=False)
 class Fit(Predictive):
-    """A fitted study."""
+    """A fitted study: draws of its posterior, what it predicts, and how far both can be trusted."""
 
     problem: Problem
+    """The study prepared for inference, with blocks as narrow as its records need."""
     run: Run
+    """Ensembles or weighted draws, as sampling left them."""
     draws: Draws
+    """Posterior draws, (ensembles, draws, parameters) in the unit of each, with their grade."""
     bands: tuple[Band, ...]
+    """50 and 90 % bands of every response axis of every record, fitted ones first [response unit]."""
     residuals: tuple[Residual, ...]
+    """What the median prediction leaves of each of these [response unit], tested for whiteness."""
     curves: StepCurves
+    """Unit step responses of every path over the longest record, at each draw."""
     metrics: tuple[Estimate, ...]
+    """Rise, delay, settling [time unit], overshoot [-] and levels [response unit] of every path."""
     sensitivity: tuple[Sensitivity, ...]
+    """How far each parameter's median moves with the power of prior or likelihood [posterior sd]."""
     evidence: Evidence | None
     """None for a single ensemble, which cannot tell its error."""
     discretisation: Discretisation
@@ -55,6 +74,39 @@ class Fit(Predictive):
     frequency: FrequencyResponse
     """Over the frequencies that the fit records resolve."""
     cross_check: CrossCheck | None = None
+    """How a second, independent sampling method agrees; None without one."""
+    rival: Rival | None = None
+    """The same study with integer orders, and how it predicts; None when none was fitted."""
+
+    @property
+    def verdict(self) -> str:
+        """What was learned, how far it can be trusted, what is wrong with it."""
+        return verdict(self)
+
+    def to_json(self) -> dict[str, Any]:
+        """Every number of the fit as plain values; see `summary.results`."""
+        return results(self)
+
+    def to_datatree(self) -> DataTree:
+        """Draws, data and prior in the ArviZ groups; see `datatree`."""
+        return posterior_tree(self)
+
+    def save(self, folder: Path | str) -> Path:
+        """Write draws, numbers and tables into a run folder, which `load_result` reads; returns the folder.
+
+        InputError naming the first file that cannot be written, and as `Result.save`.
+        """
+        origin = provenance(self.study, self.verb)
+        with opened(folder, origin) as path:
+            writable_folder(path / "tables")
+            for name, table in tables(self).items():
+                save_table(table, path / "tables" / f"{name}.csv")
+            write_whole(path / POSTERIOR, lambda beside: save_tree(self.to_datatree(), beside))
+            text = json.dumps(fit_to_json(self.problem, self.draws), allow_nan=False)
+            write_text(path / SAVED, f"{text}\n")
+            add_origin(path, self.verb, origin)
+            save_json(self.to_json(), path / self.file)
+        return path
 
 
 def fit(

@@ -85,7 +85,9 @@ class FrequencyResponse:
     frequency: Vector
     """(n,) [cycles / time unit]."""
     time_unit: str
+    """Unit that frequencies are the inverse of."""
     paths: tuple[PathResponse, ...]
+    """Gain, phase and bandwidth of each path, by response and drive."""
     outside: tuple[str, ...]
     """A sentence for frequencies below or above those that the fit records resolve, and for effects."""
     draws: int
@@ -122,7 +124,7 @@ class FrequencyResponse:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Frequencies, bands and bandwidths as plain values."""
         out: dict[str, Any] = plain(
             {
                 "frequency": self.frequency,

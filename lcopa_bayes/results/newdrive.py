@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, final
 
@@ -30,6 +29,9 @@ from lcopa_bayes.results.prediction import (
     named_rng,
     plant_draws,
 )
+from lcopa_bayes.results.provenance import provenance
+from lcopa_bayes.results.result import Result
+from lcopa_bayes.results.runfolder import add_origin, opened
 from lcopa_bayes.sampling.draws import Draws
 
 Level = Literal["fitted", "zero"]
@@ -46,8 +48,10 @@ _WEIGHTS = 100
 
 @final
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class Prediction(Result):
     """Bands of every response axis under one drive."""
+
+    verb, file = "predict", NAME
 
     study: str
     """Name of the study that was fitted."""
@@ -60,8 +64,13 @@ class Prediction:
     grade: str
     """Grade of the fit."""
     grade_reason: str
+    """Why it has this grade."""
     time_unit: str
+    """Unit of every time."""
     seed: int
+    """Seed of the noise and of the offsets that are drawn."""
+    origin: Mapping[str, Any]
+    """Provenance: command, seed, settings, hashes of records and draws, versions."""
 
     @property
     def verdict(self) -> str:
@@ -169,27 +178,18 @@ class Prediction:
         )
         return out
 
-    def save(self, folder: Path | str, **more: Any) -> dict[str, Any]:
-        """Write `predict.json`, with `more` values, and the tables of bands and drives; returns the values.
+    def save(self, folder: Path | str) -> Path:
+        """Write `predict.json` and the tables of bands and drives into a folder; returns the folder.
 
-        InputError when the folder cannot be written to.
+        InputError as `Result.save`.
         """
-        values, folder = self.to_json() | more, Path(folder)
-        writable_folder(folder / "tables")
-        for name, table in ((BANDS, self.table()), (DRIVES, self.drives())):
-            save_table(table, folder / "tables" / name)
-        save_json(values, folder / NAME)
-        return values
-
-    def report(self, folder: Path | str) -> Path:
-        """`save`, then the page `predict.html` in the same folder; returns its path."""
-        self.save(folder)
-        # pages read results, and results import no page: it is looked up when wanted
-        page = import_module("lcopa_bayes.report.predict").write_prediction(Path(folder))
-        return Path(page)
-
-    def _repr_html_(self) -> str:
-        return str(self.summary().to_html())
+        with opened(folder, self.origin) as path:
+            writable_folder(path / "tables")
+            for name, table in ((BANDS, self.table()), (DRIVES, self.drives())):
+                save_table(table, path / "tables" / name)
+            save_json(self.to_json(), path / self.file)
+            add_origin(path, self.verb, self.origin)
+        return path
 
 
 def predict(
@@ -224,6 +224,7 @@ def predict(
         grade.reason,
         study.time_unit,
         study.seed,
+        plain(provenance(study, "predict") | {"draws_sha256": draws.sha256}),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -127,7 +127,20 @@ def bands(
     Effects that differ from record to record count as noise on a held-out record, as large as on the others.
     What is drawn depends on `seed` and the record's name alone, not on the other records.
     """
-    out = []
+    drawn = record_draws(draws, model, samples, noise, held_out=held_out, seed=seed)
+    return [band_of(*one) for one in drawn]
+
+
+def record_draws(
+    draws: Draws,
+    model: ForwardModel,
+    samples: Sequence[Samples],
+    noise: Noise,
+    *,
+    held_out: bool,
+    seed: int,
+) -> Iterator[tuple[tuple[str, Axis, bool], Vector, Vector, Matrix, Matrix, tuple[Vector, str, int]]]:
+    """What `bands` are made of, axis by axis of every record: arguments of `band_of`."""
     for r, record in enumerate(samples):
         rng = named_rng(seed, record.record.name)
         alone = model.only(r)
@@ -147,8 +160,7 @@ def bands(
             if apart is not None:
                 noises += apart[axis][:, observed.index]
             one = (record.record.name, record.record.response_axes[axis], held_out)
-            out.append(band_of(one, times, observed.values, response, noises, offset))
-    return out
+            yield one, times, observed.values, response, noises, offset
 
 
 def disturbances(

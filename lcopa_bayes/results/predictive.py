@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from abc import ABC
+from abc import abstractmethod
 from pathlib import Path
 
 import pandas as pd
 from numpy.typing import ArrayLike
+from xarray import DataTree
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.drives import Drive
@@ -15,12 +16,15 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.results.frequency import FrequencyResponse, frequency_response
 from lcopa_bayes.results.newdrive import Level, Prediction, predict
+from lcopa_bayes.results.result import Result
 from lcopa_bayes.results.steps import path_metrics
 from lcopa_bayes.sampling.draws import Draws
 
 
-class Predictive(ABC):
+class Predictive(Result):
     """A study with the draws of its posterior."""
+
+    verb, file = "fit", "results.json"
 
     problem: Problem
     """The study prepared for inference."""
@@ -31,6 +35,30 @@ class Predictive(ABC):
     def study(self) -> Study:
         """The study that was fitted."""
         return self.problem.study
+
+    def summary(self) -> pd.DataFrame:
+        """One row per free parameter: median and ends of the 90 % interval [`unit`], effective sample size
+        [draws], split R-hat [-] and grade."""
+        qualities = {one.name: one for one in self.draws.qualities}
+        return pd.DataFrame(
+            [
+                {
+                    "parameter": one.name,
+                    "value": one.value,
+                    "lower": one.lower,
+                    "upper": one.upper,
+                    "unit": one.unit,
+                    "ess": one.ess,
+                    "rhat": qualities[one.name].rhat,
+                    "grade": one.grade,
+                }
+                for one in self.draws.estimates()
+            ]
+        )
+
+    @abstractmethod
+    def to_datatree(self) -> DataTree:
+        """Draws, data and prior in the ArviZ groups; see `datatree`."""
 
     def predict(self, driven: Drive | Record | Path | str, *, offset: Level = "fitted") -> Prediction:
         """Bands for a drive nobody has measured, or for a record; see `newdrive.predict`."""

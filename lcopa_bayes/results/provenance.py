@@ -5,14 +5,15 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import asdict, is_dataclass
 from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Array
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
@@ -29,6 +30,8 @@ _PACKAGES = (
     "pandas",
     "xarray",
 )
+_COMMAND: ContextVar[tuple[str, ...]] = ContextVar("_COMMAND", default=())
+"""The command line that is being carried out; empty when a function was called from Python."""
 
 
 def settings_of(study: Study) -> dict[str, Any]:
@@ -67,18 +70,25 @@ def digest(record: Record) -> str:
     return held.hexdigest()
 
 
-def digest_of(array: Array) -> str:
-    """Hash of an array."""
-    held = hashlib.sha256(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
-    return held.hexdigest()
+@contextmanager
+def commanded(command: Sequence[str]) -> Iterator[None]:
+    """Within it, results say that this command line asked for them."""
+    token = _COMMAND.set(tuple(command))
+    try:
+        yield
+    finally:
+        _COMMAND.reset(token)
 
 
-def provenance(study: Study, command: Sequence[str]) -> dict[str, Any]:
-    """What another person needs to get the same numbers."""
+def provenance(study: Study, verb: str) -> dict[str, Any]:
+    """What another person needs to get the same numbers: command line, or the function that was called, seed,
+    settings, hashes of records and input files, versions."""
     return {
-        "command": list(command),
+        "command": list(_COMMAND.get() or (f"lcopa_bayes.{verb}",)),
+        "study": study.name,
         "seed": study.seed,
         "settings": settings_of(study),
+        "records_sha256": {record.name: digest(record) for record in study.fit},
         "inputs_sha256": dict(study.inputs),
         "python": platform.python_version(),
         "versions": {name: version(name) for name in _PACKAGES},

@@ -7,8 +7,10 @@ blocks were narrowed, and what its grade rests on. Other files of the folder are
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, final
@@ -18,11 +20,14 @@ import xarray as xr
 
 from lcopa_bayes.core.arrays import Array
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.files import writable_folder, write_whole
 from lcopa_bayes.data.studycopy import study_from_json, study_to_json
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.results.datatree import POSTERIOR, load_tree
 from lcopa_bayes.results.predictive import Predictive
-from lcopa_bayes.results.provenance import digest_of
+from lcopa_bayes.results.provenance import provenance
+from lcopa_bayes.results.runfolder import add_origin, opened, origins
 from lcopa_bayes.sampling.convergence import Limitation, Quality
 from lcopa_bayes.sampling.draws import Draws
 from lcopa_bayes.sampling.modes import Modes
@@ -41,6 +46,37 @@ class SavedFit(Predictive):
     problem: Problem
     draws: Draws
     folder: Path
+    """The run folder it was read from."""
+
+    @property
+    def verdict(self) -> str:
+        """What the fit said of itself."""
+        return str(self.to_json()["verdict"])
+
+    def to_json(self) -> dict[str, Any]:
+        """Every number of the fit as plain values; InputError when its file is missing or cut short."""
+        path = self.folder / self.file
+        try:
+            values = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise InputError(f"{path}: cannot be read ({error}); {_CUT}") from None
+        return dict(values)
+
+    def to_datatree(self) -> xr.DataTree:
+        """Draws, data and prior in the ArviZ groups, as `fit` wrote them."""
+        return load_tree(self.folder / POSTERIOR)
+
+    def save(self, folder: Path | str) -> Path:
+        """Copy the files of the fit into another run folder; returns the folder. InputError as `Fit.save`."""
+        origin = origins(self.folder).get(self.verb) or provenance(self.study, self.verb)
+        with opened(folder, origin) as path:
+            if path.resolve() != self.folder.resolve():
+                writable_folder(path / "tables")
+                names = [*(f"tables/{one.name}" for one in (self.folder / "tables").glob("*.csv")), POSTERIOR]
+                for name in (*names, NAME, self.file):
+                    write_whole(path / name, partial(shutil.copyfile, self.folder / name))
+                add_origin(path, self.verb, origin)
+        return path
 
 
 def fit_to_json(problem: Problem, draws: Draws) -> dict[str, Any]:
@@ -48,7 +84,7 @@ def fit_to_json(problem: Problem, draws: Draws) -> dict[str, Any]:
     return {
         "version": version("lcopa-bayes"),
         "refinement": problem.refinement,
-        "draws_sha256": digest_of(_free(draws.table, draws.values)),
+        "draws_sha256": draws.sha256,
         "target_ess": draws.target_ess,
         "qualities": [_texts(asdict(one)) for one in draws.qualities],
         "limitations": [one.as_json() for one in draws.limitations],
@@ -105,15 +141,11 @@ def load_fit(folder: Path | str) -> SavedFit:
         wanted = values["draws_sha256"]
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: does not hold a fit ({type(error).__name__}: {error}); {_AGAIN}") from None
-    drawn, density = _draws(folder / "posterior.nc", problem.posterior.table)
-    if digest_of(_free(problem.posterior.table, drawn)) != wanted:
-        raise InputError(f"{folder / 'posterior.nc'}: does not hold the draws of {path}; {_CUT}")
-    return SavedFit(problem, Draws(problem.posterior.table, drawn, density, *parts), folder)
-
-
-def _free(table: ParameterTable, values: Array) -> Array:
-    """Draws of the free parameters, (ensembles, draws, free)."""
-    return values[..., [k for k, row in enumerate(table.rows) if row.free]]
+    drawn, density = _draws(folder / POSTERIOR, problem.posterior.table)
+    read = Draws(problem.posterior.table, drawn, density, *parts)
+    if read.sha256 != wanted:
+        raise InputError(f"{folder / POSTERIOR}: does not hold the draws of {path}; {_CUT}")
+    return SavedFit(problem, read, folder)
 
 
 def _draws(path: Path, table: ParameterTable) -> tuple[Array, Array]:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lcopa_bayes.core.estimate import plain
-from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.residuals import WHITE_P
 from lcopa_bayes.results.steps import share_unsettled
 from lcopa_bayes.sampling.convergence import Grade, shares_grade
+
+if TYPE_CHECKING:
+    from lcopa_bayes.results.fit import Fit
 
 
 def verdict(fit: Fit) -> str:
@@ -34,6 +36,8 @@ def verdict(fit: Fit) -> str:
             f"At least one step response has not reached its steady state within the longest record "
             f"({100 * slow:.0f} % of draws are more than 2 % away): algebraic tails are slow."
         )
+    if fit.rival is not None:
+        parts.append(fit.rival.sentence)
     return " ".join(parts)
 
 
@@ -81,6 +85,7 @@ def results(fit: Fit) -> dict[str, Any]:
             "discretisation": fit.discretisation.as_json(),
             "residual_rms": residual_rms(fit),
             "held_out": scores(fit, held_out=True),
+            "rival": fit.rival.as_json() if fit.rival else None,
             "fit_scores": scores(fit, held_out=False),
             "ridges": [
                 r.as_json() | {"grade": fit.draws.level(r.parameter, shares_grade(r))}

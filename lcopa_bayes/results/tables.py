@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pandas as pd
 
 from lcopa_bayes.results.bands import SIMULTANEOUS
-from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.summary import results
 from lcopa_bayes.sampling.crosscheck import CrossCheck
+
+if TYPE_CHECKING:
+    from lcopa_bayes.results.fit import Fit
 
 _QUANTILE_NAMES = ("05", "25", "50", "75", "95")
 _PRIOR_POINTS = 200

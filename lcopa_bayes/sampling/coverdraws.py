@@ -8,14 +8,14 @@ converge in the whole and in each tail and mode by itself; where they do not, en
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from math import ceil, log
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.parallel import Workers
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.coordinates import Chart
 from lcopa_bayes.sampling.cover import Cover
@@ -36,9 +36,6 @@ _PART = 500
 _TASKS = 8
 """Most tasks."""
 
-Crew = Callable[[Callable[[Posterior, Any], Any], Sequence[Any]], Iterable[Any]]
-"""A map of a task over its inputs, in this process or in others."""
-
 
 @final
 @dataclass(frozen=True)
@@ -50,7 +47,13 @@ class _Density:
 
 
 def cover_draws(
-    posterior: Posterior, visited: Matrix, wanted: float, seed: int, crew: Crew, *, least: float = 0.0
+    posterior: Posterior,
+    visited: Matrix,
+    wanted: float,
+    seed: int,
+    crew: Workers[Posterior],
+    *,
+    least: float = 0.0,
 ) -> Weighted | None:
     """Weighted draws equivalent to `wanted` independent draws for the centre, the tails and the shares of
     modes of every sampled parameter, from a cover of the points `visited` (n, dimension); None where no
@@ -87,27 +90,27 @@ def _misses(
     cover: Cover,
     weighted: Weighted,
     visited: Matrix,
-    crew: Crew,
+    crew: Workers[Posterior],
     rng: np.random.Generator,
 ) -> bool:
     """Whether a draw of the cover at some of the points visited would have more weight than all others
     together."""
     sample = visited[rng.choice(len(visited), min(_LOOKED_AT, len(visited)), replace=False)]
     z = Chart.of(posterior).usable(sample)[0]
-    density = np.concatenate(list(crew(_Density(), np.array_split(z, _TASKS))))
+    density = np.concatenate(list(crew.each(_Density(), np.array_split(z, _TASKS))))
     terrain = Chart.of(posterior).terrain
     raw = density + posterior.table.log_permutations - cover.log_density(terrain.sorted(z))
     return bool(np.mean(raw - weighted.log_evidence > log(weighted.count)) > _MISSED)
 
 
 def _drawn(
-    posterior: Posterior, cover: Cover, count: int, rng: np.random.Generator, crew: Crew
+    posterior: Posterior, cover: Cover, count: int, rng: np.random.Generator, crew: Workers[Posterior]
 ) -> tuple[Matrix, Vector, Vector]:
     """`count` draws of a cover, without those outside the charts or the prior: coordinates, log density and
     log weight."""
     z = rng.permutation(cover.draw(count, rng))
     parts = np.array_split(z, max(1, min(_TASKS, len(z) // _PART)))
-    density = np.concatenate(list(crew(_Density(), parts)))
+    density = np.concatenate(list(crew.each(_Density(), parts)))
     inside = np.isfinite(density)
     z, density = z[inside], density[inside]
     return z, density, density + posterior.table.log_permutations - cover.log_density(z)

@@ -10,7 +10,7 @@ from typing import final
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 
-from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector, digest_of
 from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
@@ -76,6 +76,11 @@ class Draws:
         return limited(
             grade, [limitation for limitation in self.limitations if limitation.concerns(parameter)]
         ).level
+
+    @cached_property
+    def sha256(self) -> str:
+        """Hash of the draws of the free parameters."""
+        return digest_of(self.values[..., [k for k, row in enumerate(self.table.rows) if row.free]])
 
     @property
     def flat(self) -> Matrix:

@@ -8,7 +8,7 @@ costs a tenth per point.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -19,7 +19,7 @@ from scipy.special import logsumexp
 from tqdm import tqdm
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
-from lcopa_bayes.core.parallel import crew
+from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.constrainedwalk import Walk
@@ -90,10 +90,9 @@ def nested(posterior: Posterior, plan: NestedPlan, *, jobs: int = 1, quiet: bool
     different strands were independent, and of that between runs, which do not share points.
     """
     *seeds, last = np.random.SeedSequence(plan.seed, spawn_key=(2_000,)).spawn(plan.runs + 1)
-    tasks = [(posterior, plan, seed) for seed in seeds]
     runs, evaluations = [], 0
     with tqdm(total=plan.runs, unit="run", disable=quiet, desc="nested sampling") as bar:
-        for strands, spent in _performed(tasks, min(jobs, plan.runs)):
+        for strands, spent in _performed(posterior, plan, seeds, min(jobs, plan.runs)):
             runs.append(strands)
             evaluations += spent
             bar.update()
@@ -144,15 +143,15 @@ def _effective(draws: Vector, ratios: Matrix, owner: Index) -> float:
 
 
 def _performed(
-    tasks: list[tuple[Posterior, NestedPlan, np.random.SeedSequence]], jobs: int
-) -> Iterable[tuple[Strands, int]]:
-    with crew(jobs) as mapped:
-        yield from mapped(_run, tasks)
+    posterior: Posterior, plan: NestedPlan, seeds: Sequence[np.random.SeedSequence], jobs: int
+) -> Iterator[tuple[Strands, int]]:
+    with workers((posterior, plan), jobs=jobs) as crew:
+        yield from crew.each(_run, seeds)
 
 
-def _run(task: tuple[Posterior, NestedPlan, np.random.SeedSequence]) -> tuple[Strands, int]:
+def _run(shared: tuple[Posterior, NestedPlan], seed: np.random.SeedSequence) -> tuple[Strands, int]:
     """One run of dynesty: its strands and the number of likelihood evaluations."""
-    posterior, plan, seed = task
+    posterior, plan = shared
     rng, cube = np.random.default_rng(seed), UnitCube(posterior)
     walk = Walk(cube, plan.steps)
     points = cube.draw(plan.live, rng)

@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-import signal
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import ceil
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, final
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix
+from lcopa_bayes.core.parallel import Workers, workers
 from lcopa_bayes.data.settings import Method
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.chainfile import Chain, load_chain, save_chain
 from lcopa_bayes.sampling.convergence import CERTAIN, Quality, drifts, qualities
-from lcopa_bayes.sampling.coverdraws import Crew, cover_draws
+from lcopa_bayes.sampling.coverdraws import cover_draws
 from lcopa_bayes.sampling.ensemble import Ensemble, advance
 from lcopa_bayes.sampling.knownmodes import around
 from lcopa_bayes.sampling.learning import due, taught
@@ -181,7 +177,7 @@ def sample(
     rounds = max(2, -(-plan.steps // (_ROUND * plan.thin)))
     done = ensembles[0].steps // (_ROUND * plan.thin) if ensembles else 0
     with (
-        _crew(posterior, min(jobs, plan.ensembles)) as crew,
+        workers(posterior, jobs=min(jobs, plan.ensembles)) as crew,
         tqdm(total=rounds, initial=done, unit="round", disable=quiet, desc="from the prior") as bar,
     ):
         if not ensembles:
@@ -191,7 +187,7 @@ def sample(
                 if easy is not None:
                     _store(chain_file, Chain(*easy), fingerprint)
                     return Run(easy[0], plan, easy[1])
-            ensembles = tuple(crew(_Birth(plan.walkers), seeds))
+            ensembles = tuple(crew.each(_Birth(plan.walkers), seeds))
             _store(chain_file, Chain(ensembles), fingerprint)
         bar.set_description("sampling")
         mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
@@ -213,21 +209,21 @@ def sample(
                     return Run(ensembles, plan, weighted, _filling(posterior, run) if doubtful else ())
             if due(done):
                 mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
-            ensembles = tuple(crew(_Round(plan.thin, mixture), ensembles))
+            ensembles = tuple(crew.each(_Round(plan.thin, mixture), ensembles))
             done += 1
             _store(chain_file, Chain(ensembles, failed=failed), fingerprint)
             bar.update()
 
 
 def _easy(
-    posterior: Posterior, plan: SamplePlan, seeds: Sequence[np.random.SeedSequence], crew: Crew
+    posterior: Posterior, plan: SamplePlan, seeds: Sequence[np.random.SeedSequence], crew: Workers[Posterior]
 ) -> tuple[tuple[Ensemble, ...], Weighted] | None:
     """Small populations from the prior after two rounds and importance draws of a cover of the second; None
     where these are not efficient enough to show that the cover is close to the posterior."""
-    ensembles = tuple(crew(_Birth(plan.walkers, _FEW_SWEEPS, _FEW), seeds))
+    ensembles = tuple(crew.each(_Birth(plan.walkers, _FEW_SWEEPS, _FEW), seeds))
     mixture = taught(posterior, ensembles, _ROUND, plan.seed, None)
     for _ in range(2):
-        ensembles = tuple(crew(_Round(plan.thin, mixture), ensembles))
+        ensembles = tuple(crew.each(_Round(plan.thin, mixture), ensembles))
     visited = np.concatenate(
         [ensemble.chain[_ROUND:].reshape(-1, posterior.dimension) for ensemble in ensembles]
     )
@@ -336,32 +332,3 @@ class _Round:
 
     def __call__(self, posterior: Posterior, ensemble: Ensemble) -> Ensemble:
         return advance(posterior, ensemble, _ROUND, self.thin, self.mixture)
-
-
-@contextmanager
-def _crew(posterior: Posterior, jobs: int) -> Iterator[Crew]:
-    """A map of a task over its inputs, in this process or in `jobs` others."""
-    if jobs <= 1:
-        with threadpool_limits(1):
-            yield lambda task, inputs: (task(posterior, argument) for argument in inputs)
-        return
-    with ProcessPoolExecutor(
-        jobs, mp_context=get_context("spawn"), initializer=_take_up, initargs=(posterior,)
-    ) as pool:
-        yield lambda task, inputs: pool.map(_perform, [task] * len(inputs), inputs)
-
-
-_posterior: Posterior | None = None
-"""The posterior a worker process samples; set once when the process starts."""
-
-
-def _take_up(posterior: Posterior) -> None:
-    global _posterior
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # an interrupt ends a worker silently
-    threadpool_limits(1)
-    _posterior = posterior
-
-
-def _perform(task: Callable[[Posterior, Any], Any], given: Any) -> Any:
-    assert _posterior is not None
-    return task(_posterior, given)

@@ -1,1 +1,1 @@
-"""The verbs of the command line: what each does with its options, the values it tells, and the words."""
+"""The public functions: each takes a study or an earlier result and gives a result."""

@@ -37,7 +37,6 @@ from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.results.discretisation import resolved
 from lcopa_bayes.results.fit import fit, plan_of
-from lcopa_bayes.results.runfolder import save_fit
 
 
 @pytest.fixture(scope="module")
@@ -602,7 +601,7 @@ def test_a_full_disk_leaves_the_store_intact(tmp_path, alone, monkeypatch):
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("fitted")
-    save_fit(fit(STUDY), folder, ["lcopa-bayes"])
+    fit(STUDY).save(folder)
     return folder
 
 
@@ -866,7 +865,7 @@ def test_a_killed_calibration_resumes_to_the_same_result(written, tmp_path):
     ],
 )
 def test_bad_input_is_told_and_nothing_is_written(written, tmp_path, capsys, monkeypatch, words, said):
-    monkeypatch.setattr("lcopa_bayes.calibration.workers.CONNECT", 0.5)
+    monkeypatch.setattr("lcopa_bayes.core.parallel.CONNECT", 0.5)
     out = tmp_path / "run"
     code, printed, told = run(capsys, "calibrate", written, *words, "--out", out, "--quiet")
     assert code == 2

@@ -1,23 +1,107 @@
 """Who does independent tasks."""
 
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from lcopa_bayes.core.parallel import crew
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.parallel import workers
 
 
-def threads(seed):
+def threads(size, seed):
     """A product, and the threads that such products may take here."""
-    made = np.random.default_rng(seed).normal(size=(50, 50))
+    made = np.random.default_rng(seed).normal(size=(size, size))
     return float(np.trace(made @ made)), max(pool["num_threads"] for pool in threadpool_info())
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_tasks_are_done_in_order_on_one_thread_each(workers, monkeypatch):
+def lost(shared, one):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def wrong(shared, one):
+    raise ZeroDivisionError
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_tasks_are_done_in_order_on_one_thread_each(jobs, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "2")  # what a worker would take by itself
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
-    with crew(workers) as mapped:
-        made = list(mapped(threads, range(5)))
-    assert [value for value, _ in made] == [threads(seed)[0] for seed in range(5)]
+    with workers(50, jobs=jobs) as crew:
+        made = list(crew.each(threads, range(5)))
+        any_order = list(crew.finished(threads, range(5)))
+    assert [value for value, _ in made] == [threads(50, seed)[0] for seed in range(5)]
     assert {count for _, count in made} == {1}
+    assert sorted(any_order) == sorted(made)
+
+
+def test_a_lost_worker_is_told_and_an_error_is_raised():
+    with pytest.raises(InputError, match="a worker process ended"), workers(0, jobs=2) as crew:
+        list(crew.each(lost, range(3)))
+    for jobs in (1, 2):
+        with pytest.raises(ZeroDivisionError), workers(0, jobs=jobs) as crew:
+            list(crew.finished(wrong, range(3)))
+
+
+SCRIPT = """
+from time import sleep, time
+from lcopa_bayes.core.parallel import workers
+print("begun", flush=True)
+with workers({length}, jobs=2) as crew:
+    print(sum(crew.each({task}, [1, 2, 3])), flush=True)
+"""
+"""A script without a main guard."""
+
+
+def test_a_script_without_a_main_guard_runs_once(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT.format(length=4, task="pow"))
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60, check=False)
+    assert done.stderr == ""
+    assert done.stdout.split() == ["begun", str(4 + 16 + 64)]
+
+
+def children(process: int) -> list[int]:
+    listed = Path(f"/proc/{process}/task/{process}/children")
+    return [int(word) for word in listed.read_text().split()]
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="reads the process table")
+def test_workers_end_when_the_process_that_started_them_is_killed(tmp_path):
+    (tmp_path / "napping.py").write_text("import time\n\ndef nap(shared, one):\n    time.sleep(300)\n")
+    script = tmp_path / "script.py"
+    script.write_text("from napping import nap\n" + SCRIPT.format(length=0, task="nap"))
+    parent = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE)
+    try:
+        wait_for(lambda: len(started(parent.pid)) == 2)
+        workers_of = started(parent.pid)
+    finally:
+        parent.kill()
+        parent.communicate()
+    wait_for(lambda: not any(alive(one) for one in workers_of))
+
+
+def started(parent: int) -> list[int]:
+    """Workers that have taken up their work: they have a thread that watches the parent."""
+    spawned = [one for one in children(parent) if b"spawn_main" in Path(f"/proc/{one}/cmdline").read_bytes()]
+    return [one for one in spawned if len(list(Path(f"/proc/{one}/task").iterdir())) > 1]
+
+
+def alive(process: int) -> bool:
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def wait_for(condition, most: float = 30.0) -> None:
+    until = time.monotonic() + most
+    while not condition():
+        assert time.monotonic() < until, "it takes too long"
+        time.sleep(0.05)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
 from small import TRUTH, TWO, draws_of, problem, record, row_values
 
 from lcopa_bayes.bench.acquisition import Bench as VirtualBench
@@ -26,12 +28,36 @@ from lcopa_bayes.experiments.nextmeasurement import next_measurement
 from lcopa_bayes.experiments.precision import cramer_rao, promises, reached, within
 from lcopa_bayes.experiments.refit import device_of, refit
 from lcopa_bayes.experiments.summary import as_json
-from lcopa_bayes.experiments.template import write_template
+from lcopa_bayes.experiments.template import template
 from lcopa_bayes.identifiability.sensitivities import sensitivities
+from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.likelihood import Landscape
-from lcopa_bayes.verbs.questions import plan_next
+from lcopa_bayes.results.predictive import Predictive
+from lcopa_bayes.sampling.draws import Draws
+from lcopa_bayes.verbs.design import design as design_next
 
 PLANT = {key: value for key, value in TRUTH.items() if key not in ("offset", "sigma")}
+
+
+@dataclass(frozen=True, eq=False)
+class Known(Predictive):
+    """A posterior that is known without sampling; there is nothing of it to save."""
+
+    problem: Problem
+    draws: Draws
+    verdict = "known"
+
+    def to_json(self):
+        return {}
+
+    def to_datatree(self):
+        raise NotImplementedError
+
+    def save(self, folder):
+        return folder
+
+    def report(self, folder):
+        return folder
 
 
 def fitted(made, *, spread: float = 0.01, rows=None):
@@ -40,9 +66,7 @@ def fitted(made, *, spread: float = 0.01, rows=None):
     values = row_values(table, TRUTH if rows is None else rows)
     free = np.array([row.free for row in table.rows])
     draws = draws_of(table, values * (1 + spread * free * rng.standard_normal((48, values.size))))
-    return SimpleNamespace(
-        problem=made, study=made.study, draws=draws, run=SimpleNamespace(plan=SimpleNamespace(seed=1))
-    )
+    return Known(made, draws)
 
 
 @pytest.fixture(scope="module")
@@ -275,7 +299,8 @@ def test_an_audit_is_told_what_to_measure_for_what_it_left_open(one):
 def test_a_filled_template_is_a_record(one, tmp_path):
     limits = limits_of(one)
     drive = candidates(limits, 24.0, np.random.default_rng(2), unit="ms")[-1].command
-    path = write_template(one.study, limits, drive, 24.0, tmp_path / "next.csv")
+    path = tmp_path / "next.csv"
+    path.write_text(template(one.study, limits, drive, 24.0))
     with pytest.raises(InputError, match="no response column holds a sample"):
         load_record(path)
     head, *rows = path.read_text().splitlines()
@@ -294,12 +319,17 @@ def test_a_filled_template_is_a_record(one, tmp_path):
 
 
 def test_a_plan_is_numbers_a_page_and_a_drive(one, tmp_path):
-    values, words = plan_next(fitted(one), tmp_path, quick=True, time=60.0)
+    made = design_next(fitted(one), quick=True, bench_time=60.0)
+    made.report(tmp_path)
     told = json.loads((tmp_path / "design.json").read_text())
-    assert told == values
+    assert told == made.to_json()
+    assert told["verdict"] in str(made)
+    assert list(made.summary()["parameter"]) == [row["name"] for row in told["parameters"]]
+    assert made.drive is not None
+    assert_array_equal(made.drive.values[:, 0], load_template(tmp_path / told["template"])[:, 1])
+    assert_array_equal(made.drive.time, load_template(tmp_path / told["template"])[:, 0])
     assert told["factor_over_step"]["value"] > 1
     assert told["confirmed"]["trials"]
-    assert told["verdict"] in words
     assert load_template(tmp_path / told["template"]).shape[0] == 301  # 60 at 0.2, and one before
     page = (tmp_path / "design.html").read_text()
     assert told["winner"]["drive"] in page

@@ -161,7 +161,7 @@ def run_folder(path: Path, size: int = 80) -> Path:
         "inputs_sha256": {"a.csv": "ab12"},
     }
     provenance |= {"python": "3.11.0", "versions": {"numpy": "2.0"}}
-    (path / "provenance.json").write_text(json.dumps(provenance), encoding="utf-8")
+    (path / "provenance.json").write_text(json.dumps({"fit": provenance}), encoding="utf-8")
     rng = np.random.default_rng(1)
     drawn = {name: (("chain", "draw"), np.exp(0.1 * rng.normal(size=(2, 60)))) for name in PARAMETERS}
     xr.Dataset(drawn).to_netcdf(path / "posterior.nc", group="posterior", engine="h5netcdf")

@@ -14,7 +14,7 @@ from lcopa_bayes.bench.command import on_off
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.results.fit import Fit, fit, plan_of
-from lcopa_bayes.results.provenance import fingerprint, provenance
+from lcopa_bayes.results.provenance import commanded, fingerprint, provenance
 from lcopa_bayes.results.summary import residual_rms, results, verdict
 
 TINY = {"ensembles": 2, "walkers": 32, "steps": 600, "thin": 3, "target_ess": 200}
@@ -138,8 +138,11 @@ def test_the_fingerprint_knows_all_that_the_draws_depend_on():
 
 
 def test_provenance_is_plain_and_complete():
-    told = provenance(STUDY, ["lcopa-bayes", "fit", "small"])
+    assert provenance(STUDY, "fit")["command"] == ["lcopa_bayes.fit"]
+    with commanded(["lcopa-bayes", "fit", "small"]):
+        told = provenance(STUDY, "fit")
     assert told["command"] == ["lcopa-bayes", "fit", "small"]
+    assert told["study"] == "small"
     assert told["seed"] == 5
     assert {"lcopa-bayes", "numpy", "scipy", "emcee"} <= told["versions"].keys()
     assert told["settings"]["held_out"] == ["held"]

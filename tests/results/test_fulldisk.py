@@ -33,7 +33,7 @@ from small import record, study
 from lcopa_bayes.core.files import write_whole
 from lcopa_bayes.results.fit import fit
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.results.runfolder import save_posterior
+from lcopa_bayes.results.datatree import save_tree
 
 def limit(size):
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
@@ -63,7 +63,7 @@ told["same"] = bool(np.array_equal(whole.draws.values, resumed.draws.values))
 told["sizes"] = len(kept), path.stat().st_size
 
 def save():
-    write_whole(folder / "posterior.nc", lambda beside: save_posterior(resumed, beside))
+    write_whole(folder / "posterior.nc", lambda beside: save_tree(resumed.to_datatree(), beside))
 
 save()
 before = (folder / "posterior.nc").read_bytes()

@@ -12,7 +12,6 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.report import write_report
 from lcopa_bayes.results.fit import Fit, fit
 from lcopa_bayes.results.integerrival import Rival, integer_rival, integer_study
-from lcopa_bayes.results.runfolder import save_fit
 
 FEW = SamplerSettings(ensembles=2, walkers=8, steps=100, thin=1, target_ess=10)
 
@@ -44,7 +43,8 @@ def test_the_rival_predicts_the_same_records_and_is_told(fitted, rival, tmp_path
     assert told["held_out"][0]["rmse"] == next(b.rmse for b in rival.fit.bands if b.held_out)
     assert told["held_out"][0]["rmse"] != fitted.bands[-1].rmse
     assert all("order" not in quality.name for quality in rival.fit.draws.qualities)
-    saved = save_fit(fitted, tmp_path, ["test"], rival=rival)
+    both = replace(fitted, rival=rival)
+    saved = json.loads((both.save(tmp_path) / "results.json").read_text())
     assert rival.sentence in saved["verdict"]
     assert json.loads((tmp_path / "results.json").read_text())["rival"]["orders"] == dict(rival.orders)
     assert (

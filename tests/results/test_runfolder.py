@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import arviz_base
+import arviz_stats
 import numpy as np
 import pandas as pd
 import pytest
@@ -20,9 +21,8 @@ from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.files import save_json, save_table
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.report.savedrun import load_run
+from lcopa_bayes.results.datatree import save_tree, variable_names
 from lcopa_bayes.results.fit import Fit, fit
-from lcopa_bayes.results.runfolder import save_fit, save_posterior, variable_names
-from lcopa_bayes.results.summary import results
 from lcopa_bayes.results.tables import tables
 
 TINY = {"ensembles": 2, "walkers": 16, "steps": 60, "thin": 1, "target_ess": 100}
@@ -38,7 +38,7 @@ def fitted(request) -> Fit:
 @pytest.fixture(scope="module")
 def folder(fitted, tmp_path_factory):
     path = tmp_path_factory.mktemp("run")
-    save_fit(fitted, path, ["lcopa-bayes", "fit"])
+    fitted.save(path)
     return path
 
 
@@ -51,8 +51,8 @@ def test_the_folder_holds_what_was_promised(fitted, folder):
         "tables",
     ]
     assert {p.stem for p in (folder / "tables").iterdir()} == set(tables(fitted))
-    assert json.loads((folder / "results.json").read_text()) == results(fitted) | {"rival": None}
-    assert json.loads((folder / "provenance.json").read_text())["command"] == ["lcopa-bayes", "fit"]
+    assert json.loads((folder / "results.json").read_text()) == fitted.to_json()
+    assert json.loads((folder / "provenance.json").read_text())["fit"]["command"] == ["lcopa_bayes.fit"]
 
 
 def test_tables_read_back(fitted, folder):
@@ -83,6 +83,10 @@ def test_posterior_has_the_arviz_groups(fitted, folder):
             "posterior_predictive",
             "observed_data",
             "constant_data",
+            "prior",
+            "prior_predictive",
+            "predictions",
+            "predictions_constant_data",
         }
         free = [row.name for row in fitted.draws.table.rows if row.free]
         assert "delay" not in free
@@ -96,8 +100,30 @@ def test_posterior_has_the_arviz_groups(fitted, folder):
         assert_array_equal(read["posterior"]["gain"], fitted.draws.values[..., 0])
         assert_array_equal(read["sample_stats"]["lp"], fitted.draws.log_density)
         assert_allclose(read["observed_data"]["a_y"], PAIR[0].response[~np.isnan(PAIR[0].response[:, 0]), 0])
-        assert_allclose(read["constant_data"]["b_y_time"], PAIR[1].time[~np.isnan(PAIR[1].response[:, 0])])
+        assert_allclose(read["observed_data"]["b_y_time"], PAIR[1].time[~np.isnan(PAIR[1].response[:, 0])])
         assert read.attrs["grade"] == fitted.draws.grade.level
+        assert read.attrs["seed"] == fitted.study.seed
+        assert json.loads(read.attrs["settings"])["sampler"]["walkers"] == 16
+        assert read["log_likelihood"]["a_y"].dims == ("chain", "draw", "a_y_time")
+        assert read["observed_data"]["a_y"].attrs["units"] == "rad"
+        assert list(read["constant_data"].coords["record"].to_numpy()) == ["a", "b"]
+        assert_array_equal(read["constant_data"]["a_drive"].sel(drive="u").to_numpy(), PAIR[0].drive[:, 0])
+        assert_array_equal(read["constant_data"]["a_drive_time"], PAIR[0].time)
+        # held-out records: the same draws as the bands'
+        held = [band for band in fitted.bands if band.held_out]
+        assert_allclose(
+            np.quantile(read["predictions"]["held_y"].to_numpy()[0], 0.95, axis=0),
+            held[0].noisy[4],
+            atol=1e-5,
+        )
+        assert_array_equal(read["predictions_constant_data"]["held_y"], held[0].observed)
+        # the prior as it is drawn, and wider than what the records leave of it
+        assert read["prior"]["time_1"].shape == (1, 200)
+        assert read["prior"]["time_1"].attrs["units"] == "ms"
+        assert set(read["prior_predictive"].data_vars) == {"a_y", "b_y"}
+        spread = [float(read[group]["a_y"].std()) for group in ("prior_predictive", "posterior_predictive")]
+        assert spread[0] > spread[1]
+        assert arviz_stats.summary(read, var_names=["time_1"], fmt="wide").shape[0] == 1
         predictive = np.median(read["posterior_predictive"]["a_y"], axis=(0, 1))
         width = fitted.bands[0].noisy[4] - fitted.bands[0].noisy[0]
         assert np.all(np.abs(predictive - fitted.bands[0].noisy[2]) < 0.2 * width)
@@ -147,9 +173,9 @@ def test_a_failed_save_leaves_no_file(fitted, tmp_path, monkeypatch):
     def fail(*_):
         raise OSError("disk full")
 
-    monkeypatch.setattr("lcopa_bayes.results.runfolder.save_posterior", fail)
+    monkeypatch.setattr("lcopa_bayes.results.fit.save_tree", fail)
     with pytest.raises(InputError, match=r"posterior\.nc: cannot be written \(disk full\)"):
-        save_fit(fitted, tmp_path, [])
+        fitted.save(tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["tables"]
 
 
@@ -166,18 +192,19 @@ def test_names_that_a_netcdf_group_would_split_are_kept_apart(tmp_path):
     axis = Axis("front/left", "rad")
     slashed = Record("a", plain.time, plain.drive, plain.response, (Axis("u/1", "V"),), (axis,), "ms")
     made = fit(study(slashed, sampler=TINY))
-    save_posterior(made, tmp_path / "posterior.nc")
+    save_tree(made.to_datatree(), tmp_path / "posterior.nc")
     with xarray.open_datatree(tmp_path / "posterior.nc", engine="h5netcdf") as read:
         (name,) = read["observed_data"].data_vars
         assert_allclose(read["observed_data"][name], made.bands[0].observed)
-        assert len(read.children) == 7
+        assert len(read.children) == 9
 
 
 def test_a_record_too_short_for_residual_tests_is_saved_all_the_same(tmp_path):
     short = record(camera=1.5)
     assert short.response.size - np.isnan(short.response).sum() == 8
-    told = save_fit(fit(study(short, sampler=TINY)), tmp_path, [])
-    assert told["residual_tests"] == []
+    made = fit(study(short, sampler=TINY))
+    made.save(tmp_path)
+    assert made.to_json()["residual_tests"] == []
 
 
 def test_names_are_kept_plain_unless_they_collide():
@@ -210,7 +237,7 @@ def test_records_and_axes_with_the_same_joint_name_are_kept_apart(tmp_path):
     ]
     known = {"time_1": 1.5, "order_1": 0.8, "delay": 0.73}
     made = fit(study(*both, sampler=TINY | {"steps": 20}, share="all", offset="shared", priors=known))
-    save_posterior(made, tmp_path / "posterior.nc")
+    save_tree(made.to_datatree(), tmp_path / "posterior.nc")
     with xarray.open_datatree(tmp_path / "posterior.nc", engine="h5netcdf") as read:
         groups = [read[g] for g in ("observed_data", "log_likelihood", "posterior_predictive")]
         for group in groups:
@@ -223,7 +250,7 @@ def test_records_and_axes_with_the_same_joint_name_are_kept_apart(tmp_path):
             }
         seen = ~np.isnan(response[:, 1])
         assert_array_equal(read["observed_data"]["a_b_c_2"], response[seen, 1] + 0.01)
-        assert read["constant_data"]["a_b_c_2_time"].attrs["record"] == "a"
+        assert read["observed_data"]["a_b_c_2"].attrs["record"] == "a"
 
 
 def test_the_report_finds_parameters_whose_names_hold_a_slash(tmp_path):
@@ -233,5 +260,5 @@ def test_the_report_finds_parameters_whose_names_hold_a_slash(tmp_path):
         "a", plain.time, plain.drive, np.column_stack([plain.response] * 2), (Axis("u", "V"),), axes, "ms"
     )
     known = {"time_1": 1.5, "order_1": 0.8, "delay": 0.73}
-    save_fit(fit(study(two, sampler=TINY | {"steps": 20}, share="all", priors=known)), tmp_path, [])
+    fit(study(two, sampler=TINY | {"steps": 20}, share="all", priors=known)).save(tmp_path)
     assert "gain_front/left_u" in load_run(tmp_path).draws

@@ -19,7 +19,6 @@ from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.data.studycopy import study_from_json, study_to_json
 from lcopa_bayes.results.fit import Fit, fit
 from lcopa_bayes.results.provenance import fingerprint, settings_of
-from lcopa_bayes.results.runfolder import save_fit
 from lcopa_bayes.results.savedfit import fit_to_json, load_fit
 
 TINY = {"ensembles": 2, "walkers": 16, "steps": 60, "thin": 1, "target_ess": 100}
@@ -35,7 +34,7 @@ def fitted() -> Fit:
 @pytest.fixture(scope="module")
 def folder(fitted, tmp_path_factory):
     path = tmp_path_factory.mktemp("run")
-    save_fit(fitted, path, ["lcopa-bayes", "fit"])
+    fitted.save(path)
     return path
 
 

@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 from small import Toy, problem, record
 
+from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.sampling.chainfile import Chain, load_chain, save_chain
 from lcopa_bayes.sampling.cover import Cover
 from lcopa_bayes.sampling.coverdraws import cover_draws
@@ -21,11 +22,6 @@ from lcopa_bayes.sampling.weighted import BATCHES, Weighted
 WIDE = ("norm", {"loc": 0.0, "scale": 10.0})
 SMALL, NARROW, APART = 0.06, 0.15, 8.0
 """Share and width of a second mode, and its distance from the first, whose width is one."""
-
-
-def here(task, inputs):
-    """A crew of this process."""
-    return [task(TOY, one) for one in inputs]
 
 
 def log_likelihood(z):
@@ -57,7 +53,8 @@ def test_shares_are_right_where_those_of_the_ensembles_are_not(share):
     """Over seeds: no bias, and the scatter is the reported error."""
     found, errors, means = [], [], []
     for seed in range(16):
-        weighted = cover_draws(TOY, underfilled(np.random.default_rng(seed), share), 1_000, seed, here)
+        with workers(TOY) as crew:
+            weighted = cover_draws(TOY, underfilled(np.random.default_rng(seed), share), 1_000, seed, crew)
         assert weighted is not None
         weights, inside = np.exp(weighted.log_weights), weighted.sampled[:, 0] > APART / 2
         found.append(weights @ inside)

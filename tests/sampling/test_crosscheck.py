@@ -17,7 +17,6 @@ from lcopa_bayes.data.record import save_record
 from lcopa_bayes.report import write_report
 from lcopa_bayes.report.savedrun import load_run
 from lcopa_bayes.results.fit import Fit, fit
-from lcopa_bayes.results.runfolder import save_fit
 from lcopa_bayes.results.summary import results, verdict
 from lcopa_bayes.sampling.convergence import Grade, Quality, limited
 from lcopa_bayes.sampling.crosscheck import ALARM, CrossCheck, holm
@@ -201,7 +200,7 @@ def test_the_report_shows_both_methods(checked, doubted, tmp_path):
     for made, word in ((checked, "agrees"), (doubted, "disagrees")):
         folder = tmp_path / word
         folder.mkdir()
-        save_fit(made, folder, ["lcopa-bayes", "fit", "--cross-check"])
+        made.save(folder)
         page = write_report(folder).read_text(encoding="utf-8")
         assert "Second method" in page
         assert f"Nested sampling, an independent method, {word}" in page
@@ -222,7 +221,7 @@ def test_without_a_second_method_nothing_is_claimed(checked, tmp_path):
     alone = replace(checked, cross_check=None)
     assert results(alone)["cross_check"] is None
     assert "ested sampling" not in verdict(alone)
-    save_fit(alone, tmp_path, ["lcopa-bayes", "fit"])
+    alone.save(tmp_path)
     assert "Not run: <code>" not in (page := write_report(tmp_path).read_text(encoding="utf-8"))
     assert "Not run: `fit --cross-check`" in page
     assert not (tmp_path / "tables" / "cross_check.csv").exists()
@@ -235,7 +234,7 @@ def test_the_command_line_asks_for_it(monkeypatch, tmp_path):
         asked.append(options["cross_check"])
         raise InputError("asked")
 
-    monkeypatch.setattr("lcopa_bayes.verbs.runs.fit", stop)
+    monkeypatch.setattr("lcopa_bayes.verbs.fit.fit", stop)
     save_record(record(camera=0.6), tmp_path / "one.csv")
     for words in (["fit"], ["fit", "--cross-check"], ["run", "--cross-check"]):
         assert main([*words, str(tmp_path / "one.csv")]) == 2

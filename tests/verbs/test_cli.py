@@ -75,7 +75,7 @@ def test_records_alone_are_a_study(record, tmp_path, capsys, monkeypatch):
     code, printed, _ = run(capsys, "fit", record, "--json", "--quiet", "--quick", "--jobs", 1)
     assert code == 0
     assert json.loads(printed)["study"] == "pulse"
-    assert (tmp_path / "reports" / "pulse" / "report.html").exists()
+    assert (tmp_path / "runs" / "pulse" / "report.html").exists()
 
 
 @pytest.mark.parametrize(

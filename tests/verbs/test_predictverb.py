@@ -14,7 +14,6 @@ from lcopa_bayes.bench.command import on_off
 from lcopa_bayes.cli import main
 from lcopa_bayes.data.record import save_record
 from lcopa_bayes.results.fit import fit
-from lcopa_bayes.results.runfolder import save_fit
 
 TINY = {"ensembles": 2, "walkers": 16, "steps": 60, "thin": 1, "target_ess": 100}
 HELD = record(3, command=on_off(-0.7, hold=4.0, at=1.3), camera=0.3, name="held")
@@ -29,7 +28,7 @@ def fitted():
 @pytest.fixture
 def folder(fitted, tmp_path) -> Path:
     path = tmp_path / "run"
-    save_fit(fitted, path, ["lcopa-bayes", "fit"])
+    fitted.save(path)
     return path
 
 
@@ -49,8 +48,7 @@ def test_bands_of_a_drive_are_written_with_a_page_and_are_those_of_python(fitted
     page = (place / "predict.html").read_text()
     assert "response to plan" in page
     assert page.count("<svg") == 1
-    values = json.loads((place / "predict.json").read_text())
-    assert values["provenance"]["command"][1] == "predict"
+    assert json.loads((place / "provenance.json").read_text())["predict"]["command"][1] == "predict"
     result = fitted.predict(path)
     table = pd.read_csv(place / "tables" / "predict_bands.csv")
     pd.testing.assert_frame_equal(table, result.table(), check_dtype=False)

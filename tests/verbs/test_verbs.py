@@ -222,7 +222,7 @@ def test_claims_write_their_page_and_tell_their_rows(tmp_path, capsys, monkeypat
     assert len(told["claims"]) == 19
     for row in told["claims"]:
         assert row["verdict"] in {"supported", "contradicted", "undecided"}
-    folder = tmp_path / "reports" / "claims"
+    folder = tmp_path / "runs" / "claims"
     page = check_page(folder / "report.html")
     assert page.count("<svg") == len(list((folder / "figures").iterdir())) == 5
     assert all(f">{row['id']}<" in page for row in told["claims"])

@@ -1,0 +1,251 @@
+"""The draws of a fit as an ArviZ data tree, and its netCDF file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from itertools import count
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, final
+
+import arviz_base
+import numpy as np
+import xarray as xr
+from xarray import DataTree
+
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.files import enduring
+from lcopa_bayes.data.record import Record
+from lcopa_bayes.inference.observations import Samples
+from lcopa_bayes.results.prediction import record_draws, responses
+from lcopa_bayes.results.provenance import settings_of
+
+if TYPE_CHECKING:
+    from lcopa_bayes.results.fit import Fit
+
+POSTERIOR = "posterior.nc"
+"""File of a run folder that holds the tree."""
+_PORTION = 64
+"""Draws predicted at a time."""
+_PRIOR_DRAWS = 200
+"""Draws of the prior."""
+
+
+def save_tree(tree: DataTree, path: Path) -> None:
+    """Write a data tree as netCDF, compressed without loss."""
+    squeezed = {
+        node.path: {name: {"compression": "gzip", "compression_opts": 4} for name in node.data_vars}
+        for node in tree.subtree
+    }
+    with enduring(path) as file:
+        tree.to_netcdf(file, engine="h5netcdf", encoding=squeezed)
+
+
+def load_tree(path: Path) -> DataTree:
+    """The data tree in a netCDF file, in memory; InputError when it cannot be read."""
+    try:
+        with xr.open_datatree(path, engine="h5netcdf") as tree:
+            return tree.load()
+    except (OSError, ValueError, RuntimeError) as error:
+        raise InputError(f"{path}: cannot be read as draws ({error}); run `fit` again to write it") from None
+
+
+def posterior_tree(fit: Fit) -> DataTree:
+    """Draws of a fit with its data and prior in the ArviZ groups.
+
+    `posterior`, `prior` and `log_prior` hold one variable per free parameter, with its name and unit as
+    attributes; per response axis of a record, `<record>_<axis>` with both as attributes, there are
+    `log_likelihood`, `posterior_predictive` and `prior_predictive` (plant with noise) and `observed_data`,
+    and of held-out records `predictions` (with noise) and, beside the drives, `predictions_constant_data`.
+    Their dimension is `<record>_<axis>_time` with the times as coordinate. Drives stand in the constant data
+    by `<record>_drive_time` and `drive`, the axes' names; `record` lists the records.
+
+    The priors of single parameters add up to that of all but for a constant, the attribute `joint_support` of
+    `log_prior`: decreasing orders and resolved terms hold a part of the mass. A slash in a name, which netCDF
+    keeps for groups, is written as a vertical bar; names that would be the same are told apart by a number
+    (`variable_names`).
+    """
+    draws, problem = fit.draws, fit.problem
+    posterior, table, study = problem.posterior, draws.table, fit.study
+    free = [k for k, row in enumerate(table.rows) if row.free]
+    variables = dict(zip(free, variable_names([table.names[k] for k in free]), strict=True))
+    rng = np.random.default_rng([study.seed, 3])
+    prior = table.draw(_PRIOR_DRAWS, np.random.default_rng([study.seed, 9]))
+    fitted = _Series.of(posterior.samples)
+    likelihood, predictive = _predicted(fit, fitted, draws.flat, rng, likelihood=True)
+    _, before = _predicted(fit, fitted, prior, np.random.default_rng([study.seed, 10]), likelihood=False)
+    shape = draws.values.shape[:2]
+    groups: dict[str, dict[str, Any]] = {
+        "posterior": {name: draws.values[..., k] for k, name in variables.items()},
+        "sample_stats": {"lp": draws.log_density},
+        "log_prior": {
+            name: table.rows[k].log_prior(draws.values[..., k].ravel()).reshape(shape)
+            for k, name in variables.items()
+        },
+        "prior": {name: prior[None, :, k] for k, name in variables.items()},
+        "log_likelihood": {name: each.reshape(*shape, -1) for name, each in likelihood.items()},
+        "posterior_predictive": {name: each.reshape(*shape, -1) for name, each in predictive.items()},
+        "prior_predictive": {name: each[None] for name, each in before.items()},
+        "observed_data": fitted.observed,
+    }
+    series = [fitted]
+    commanded = _Drives.of(study.fit)
+    groups["constant_data"] = commanded.values
+    drives = [commanded]
+    if study.held_out:
+        samples, model = problem.simulated(study.held_out)
+        apart, later = _Series.of(samples), _Drives.of(study.held_out)
+        found = record_draws(draws, model, samples, posterior.noise, held_out=True, seed=fit.run.plan.seed)
+        names = {pair: name for name, pair in apart.told.items()}
+        groups["predictions"] = {
+            names[record, axis.name]: (response + offset[0][:, None] + noises)[None].astype(np.float32)
+            for (record, axis, _), _, _, response, noises, offset in found
+        }
+        groups["predictions_constant_data"] = apart.observed | later.values
+        series, drives = [fitted, apart], [commanded, later]
+    dims, coords = _dimensions(series, drives, [axis.name for axis in study.drive_axes])
+    tree = arviz_base.from_dict(groups, dims=dims, coords=coords, pred_dims=dims, pred_coords=coords)
+    _describe(tree, fit, variables, series)
+    return tree
+
+
+def _dimensions(
+    series: Sequence[_Series], drives: Sequence[_Drives], axes: Sequence[str]
+) -> tuple[dict[str, list[str]], dict[str, Any]]:
+    """Dimensions of every variable beyond chain and draw, and their coordinates."""
+    dims: dict[str, list[str]] = {}
+    coords: dict[str, Any] = {"drive": list(axes)}
+    for one in series:
+        dims |= {name: [f"{name}_time"] for name in one.observed}
+        coords |= {f"{name}_time": times for name, times in one.times.items()}
+    for each in drives:
+        dims |= {name: [f"{name}_time", "drive"] for name in each.values}
+        coords |= {f"{name}_time": times for name, times in each.times.items()}
+    return dims, coords
+
+
+def _describe(tree: DataTree, fit: Fit, variables: Mapping[int, str], series: Sequence[_Series]) -> None:
+    """Names, units, records and what the whole rests on, as attributes and coordinates."""
+    table, study, grade = fit.draws.table, fit.study, fit.draws.grade
+    for k, name in variables.items():
+        for group in ("posterior", "prior"):
+            tree[group][name].attrs |= {"parameter": table.rows[k].name, "units": table.rows[k].unit}
+    units = {axis.name: axis.unit for axis in study.response_axes}
+    for node in tree.children.values():
+        for one in series:
+            for name, (record, axis) in one.told.items():
+                if name in node.data_vars:
+                    more = {} if node.name == "log_likelihood" else {"units": units[axis]}
+                    node[name].attrs |= {"record": record, "axis": axis, **more}
+        for coordinate in node.coords:
+            if str(coordinate).endswith("_time"):
+                node[str(coordinate)].attrs["units"] = study.time_unit
+    for group, records in (("constant_data", study.fit), ("predictions_constant_data", study.held_out)):
+        if group in tree.children:
+            tree[group].coords["record"] = [record.name for record in records]
+    tree["log_prior"].attrs["joint_support"] = table.log_support - table.log_permutations
+    tree.attrs |= {
+        "study": study.name,
+        "version": version("lcopa-bayes"),
+        "seed": study.seed,
+        "settings": json.dumps(settings_of(study), sort_keys=True),
+        "time_unit": study.time_unit,
+        "grade": grade.level,
+        "grade_reason": grade.reason,
+        "noise": fit.problem.posterior.noise.kind,
+    }
+
+
+def variable_names(wanted: Sequence[str]) -> list[str]:
+    """Distinct netCDF names: as wanted, a slash as a bar; where several would be the same, or one would
+    be the time `<name>_time` of another, a number follows, in their order."""
+    plain_names = [name.replace("/", "|") for name in wanted]
+    times = {f"{name}_time" for name in plain_names}
+    clear = [plain_names.count(name) == 1 and name not in times for name in plain_names]
+    taken = {*plain_names, *times}
+    out = []
+    for name, is_clear in zip(plain_names, clear, strict=True):
+        numbered = (f"{name}_{number}" for number in count(1))
+        out.append(name if is_clear else next(n for n in numbered if not {n, f"{n}_time"} & taken))
+        taken |= {out[-1], f"{out[-1]}_time"}
+    return out
+
+
+@final
+@dataclass(frozen=True)
+class _Series:
+    """What was seen of some records, by variable name."""
+
+    told: dict[str, tuple[str, str]]
+    """Record and axis."""
+    places: dict[str, tuple[int, int]]
+    """Their positions."""
+    observed: dict[str, Vector]
+    times: dict[str, Vector]
+
+    @classmethod
+    def of(cls, samples: Sequence[Samples]) -> _Series:
+        """Of every axis of every record that has a sample."""
+        told = {
+            (r, axis): (record.record.name, record.record.response_axes[axis].name)
+            for r, record in enumerate(samples)
+            for axis, seen in enumerate(record.axes)
+            if seen.values.size
+        }
+        names = variable_names(["_".join(pair) for pair in told.values()])
+        places = dict(zip(names, told, strict=True))
+        return cls(
+            dict(zip(names, told.values(), strict=True)),
+            places,
+            {name: samples[r].axes[axis].values for name, (r, axis) in places.items()},
+            {name: samples[r].times[samples[r].axes[axis].index] for name, (r, axis) in places.items()},
+        )
+
+
+@final
+@dataclass(frozen=True)
+class _Drives:
+    """Drives of some records, by variable name."""
+
+    values: dict[str, Matrix]
+    """(rows, axes) each."""
+    times: dict[str, Vector]
+
+    @classmethod
+    def of(cls, records: Sequence[Record]) -> _Drives:
+        """Of every record, row by row."""
+        names = variable_names([f"{record.name}_drive" for record in records])
+        pairs = list(zip(names, records, strict=True))
+        return cls({name: one.drive for name, one in pairs}, {name: one.time for name, one in pairs})
+
+
+def _predicted(
+    fit: Fit, fitted: _Series, values: Matrix, rng: np.random.Generator, *, likelihood: bool
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Log likelihood, where it is wanted, and predictive draws of table values, (draws, samples) each, of
+    every axis of every fit record by variable name.
+
+    Single precision, a few draws at a time: these are by far the largest arrays of a run.
+    """
+    posterior, table = fit.problem.posterior, fit.draws.table
+    size = values.shape[0]
+    density, drawn = (
+        {name: np.empty((size, seen.size), np.float32) for name, seen in fitted.observed.items()}
+        for _ in range(2)
+    )
+    for first in range(0, size, _PORTION):
+        rows = slice(first, first + _PORTION)
+        part = values[rows]
+        pointwise = posterior.pointwise(part) if likelihood else ()
+        plant = responses(table, posterior.model, part)
+        for name, (r, axis) in fitted.places.items():
+            seen = posterior.samples[r].axes[axis]
+            noise = posterior.noise.draw(posterior.noise_parameters(part, axis), seen.gaps, rng)
+            offset = table.offset(part, axis, r)[:, None]
+            drawn[name][rows] = plant[r][axis][:, seen.index] + offset + noise
+            if likelihood:
+                density[name][rows] = pointwise[r][axis]
+    return density if likelihood else {}, drawn

@@ -1,0 +1,72 @@
+"""The manners every result has: table, plain values, folder, pages."""
+
+from __future__ import annotations
+
+import json
+from abc import ABC, abstractmethod
+from importlib import import_module
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pandas as pd
+
+from lcopa_bayes.core.estimate import plain
+
+
+class Result(ABC):
+    """What a public function returns.
+
+    Whether just computed or read back by `load_result`, it gives the same table, values and pages.
+    """
+
+    verb: ClassVar[str]
+    """Name of the function and of the command."""
+    file: ClassVar[str]
+    """File of a run folder that holds `to_json()`."""
+
+    @abstractmethod
+    def summary(self) -> pd.DataFrame:
+        """The result as a table."""
+
+    @abstractmethod
+    def to_json(self) -> dict[str, Any]:
+        """Every number as plain values; what is open, infinite or undefined is None."""
+
+    @abstractmethod
+    def save(self, folder: Path | str) -> Path:
+        """Write the files of the result into a run folder; returns the folder.
+
+        InputError when the folder holds another study's results, another run is writing there, or a file
+        cannot be written.
+        """
+
+    @property
+    @abstractmethod
+    def verdict(self) -> str:
+        """The result in a sentence or a few."""
+
+    def report(self, folder: Path | str) -> Path:
+        """Write the page of the result into a run folder, saving the result there first if it is not there
+        yet; returns the path of the page. InputError as `save`."""
+        folder = Path(folder)
+        if not self.is_in(folder):
+            self.save(folder)
+        # pages read results, and results import no page: it is looked up when wanted
+        page: Path = import_module("lcopa_bayes.report.pages").write_page_of(self.verb, folder)
+        return page
+
+    def is_in(self, folder: Path) -> bool:
+        """Whether a run folder holds this very result."""
+        try:
+            stored = json.loads((folder / self.file).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return False
+        return bool(stored == plain(self.to_json()))
+
+    def __str__(self) -> str:
+        return f"{self.summary().to_string(index=False)}\n\n{self.verdict}"
+
+    def _repr_html_(self) -> str:
+        from html import escape
+
+        return f"<p>{escape(self.verdict)}</p>{self.summary().to_html(index=False)}"

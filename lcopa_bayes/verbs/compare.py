@@ -1,0 +1,93 @@
+"""`compare`: which of several models of the same records is warranted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import final
+
+import pandas as pd
+
+from lcopa_bayes.comparison.candidatefit import CARD
+from lcopa_bayes.comparison.candidates import candidates_of, of_studies
+from lcopa_bayes.comparison.compare import compare as compared
+from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.data.candidatesettings import CandidateSettings
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.data.studyfile import load_candidates
+from lcopa_bayes.results.provenance import provenance
+from lcopa_bayes.results.runfolder import opened
+from lcopa_bayes.results.stored import StoredResult
+from lcopa_bayes.verbs.sources import FitLike, study_of
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Comparison(StoredResult):
+    """Candidates fitted to the same records, scored and decided."""
+
+    verb, file = "compare", "compare.json"
+    beside = ("candidates/*/tables/*.csv", f"candidates/*/{CARD}")
+
+    @property
+    def verdict(self) -> str:
+        """Which candidate is preferred, why, and whether fractional orders are warranted."""
+        return f"{self.values['why']} {self.values['fractional']['sentence']}"
+
+    @property
+    def preferred(self) -> str | None:
+        """Name of the preferred candidate; None when none is."""
+        name: str | None = self.values["preferred"]
+        return name
+
+    def summary(self) -> pd.DataFrame:
+        """One row per candidate, in the order given: sampled parameters, log evidence with its standard
+        deviation [nat], None where undefined, probability [-], and grade."""
+        keys = ("name", "about", "parameters", "log_evidence", "log_evidence_sd", "probability", "grade")
+        rows = [{key: row.get(key) for key in keys} for row in self.values["models"]]
+        return pd.DataFrame(rows).assign(preferred=lambda table: table["name"] == self.preferred)
+
+
+def compare(
+    study: FitLike | Sequence[Study],
+    candidates: Sequence[str] | None = None,
+    *,
+    described: Path | str | Sequence[CandidateSettings] = (),
+    jobs: int = 1,
+    folder: Path | str | None = None,
+    resume: bool = False,
+    quick: bool = False,
+    quiet: bool = True,
+) -> Comparison:
+    """Fit several models of the same records, score them by evidence and by prediction, and decide.
+
+    Parameters: `study`, from which candidates are derived (a fit stands for its study), or several studies of
+    the same records, which are the candidates; `candidates`, names such as ``fractional-2`` or
+    ``second-order``, by default those of the study or a short list; `described`, further candidates, or a
+    file of them; `jobs`, processes to use; `folder`, a run folder to write into, from which `resume` goes on;
+    `quick`, a quarter of the steps; `quiet`, no progress bar.
+
+    InputError for fewer than two different candidates, unknown names, different records, and as `fit`.
+    """
+    several = not isinstance(study, str) and isinstance(study, Sequence)
+    if several and all(isinstance(one, Study) for one in study):  # type: ignore[union-attr]
+        models = of_studies(study)  # type: ignore[arg-type]
+    else:
+        named = isinstance(described, Path | str)
+        chosen, more = load_candidates(Path(described)) if named else (None, described)  # type: ignore[arg-type]
+        models = candidates_of(study_of(study), more, candidates or chosen)  # type: ignore[arg-type]
+    origin = plain(provenance(models[0].study, "compare"))
+    with (
+        TemporaryDirectory() if folder is None else nullcontext(str(folder)) as place,
+        opened(place, origin) as path,
+    ):
+        values = compared(models, jobs=jobs, folder=path, resume=resume, quick=quick, quiet=quiet)
+        found = sorted(one for pattern in Comparison.beside for one in path.glob(pattern))
+        texts = {str(one.relative_to(path)): one.read_text(encoding="utf-8") for one in found}
+        result = Comparison(values, origin, texts)
+        if folder is not None:
+            result.save(folder)
+    return result

@@ -1,0 +1,71 @@
+"""`fit`: the posterior of a study, what it predicts, and how far both can be trusted."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+from lcopa_bayes.results.fit import Fit
+from lcopa_bayes.results.fit import fit as sampled
+from lcopa_bayes.results.integerrival import integer_rival
+from lcopa_bayes.results.predictive import Predictive
+from lcopa_bayes.results.provenance import provenance
+from lcopa_bayes.results.runfolder import opened
+from lcopa_bayes.verbs.sources import FitLike, StudyLike, finished, study_of
+
+
+def fit(
+    study: StudyLike,
+    *,
+    jobs: int = 1,
+    folder: Path | str | None = None,
+    resume: bool = False,
+    quick: bool = False,
+    cross_check: bool = False,
+    rival: bool = False,
+    quiet: bool = True,
+) -> Fit:
+    """Sample the posterior of a study and derive what it predicts.
+
+    Parameters: `study`, or where it is described; `jobs`, processes to use, which change no number; `folder`,
+    a run folder in which draws are kept while they are made, so that `resume` goes on from them, and the
+    result afterwards; `quick`, a quarter of the steps; `cross_check`, sample by nested sampling too; `rival`,
+    fit the study with integer orders too and compare what both predict of the held-out records; `quiet`, no
+    progress bar.
+
+    The same study gives the same draws. InputError when the study cannot be used, or the folder cannot be
+    written to, holds another study's results, or is being written by another run; then nothing is written.
+    """
+    wanted = study_of(study)
+    with nullcontext() if folder is None else opened(folder, provenance(wanted, "fit")) as place:
+        made = sampled(
+            wanted,
+            jobs=jobs,
+            folder=place,
+            resume=resume,
+            quick=quick,
+            cross_check=cross_check,
+            quiet=quiet,
+        )
+        if rival:
+            made = replace(made, rival=integer_rival(made, jobs=jobs, quick=quick, quiet=quiet))
+        if place is not None:
+            made.save(place)
+    return made
+
+
+def basis(
+    source: FitLike,
+    *,
+    jobs: int,
+    folder: Path | str | None,
+    resume: bool,
+    quick: bool,
+    quiet: bool,
+) -> Predictive:
+    """The finished fit that is given or named, else the fit of the study that is; parameters as `fit`."""
+    found = finished(source)
+    if found is not None:
+        return found
+    return fit(study_of(source), jobs=jobs, folder=folder, resume=resume, quick=quick, quiet=quiet)

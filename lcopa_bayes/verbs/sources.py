@@ -1,0 +1,37 @@
+"""What a public function is given: a study, where one is described, or a finished fit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TypeAlias
+
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.data.studyfile import load_study
+from lcopa_bayes.results.predictive import Predictive
+from lcopa_bayes.results.savedfit import NAME, load_fit
+
+StudyLike: TypeAlias = Study | Path | str | Sequence[Path | str]
+"""A study, its folder or file, or record files to make one of."""
+FitLike: TypeAlias = StudyLike | Predictive
+"""A fit, or what `StudyLike` is; a path may be the run folder of a finished fit."""
+
+
+def study_of(source: FitLike) -> Study:
+    """The study, read where it is named by paths; InputError when it cannot be used."""
+    found = finished(source)
+    if found is not None:
+        return found.study
+    return source if isinstance(source, Study) else load_study(source)  # type: ignore[arg-type]
+
+
+def finished(source: FitLike) -> Predictive | None:
+    """The finished fit that is given or kept in the run folder that is named; None for a study."""
+    if isinstance(source, Predictive):
+        return source
+    if isinstance(source, Study):
+        return None
+    paths = [Path(source)] if isinstance(source, Path | str) else [Path(one) for one in source]
+    if len(paths) == 1 and (paths[0] / NAME).is_file():
+        return load_fit(paths[0])
+    return None

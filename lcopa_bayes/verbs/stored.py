@@ -1,0 +1,41 @@
+"""`load_result`: a result read back from its run folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.results.result import Result
+from lcopa_bayes.results.runfolder import origins
+from lcopa_bayes.results.savedfit import load_fit
+from lcopa_bayes.results.stored import StoredResult
+from lcopa_bayes.verbs.audit import AuditResult
+from lcopa_bayes.verbs.calibrate import CalibrationResult
+from lcopa_bayes.verbs.compare import Comparison
+from lcopa_bayes.verbs.design import DesignResult
+from lcopa_bayes.verbs.loop import LoopResult
+from lcopa_bayes.verbs.predict import SavedPrediction
+
+_KINDS: Mapping[str, type[StoredResult]] = {
+    kind.verb: kind
+    for kind in (AuditResult, DesignResult, Comparison, LoopResult, CalibrationResult, SavedPrediction)
+}
+
+
+def load_result(folder: Path | str, verb: str | None = None) -> Result:
+    """The result in the run folder `folder`: that of `verb`, by default the last one written there.
+
+    It has the table, values, draws and pages that it had when it was made. InputError when there is no such
+    result, or its files are missing, cut short or of another version.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: there is no such run folder; give the folder that a verb wrote")
+    there = origins(folder)
+    if not there:
+        raise InputError(f"{folder}: holds no result; give the folder that a verb wrote")
+    wanted = verb or list(there)[-1]
+    if wanted not in there:
+        raise InputError(f"{folder}: holds no result of {wanted!r}{nearest(wanted, there)}")
+    return load_fit(folder) if wanted == "fit" else _KINDS[wanted].load(folder)
