@@ -77,6 +77,8 @@ def compare_study(options: argparse.Namespace, command: list[str]) -> Told:
     """Candidates derived from a study, scored and decided, with a page of its own."""
     study = study_of(options)
     folder, jobs = place_of(options, study)
+    if study.effects.use:  # its candidates have them or not, but never without their priors
+        problem_of(study)
     chosen, extra = load_candidates(options.candidates) if options.candidates else (None, ())
     values = compare(
         candidates_of(study, extra, options.pick or chosen),
@@ -94,6 +96,7 @@ def loop_study(options: argparse.Namespace, command: list[str]) -> Told:
     """What the base model lacks, traced to an effect, with errors before and after, and a page of its own."""
     study = study_of(options)
     folder, jobs = place_of(options, study)
+    problem_of(study)  # what is wrong with the study is said before anything is written
     writable_folder(folder)
     found = loop(study, jobs=jobs, quick=options.quick, as_stated=options.as_stated)
     values = loop_results(found)
