@@ -234,8 +234,8 @@ def exchanges(table: ParameterTable) -> tuple[Symmetry, ...]:
                 for term in (a, b)
             )
             sentence = (
-                f"({', '.join(first)}) and ({', '.join(second)}) may change places; by keeping orders "
-                "decreasing each plant is counted once"
+                f"({', '.join(first)}) and ({', '.join(second)}) are interchangeable; with "
+                "decreasing orders each plant is counted once"
             )
             out.append(Symmetry("exchange", (*first, *second), (), sentence))
     return tuple(out)

@@ -123,7 +123,7 @@ def _decided(
         side, end = ("above", high) if low is None else ("below", low)
         other, limit = ("below", profile.said_end(0)) if low is None else ("above", profile.said_end(1))
         return "one-sided", (
-            f"bounded {side} by {end:.3g}{unit} ({level}), but {other} the data allow everything to the "
+            f"bounded {side} by {end:.3g}{unit} ({level}), but {other} it the data exclude nothing up to the "
             f"end of the search at {limit}{unit}{moving}"
         )
     share = belief.contraction

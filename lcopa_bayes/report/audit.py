@@ -163,10 +163,10 @@ def _next(results: Mapping[str, Any]) -> Section:
         for row in advice["parameters"]
     )
     caption = (
-        f"Parameters that are not identified and what one more record of {advice['time']:g} "
-        f"{advice['time_unit']} is expected to give for each with its best drive: median Cramer-Rao bounds "
-        "over draws of the posterior; above 1 it is still not determined. The verb design tries "
-        "other times and confirms by simulation."
+        "Parameters that are not identified, and their relative sd after a further record of "
+        f"{advice['time']:g} {advice['time_unit']}, each with its best drive: median Cramer-Rao bounds over "
+        "draws of the posterior; above 1 a parameter is still not determined. The verb design tries other "
+        "times and confirms the result by simulation."
     )
     return Section("What to measure next", text, (), (Table(columns, rows, caption),))
 
@@ -185,7 +185,9 @@ def _expected(row: Mapping[str, Any], which: str) -> str:
 def _symmetries(results: Mapping[str, Any]) -> Section:
     text, printed = [], results["printed_form"]
     sentences = [f"{symmetry['kind']}: {symmetry['sentence']}." for symmetry in results["symmetries"]]
-    text += sentences or ["The model has no symmetry with these drives: every parameter acts on its own."]
+    text += sentences or [
+        "The model has no symmetry with these drives: each parameter has an effect of its own."
+    ]
     if not results["structure"]["certain"]:
         text.append(
             "The rank of the sensitivities changes with the tolerance: what is a symmetry and what is "
@@ -202,9 +204,9 @@ def _symmetries(results: Mapping[str, Any]) -> Section:
     if results["radial"] is not None:
         moved, fall = results["radial"]["moved"], results["radial"]["fall"]
         text.append(
-            f"Radial test: {figures(results['radial']['reached'], 2)} prior standard deviations away from "
-            f"the maximum twice the log likelihood has fallen by {figures(fall, 2)}; "
-            f"{', '.join(moved) or 'no parameter'} moved."
+            f"Radial test: at {figures(results['radial']['reached'], 2)} prior standard deviations from the "
+            f"maximum, twice the log likelihood is lower by {figures(fall, 2)}; parameters that moved: "
+            f"{', '.join(moved) or 'none'}."
         )
     return Section("Symmetries", tuple(text))
 
@@ -328,12 +330,12 @@ def _pairs(results: Mapping[str, Any], run: SavedRun) -> Section:
                 pairs.setdefault(frozenset((row["name"], partner)), (row["name"], partner))
     shown = list(pairs.values())[:_PAIRS]
     if not shown:
-        return Section("Degenerate pairs", ("No parameter needs a partner to explain it.",))
+        return Section("Degenerate pairs", ("No parameter has a partner that compensates it.",))
     figure, panels = grid(len(shown), columns=3, height=2.1)
     for panel, (a, b) in zip(panels, shown, strict=True):
         _pair(panel, run, a, b)
     omitted = len(pairs) - len(shown)
-    caption = "Draws of parameters that are not identified against those that make up for them." + (
+    caption = "Draws of parameters that are not identified against the parameters that compensate them." + (
         f" {omitted} more pairs are not drawn." if omitted else ""
     )
     return Section("Degenerate pairs", drawings=(Drawing("degenerate_pairs", svg_of(figure), caption),))

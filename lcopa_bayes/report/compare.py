@@ -106,7 +106,7 @@ def _scores(results: Mapping[str, Any]) -> Section:
     )
     caption = (
         "± is a standard error: of the evidence by bridge sampling, of predictive densities by the spread "
-        "over stretches of the records. The Bayes factor is against the best, the probability among these "
+        "over parts of the records. The Bayes factor is against the best, the probability among these "
         "models alone, with equal prior probabilities. elpd is the log density of one forecast of held-out "
         "data, each sample predicted from those before it. AIC and BIC are from the maximum of the "
         "likelihood and take account of neither priors nor several modes."
@@ -156,7 +156,8 @@ def _priors(results: Mapping[str, Any]) -> Section:
         "The evidence depends on the width of the priors. Here gains, times and delays have priors half and "
         "twice as wide; orders keep theirs, which are the ends of their domain. Importance weights use the "
         "existing draws; a refit moves them to the new posterior and repeats the bridge sampling; undefined "
-        "are narrower priors that exclude values the data support: where these occur no preference is stated."
+        "marks narrower priors that exclude values the data support; no preference is stated where this "
+        "occurs."
     )
     tables = (Table(columns, tuple(rows)),) if rows else ()
     return Section("Influence of the prior", (text,), (), tables)

@@ -78,8 +78,8 @@ def _parameters(results: Mapping[str, Any]) -> Section:
         )
         for row in results["parameters"]
     )
-    caption = f"What every parameter gains by the drive that is best for it: {_SPREAD}."
-    return Section("What each parameter gains", tuple(text), (), (Table(columns, rows, caption),))
+    caption = f"Precision of every parameter with its best drive: {_SPREAD}."
+    return Section("Gain of each parameter", tuple(text), (), (Table(columns, rows, caption),))
 
 
 def _curve(results: Mapping[str, Any]) -> Section:

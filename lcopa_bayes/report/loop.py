@@ -127,7 +127,7 @@ def _effects(results: Mapping[str, Any]) -> Section:
 def _errors(results: Mapping[str, Any]) -> Section:
     before, after = results["before"], results["after"]
     columns = (
-        *(Column("record"), Column("axis"), Column("unseen"), Column("RMSE before", "number")),
+        *(Column("record"), Column("axis"), Column("held out"), Column("RMSE before", "number")),
         *(
             Column("RMSE after", "number"),
             Column("after / noise", "number"),
@@ -145,7 +145,7 @@ def _errors(results: Mapping[str, Any]) -> Section:
         for a, b in zip(before["scores"], after["scores"], strict=True)
     )
     text = (
-        f"Unseen records were predicted by {results['unseen_by']}. Pointwise 90 % bands hold "
+        f"Held-out records were predicted by {results['unseen_by']}. Pointwise 90 % bands hold "
         f"{percent(before['held_out_coverage_90'])} of their samples before and "
         f"{percent(after['held_out_coverage_90'])} after; log evidence "
         f"{figures(before['log_evidence'], 6)} before and {figures(after['log_evidence'], 6)} after "

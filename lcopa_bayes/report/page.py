@@ -46,8 +46,8 @@ _SECTIONS = (
 )
 """What a report shows, in this order; a later stage adds its own section here."""
 _ADVICE = {
-    "reliable": "The sampling behind the numbers can be relied on.",
-    "tentative": "Read the numbers below with caution: a longer run or another model may move them.",
+    "reliable": "The sampling behind the numbers is reliable.",
+    "tentative": "Read the numbers below with caution: a longer run or another model may change them.",
     "unusable": "Do not use the numbers below.",
 }
 

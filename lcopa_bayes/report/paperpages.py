@@ -61,7 +61,7 @@ def _verdicts(judged: Sequence[Judged]) -> Section:
         "Verdicts",
         (
             f"{len(judged)} claims of Ta et al. 2026: {said}. A verdict follows from the printed numbers by "
-            "the calculation beside it; undecided means that what decides it is not at hand.",
+            "the calculation beside it; undecided means that data needed to decide it are missing.",
         ),
         tables=(Table(columns, rows),),
     )

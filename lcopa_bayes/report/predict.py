@@ -80,7 +80,7 @@ def _curves(values: Mapping[str, Any], bands: pd.DataFrame, drives: pd.DataFrame
         Column(f"widest {SIMULTANEOUS}", "number"),
         Column("widest with noise", "number"),
     )
-    caption = "Half widths of the 90 % bands where they are widest; the plant alone but for the last."
+    caption = "Half widths of the 90 % bands where they are widest; only the last column includes noise."
     text = (
         f"A {POINTWISE} band holds the response at each time by itself; a {SIMULTANEOUS} band holds the "
         "whole curve of its axis, at all times at once. Blue: the plant alone. Grey: samples, with noise.",

@@ -59,7 +59,7 @@ def save_chain(path: Path, chain: Chain, fingerprint: str) -> None:
         write_whole(path, write)
     except InputError as error:
         if any(ensemble.steps for ensemble in chain.ensembles) and path.exists():  # not the first save
-            kept = "; the rounds before it are kept: the same command with --resume goes on from them"
+            kept = "; the rounds before it are kept: the same command with --resume continues from them"
             raise InputError([problem + kept for problem in error.problems]) from error
         raise
 

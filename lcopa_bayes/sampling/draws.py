@@ -156,14 +156,14 @@ def gather(posterior: Posterior, run: Run) -> Draws:
 
 
 def _unconfirmed(parameters: tuple[str, ...]) -> tuple[Limitation, ...]:
-    """That no independent draws confirm the shares of modes of these parameters."""
+    """Limitation of parameters whose shares of modes no independent draws confirm."""
     if not parameters:
         return ()
     return (
         Limitation(
             "tentative",
-            f"modes of {', '.join(parameters)} filled while the ensembles ran, and independent draws of a "
-            "cover could not confirm their shares",
+            f"the shares of the modes of {', '.join(parameters)} changed during the run, and independent "
+            "draws could not confirm them",
             "allow more steps, or fix parameters that the record does not determine, or narrow their priors",
             parameters,
         ),

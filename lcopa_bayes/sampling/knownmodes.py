@@ -63,6 +63,6 @@ def _filled(posterior: Posterior, z: Matrix, count: int, rng: np.random.Generato
     if len(out) < count:
         raise InputError(
             "a known start of this posterior lies at an edge of its prior or on a narrow peak that sampling "
-            "cannot resolve; leave it out"
+            "cannot resolve; omit it"
         )
     return np.asarray(out[:count])

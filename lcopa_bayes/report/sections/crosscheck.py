@@ -76,8 +76,8 @@ def _marginals(check: Mapping[str, Any]) -> Table:
         columns,
         tuple(rows),
         "Intervals are equal-tailed credible. ESS is the effective sample size. Distance is the largest "
-        "difference of the two cumulative probabilities; from the next column on it would be called a "
-        "disagreement.",
+        "difference of the two cumulative probabilities; the next column is the distance from which it "
+        "counts as a disagreement.",
     )
 
 

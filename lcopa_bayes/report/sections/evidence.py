@@ -13,7 +13,7 @@ _TITLE = "Evidence"
 _HOW = (
     "Log evidence {value:.2f} ± {sd:.2f} nat (standard error; grade {grade}), by bridge sampling between the "
     "draws of each ensemble and a mixture fitted to the others. It compares models of the same records only, "
-    "and moves with the width of their priors."
+    "and depends on the width of their priors."
 )
 
 

@@ -35,7 +35,7 @@ def section(run: SavedRun) -> Section:
     return Section(
         "Priors and posteriors",
         (
-            "A histogram that follows the line was not moved by the data.",
+            "Where the histogram follows the line the data have not changed the prior.",
             f"Times, those in priors included, are in {run.time_unit}: the `time_unit` of the study, by "
             "default the unit of the first fit record.",
         ),

@@ -48,7 +48,7 @@ def section(run: SavedRun) -> Section:
         (
             "The plant bands hold the response without noise, the grey band the samples themselves. "
             f"Bands are {POINTWISE}: each holds at every time by itself; a whole curve leaves it more often. "
-            "A model that is right has about 50 and 90 % of the samples in its bands with noise.",
+            "A correct model has about 50 and 90 % of the samples in its bands with noise.",
         ),
         tuple(drawings),
         (_scores(run),),
@@ -129,7 +129,7 @@ def _before(run: SavedRun, rows: pd.DataFrame, record: str) -> str:
     begin = drives.loc[drives["record"] == record, "time"].min()
     first, last = rows["time"].min(), rows["time"].max()
     early = begin < first - 0.02 * (last - first)
-    return f" The drive from {figures(begin)} {run.time_unit} on counts but is not shown." if early else ""
+    return f" The drive from {figures(begin)} {run.time_unit} on is included but not shown." if early else ""
 
 
 def _scores(run: SavedRun) -> Table:

@@ -82,8 +82,8 @@ def _metrics(metrics: Sequence[Mapping[str, Any]]) -> Table:
         columns,
         tuple(_row(metric) for metric in metrics),
         "Times count from the step. Intervals are 90 % equal-tailed credible; where they are open, the "
-        "response of that share of the draws does not get there within the record, or does not stay there "
-        "after it.",
+        "response of that share of the draws does not reach them within the record, or does not remain "
+        "there after it.",
     )
 
 
