@@ -1,8 +1,8 @@
 """A run of a posterior whose plant has effects: importance sampling around the optima.
 
-A response with effects costs as much as ten without, and ensembles from the prior need a million. Draws
-of a proposal fitted to the posterior are weighted instead (`importance`), through a surrogate where it is
-valid. No weight shows what no draw reaches, so a run whose proposal is far from the posterior is tentative,
+One response with effects costs as much as ten without, and ensembles from the prior ask for a million. Draws
+of a proposal fitted to the posterior are weighted instead (`importance`), by way of a surrogate where one
+holds. What no draw reaches no weight shows, so a run whose proposal is far from the posterior is tentative,
 and ensembles follow where weights fail.
 """
 
@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.parallel import crew
 from lcopa_bayes.inference.optimum import Optimum, find_optima
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.surrogate import Surrogate
@@ -32,16 +32,16 @@ from lcopa_bayes.sampling.weighted import BATCHES, Weighted
 _PLAN = ImportancePlan((Effort(4_000, 1_500, 6), Effort(8_000, 3_000, 6), Effort(16_000, 6_000, 4)), starts=4)
 _QUICK = ImportancePlan((Effort(2_000, 1_000, 5), Effort(4_000, 2_000, 4)), starts=2)
 _STREAM = 12
-"""Key of the random stream of such a run."""
+"""Marks the randomness of such a run."""
 _FEWEST = 100.0
 """Effective draws below which weights are not used [-]."""
 _EXACT = 6.0
 """Draws of a surrogate that are weighted by the posterior itself, over the effective draws wanted [-]."""
 _WALKERS = 64
-"""Least number of walkers of an ensemble that starts from draws of a surrogate [-]."""
+"""Walkers of an ensemble that moves draws of a surrogate on, at least [-]."""
 _ROUNDS, _KEPT, _THIN = 8, 20, 5
 """Most rounds of such moves, draws kept of each, and steps per draw [-]."""
-_MOVED_ESS = 1000.0
+_WALKED = 1000.0
 """Effective draws at which they end [-]."""
 _SMALL = 0.5
 """Largest Pareto k of the weights of a surrogate [-]: their variance is finite below it."""
@@ -57,8 +57,7 @@ def weighted_run(
     rng = np.random.default_rng([plan.seed, _STREAM])
     size = min(plan.target_ess, 400.0) if quick else plan.target_ess
     wanted = replace(_QUICK if quick else _PLAN, wanted=size)
-    with workers(None, jobs=jobs) as crew:
-        mapped = crew.map
+    with crew(jobs) as mapped:
         optima = find_optima(posterior, rng, starts=wanted.starts)
         if not optima:
             return None
@@ -79,7 +78,7 @@ def weighted_run(
                 Limitation(
                     "tentative",
                     f"the proposal of the importance sampling is {100 * share:.0f} % efficient (Pareto k "
-                    f"{weighted.pareto_k:.2f}): a mode away from the optima would be missed",
+                    f"{weighted.pareto_k:.2f}): a mode far from the optima would be missed",
                     'sample by ensembles, [sampler] method = "ensembles", or narrow the priors',
                 )
             ]
@@ -95,8 +94,8 @@ def usable(weighted: Weighted) -> bool:
 def _by_surrogate(
     posterior: Posterior, optimum: Optimum, rng: np.random.Generator, plan: ImportancePlan, mapped: Mapped
 ) -> tuple[Posterior, Weighted | None, float]:
-    """The posterior of a surrogate about an optimum; draws of it weighted by the posterior itself; and their
-    efficiency [-]. No draws where the surrogate is not valid."""
+    """The posterior of a surrogate about an optimum; draws of it weighted by the posterior itself; and how
+    efficient they can be called [-]. No draws where the surrogate does not hold."""
     surrogate = Surrogate.of(posterior, optimum, rng, mapped)
     if surrogate is None:
         return posterior, None, 0.0
@@ -106,7 +105,7 @@ def _by_surrogate(
         return posterior, None, 0.0
     count, share = int(_EXACT * plan.wanted), first.ess / first.count
     if share < LEAST_EFFICIENCY:
-        z, about, share = _moved(near, first, count, rng, mapped)
+        z, about, share = _walked(near, first, count, rng, mapped)
     else:
         drawn = first.batches(int(min(count, first.ess)) // BATCHES, rng).ravel()
         z, about = first.coordinates[drawn], first.log_density[drawn]
@@ -120,14 +119,14 @@ def _by_surrogate(
     return near, replace(weighted, log_evidence_sd=error), share
 
 
-def _moved(
+def _walked(
     near: Posterior, first: Weighted, most: int, rng: np.random.Generator, mapped: Mapped
 ) -> tuple[Matrix, Vector, float]:
-    """Weighted draws moved further as ensembles of walkers, as many as are effective, at most `most`;
+    """Draws of weighted ones moved on as ensembles of walkers, as many as they are worth and `most` at most;
     log densities, and 1 where the ensembles agree, else the efficiency of the weights.
 
     Resampling and moving (Gilks and Berzuini 2001, J. R. Statist. Soc. B 63): where the proposal is far from
-    the posterior the walkers leave it, and their agreement shows whether they have converged.
+    the posterior the walkers leave it, and their agreement tells whether they have arrived.
     """
     walkers = max(_WALKERS, 2 * near.dimension + 2)
     ensembles = []
@@ -137,21 +136,19 @@ def _moved(
         nothing = np.empty((0, walkers, near.dimension)), np.empty((0, walkers))
         still = np.zeros(walkers)
         ensembles.append(Ensemble(*nothing, position, density, still, 0, random, position, 0))
-    mixture = learned(near, [ensemble.position[None] for ensemble in ensembles], int(rng.integers(2**31)))
+    mixture = learned(near, [one.position[None] for one in ensembles], int(rng.integers(2**31)))
     names = [near.table.names[k] for k in near.sampled]
     for _ in range(_ROUNDS):
-        tasks = [(near, ensemble, _KEPT, _THIN, mixture) for ensemble in ensembles]
+        tasks = [(near, one, _KEPT, _THIN, mixture) for one in ensembles]
         ensembles = list(mapped(_advanced, tasks))
-        chain = np.stack([ensemble.chain for ensemble in ensembles])
+        chain = np.stack([one.chain for one in ensembles])
         kept = chain[:, 2 * chain.shape[1] // 5 :].swapaxes(1, 2)
-        diagnostics = qualities(names, kept)
-        if all(quality.grade(_MOVED_ESS).level == "reliable" for quality in diagnostics):
+        measured = qualities(names, kept)
+        if all(quality.grade(_WALKED).level == "reliable" for quality in measured):
             break
-    agree = all(quality.grade(_FEWEST).level == "reliable" for quality in diagnostics)
-    worth = float(np.min([quality.ess for quality in diagnostics]))
-    log_density = np.stack([ensemble.log_density for ensemble in ensembles])[:, -kept.shape[2] :].swapaxes(
-        1, 2
-    )
+    agree = all(quality.grade(_FEWEST).level == "reliable" for quality in measured)
+    worth = float(np.min([quality.ess for quality in measured]))
+    log_density = np.stack([one.log_density for one in ensembles])[:, -kept.shape[2] :].swapaxes(1, 2)
     flat = kept.reshape(len(ensembles), -1, near.dimension)
     count = max(1, int(min(most, worth)) // BATCHES)
     order = rng.permutation(flat.shape[1])[:count]

@@ -114,7 +114,7 @@ def test_a_refit_keeps_what_deflections_are_counted_in(stiff: tuple[Problem, np.
 
 
 def test_candidates_with_and_without(stiff: tuple[Problem, np.ndarray]):
-    problem, truth = stiff
+    problem, _ = stiff
     told = candidates_of(problem.study)
     assert [one.name for one in told] == ["study", "study-no-effects"]
     assert [one.study.effects.use for one in told] == [("cubic_stiffness",), ()]
