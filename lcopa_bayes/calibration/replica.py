@@ -26,6 +26,7 @@ from lcopa_bayes.results.steps import StepCurves, curves_of, step_curves
 from lcopa_bayes.sampling.draws import Draws, gather, weighted_draws
 from lcopa_bayes.sampling.importance import Effort, ImportancePlan, importance
 from lcopa_bayes.sampling.sampler import SamplePlan, sample
+from lcopa_bayes.sampling.weightedrun import weighted_run
 
 RANKED = 99
 """Draws a truth is ranked among [-]; so few of a run's draws are nearly independent."""
@@ -206,7 +207,12 @@ class Replication:
     ) -> tuple[Problem, Draws, Engine, float | None]:
         """The problem on narrow enough blocks, draws, what gave them, and the Pareto k of weights."""
         look = None
-        if self.engine == "importance":
+        if self.engine == "importance" and problem.posterior.simulation is not None:
+            problem = resolved(problem)
+            found = weighted_run(problem.posterior, replace(self.plan, seed=seed), quick=True)
+            if found is not None and found[0].weighted is not None:
+                return problem, found[1], "importance", found[0].weighted.pareto_k
+        elif self.engine == "importance":
             optima = find_optima(problem.posterior, rng, starts=_LOOK.starts)
             problem = resolved(problem, optima)
             look = importance(problem.posterior, optima, rng, _LOOK) if optima else None

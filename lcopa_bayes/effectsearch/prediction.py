@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import final
@@ -11,12 +10,12 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.data.record import Record
-from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.autoregression import Autoregression
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.noisesamples import quiet_samples
 from lcopa_bayes.effectsearch.whitening import parts, stacked
 from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.declared import campaign_places
 from lcopa_bayes.inference.effects import Effected, carried
 from lcopa_bayes.inference.observations import Samples
 
@@ -43,7 +42,7 @@ def predicted(
     """
     samples, forward = problem.simulated(records)
     own = model.effected
-    places = taken(problem.study)
+    places = campaign_places(problem.study)
     there = own.over(forward, samples, np.array([places[record.name] for record in records]))
     values, psi = model.split(x)
     moved = carried(psi, own, there)
@@ -58,20 +57,6 @@ def predicted(
         tangents = np.vstack([plant, shared * model.scale[:, None]])
     variance = np.einsum("kn,kl,ln->n", tangents, covariance, tangents, optimize=True)
     return Prediction(samples, mean, np.asarray(variance + extra))
-
-
-def taken(study: Study) -> dict[str, float]:
-    """Place of every record in the campaign by its name, -1/2 to 1/2 [-]: records, fitted or held out,
-    count as
-    taken in the order of their names, numbers by value."""
-    names = sorted((one.name for one in (*study.fit, *study.held_out)), key=_natural)
-    places = np.linspace(-0.5, 0.5, len(names)) if len(names) > 1 else np.zeros(1)
-    return dict(zip(names, places.tolist(), strict=True))
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Digits by value: run2 before run10."""
-    return [(int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", name)]
 
 
 def _with_shared_offset(

@@ -19,13 +19,13 @@ from lcopa_bayes.effectsearch.basefit import BaseFit, base_fit
 from lcopa_bayes.effectsearch.basemodel import BaseModel
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.gaussnewton import Regression
-from lcopa_bayes.effectsearch.prediction import taken
 from lcopa_bayes.effectsearch.refits import log_bayes_factor
 from lcopa_bayes.effectsearch.rounds import leading
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.startlevel import Mended, started
 from lcopa_bayes.effectsearch.trace import trace
 from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.inference.declared import campaign_places
 from lcopa_bayes.inference.nestedmodels import lifted
 from lcopa_bayes.model.effects.effect import Effect
 from lcopa_bayes.results.discretisation import FACTORS, largest_shift, narrowed
@@ -148,7 +148,7 @@ def _fit(problem: Problem, key: Sequence[int], contained: Base | None) -> BaseFi
 
 
 def _state(study: Study, fit: BaseFit) -> State:
-    model = ExtendedModel.of(fit.model, fit.optimum.x, taken=taken(study))
+    model = ExtendedModel.of(fit.model, fit.optimum.x, taken=campaign_places(study))
     return State(model, fit.optimum, fit.regression.whitening, fit.optimum.covariance)
 
 

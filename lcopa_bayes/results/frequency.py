@@ -89,7 +89,7 @@ class FrequencyResponse:
     paths: tuple[PathResponse, ...]
     """Gain, phase and bandwidth of each path, by response and drive."""
     outside: tuple[str, ...]
-    """A sentence for frequencies below or above those that the fit records resolve."""
+    """A sentence for frequencies below or above those that the fit records resolve, and for effects."""
     draws: int
     """Draws behind the bands."""
 
@@ -230,6 +230,9 @@ def frequency_response(
                 )
             )
     outside = []
+    if table.effects is not None:
+        names = ", ".join(kind.card.name for kind in table.effects.kinds)
+        outside.append(f"It is that of the linear plant alone: its effects ({names}) are left out.")
     if frequency[0] < lowest * (1 - 1e-9):
         outside.append(
             f"Below {lowest:.3g} 1/{time_unit} the fit records are shorter than one cycle: the "

@@ -21,7 +21,14 @@ from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
 from lcopa_bayes.results.fittedrange import FittedRange, Outside, beginning
 from lcopa_bayes.results.frequency import Bands, named, transfer_function
-from lcopa_bayes.results.prediction import Band, band_of, bands, named_rng, plant_draws
+from lcopa_bayes.results.prediction import (
+    Band,
+    band_of,
+    bands,
+    disturbances,
+    named_rng,
+    plant_draws,
+)
 from lcopa_bayes.results.provenance import provenance
 from lcopa_bayes.results.result import Result
 from lcopa_bayes.results.runfolder import add_origin, opened
@@ -257,13 +264,17 @@ def _unmeasured(problem: Problem, draws: Draws, drive: Drive, level: Level) -> t
         raise InputError([f"drive {drive.name!r}: {problem}; {advice}" for problem in problems])
     times = _times(drive, scales.span, scales.period)
     gaps = np.concatenate(([1.0], np.diff(times) / scales.period))
-    values, plant = plant_draws(draws, problem.driven(drive, times))
+    model = problem.driven(drive, times)
+    values, plant = plant_draws(draws, model)
     noise, out = problem.posterior.noise, []
     rng, alike = named_rng(study.seed, drive.name), fitted.resting_at(drive.drive[0])
+    apart = disturbances(draws.table, model, values, plant, rng)
     for axis, declared in enumerate(study.response_axes):
         parameters = values[:, [draws.table.at(name, axis) for name in noise.names]]
         known = _level(draws, values, axis, level, alike, rng)
         noises = noise.draw(parameters, gaps, rng)
+        if apart is not None:
+            noises += apart[axis]
         nothing = np.full(times.size, np.nan)
         out.append(band_of((drive.name, declared, False), times, nothing, plant[axis], noises, (*known, 0)))
     return drive, out

@@ -145,24 +145,32 @@ def record_draws(
         rng = named_rng(seed, record.record.name)
         alone = model.only(r)
         values, plant = plant_draws(draws, alone)
-        disturbed = plant
-        if held_out and alone.effects is not None and alone.effects.per_record:
-            disturbed = Simulation(draws.table, alone).disturbed(values, rng)[0]
+        apart = disturbances(draws.table, alone, values, plant, rng) if held_out else None
         for axis, observed in enumerate(record.axes):
             if observed.values.size == 0:
                 continue
             response = plant[axis][:, observed.index]
-            seen = response if disturbed is plant else disturbed[axis][:, observed.index]
+            seen = response if apart is None else response + apart[axis][:, observed.index]
             offset = offset_draws(
                 draws.table, values, axis, r, record, seen, noise, held_out=held_out, rng=rng
             )
             parameters = values[:, [draws.table.at(name, axis) for name in noise.names]]
             times = record.times[observed.index]
             noises = noise.draw(parameters, observed.gaps, rng)
-            if disturbed is not plant:
-                noises += seen - response
+            if apart is not None:
+                noises += apart[axis][:, observed.index]
             one = (record.record.name, record.record.response_axes[axis], held_out)
             yield one, times, observed.values, response, noises, offset
+
+
+def disturbances(
+    table: ParameterTable, model: ForwardModel, values: Matrix, plant: Array, rng: np.random.Generator
+) -> Array | None:
+    """What effects that differ from record to record add to one that was not fitted, as large as on those
+    that were, (axes, draws, samples) [response unit]; None without such effects. `plant` is without."""
+    if model.effects is None or not model.effects.per_record:
+        return None
+    return np.asarray(Simulation(table, model).disturbed(values, rng)[0] - plant)
 
 
 def named_rng(seed: int, name: str) -> np.random.Generator:

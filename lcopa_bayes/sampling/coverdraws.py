@@ -9,7 +9,7 @@ converge in the whole and in each tail and mode by itself; where they do not, en
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import ceil
+from math import ceil, log
 from typing import final
 
 import numpy as np
@@ -17,6 +17,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.parallel import Workers
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.sampling.coordinates import Chart
 from lcopa_bayes.sampling.cover import Cover
 from lcopa_bayes.sampling.weighted import Weighted
 
@@ -26,6 +27,8 @@ _PILOT = 20_000
 """First draws, which tell how many are needed."""
 _MOST = 320_000
 """Most draws."""
+_LOOKED_AT, _MISSED = 4_000, 1e-3
+"""Points visited that are looked at, and the share of them that a cover may all but miss [-]."""
 _SPARE = 1.15
 """Factor on the number of draws that those so far say are needed [-]."""
 _PART = 500
@@ -44,11 +47,18 @@ class _Density:
 
 
 def cover_draws(
-    posterior: Posterior, visited: Matrix, wanted: float, seed: int, crew: Workers[Posterior]
+    posterior: Posterior,
+    visited: Matrix,
+    wanted: float,
+    seed: int,
+    crew: Workers[Posterior],
+    *,
+    least: float = 0.0,
 ) -> Weighted | None:
     """Weighted draws worth `wanted` effective ones for the centre, the tails and the shares of modes of every
     sampled parameter, from a cover of the points `visited` (n, dimension); None where no number of draws in
-    reach gives them or the weights do not converge.
+    reach gives them, where draws of the cover are worth less than `least` effective ones each, or where it
+    all but misses points that were visited.
 
     Deterministic given the arguments; FloatingPointError where the density is NaN.
     """
@@ -61,6 +71,8 @@ def cover_draws(
         count = wanted_count
         z, density, raw = (np.concatenate(part) for part in zip(*drawn, strict=True))
         found = Weighted.of(posterior, z, density, raw, count, smooth=False)
+        if found.ess < least * count or (least > 0 and _misses(posterior, cover, found, visited, crew, rng)):
+            return None
         worth = found.smallest_ess(rng)
         if worth >= wanted:
             return found
@@ -69,6 +81,23 @@ def cover_draws(
             return None
         wanted_count = min(max(needed, 2 * count), 4 * count)
     return None
+
+
+def _misses(
+    posterior: Posterior,
+    cover: Cover,
+    found: Weighted,
+    visited: Matrix,
+    crew: Workers[Posterior],
+    rng: np.random.Generator,
+) -> bool:
+    """Whether a draw of the cover at some of the points visited would outweigh all others together."""
+    some = visited[rng.choice(len(visited), min(_LOOKED_AT, len(visited)), replace=False)]
+    z = Chart.of(posterior).usable(some)[0]
+    density = np.concatenate(list(crew.each(_Density(), np.array_split(z, _TASKS))))
+    terrain = Chart.of(posterior).terrain
+    raw = density + posterior.table.log_permutations - cover.log_density(terrain.sorted(z))
+    return bool(np.mean(raw - found.log_evidence > log(found.count)) > _MISSED)
 
 
 def _drawn(

@@ -12,7 +12,7 @@ from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.ridgemoves import walking
-from lcopa_bayes.sampling.tempering import temper
+from lcopa_bayes.sampling.tempering import CROWD, temper
 
 
 @final
@@ -40,12 +40,19 @@ class Ensemble:
     """Moves per walker that the way from the prior took [-]."""
 
     @classmethod
-    def born(cls, posterior: Posterior, walkers: int, sweeps: int, seed: np.random.SeedSequence) -> Ensemble:
+    def born(
+        cls,
+        posterior: Posterior,
+        walkers: int,
+        sweeps: int,
+        seed: np.random.SeedSequence,
+        crowd: int = CROWD,
+    ) -> Ensemble:
         """A population tempered from the prior; emcee needs a legacy generator, seeded here and nowhere
         else."""
         draw, walk = seed.spawn(2)
         random = tuple(np.random.RandomState(np.random.MT19937(walk)).get_state())
-        population, random = temper(posterior, walkers, sweeps, np.random.default_rng(draw), random)
+        population, random = temper(posterior, walkers, sweeps, np.random.default_rng(draw), random, crowd)
         return cls(
             np.empty((0, walkers, posterior.dimension)),
             np.empty((0, walkers)),

@@ -13,6 +13,8 @@ LEARNING = 2
 """Rounds before the mixture is learned from the draws of all ensembles."""
 _WIDE = 1.0
 """Share of the mixture that is learned from the populations on their way from the prior, times rounds [-]."""
+_COMPONENTS = 40
+"""Most components of the mixture that is learned from draws."""
 _KNOWN = 0.2
 """Share of modes that are known from elsewhere, where there are any [-]."""
 
@@ -44,6 +46,6 @@ def taught(
         found = wide
     else:
         first, end = per_round * last // 2, per_round * last
-        own = learned(posterior, [ensemble.chain[first:end] for ensemble in ensembles], seed)
+        own = learned(posterior, [ensemble.chain[first:end] for ensemble in ensembles], seed, _COMPONENTS)
         found = own.levelled().blended(wide, _WIDE / last)
     return found if known is None else found.blended(known, _KNOWN)

@@ -15,9 +15,9 @@ from sklearn.mixture import GaussianMixture
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 
-_COMPONENTS = 40
+COMPONENTS = 20
 """Most components of a mixture."""
-_FITTED = 8_000
+_FITTED = 6_000
 """Most points a mixture is fitted to."""
 FREEDOM = 5.0
 """Degrees of freedom of the components: tails heavy enough to cover what the fit has not seen [-]."""
@@ -40,7 +40,7 @@ class Mixture:
     """Lower Cholesky factors of the scale matrices, (components, dimension, dimension)."""
 
     @classmethod
-    def fitted(cls, points: Matrix, seed: int, components: int = _COMPONENTS) -> Mixture:
+    def fitted(cls, points: Matrix, seed: int, components: int = COMPONENTS) -> Mixture:
         """Fit to points (n, dimension) by expectation maximisation of Gaussians, at most `components`.
 
         Deterministic given `seed`. Fewer components are used when there are not ten points per

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import ceil
@@ -13,7 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix
-from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.parallel import Workers, workers
 from lcopa_bayes.data.settings import Method
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.chainfile import Chain, load_chain, save_chain
@@ -24,6 +24,7 @@ from lcopa_bayes.sampling.knownmodes import around
 from lcopa_bayes.sampling.learning import due, taught
 from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.modes import Ridges, ridges
+from lcopa_bayes.sampling.tempering import CROWD
 from lcopa_bayes.sampling.weighted import BATCHES, CHAIN, Weighted
 
 _ROUND = 20
@@ -42,6 +43,12 @@ _TREND = 2.0
 [-]: there chance is the less likely reason, and to go on costs little."""
 _THIN = 5
 """Steps per kept draw unless the study says otherwise."""
+_FEW, _FEW_SWEEPS = 2, 15
+"""How many times more walkers come from the prior than are kept, and most moves at each temperature, for the
+first look at a posterior."""
+_EFFICIENT = 0.3
+"""Effective draws per draw of a cover from which a posterior counts as easy [-]: two-term posteriors with
+several ridges stay below 0.2."""
 _ATTEMPTS, _LONGER = 2, 1.5
 """Most attempts at importance draws, and how many times as long ensembles have run at the next one [-]."""
 _DELIVERED = 500
@@ -154,7 +161,7 @@ def sample(
 ) -> Run:
     """Sample a posterior: populations tempered from the prior, then rounds of emcee; and, as the plan allows,
     importance draws of a cover of where these have been (`coverdraws`), which are the result where their
-    weights converge.
+    weights converge. Where a first look with small populations shows an easy posterior, its cover suffices.
 
     Where they do not in a posterior of several modes, the ensembles go on and it is tried again. The draws
     depend on the arguments alone, not on `jobs` nor on interruptions: with `resume`, a run killed at any
@@ -175,6 +182,11 @@ def sample(
     ):
         if not ensembles:
             seeds = np.random.SeedSequence(plan.seed).spawn(plan.ensembles)
+            if plan.method == "auto" and known is None:
+                easy = _easy(posterior, plan, seeds, crew)
+                if easy is not None:
+                    _store(chain_file, Chain(*easy), fingerprint)
+                    return Run(easy[0], plan, easy[1])
             ensembles = tuple(crew.each(_Birth(plan.walkers), seeds))
             _store(chain_file, Chain(ensembles), fingerprint)
         bar.set_description("sampling")
@@ -201,6 +213,21 @@ def sample(
             done += 1
             _store(chain_file, Chain(ensembles, failed=failed), fingerprint)
             bar.update()
+
+
+def _easy(
+    posterior: Posterior, plan: SamplePlan, seeds: Sequence[np.random.SeedSequence], crew: Workers[Posterior]
+) -> tuple[tuple[Ensemble, ...], Weighted] | None:
+    """Small populations from the prior after two rounds and importance draws of a cover of the second; None
+    where these are not so efficient that the posterior has to be close to what the cover can follow."""
+    ensembles = tuple(crew.each(_Birth(plan.walkers, _FEW_SWEEPS, _FEW), seeds))
+    mixture = taught(posterior, ensembles, _ROUND, plan.seed, None)
+    for _ in range(2):
+        ensembles = tuple(crew.each(_Round(plan.thin, mixture), ensembles))
+    visited = np.concatenate([one.chain[_ROUND:].reshape(-1, posterior.dimension) for one in ensembles])
+    wanted = _SURPLUS * plan.target_ess
+    weighted = cover_draws(posterior, visited, wanted, plan.seed, crew, least=_EFFICIENT)
+    return None if weighted is None else (ensembles, weighted)
 
 
 def _filling(posterior: Posterior, run: Run) -> tuple[str, ...]:
@@ -286,9 +313,11 @@ class _Birth:
     """Task: a new ensemble of a seed."""
 
     walkers: int
+    sweeps: int = _SWEEPS
+    crowd: int = CROWD
 
     def __call__(self, posterior: Posterior, seed: np.random.SeedSequence) -> Ensemble:
-        return Ensemble.born(posterior, self.walkers, _SWEEPS, seed)
+        return Ensemble.born(posterior, self.walkers, self.sweeps, seed, self.crowd)
 
 
 @final

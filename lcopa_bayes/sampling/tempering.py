@@ -27,7 +27,7 @@ _NEAR = 0.1
 """From this power on populations are remembered: they lie where the posterior does, only wider."""
 _EFFECTIVE = 0.5
 """Share of the population that stays effective in one rise of the temperature."""
-_CROWD = 4
+CROWD = 4
 """How many times more walkers come from the prior than are kept."""
 _BLOCK = 5
 """Moves of every walker between two looks at how far they have travelled."""
@@ -51,14 +51,20 @@ class Population:
 
 
 def temper(
-    posterior: Posterior, walkers: int, sweeps: int, rng: np.random.Generator, random: tuple[Any, ...]
+    posterior: Posterior,
+    walkers: int,
+    sweeps: int,
+    rng: np.random.Generator,
+    random: tuple[Any, ...],
+    factor: int = CROWD,
 ) -> tuple[Population, tuple[Any, ...]]:
     """A population of the posterior and the state of emcee's generator afterwards.
 
     At each temperature every walker makes moves until the population has left where it stood, at most
-    `sweeps` of them and a third while the temperature is low. Deterministic given `rng` and `random`.
+    `sweeps` of them and a third while the temperature is low. `factor` times as many walkers come from the
+    prior as are kept. Deterministic given `rng` and `random`.
     """
-    crowd = _CROWD * walkers
+    crowd = factor * walkers
     position = posterior.coordinates(posterior.table.draw(crowd, rng))
     prior = posterior.log_prior(position)
     likelihood = posterior.log_density(position) - prior
@@ -73,7 +79,7 @@ def temper(
         state = emcee.State(position, log_prob=prior + heat * likelihood)
         for _ in range(max(1, (sweeps if heat > _WARM else sweeps // 3) // _BLOCK)):
             state = sampler.run_mcmc(state, _BLOCK, skip_initial_state_check=True, store=False)
-            made += _CROWD * _BLOCK
+            made += factor * _BLOCK
             if _memory(posterior, position, state.coords) <= _TRAVELLED:
                 break
         random = tuple(sampler.random_state)

@@ -11,10 +11,13 @@ from scipy.optimize import brentq
 from small import draws_of, record, study, with_effect
 
 from lcopa_bayes.bench.command import staircase
+from lcopa_bayes.data.drives import Drive
 from lcopa_bayes.data.settings import EffectsSettings, SamplerSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.results.fit import Fit, fit
+from lcopa_bayes.results.frequency import frequency_response
+from lcopa_bayes.results.newdrive import predict
 from lcopa_bayes.results.prediction import bands
 from lcopa_bayes.results.steps import step_curves, step_metrics
 
@@ -108,3 +111,28 @@ def test_a_vibration_of_an_unseen_record_is_noise():
     wave = 0.02 * (1 - np.cos(2 * np.pi * 0.4 * (shown.time - quiet)))
     assert_allclose(spread, np.sqrt(wave + 1.5 * TRUTH["sigma"] ** 2), rtol=0.2, atol=0.01)
     assert shown.coverage(0.9) > 0.75
+
+
+def test_a_new_drive_is_predicted_with_the_effect():
+    """Held long enough, ``y + c y^3 / ymax^2`` of the steady deflection; the frequency response says that it
+    is that of the linear plant."""
+    made, truth = with_effect(campaign(), ["odd_curvature"], TRUTH | {"order": 1.0, "coefficient": 0.2})
+    problem = problem_of(made)
+    draws = draws_of(problem.posterior.table, np.tile(truth, (8, 1)))
+    (band,) = predict(problem, draws, Drive.steps(u=[(0.5, 0.8)], until=14.0), offset="zero").bands
+    assert problem.ranges is not None
+    steady = 2.0 * 0.8
+    bent = steady + 0.2 * steady**3 / problem.ranges.response[0] ** 2
+    assert band.plant[2, -1] == pytest.approx(bent, rel=1e-3)
+    told = frequency_response(draws, span=15.0, period=0.3, time_unit="ms")
+    assert "odd_curvature" in told.outside[0]
+
+
+def test_a_record_disturbed_alike_widens_the_band_of_a_new_drive():
+    made, truth = with_effect(campaign(), ["vibration"], TRUTH | {"coefficient": 0.1, "constant": 0.4})
+    problem = problem_of(made)
+    draws = draws_of(problem.posterior.table, np.tile(truth, (400, 1)))
+    (band,) = predict(problem, draws, Drive.steps(u=[(0.5, 0.8)], until=14.0), offset="zero").bands
+    spread = (band.noisy[4] - band.noisy[0]) / (2 * 1.645)
+    assert_allclose(spread, np.hypot(0.1, TRUTH["sigma"]), rtol=0.2)
+    assert np.ptp(band.plant, axis=0).max() < 1e-9

@@ -1,0 +1,101 @@
+"""The surrogate of a posterior with effects: near its optimum it is the posterior."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from small import record, study, with_effect
+
+from lcopa_bayes.bench.command import staircase
+from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.inference.optimum import Optimum, find_optima
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.surrogate import Surrogate
+from lcopa_bayes.results.fit import plan_of
+from lcopa_bayes.sampling import weightedrun
+from lcopa_bayes.sampling.sampler import SamplePlan
+from lcopa_bayes.sampling.weightedrun import weighted_run
+
+TRUTH = {
+    "gain": 2.0, "time": 1.5, "order": 0.8, "delay": 0.73, "offset": 0.3, "sigma": 0.02, "coefficient": 0.4,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def stiff() -> tuple[Posterior, Optimum]:
+    commands = [staircase([a, -0.7 * a, 0.4 * a, 0.0], hold=3.0, start=0.55) for a in (1.0, 0.5)]
+    made = [record(k, command=c, camera=0.2, duration=15.0, name=f"r{k}") for k, c in enumerate(commands)]
+    stated, _ = with_effect(study(*made, noise="white", seed=4), ["cubic_stiffness"], TRUTH)
+    posterior = problem_of(stated).posterior
+    return posterior, find_optima(posterior, np.random.default_rng(1), starts=2)[0]
+
+
+def test_it_is_exact_for_a_response_that_is_quadratic(stiff: tuple[Posterior, Optimum]):
+    """Responses replaced by squares of one coordinate come back to rounding."""
+    posterior, optimum = stiff
+
+    def bent(values: np.ndarray) -> list:
+        told = posterior.simulation(values[:1])  # type: ignore[misc]
+        z = posterior.coordinates(values)[:, 1]
+        level = 0.3 + 0.2 * z - 0.1 * z**2
+        return [
+            one._replace(
+                base=np.broadcast_to(level[:, None], (1, z.size, one.base.shape[2])).copy(),
+                bounded=np.ones(z.size, dtype=bool),
+            )
+            for one in told
+        ]
+
+    made = Surrogate.of(replace(posterior, surrogate=bent), optimum, np.random.default_rng(2))
+    assert made is not None
+    values = posterior.values(posterior.coordinates(optimum.values[None]) + 0.01)
+    assert_allclose(made(values)[0].base, bent(values)[0].base, rtol=1e-9)
+
+
+def test_near_the_optimum_it_has_the_density_of_the_posterior(stiff: tuple[Posterior, Optimum]):
+    posterior, optimum = stiff
+    made = Surrogate.of(posterior, optimum, np.random.default_rng(2))
+    near = replace(posterior, surrogate=made)
+    rng = np.random.default_rng(3)
+    z = rng.multivariate_normal(posterior.coordinates(optimum.values[None])[0], optimum.covariance, size=200)
+    exact = posterior.log_density(z)
+    inside = np.isfinite(exact)
+    apart = (near.log_density(z) - exact)[inside]
+    assert inside.mean() > 0.8
+    assert np.std(exact[inside]) > 1.0  # what is approximated varies much more
+    assert np.std(apart) < 0.3
+
+
+def test_weights_make_up_for_a_surrogate_that_is_wrong(stiff: tuple[Posterior, Optimum], monkeypatch):
+    """Evidence and stiffness by weighted draws of a surrogate, and by those of the posterior itself."""
+    posterior, _ = stiff
+    plan = SamplePlan.of(posterior.dimension, seed=3, target_ess=400)
+    first = weighted_run(posterior, plan, quick=True)
+    monkeypatch.setattr(weightedrun.Surrogate, "of", lambda *given: None)
+    other = weighted_run(posterior, plan, quick=True)
+    assert first is not None
+    assert other is not None
+    weighted = [run.weighted for run, _ in (first, other)]
+    evidence = [one.log_evidence for one in weighted]
+    errors = np.hypot(*(one.log_evidence_sd for one in weighted))
+    assert abs(evidence[0] - evidence[1]) < 4 * errors + 1e-3
+    columns = [draws.column("cubic_stiffness.c") for _, draws in (first, other)]
+    error = np.hypot(
+        *(one.std() / np.sqrt(draws.ess) for one, (_, draws) in zip(columns, (first, other), strict=True))
+    )
+    assert abs(columns[0].mean() - columns[1].mean()) < 4 * error
+    assert columns[0].std() == pytest.approx(columns[1].std(), rel=0.15)
+
+
+def test_a_run_is_reproducible():
+    commands = [staircase([1.0, -0.7, 0.4, 0.0], hold=3.0, start=0.55)]
+    made = study(record(1, command=commands[0], camera=0.3, duration=15.0), noise="white", seed=4)
+    found = problem_of(with_effect(made, ["odd_curvature"], TRUTH | {"coefficient": 0.1})[0])
+    plan = plan_of(found, quick=False)
+    one, other = (weighted_run(found.posterior, plan, quick=True) for _ in range(2))
+    assert one is not None
+    assert other is not None
+    np.testing.assert_array_equal(one[1].values, other[1].values)
