@@ -9,6 +9,7 @@ from typing import Any, final
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import LEVEL
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.bandwidening import Widening
@@ -139,8 +140,14 @@ def loop(
 
     Unless `as_stated`, a study with one viscous term gets as many as the evidence asks for. Without
     `sample` intervals and bands are those of a Laplace approximation. With `quick` fewer chance residuals
-    are drawn and ensembles are half as long. InputError when the study does not fit its records.
+    are drawn and ensembles are half as long. InputError when the study does not fit its records, or uses
+    effects already.
     """
+    if study.effects.use:
+        raise InputError(
+            f"{study.name}: uses {', '.join(study.effects.use)} already; `loop` starts from the plant alone, "
+            "so leave `use` out of [effects]"
+        )
     kinds = list(catalogue(study.effects.add, study.folder).values()) if library is None else list(library)
     with threadpool_limits(1):  # many small products: more threads only wait for each other
         return _looped(study, kinds, jobs=jobs, sample=sample, quick=quick, as_stated=as_stated)

@@ -18,6 +18,7 @@ from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.data.candidatesettings import CandidateSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_candidates
+from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.results.provenance import provenance
 from lcopa_bayes.results.runfolder import opened
 from lcopa_bayes.results.stored import StoredResult
@@ -78,7 +79,10 @@ def compare(
     else:
         named = isinstance(described, Path | str)
         chosen, more = load_candidates(Path(described)) if named else (None, described)  # type: ignore[arg-type]
-        models = candidates_of(study_of(study), more, candidates or chosen)  # type: ignore[arg-type]
+        single = study_of(study)  # type: ignore[arg-type]
+        if single.effects.use:  # its candidates have them or not, but never without their priors
+            problem_of(single)
+        models = candidates_of(single, more, candidates or chosen)  # type: ignore[arg-type]
     origin = plain(provenance(models[0].study, "compare"))
     with (
         TemporaryDirectory() if folder is None else nullcontext(str(folder)) as place,

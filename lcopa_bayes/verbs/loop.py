@@ -16,6 +16,7 @@ from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.data.studywriter import write_study
 from lcopa_bayes.effectsearch.loop import loop as searched
 from lcopa_bayes.effectsearch.summary import drawn, results, words
+from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.results.provenance import provenance
 from lcopa_bayes.results.runfolder import opened
 from lcopa_bayes.results.stored import StoredResult
@@ -92,6 +93,7 @@ def loop(
     shorter ensembles. InputError as `fit`.
     """
     wanted = study_of(study)
+    problem_of(wanted)  # what is wrong with the study is said before anything is written
     origin = plain(provenance(wanted, "loop"))
     with nullcontext() if folder is None else opened(folder, origin):
         found = searched(wanted, jobs=jobs, quick=quick, as_stated=as_stated)

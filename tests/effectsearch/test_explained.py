@@ -11,6 +11,7 @@ import pytest
 from test_loop import LIBRARY, study
 
 from lcopa_bayes.cli import main
+from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.data.studywriter import write_study
 from lcopa_bayes.effectsearch.explained import coordinates_of, explained_study
@@ -88,6 +89,11 @@ def test_a_clean_loop_leaves_the_study_as_it_was(bent: Loop):
     made = explained_study(bent.problem.study, bent.before.state.model)
     assert made.effects == bent.problem.study.effects
     assert problem_of(made).posterior.simulation is None
+
+
+def test_what_is_explained_already_is_refused(bent: Loop):
+    with pytest.raises(InputError, match=r"uses odd_curvature already; .* leave `use` out of \[effects\]"):
+        loop(bent.study, library=LIBRARY, quick=True)
 
 
 def test_the_command_writes_it(tmp_path: Path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +13,11 @@ from small import record, study, with_effect
 from lcopa_bayes.bench.command import Command, staircase
 from lcopa_bayes.calibration.simulation import exact_responses, model_gap
 from lcopa_bayes.calibration.truths import Truths
+from lcopa_bayes.cli import main
 from lcopa_bayes.comparison.candidates import candidates_of, derived, known_settings
+from lcopa_bayes.data.settings import EffectsSettings, PriorSettings
 from lcopa_bayes.data.study import Study
+from lcopa_bayes.data.studywriter import write_study
 from lcopa_bayes.experiments.information import Bench
 from lcopa_bayes.experiments.refit import EffectedDevice, device_of, refit
 from lcopa_bayes.identifiability.sensitivities import sensitivities
@@ -143,3 +147,20 @@ def test_records_of_a_calibration_have_the_effect(stiff: tuple[Problem, np.ndarr
     assert model_gap(problem, off, exact) > 20.0
     drawn = Truths(problem.posterior.table).draw(np.random.default_rng(1))
     assert drawn.shape == truth.shape
+
+
+@pytest.mark.parametrize("verb", ["fit", "audit", "design", "compare", "loop", "calibrate"])
+def test_effects_that_cannot_be_used_end_with_code_2_and_nothing_written(
+    verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    uses = EffectsSettings(use=("cubic_stifness", "axis_rotation"))
+    priors = {"ion_creep.k": PriorSettings("ion_creep.k", fixed=0.1)}
+    (tmp_path / "in").mkdir()
+    write_study(replace(campaign(), effects=uses, priors=priors), tmp_path / "in" / "study.toml")
+    out = tmp_path / "out"
+    assert main([verb, str(tmp_path / "in"), "--out", str(out), "--jobs", "1", "--quiet"]) == 2
+    said = capsys.readouterr().err
+    assert "did you mean 'cubic_stiffness'?" in said
+    assert "'axis_rotation' has no place" in said
+    assert "'ion_creep' is not used" in said
+    assert not out.exists()
