@@ -132,6 +132,7 @@ class Toy:
     """
 
     linear = ()
+    simulation = None
 
     def __init__(
         self,

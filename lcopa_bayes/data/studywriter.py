@@ -18,7 +18,7 @@ from lcopa_bayes.data.study import Study
 def write_study(study: Study, path: Path, *, note: str = "") -> tuple[Path, ...]:
     """Write a study file, with `note` as a comment at its head, and the records in a folder of its name.
 
-    Numbers are written to the last digit. Tables of candidates and stages are left out. Returns the paths,
+    Numbers are written to the last digit. Tables of candidates and stages are not written. Returns the paths,
     the study file last; InputError when one of them cannot be written.
     """
     folder = writable_folder(path.parent / path.stem)
@@ -54,12 +54,12 @@ def _given(settings: Any) -> dict[str, Any]:
 
 
 def _effects(effects: EffectsSettings, before: Path | None, after: Path) -> dict[str, Any]:
-    """Settings of effects; files of the user's own as they are found from the new folder."""
-    told = {key: value for key, value in _given(effects).items() if value not in ((), {})}
+    """Settings of effects; files of the user's own by their paths from the new folder."""
+    given = {key: value for key, value in _given(effects).items() if value not in ((), {})}
     if effects.add:
         own = (before or Path()).resolve()
-        told["add"] = [os.path.relpath(own / text, after.resolve()) for text in effects.add]
-    return told
+        given["add"] = [os.path.relpath(own / text, after.resolve()) for text in effects.add]
+    return given
 
 
 def _prior(prior: PriorSettings) -> float | dict[str, Any]:

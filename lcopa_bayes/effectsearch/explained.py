@@ -1,4 +1,4 @@
-"""The study that a loop ends with: what it found declared, so that everything else can be asked of it."""
+"""The study that a loop ends with: its effects declared, so that everything else can be asked of it."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ def explained_draws(study: Study, *, jobs: int = 1, quick: bool = False) -> Draw
     """Draws of an explained study, the same that a fit of it gives; None where importance sampling does not
     hold, and a fit takes ensembles from the prior."""
     problem = resolved(problem_of(study))
-    found = weighted_run(problem.posterior, plan_of(problem, quick=False), jobs=jobs, quick=quick)
-    return None if found is None else found[1]
+    result = weighted_run(problem.posterior, plan_of(problem, quick=False), jobs=jobs, quick=quick)
+    return None if result is None else result[1]
 
 
 def coordinates_of(model: ExtendedModel, draws: Draws) -> Matrix:

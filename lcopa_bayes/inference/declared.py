@@ -184,10 +184,10 @@ def effect_rows(
     for e, kind in enumerate(acting):
         constants = kind.internal(ranges)
         instance = kind.with_constants(ranges, [one.low for one in constants])
-        told = instance.coefficients(ranges)
+        coefficients = instance.coefficients(ranges)
         repeats = [f"[{name}]" for name in records] if kind.card.per_record and len(records) > 1 else [""]
         for r, suffix in enumerate(repeats):
-            for k, one in enumerate(told):
+            for k, one in enumerate(coefficients):
                 unit = units.get(one.unit, one.unit)
                 if unit == "response":
                     unit = layout.responses[one.axis or 0].unit
@@ -196,7 +196,7 @@ def effect_rows(
                         f"{kind.card.name}.{one.name}{suffix}",
                         unit,
                         "magnitude" if one.one_signed else "coefficient",
-                        Place(e, r * len(told) + k),
+                        Place(e, r * len(coefficients) + k),
                         coefficient_prior(one),
                         adds_to=one.axis if adding and kind.additive else None,
                     )
@@ -233,7 +233,7 @@ def unused(key: str, study: Study) -> str | None:
         return None
     try:
         known = catalogue(study.effects.add, study.folder)
-    except InputError:  # told where the effects are
+    except InputError:  # reported where the effects are
         return None
     if name not in known:
         return None

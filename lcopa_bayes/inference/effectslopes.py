@@ -20,47 +20,47 @@ def effect_slopes(simulation: Simulation, values: Vector, *, exact: bool = True)
     over 1e-4. The plant's rows as there; unless `exact` those of the plant alone, fifty times cheaper and
     good enough to descend with. Raises UnstableError where there is no bounded response.
     """
-    made, psi = _effected(simulation, values), simulation.psi(values)
-    plant = made if exact else made.with_effects(())
+    model, psi = _effected(simulation, values), simulation.psi(values)
+    plant = model if exact else model.with_effects(())
     out = plant.jacobian(values, psi if exact else plant.vanishing)
     rows = [k for each in simulation.coefficients for k in each]
     if rows:
-        for whole, slope in zip(out, made.signature(values, psi), strict=True):
+        for whole, slope in zip(out, model.signature(values, psi), strict=True):
             whole[..., rows] = slope
     for e, constants in enumerate(simulation.constants):
         for position, k in enumerate(constants):
             if simulation.table.rows[k].free:
-                for whole, slope in zip(out, _by_constant(made, values, psi, (e, position, k)), strict=True):
+                for whole, slope in zip(out, _by_constant(model, values, psi, (e, position, k)), strict=True):
                     whole[..., k] = slope
     return out
 
 
 def _effected(simulation: Simulation, values: Vector) -> Effected:
-    told = simulation.declared
+    declared = simulation.declared
     names = tuple(one.name for one in simulation.model.experiments)
-    offsets = tuple(-2 if place is None else place for place in told.fitted)
+    offsets = tuple(-2 if place is None else place for place in declared.fitted)
     return Effected(simulation.table, simulation.simulator(simulation.effects(values)), names, offsets)
 
 
-def _by_constant(made: Effected, values: Vector, psi: Vector, at: tuple[int, int, int]) -> list[Matrix]:
+def _by_constant(model: Effected, values: Vector, psi: Vector, at: tuple[int, int, int]) -> list[Matrix]:
     """Derivative in one internal constant: effect, its position there, row of the table."""
     effect, position, k = at
-    row = made.table.rows[k]
+    row = model.table.rows[k]
     step = _STEP * (1.0 if row.kind == "fraction" else float(values[k]))
     ends = [values[k] - step, values[k] + step]
     if row.kind == "fraction":
         ends = [max(ends[0], 0.0), min(ends[1], 1.0)]
-    sides = [_responses(made, values, psi, _moved(made, effect, position, end)) for end in ends]
+    sides = [_responses(model, values, psi, _moved(model, effect, position, end)) for end in ends]
     return [(b - a) / (ends[1] - ends[0]) for a, b in zip(*sides, strict=True)]
 
 
-def _moved(made: Effected, effect: int, position: int, value: float) -> tuple[Effect, ...]:
+def _moved(model: Effected, effect: int, position: int, value: float) -> tuple[Effect, ...]:
     """The effects with one constant of one of them at another value."""
-    effects = list(made.effects)
+    effects = list(model.effects)
     name = list(effects[effect].constants)[position]
     effects[effect] = replace(effects[effect], **{name: value})  # type: ignore[type-var]
     return tuple(effects)
 
 
-def _responses(made: Effected, values: Vector, psi: Vector, effects: tuple[Effect, ...]) -> list[Matrix]:
-    return made.with_effects(effects).responses(values, psi)
+def _responses(model: Effected, values: Vector, psi: Vector, effects: tuple[Effect, ...]) -> list[Matrix]:
+    return model.with_effects(effects).responses(values, psi)

@@ -74,9 +74,9 @@ def _gain(posterior: Posterior, values: Vector) -> float:
         return -np.inf
     own = [p for p, k in enumerate(least.columns) if kinds[k] in COEFFICIENTS]
     plant = [p for p, k in enumerate(least.columns) if kinds[k] not in (*COEFFICIENTS, *CONSTANTS)]
-    left = residual - _fitted(jacobian[:, plant], residual)
+    unexplained = residual - _fitted(jacobian[:, plant], residual)
     whole = residual - _fitted(jacobian[:, [*plant, *own]], residual)
-    return float(left @ left - whole @ whole)
+    return float(unexplained @ unexplained - whole @ whole)
 
 
 def _fitted(columns: Matrix, target: Vector) -> Vector:

@@ -38,7 +38,7 @@ class Simulated(NamedTuple):
     """One record under a batch of plants."""
 
     base: Array
-    """Response with all `columns` left out, (axes, batch, samples) [response unit]."""
+    """Response without its `columns`, (axes, batch, samples) [response unit]."""
     columns: Mapping[int, Matrix]
     """What a unit of a table row adds to its response axis, (batch, samples); none for what does not act."""
     bounded: Flags
@@ -117,8 +117,8 @@ class Simulation:
 
     def simulator(self, effects: tuple[Effect, ...]) -> Simulator:
         """What simulates one plant with these effects."""
-        told = self.declared
-        return Simulator(self.model.plain, effects, told.ranges, told.epochs, told.times)
+        declared = self.declared
+        return Simulator(self.model.plain, effects, declared.ranges, declared.epochs, declared.times)
 
     def plant(self, values: Vector) -> Plant:
         """The plant of canonical table values, (rows,), without offsets."""
@@ -128,11 +128,11 @@ class Simulation:
 
     def __call__(self, values: Matrix) -> list[Simulated]:
         """Every record at canonical table values, (batch, rows)."""
-        told, batch, layout = self.declared, len(values), self.table.layout
+        declared, batch, layout = self.declared, len(values), self.table.layout
         shared = None
-        if not (told.bending or told.commanding):
+        if not (declared.bending or declared.commanding):
             shared = self.model.plain.unit_responses(self.table.dynamics(values))
-        sizes = [times.size for times in told.times]
+        sizes = [times.size for times in declared.times]
         bounded = np.ones(batch, dtype=bool)
         out = [
             Simulated(
@@ -143,12 +143,12 @@ class Simulation:
             for r, n in enumerate(sizes)
         ]
         effects, simulator = None, None
-        left = np.arange(batch)
-        if told.forced:
-            left = self._forced(values, out)
+        pending = np.arange(batch)
+        if declared.forced:
+            pending = self._forced(values, out)
         elif self._scales_commands(values):
-            left = self._commanded(values, out)
-        for b in left.tolist():
+            pending = self._commanded(values, out)
+        for b in pending.tolist():
             row = values[b]
             own = self.effects(row)
             if simulator is None or own != effects:
@@ -180,13 +180,13 @@ class Simulation:
 
         They are drawn as large as those of the fit records: normal about 0, of their root mean square.
         """
-        told, out = self.declared, values.copy()
-        for kind, rows, count in zip(told.kinds, self.coefficients, self._counts, strict=True):
+        declared, out = self.declared, values.copy()
+        for kind, rows, count in zip(declared.kinds, self.coefficients, self._counts, strict=True):
             if kind.card.per_record:
                 fitted = values[:, rows].reshape(len(values), -1, count)
                 size = np.sqrt(np.mean(fitted**2, axis=1))
                 out[:, rows[:count]] = size * rng.standard_normal(size.shape)
-        own = replace(self.model, effects=replace(told, fitted=(0,) * len(told.fitted)))
+        own = replace(self.model, effects=replace(declared, fitted=(0,) * len(declared.fitted)))
         return Simulation(self.table, own).responses(out)
 
     def _acts(self, k: int, r: int) -> bool:
@@ -200,10 +200,10 @@ class Simulation:
 
     def _forced(self, values: Matrix, out: list[Simulated]) -> Index:
         """Write the responses of plants under forces, all at once; returns those that ask for more."""
-        told, layout, table = self.declared, self.table.layout, self.table
+        declared, layout, table = self.declared, self.table.layout, self.table
         axes, gains, dynamics = len(layout.responses), table.gains(values), table.dynamics(values)
         forces = []
-        for kind, rows, constants in zip(told.kinds, self.coefficients, self.constants, strict=True):
+        for kind, rows, constants in zip(declared.kinds, self.coefficients, self.constants, strict=True):
             if issubclass(kind, ForceEffect):
                 psi = np.repeat(values[:, rows].T, axes, axis=1)[..., None]
                 own = [np.repeat(values[:, k], axes)[:, None] for k in constants]
@@ -212,13 +212,13 @@ class Simulation:
         done = np.ones(len(values), dtype=bool)
         for r, units in enumerate(self.model.plain.unit_responses(dynamics)):
             scene = simulator.scene(r, self.plant(values[0]))
-            change, found = BatchPassage(self.model, r, scene, gains, dynamics).change(forces)
-            done &= found
+            change, solved = BatchPassage(self.model, r, scene, gains, dynamics).change(forces)
+            done &= solved
             for i, row in enumerate(layout.unit_of):
                 for j, unit in enumerate(row):
                     out[r].base[i] += gains[:, i, j, None] * (scene.rest[j] + units[unit])
             out[r].base[...] += change
-        if len(forces) < len(told.kinds):
+        if len(forces) < len(declared.kinds):
             for b in np.flatnonzero(done).tolist():
                 simulator = self.simulator(self.effects(values[b]))
                 self._finished(simulator, values[b], b, out)

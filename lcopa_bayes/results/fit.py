@@ -141,9 +141,9 @@ def fit(
     problem = resolved(problem)
     plan = plan_of(problem, quick=quick)
     effective = problem.posterior.simulation is not None and plan.method == "auto"
-    found = weighted_run(problem.posterior, plan, jobs=jobs, quick=quick) if effective else None
-    if found is not None:
-        run, draws = found
+    weighted_result = weighted_run(problem.posterior, plan, jobs=jobs, quick=quick) if effective else None
+    if weighted_result is not None:
+        run, draws = weighted_result
     else:
         run = sample(
             problem.posterior,

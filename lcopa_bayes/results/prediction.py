@@ -24,7 +24,7 @@ _CELLS = 2_000_000
 """Draws times samples behind the bands of one axis of one record."""
 _FEWEST = 200
 """Draws behind a band at least."""
-_WITH_EFFECTS = 1000
+_WITH_EFFECTS = 400
 """Draws behind a band at most where the plant has effects, which take a simulation each."""
 _SWEEPS = 20
 """Sweeps after which a Gibbs chain of a level has forgotten its start [-]: 1e-6 of it is left at nu = 1."""

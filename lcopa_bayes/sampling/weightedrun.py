@@ -62,16 +62,16 @@ def weighted_run(
         optima = find_optima(posterior, rng, starts=wanted.starts)
         if not optima:
             return None
-        near, found, share = posterior, None, 0.0
+        near, weighted, share = posterior, None, 0.0
         chosen = weighty(optima)
         if posterior.simulation is not None and len(chosen) == 1:
-            near, found, share = _by_surrogate(posterior, chosen[0], rng, wanted, mapped)
-        if found is None or not usable(found):
-            near, found = posterior, importance(posterior, optima, rng, wanted, mapped).weighted
-            share = found.ess / found.count
-    if not usable(found):
+            near, weighted, share = _by_surrogate(posterior, chosen[0], rng, wanted, mapped)
+        if weighted is None or not usable(weighted):
+            near, weighted = posterior, importance(posterior, optima, rng, wanted, mapped).weighted
+            share = weighted.ess / weighted.count
+    if not usable(weighted):
         return None
-    run = Run((), plan, found)
+    run = Run((), plan, weighted)
     draws = gather(near, run)
     if share < LEAST_EFFICIENCY:
         draws = draws.limited(
@@ -79,7 +79,7 @@ def weighted_run(
                 Limitation(
                     "tentative",
                     f"the proposal of the importance sampling is {100 * share:.0f} % efficient (Pareto k "
-                    f"{found.pareto_k:.2f}): a mode away from the optima would be missed",
+                    f"{weighted.pareto_k:.2f}): a mode far from the optima would be missed",
                     'sample by ensembles, [sampler] method = "ensembles", or narrow the priors',
                 )
             ]
@@ -87,9 +87,9 @@ def weighted_run(
     return run, draws
 
 
-def usable(found: Weighted) -> bool:
+def usable(weighted: Weighted) -> bool:
     """Whether averages converge and enough draws count."""
-    return found.pareto_k <= usable_k(found.count) and found.ess >= _FEWEST
+    return weighted.pareto_k <= usable_k(weighted.count) and weighted.ess >= _FEWEST
 
 
 def _by_surrogate(
@@ -113,11 +113,11 @@ def _by_surrogate(
     exact = spread(posterior, z, mapped)
     inside = np.isfinite(exact)
     raw = (exact - about)[inside] + first.log_evidence
-    found = Weighted.of(posterior, z[inside], exact[inside], raw, len(z), smooth=True)
-    if not (found.pareto_k <= _SMALL and found.ess >= LEAST_EFFICIENCY * found.count):
+    weighted = Weighted.of(posterior, z[inside], exact[inside], raw, len(z), smooth=True)
+    if not (weighted.pareto_k <= _SMALL and weighted.ess >= LEAST_EFFICIENCY * weighted.count):
         return posterior, None, 0.0
-    error = float(np.hypot(found.log_evidence_sd, first.log_evidence_sd))
-    return near, replace(found, log_evidence_sd=error), share
+    error = float(np.hypot(weighted.log_evidence_sd, first.log_evidence_sd))
+    return near, replace(weighted, log_evidence_sd=error), share
 
 
 def _walked(
@@ -144,11 +144,11 @@ def _walked(
         ensembles = list(mapped(_advanced, tasks))
         chain = np.stack([one.chain for one in ensembles])
         kept = chain[:, 2 * chain.shape[1] // 5 :].swapaxes(1, 2)
-        found = qualities(names, kept)
-        if all(quality.grade(_WALKED).level == "reliable" for quality in found):
+        measured = qualities(names, kept)
+        if all(quality.grade(_WALKED).level == "reliable" for quality in measured):
             break
-    agree = all(quality.grade(_FEWEST).level == "reliable" for quality in found)
-    worth = float(np.min([quality.ess for quality in found]))
+    agree = all(quality.grade(_FEWEST).level == "reliable" for quality in measured)
+    worth = float(np.min([quality.ess for quality in measured]))
     log_density = np.stack([one.log_density for one in ensembles])[:, -kept.shape[2] :].swapaxes(1, 2)
     flat = kept.reshape(len(ensembles), -1, near.dimension)
     count = max(1, int(min(most, worth)) // BATCHES)

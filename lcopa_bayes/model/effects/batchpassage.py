@@ -1,7 +1,7 @@
 """Passage of one record through many plants at once, where their forces act point by point.
 
 The same fixed points as `passage` and `balance`, by one accelerated iteration over all plants and axes. What
-it does not bring to rest within its sweeps is left to the iteration of a single plant, which divides the
+it does not bring to rest within its sweeps falls to the iteration of a single plant, which divides the
 record.
 """
 
@@ -91,15 +91,15 @@ class BatchPassage:
         )
         f0 = rest.reshape(rows, 1)
         f = f0 + (gains[..., None] * driven).reshape(rows, -1)
-        made = _Balanced(forces, scene, f, kernel.reshape(rows, -1), self.experiment.mesh.grid.step)
-        level, found = made.level(f0)
-        y, moving = made.solve(level, found)
-        found &= moving
+        balance = _Balanced(forces, scene, f, kernel.reshape(rows, -1), self.experiment.mesh.grid.step)
+        level, solved = balance.level(f0)
+        y, moving = balance.solve(level, solved)
+        solved &= moving
         change = y.reshape(batch, axes, -1) - linear
         shift = (level - f0).reshape(batch, axes)
         read = self.experiment.mesh.reading(change.reshape(rows, -1)).reshape(batch, axes, -1)
         out = np.moveaxis(read + shift[..., None], 1, 0)
-        known = found.reshape(batch, axes).all(axis=1) & np.isfinite(out).all(axis=(0, 2))
+        known = solved.reshape(batch, axes).all(axis=1) & np.isfinite(out).all(axis=(0, 2))
         return out, np.asarray(known)
 
 
@@ -141,14 +141,14 @@ class _Balanced:
                 slope = (self.acting(every, f0, y + step, still) - (y + step) - ahead) / step
                 y = np.where(done, y, y - ahead / slope)
                 ahead = self.acting(every, f0, y, still) - y
-        found = (np.abs(ahead) <= TOLERANCE * scale) & (np.abs(y) < RUNAWAY * scale)
-        return np.where(found, y, 0.0), found[:, 0]
+        solved = (np.abs(ahead) <= TOLERANCE * scale) & (np.abs(y) < RUNAWAY * scale)
+        return np.where(solved, y, 0.0), solved[:, 0]
 
     def solve(self, level: Matrix, possible: Flags) -> tuple[Matrix, Flags]:
         """Deviation from the level, (rows, blocks), and the rows that the iteration brought to rest."""
         n = self.kernel.shape[1]
         length = fft.next_fast_len(2 * n - 1, real=True)
-        out, found = np.zeros(self.kernel.shape), np.zeros(len(self.kernel), dtype=bool)
+        out, solved = np.zeros(self.kernel.shape), np.zeros(len(self.kernel), dtype=bool)
         rows = np.flatnonzero(possible)
         spectrum = fft.rfft(self.kernel[rows], length)
         y = np.zeros((rows.size, n))
@@ -164,7 +164,7 @@ class _Balanced:
                 change = (target - y) / scale
                 size = np.abs(change).max(axis=1)
             done = size < TOLERANCE
-            out[rows[done]], found[rows[done]] = target[done], True
+            out[rows[done]], solved[rows[done]] = target[done], True
             kept = ~done & (size < RUNAWAY)  # NaN is not kept
             steps.append(change)
             points.append(target / scale)
@@ -173,7 +173,7 @@ class _Balanced:
                 rows, spectrum, target, scale = rows[kept], spectrum[kept], target[kept], scale[kept]
                 steps, points = [one[kept] for one in steps], [one[kept] for one in points]
             y = target if len(steps) == 1 else _mixed(steps, points) * scale
-        return out, found
+        return out, solved
 
     def _deviation(self, rows: Index, level: Matrix, y: Matrix) -> Matrix:
         """Force less the level, its argument the deviation from it."""
@@ -194,5 +194,7 @@ def _mixed(steps: Sequence[Matrix], points: Sequence[Matrix]) -> Matrix:
 
 def _of_rows(effect: ForceEffect, rows: Index) -> ForceEffect:
     """The effect with those constants that differ from row to row taken of some rows."""
-    told = {name: value[rows] for name, value in effect.constants.items() if isinstance(value, np.ndarray)}
-    return replace(effect, **told) if told else effect  # type: ignore[type-var]
+    constants = {
+        name: value[rows] for name, value in effect.constants.items() if isinstance(value, np.ndarray)
+    }
+    return replace(effect, **constants) if constants else effect  # type: ignore[type-var]
