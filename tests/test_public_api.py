@@ -23,6 +23,7 @@ from lcopa_bayes.cli import main
 from lcopa_bayes.data.record import save_record
 from lcopa_bayes.results.provenance import provenance
 from lcopa_bayes.results.runfolder import LOCK, opened
+from lcopa_bayes.verbs.choices import RUNS
 
 TINY = {"ensembles": 2, "walkers": 16, "steps": 60, "thin": 1, "target_ess": 50}
 """Too short for numbers that hold, long enough for every table."""
@@ -437,3 +438,12 @@ def test_every_public_name_has_a_docstring_that_says_what_it_takes_gives_and_ref
                     if each.name not in told
                 ]
     assert lacking == []
+
+
+def test_runs_leave_what_is_published_alone():
+    """Run folders are made where version control does not look."""
+    ignored = (Path(__file__).parents[1] / ".gitignore").read_text().splitlines()
+    assert f"{RUNS}/" in ignored
+    published = Path(__file__).parents[1] / "reports"
+    assert lb.load_result(published / "paper-step").verb == "compare"
+    assert "coverage" in lb.load_result(published / "calibration" / "one-term").to_json()

@@ -79,10 +79,10 @@ def compare(
     else:
         named = isinstance(described, Path | str)
         chosen, more = load_candidates(Path(described)) if named else (None, described)  # type: ignore[arg-type]
-        models = candidates_of(study_of(study), more, candidates or chosen)  # type: ignore[arg-type]
-    for model in models:  # what is wrong with a study's effects is said before anything is written
-        if model.study.effects.use:
-            problem_of(model.study)
+        single = study_of(study)  # type: ignore[arg-type]
+        if single.effects.use:  # its candidates have them or not, but never without their priors
+            problem_of(single)
+        models = candidates_of(single, more, candidates or chosen)  # type: ignore[arg-type]
     origin = plain(provenance(models[0].study, "compare"))
     with (
         TemporaryDirectory() if folder is None else nullcontext(str(folder)) as place,
