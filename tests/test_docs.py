@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from lcopa_bayes.cli import main
+from lcopa_bayes.comparison.candidates import KNOWN, VARIANTS
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.candidatesettings import CandidateSettings, CompareSettings
 from lcopa_bayes.data.record import load_record
@@ -164,6 +165,15 @@ def test_documented_limits_of_grades_are_those_of_the_code():
 def test_documented_verdicts_of_an_audit_are_those_it_may_give():
     told = rows(sections(ROOT / "docs" / "questions.md")["audit"], "verdict")
     assert set(told) == set(audit.Verdict.__args__)
+
+
+def test_candidates_and_variants_are_documented():
+    text = sections(ROOT / "docs" / "questions.md")["compare"]
+    named = set(re.findall(r"`([\w-]+)`", text))
+    assert {f"-{name}" for name in VARIANTS} == {
+        name for name in named if name.startswith("-") and name[1] != "-"
+    }
+    assert set(KNOWN) - {"fractional-2", "fractional-3"} <= named
 
 
 def test_every_effect_is_documented_by_its_formula():
