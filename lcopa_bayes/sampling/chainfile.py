@@ -27,8 +27,6 @@ class Chain:
     ensembles: tuple[Ensemble, ...] = ()
     weighted: Weighted | None = None
     """Importance draws, the result of a run that has them."""
-    failed: tuple[int, ...] = ()
-    """Rounds after which importance draws were tried without success."""
 
 
 def save_chain(path: Path, chain: Chain, fingerprint: str) -> None:
@@ -40,7 +38,6 @@ def save_chain(path: Path, chain: Chain, fingerprint: str) -> None:
     def write(beside: Path) -> None:
         with enduring(beside) as raw, h5py.File(raw, "w") as file:
             file.attrs["fingerprint"] = fingerprint
-            file.attrs["failed"] = np.array(chain.failed, dtype=int)
             if chain.weighted is not None:
                 _write_weighted(file.create_group("weighted"), chain.weighted)
             for number, ensemble in enumerate(chain.ensembles):
@@ -79,7 +76,6 @@ def load_chain(path: Path, fingerprint: str) -> Chain:
             chain = Chain(
                 tuple(_ensemble(file[f"ensemble_{number}"]) for number in range(count)),
                 _read_weighted(file["weighted"]) if "weighted" in file else None,
-                tuple(int(done) for done in file.attrs["failed"]),
             )
     except (
         OSError,

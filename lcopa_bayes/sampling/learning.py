@@ -11,21 +11,15 @@ from lcopa_bayes.sampling.mixturemoves import learned
 
 LEARNING = 2
 """Rounds before the mixture is learned from the draws of all ensembles."""
-_WIDE = 1.0
-"""Share of the mixture that is learned from the populations of the tempering path, times rounds [-]."""
-_COMPONENTS = 40
-"""Most components of the mixture that is learned from draws."""
+_WIDE = 0.5
+"""Share of the mixture that is learned from the populations of the tempering path [-]."""
 _KNOWN = 0.2
 """Share of modes that are known from elsewhere, where there are any [-]."""
 
 
 def due(done: int) -> bool:
-    """Whether the mixture is learned again after so many rounds: 2, 3, ... 8, then 10, 12, 14, 16, 20, ...
-
-    Often at first, for a mode that few walkers have reached gains components each time; then ever more
-    rarely.
-    """
-    return done >= LEARNING and done % (1 << max(0, done.bit_length() - 3)) == 0
+    """Whether the mixture is learned again after so many rounds: at every power of two."""
+    return done >= LEARNING and done.bit_count() == 1
 
 
 def taught(
@@ -47,6 +41,6 @@ def taught(
         mixture = wide
     else:
         first, end = per_round * last // 2, per_round * last
-        own = learned(posterior, [ensemble.chain[first:end] for ensemble in ensembles], seed, _COMPONENTS)
-        mixture = own.levelled().blended(wide, _WIDE / last)
+        own = learned(posterior, [ensemble.chain[first:end] for ensemble in ensembles], seed)
+        mixture = own.levelled().blended(wide, _WIDE)
     return mixture if known is None else mixture.blended(known, _KNOWN)

@@ -15,7 +15,7 @@ from sklearn.mixture import GaussianMixture
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 
-COMPONENTS = 20
+_COMPONENTS = 20
 """Most components of a mixture."""
 _FITTED = 6_000
 """Most points a mixture is fitted to."""
@@ -40,7 +40,7 @@ class Mixture:
     """Lower Cholesky factors of the scale matrices, (components, dimension, dimension)."""
 
     @classmethod
-    def fitted(cls, points: Matrix, seed: int, components: int = COMPONENTS) -> Mixture:
+    def fitted(cls, points: Matrix, seed: int, components: int = _COMPONENTS) -> Mixture:
         """Fit to points (n, dimension) by expectation maximisation of Gaussians, at most `components`.
 
         Deterministic given `seed`. Fewer components are used when there are not ten points per

@@ -10,19 +10,17 @@ import numpy as np
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.coordinates import Chart
-from lcopa_bayes.sampling.mixture import COMPONENTS, Mixture
+from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.moves import PopulationMove, scales
 
 
-def learned(
-    posterior: Posterior, chains: Sequence[Array], seed: int, components: int = COMPONENTS
-) -> Mixture:
+def learned(posterior: Posterior, chains: Sequence[Array], seed: int) -> Mixture:
     """Mixture in the chart of a posterior, fitted to chains (draws, walkers, dimension).
 
     From the draws of all ensembles: a mode that one has reached, all can then reach.
     """
     pooled = np.concatenate([chain.reshape(-1, posterior.dimension) for chain in chains])
-    return Mixture.fitted(Chart.of(posterior).usable(pooled)[1], seed, components)
+    return Mixture.fitted(Chart.of(posterior).usable(pooled)[1], seed)
 
 
 @final

@@ -49,14 +49,12 @@ first short run."""
 _EFFICIENT = 0.3
 """Effective draws per draw of a cover from which a posterior counts as easy [-]: two-term posteriors with
 several modes stay below 0.2."""
-_ATTEMPTS, _LONGER = 2, 1.5
-"""Most attempts at importance draws, and how many times as long ensembles have run at the next one [-]."""
 _DELIVERED = 500
 """Fewest importance draws of a batch that are delivered."""
-_PER_WANTED = 4.0
+_PER_WANTED = 10.0
 """Delivered draws per effective draw wanted [-] ..."""
-_SURPLUS = 1.4
-"""... and effective importance draws: 1.4 and 4 times as many are together worth 1.04 times as many."""
+_SURPLUS = 1.12
+"""... and effective importance draws: 1.12 and 10 times as many are together worth 1.007 times as many."""
 
 
 @final
@@ -163,8 +161,7 @@ def sample(
     importance draws of a cover of where these have been (`coverdraws`), which are the result where their
     weights converge. Where a short run of small populations shows an easy posterior, its cover is enough.
 
-    Where they do not in a posterior of several modes, the ensembles go on and it is tried again. The draws
-    depend on the arguments alone, not on `jobs` nor on interruptions: with `resume`, a run killed at any
+    The draws depend on the arguments alone, not on `jobs` nor on interruptions: with `resume`, a run killed at any
     moment continues from the last complete round in `chain_file`. `starts`, table values (starts, rows), are
     modes known from elsewhere, which moves propose too (`knownmodes`); InputError when none lies inside the
     prior.
@@ -193,26 +190,20 @@ def sample(
         mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
         hardest = max(ensemble.tempering_moves for ensemble in ensembles)
         least = max(_LEAST, round(_AS_LONG * hardest / (_ROUND * plan.thin)))
-        failed = stored.failed
-        while True:
-            run, again = Run(ensembles, plan), ceil(_LONGER * failed[-1]) if failed else least
-            if done >= rounds or (done >= again and finished(posterior, run, bar)):
-                weighted = None
-                if plan.method == "auto":
-                    wanted = _SURPLUS * plan.target_ess
-                    weighted = cover_draws(posterior, run.visited, wanted, plan.seed, crew)
-                failed = (*failed, done)
-                last = done >= rounds or len(failed) == _ATTEMPTS or not _filling(posterior, run)
-                if weighted is not None or plan.method == "ensembles" or last:
-                    _store(chain_file, Chain(ensembles, weighted), fingerprint)
-                    doubtful = plan.method == "auto" and weighted is None
-                    return Run(ensembles, plan, weighted, _filling(posterior, run) if doubtful else ())
+        while not (done >= rounds or (done >= least and finished(posterior, Run(ensembles, plan), bar))):
             if due(done):
                 mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
             ensembles = tuple(crew.each(_Round(plan.thin, mixture), ensembles))
             done += 1
-            _store(chain_file, Chain(ensembles, failed=failed), fingerprint)
+            _store(chain_file, Chain(ensembles), fingerprint)
             bar.update()
+        run = Run(ensembles, plan)
+        if plan.method == "ensembles":
+            return run
+        bar.set_description("importance draws")
+        weighted = cover_draws(posterior, run.visited, _SURPLUS * plan.target_ess, plan.seed, crew)
+        _store(chain_file, Chain(ensembles, weighted), fingerprint)
+        return Run(ensembles, plan, weighted, _filling(posterior, run) if weighted is None else ())
 
 
 def _easy(

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.core.parallel import crew
+from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.inference.optimum import Optimum, find_optima
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.surrogate import Surrogate
@@ -57,7 +57,8 @@ def weighted_run(
     rng = np.random.default_rng([plan.seed, _STREAM])
     size = min(plan.target_ess, 400.0) if quick else plan.target_ess
     wanted = replace(_QUICK if quick else _PLAN, wanted=size)
-    with crew(jobs) as mapped:
+    with workers(None, jobs=jobs) as crew:
+        mapped = crew.map
         optima = find_optima(posterior, rng, starts=wanted.starts)
         if not optima:
             return None

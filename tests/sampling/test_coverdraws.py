@@ -11,7 +11,6 @@ from scipy import stats
 from small import Toy, problem, record
 
 from lcopa_bayes.core.parallel import workers
-from lcopa_bayes.sampling.chainfile import Chain, load_chain, save_chain
 from lcopa_bayes.sampling.cover import Cover
 from lcopa_bayes.sampling.coverdraws import cover_draws
 from lcopa_bayes.sampling.draws import gather
@@ -135,9 +134,6 @@ def test_a_finished_run_resumes_to_the_same_importance_draws(weighted_run):
     assert again.weighted is not None
     assert_array_equal(again.weighted.coordinates, run.weighted.coordinates)
     assert_array_equal(again.kept()[0], run.kept()[0])
-    stored = load_chain(path, "it")
-    save_chain(path, Chain(stored.ensembles, failed=(7,)), "it")
-    assert load_chain(path, "it").failed == (7,)
 
 
 def test_ensembles_alone_where_the_plan_says_so(weighted_run):
