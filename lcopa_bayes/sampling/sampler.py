@@ -161,10 +161,10 @@ def sample(
     importance draws of a cover of where these have been (`coverdraws`), which are the result where their
     weights converge. Where a short run of small populations shows an easy posterior, its cover is enough.
 
-    The draws depend on the arguments alone, not on `jobs` nor on interruptions: with `resume`, a run killed at any
-    moment continues from the last complete round in `chain_file`. `starts`, table values (starts, rows), are
-    modes known from elsewhere, which moves propose too (`knownmodes`); InputError when none lies inside the
-    prior.
+    The draws depend on the arguments alone, not on `jobs` nor on interruptions: with `resume`, a run killed
+    at any moment continues from the last complete round in `chain_file`. `starts`, table values (starts,
+    rows), are modes known from elsewhere, which moves propose too (`knownmodes`); InputError when none lies
+    inside the prior.
     """
     known = None if starts is None else around(posterior, starts, plan.seed)
     stored = load_chain(chain_file, fingerprint) if resume and chain_file else Chain()
