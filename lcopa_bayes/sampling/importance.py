@@ -33,6 +33,8 @@ LEAST_EFFICIENCY = 0.4
 k = 0.4 at an efficiency of 0.2 while a third of its mass was not covered."""
 _MOST = 12
 """Components beyond which a further attempt takes more draws alone [-]."""
+_SURPLUS = 1.25
+"""Effective draws for every centre and tail over those wanted [-]: resampling costs the rest."""
 _LIGHT = 0.2
 """Pareto k at which the proposal is fitted no further, if it is efficient [-]."""
 
@@ -77,7 +79,9 @@ class Importance:
     def good(self, wanted: float) -> bool:
         """Whether averages converge, the proposal is close to the posterior, and enough draws count."""
         own = self.weighted
-        return own.pareto_k <= usable_k(own.count) and own.ess >= max(wanted, LEAST_EFFICIENCY * own.count)
+        if own.pareto_k > usable_k(own.count) or own.ess < max(wanted, LEAST_EFFICIENCY * own.count):
+            return False
+        return bool(min(own.centre_ess.min(), own.tail_ess.min()) >= _SURPLUS * wanted)
 
 
 def first_look(

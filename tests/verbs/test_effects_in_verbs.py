@@ -48,13 +48,13 @@ def test_a_climb_with_the_effect_held_is_a_profile(stiff: tuple[Problem, np.ndar
     problem, truth = stiff
     landscape = Landscape(problem.posterior)
     k = problem.posterior.table.names.index("cubic_stiffness.c")
-    best = landscape.climb(truth)
+    best = landscape.maximise(truth)
     assert best.log_likelihood > float(landscape.log_likelihood(truth[None])[0])
     apart = []
     for step in (-0.05, 0.05):
         start = best.values.copy()
         start[k] += step
-        held = landscape.climb(start, held=k)
+        held = landscape.maximise(start, held=k)
         assert held.values[k] == start[k]
         apart.append(best.log_likelihood - held.log_likelihood)
     assert min(apart) > 0.2

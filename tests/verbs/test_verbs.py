@@ -172,7 +172,7 @@ def test_identify_draws_every_record(identified):
     assert [path.stem for path in (identified / "figures").iterdir()] == ["identify_01_one_out"]
     assert "last eta = 1" in page
     assert "Step metrics" in page
-    assert "Table 1: seen/fract./int." in page
+    assert "Table 1: measured/fract./int." in page
 
 
 def test_identify_leaves_the_report_of_a_fit_alone(identified):
