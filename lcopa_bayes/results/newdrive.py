@@ -75,10 +75,10 @@ class Prediction(Result):
     @property
     def verdict(self) -> str:
         """What was predicted and how far it can be trusted, in words."""
-        axes = ", ".join(band.axis for band in self.bands)
+        axes, time = ", ".join(band.axis for band in self.bands), self.bands[0].time
+        start = 0.0 if abs(time[0]) < 1e-9 * np.ptp(time) else float(time[0])  # rounding is no time
         parts = [
-            f"Response of {axes} to {self.driven.name} from {self.bands[0].time[0]:.4g} to "
-            f"{self.bands[0].time[-1]:.4g} {self.time_unit}."
+            f"Response of {axes} to {self.driven.name} from {start:.4g} to {time[-1]:.4g} {self.time_unit}."
         ]
         if isinstance(self.driven, Record):
             parts += [

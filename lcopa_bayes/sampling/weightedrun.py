@@ -39,9 +39,9 @@ _EXACT = 6.0
 """Draws of a surrogate that are weighted by the posterior itself, over the effective draws wanted [-]."""
 _WALKERS = 64
 """Walkers of an ensemble that moves draws of a surrogate on, at least [-]."""
-_ROUNDS, _KEPT, _THIN = 8, 20, 5
+_ROUNDS, _KEPT, _THIN = 24, 20, 5
 """Most rounds of such moves, draws kept of each, and steps per draw [-]."""
-_WALKED = 1000.0
+_WALKED = 2000.0
 """Effective draws at which they end [-]."""
 _SMALL = 0.5
 """Largest Pareto k of the weights of a surrogate [-]: their variance is finite below it."""
