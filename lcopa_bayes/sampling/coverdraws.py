@@ -25,7 +25,7 @@ _COMPONENTS = 60
 """Components of the cover."""
 _PILOT = 20_000
 """First draws, from which the number needed is estimated."""
-_MOST = 480_000
+_MOST = 200_000
 """Most draws."""
 _LOOKED_AT, _MISSED = 4_000, 1e-3
 """Visited points that are checked, and the share of them that a cover may almost miss [-]."""
