@@ -35,7 +35,7 @@ _STREAM = 12
 """Marks the randomness of such a run."""
 _FEWEST = 100.0
 """Effective draws below which weights are not used [-]."""
-_EXACT = 6.0
+_EXACT = 8.0
 """Draws of a surrogate that are weighted by the posterior itself, over the effective draws wanted [-]."""
 _WALKERS = 64
 """Walkers of an ensemble that moves draws of a surrogate on, at least [-]."""
