@@ -71,9 +71,10 @@ def cover_draws(
         count = wanted_count
         z, density, raw = (np.concatenate(part) for part in zip(*drawn, strict=True))
         weighted = Weighted.of(posterior, z, density, raw, count, smooth=False)
-        if weighted.ess < least * count or (
-            least > 0 and _misses(posterior, cover, weighted, visited, crew, rng)
-        ):
+        if weighted.ess < least * count:
+            return None
+        # more draws of the same cover change nothing about what it misses
+        if least > 0 and len(drawn) == 1 and _misses(posterior, cover, weighted, visited, crew, rng):
             return None
         worth = weighted.smallest_ess(rng)
         if worth >= wanted:
@@ -96,10 +97,10 @@ def _misses(
     """Whether a draw of the cover at some of the points visited would have more weight than all others
     together."""
     sample = visited[rng.choice(len(visited), min(_LOOKED_AT, len(visited)), replace=False)]
-    z = Chart.of(posterior).usable(sample)[0]
-    density = np.concatenate(list(crew.each(_Density(), np.array_split(z, _TASKS))))
-    terrain = Chart.of(posterior).terrain
-    raw = density + posterior.table.log_permutations - cover.log_density(terrain.sorted(z))
+    chart = Chart.of(posterior)
+    z = chart.usable(sample)[0]
+    density = _density(z, crew) + posterior.table.log_permutations
+    raw = density - cover.log_density(chart.terrain.sorted(z))
     return bool(np.mean(raw - weighted.log_evidence > log(weighted.count)) > _MISSED)
 
 
@@ -109,8 +110,13 @@ def _drawn(
     """`count` draws of a cover, without those outside the charts or the prior: coordinates, log density and
     log weight."""
     z = rng.permutation(cover.draw(count, rng))
-    parts = np.array_split(z, max(1, min(_TASKS, len(z) // _PART)))
-    density = np.concatenate(list(crew.each(_Density(), parts)))
+    density = _density(z, crew)
     inside = np.isfinite(density)
     z, density = z[inside], density[inside]
     return z, density, density + posterior.table.log_permutations - cover.log_density(z)
+
+
+def _density(z: Matrix, crew: Workers[Posterior]) -> Vector:
+    """Log density of points by the workers that share the posterior, (n,) [nat]."""
+    parts = np.array_split(z, max(1, min(_TASKS, len(z) // _PART)))
+    return np.concatenate(list(crew.each(_Density(), parts)))

@@ -11,6 +11,7 @@ from scipy import stats
 from small import Toy, problem, record
 
 from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.sampling import coverdraws
 from lcopa_bayes.sampling.cover import Cover
 from lcopa_bayes.sampling.coverdraws import cover_draws
 from lcopa_bayes.sampling.draws import gather
@@ -65,6 +66,34 @@ def test_shares_are_right_where_those_of_the_ensembles_are_not(share):
     for ratio in (np.var(found, ddof=1) / np.mean(np.square(errors)), np.mean(np.square(means))):
         low, high = stats.chi2(15).ppf([1e-3, 1 - 1e-3]) / 15
         assert low < ratio < high
+
+
+def test_a_cover_counts_as_easy_only_where_its_draws_are_worth_enough():
+    """The same points and cover: accepted without a least efficiency, refused above its own."""
+    visited = underfilled(np.random.default_rng(3), 0.3)
+    with workers(TOY) as crew:
+        drawn = cover_draws(TOY, visited, 400, 3, crew, least=0.3)
+        assert drawn is not None
+        efficiency = drawn.ess / drawn.count
+        assert cover_draws(TOY, visited, 400, 3, crew, least=1.02 * efficiency) is None
+
+
+@pytest.mark.parametrize("share", [0.0, 0.05])
+def test_visited_points_that_a_cover_misses_are_noticed(share):
+    """A mode 30 standard deviations away, in none of the points the cover is fitted to."""
+
+    def far(z):
+        mode = stats.norm(30.0, NARROW).logpdf(z[:, 0]) + stats.norm(0.0, 1.0).logpdf(z[:, 1])
+        return np.logaddexp(stats.norm(0.0, 1.0).logpdf(z).sum(axis=1), mode)
+
+    toy, rng = Toy(far, {"a": WIDE, "b": WIDE}), np.random.default_rng(5)
+    points = rng.standard_normal((4_000, 2))
+    cover = Cover.fitted(toy, points, 5, 10)
+    visited = points + np.where(rng.random((4_000, 1)) < share, [[30.0, 0.0]], 0.0)
+    with workers(toy) as crew:
+        z, density, raw = coverdraws._drawn(toy, cover, 2_000, rng, crew)
+        weighted = Weighted.of(toy, z, density, raw, 2_000, smooth=False)
+        assert coverdraws._misses(toy, cover, weighted, visited, crew, rng) == (share > 0)
 
 
 def test_an_error_that_hangs_on_few_draws_is_taken_larger(rng):
