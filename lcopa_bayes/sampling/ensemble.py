@@ -40,6 +40,15 @@ class Ensemble:
     """Moves of tempering per walker [-]."""
 
     @classmethod
+    def started(
+        cls, position: Matrix, log_density: Vector, trail: Matrix, seed: np.random.SeedSequence
+    ) -> Ensemble:
+        """Walkers at a population that is nearly the posterior's; `trail` others of it."""
+        random = tuple(np.random.RandomState(np.random.MT19937(seed)).get_state())
+        nothing = np.empty((0, *position.shape)), np.empty((0, len(position)))
+        return cls(*nothing, position, log_density, np.zeros(len(position)), 0, random, trail, 0)
+
+    @classmethod
     def tempered(
         cls,
         posterior: Posterior,
