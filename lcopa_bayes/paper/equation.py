@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import gamma
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
-from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.blockpulses import integration_weights, lower_toeplitz
 from lcopa_bayes.model.grid import Mesh
 from lcopa_bayes.model.path import Normalisation, TransferPath
@@ -93,7 +93,7 @@ def responses(
 
 
 def response_to(
-    drive: Drive, model: TransferPath, times: Vector, *, blocks: int | None = None, exposure: float = 0.0
+    drive: AxisDrive, model: TransferPath, times: Vector, *, blocks: int | None = None, exposure: float = 0.0
 ) -> Vector:
     """Modelled deviation from rest at `times` [time unit] under a drive that moves [response unit].
 

@@ -13,7 +13,7 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
-from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.drive import AxisDrive, axis_drives, first_change
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.model.literature import PAPER, Stated
@@ -80,7 +80,7 @@ def panels(study: Study, identified: Sequence[Identification], stated: Stated = 
             figure = paper_figure(record, stated)
             for i, axis in enumerate(study.response_axes):
                 taken = np.isfinite(record.response[:, i])
-                if taken.any() and _moved(record):
+                if taken.any() and any(drive.moves for drive in axis_drives(record)):
                     time, seen = record.time[taken], record.response[taken, i]
                     sums = {kind: _response(study, identified, record, i, kind) for kind in KINDS}
                     curves = tuple(
@@ -107,7 +107,7 @@ def paper_figure(record: Record, stated: Stated = PAPER) -> str:
         tuple(float(record.drive[row, axes[name]]) if name in axes else 0.0 for name in "xy")
         for row in (0, -1)
     )
-    steps = [Drive.of_rows(record.time, record.drive[:, j]).times.size for j in axes.values()]
+    steps = [AxisDrive.of_rows(record.time, record.drive[:, j]).times.size for j in axes.values()]
     if max(steps) > 1:
         return ""
     given, rest = stated.records, (0.0, 0.0)
@@ -123,20 +123,15 @@ def paper_figure(record: Record, stated: Stated = PAPER) -> str:
     return ""
 
 
-def _moved(record: Record) -> list[Drive]:
-    drives = [Drive.of_rows(record.time, column) for column in record.drive.T]
-    return [drive for drive in drives if drive.moves]
-
-
 def _response(
     study: Study, identified: Sequence[Identification], record: Record, response: int, kind: str
 ) -> Vector:
     taken = np.isfinite(record.response[:, response])
     times, seen = record.time[taken], record.response[taken, response]
-    begin = min(float(drive.times[0]) for drive in _moved(record))
+    begin = first_change(record)
     out = np.full(times.size, resting_level(times, seen, begin)[0])
     for each in identified:
-        drive = Drive.of_rows(record.time, record.drive[:, each.data.drive])
+        drive = AxisDrive.of_rows(record.time, record.drive[:, each.data.drive])
         if each.data.response == response and drive.moves:
             model: TransferPath = model_of(each, kind).model
             out += response_to(drive, model, times, exposure=study.model.exposure)

@@ -14,7 +14,7 @@ import numpy as np
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import plain
-from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.model.literature import PAPER, Stated
 from lcopa_bayes.model.path import TransferPath
@@ -66,7 +66,7 @@ def step_of(model: TransferPath, size: float, span: float) -> Step:
     Settling and rise are about the value the response tends to, as for a posterior.
     """
     times = np.linspace(0.0, span, _POINTS + 1)[1:]
-    curve = response_to(Drive(np.zeros(1), np.full(1, size)), model, times)
+    curve = response_to(AxisDrive(np.zeros(1), np.full(1, size)), model, times)
     steady = model.steady * size
     part = (curve / steady)[None]
     low, high = (float(crossing(times, part, level)[0]) for level in (0.1, 0.9))

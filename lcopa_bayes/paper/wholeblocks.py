@@ -16,7 +16,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.model.forward import Dynamics, Experiment, ForwardModel
@@ -145,7 +145,7 @@ def _response(path: TransferPath, times: Vector, drive: float, delay: float) -> 
     axis = Axis("x", "rad")
     layout = Layout.of([axis], [axis], ModelSettings(terms=len(path.orders)))
     mesh = Mesh.of_samples(times, 0.0, blocks=_FINE)
-    experiment = Experiment("step", mesh, (Drive(np.zeros(1), np.array([drive])),), np.zeros(1))
+    experiment = Experiment("step", mesh, (AxisDrive(np.zeros(1), np.array([drive])),), np.zeros(1))
     dynamics = Dynamics((np.array([path.times]),), (np.array([path.orders]),), np.array([[delay]]))
     unit, slopes = ForwardModel(layout, (experiment,)).unit_slopes(dynamics)[0]
     return path.steady * unit[0, 0], np.concatenate([unit[0], path.steady * slopes[0][:, 0]]).T

@@ -14,7 +14,7 @@ from small import TWO, record, study
 from lcopa_bayes.bench.command import on_off
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.candidatesettings import CandidateSettings, CompareSettings
-from lcopa_bayes.data.drives import Drive
+from lcopa_bayes.data.drive import Drive
 from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.data.studycopy import study_from_json, study_to_json
 from lcopa_bayes.results.fit import Fit, fit

@@ -8,7 +8,7 @@ from typing import ClassVar, final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
-from lcopa_bayes.data.drive import Drive, sorted_jumps
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.effects.effect import (
     Card,
     Coefficient,
@@ -38,8 +38,8 @@ class SampledDrive(DriveEffect):
         return single("w", 0.6, one_signed=True)
 
     def commands(
-        self, drive: Drive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[Drive, float]:
+        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
+    ) -> tuple[AxisDrive, float]:
         """All changes by the same time."""
         times = drive.times - 0.5 * psi[0] * scene.ranges.period
-        return sorted_jumps(times, np.diff(drive.values, prepend=0.0)), rest
+        return AxisDrive.of_jumps(times, np.diff(drive.values, prepend=0.0)), rest

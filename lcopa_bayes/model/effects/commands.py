@@ -9,7 +9,7 @@ from typing import ClassVar, Self, final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
-from lcopa_bayes.data.drive import Drive, sorted_jumps
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.effects.effect import (
     Card,
     Coefficient,
@@ -51,12 +51,12 @@ class OverdrivePulse(DriveEffect):
         return single("k", 0.2)
 
     def commands(
-        self, drive: Drive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[Drive, float]:
+        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
+    ) -> tuple[AxisDrive, float]:
         """One more pair of changes per change."""
         jumps = np.diff(drive.values, prepend=0.0)
         times = np.concatenate((drive.times, drive.times + self.frame))
-        return sorted_jumps(times, np.concatenate(((1 + psi[0]) * jumps, -psi[0] * jumps))), rest
+        return AxisDrive.of_jumps(times, np.concatenate(((1 + psi[0]) * jumps, -psi[0] * jumps))), rest
 
 
 @final
@@ -98,20 +98,20 @@ class RefreshHold(DriveEffect):
         return single("w", 0.6, one_signed=True)
 
     def commands(
-        self, drive: Drive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[Drive, float]:
+        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
+    ) -> tuple[AxisDrive, float]:
         """Of several changes that fall to one refresh the sum acts."""
         ticks = np.ceil(drive.times / self.refresh - self.phase - 1e-9) + self.phase
         times = drive.times + psi[0] * (self.refresh * ticks - drive.times)
-        return sorted_jumps(times, np.diff(drive.values, prepend=0.0)), rest
+        return AxisDrive.of_jumps(times, np.diff(drive.values, prepend=0.0)), rest
 
 
-def _mapped(drive: Drive, rest: float, levels: Vector) -> tuple[Drive, float]:
+def _mapped(drive: AxisDrive, rest: float, levels: Vector) -> tuple[AxisDrive, float]:
     """The drive with other levels: that at rest, then one per change."""
-    return sorted_jumps(drive.times, np.diff(levels)), float(levels[0])
+    return AxisDrive.of_jumps(drive.times, np.diff(levels)), float(levels[0])
 
 
-def _levels(drive: Drive, rest: float) -> Vector:
+def _levels(drive: AxisDrive, rest: float) -> Vector:
     """Drive at rest and after every change, (1 + changes,)."""
     return rest + np.concatenate(([0.0], drive.values))
 
@@ -149,8 +149,8 @@ class GreyQuantisation(DriveEffect):
         return single("w", 0.6, one_signed=True)
 
     def commands(
-        self, drive: Drive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[Drive, float]:
+        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
+    ) -> tuple[AxisDrive, float]:
         """Level by level."""
         step, levels = scene.ranges.drive[axis] / self.levels, _levels(drive, rest)
         return _mapped(drive, rest, levels + psi[0] * (step * np.round(levels / step) - levels))
@@ -184,8 +184,8 @@ class Hysteresis(DriveEffect):
         return single("h", 0.1)
 
     def commands(
-        self, drive: Drive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[Drive, float]:
+        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
+    ) -> tuple[AxisDrive, float]:
         """The play starts where the drive rests."""
         radius, levels = self.width * scene.ranges.drive[axis], _levels(drive, rest)
         played = levels.copy()
@@ -214,8 +214,8 @@ class VoltageKnee(DriveEffect):
         return single("k", 0.05)
 
     def commands(
-        self, drive: Drive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[Drive, float]:
+        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
+    ) -> tuple[AxisDrive, float]:
         """Level by level."""
         levels = _levels(drive, rest)
         return _mapped(drive, rest, levels * (1 + psi[0] * (1 - np.abs(levels) / scene.ranges.drive[axis])))
@@ -240,11 +240,11 @@ class FieldDependentDelay(DriveEffect):
         return single("e", 0.15)
 
     def commands(
-        self, drive: Drive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[Drive, float]:
+        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
+    ) -> tuple[AxisDrive, float]:
         """Every change is shifted by its own part of the delay of the drive's own path."""
         own = np.flatnonzero(scene.ranges.direct == axis)
         delay = float(scene.delays[own[0] if own.size else 0, axis])
         levels = np.abs(_levels(drive, rest)[1:]) / scene.ranges.drive[axis]
         times = drive.times + psi[0] * delay * (0.5 - levels)
-        return sorted_jumps(times, np.diff(drive.values, prepend=0.0)), rest
+        return AxisDrive.of_jumps(times, np.diff(drive.values, prepend=0.0)), rest

@@ -19,7 +19,7 @@ from types import MappingProxyType
 from typing import Any, ClassVar, Literal, Self, final
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
-from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.grid import Grid
 from lcopa_bayes.model.layout import Layout
 
@@ -135,7 +135,7 @@ class Scene:
     times: Vector
     """Sample times [time unit]."""
     grid: Grid
-    drives: tuple[Drive, ...]
+    drives: tuple[AxisDrive, ...]
     """Commands as recorded, deviations from rest."""
     rest: Vector
     """Drive before the first command [drive unit]."""
@@ -144,7 +144,7 @@ class Scene:
     delays: Matrix
     """(responses, drives) [time unit]."""
 
-    def direct(self, axis: int) -> tuple[Drive, float, float, float]:
+    def direct(self, axis: int) -> tuple[AxisDrive, float, float, float]:
         """Own drive of a response axis, its rest, gain and delay."""
         j = int(self.ranges.direct[axis])
         return self.drives[j], float(self.rest[j]), float(self.gains[axis, j]), float(self.delays[axis, j])
@@ -220,8 +220,8 @@ class DriveEffect(Effect):
 
     @abstractmethod
     def commands(
-        self, drive: Drive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[Drive, float]:
+        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
+    ) -> tuple[AxisDrive, float]:
         """Commands as they act: deviations from the resting drive, and that rest [drive unit]."""
 
 

@@ -10,7 +10,7 @@ from typing import ClassVar, Self, final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
-from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.effects.effect import Card, Coefficient, ParallelEffect, Ranges, Scene, single
 from lcopa_bayes.model.effects.superposition import jumps_of, summed
 from lcopa_bayes.model.layout import Layout
@@ -21,7 +21,7 @@ def relaxing(time: float) -> Callable[[Array], Array]:
     return lambda t: np.asarray(-np.expm1(-t / time))
 
 
-def falling(drive: Drive, rest: float) -> Array:
+def falling(drive: AxisDrive, rest: float) -> Array:
     """Whether each change leads to a smaller magnitude."""
     levels = np.abs(rest + np.concatenate(([0.0], drive.values)))
     return np.asarray(levels[1:] < levels[:-1])

@@ -8,7 +8,7 @@ from typing import ClassVar, final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.effects.effect import (
     Card,
     Coefficient,
@@ -67,11 +67,11 @@ class ClockSkew(DriveEffect):
         return single("e", 2 * ranges.period / ranges.span)
 
     def commands(
-        self, drive: Drive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[Drive, float]:
+        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
+    ) -> tuple[AxisDrive, float]:
         """All changes are stretched."""
         start = scene.times[0]
-        return Drive(drive.times + psi[0] * (drive.times - start), drive.values), rest
+        return AxisDrive(drive.times + psi[0] * (drive.times - start), drive.values), rest
 
 
 @final
@@ -95,10 +95,10 @@ class TriggerJitter(DriveEffect):
         return single("dt", 2 * ranges.period, "time")
 
     def commands(
-        self, drive: Drive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[Drive, float]:
+        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
+    ) -> tuple[AxisDrive, float]:
         """All changes are shifted alike."""
-        return Drive(drive.times + psi[0], drive.values), rest
+        return AxisDrive(drive.times + psi[0], drive.values), rest
 
 
 @final

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.signal import fftconvolve
 
 from lcopa_bayes.core.arrays import Array, Vector
-from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.drive import AxisDrive
 
 _MANY = 64
 """Changes above which a convolution is worth while [-]."""
@@ -17,7 +17,7 @@ _ROUNDING = 1e-4
 
 
 def summed(
-    times: Vector, drive: Drive, delay: float, jumps: Vector, shape: Callable[[Array], Array]
+    times: Vector, drive: AxisDrive, delay: float, jumps: Vector, shape: Callable[[Array], Array]
 ) -> Vector:
     """``sum_k jumps_k shape(t - t_k - delay)``, (samples,); shape is 0 before 0.
 
@@ -58,6 +58,6 @@ def _convolved(
     return np.asarray(fftconvolve(kernel, dense)[-begin : times.size - begin])
 
 
-def jumps_of(drive: Drive) -> Vector:
+def jumps_of(drive: AxisDrive) -> Vector:
     """Change of the drive at each instant [drive unit]."""
     return np.diff(drive.values, prepend=0.0)

@@ -6,7 +6,7 @@ from math import pi
 
 import numpy as np
 
-from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.literature import PAPER, Stated
 from lcopa_bayes.optics.array import LinearArray, paper_array
 from lcopa_bayes.optics.chain import geometry_check, linearisation_error
@@ -109,7 +109,7 @@ def _steady(stated: Stated) -> str:
                 label=f"within {band:.0%}",
             )
         panel.plot(times, model.step_on[at], color=BAND, label="Eq. 65")
-        drive = Drive(np.zeros(1), np.full(1, given.step_drive))
+        drive = AxisDrive(np.zeros(1), np.full(1, given.step_drive))
         integer = response_to(drive, rival.model, times)
         panel.plot(times, integer, color=CYCLE[1], ls=(0, (4, 2)), label="closest integer order")
         panel.axhline(
