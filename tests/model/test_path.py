@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 
 from lcopa_bayes.bench.inversion import step_response
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.literature import PAPER
 from lcopa_bayes.model.path import Normalisation, TransferPath
 from lcopa_bayes.model.transfer import denominator
@@ -85,7 +85,7 @@ def test_both_normalisations_are_one_frequency_response(path):
 def test_both_normalisations_are_one_response(name):
     """On the bench and by the paper's algebra."""
     path, times = PATHS[name], np.linspace(0.1, 25.0, 250)
-    drive = Drive(np.zeros(1), np.ones(1))
+    drive = AxisDrive(np.zeros(1), np.ones(1))
     wanted, modelled = step_response(path, times), response_to(drive, path, times)
     for normalisation in Normalisation:
         other = path.normalised(normalisation, 2.0)
