@@ -11,11 +11,10 @@ import numpy as np
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.optics.cell import Field
-from lcopa_bayes.optics.chain import linearisation_error, linearised_angle, paper_chain
-from lcopa_bayes.optics.checks import finite
 from lcopa_bayes.optics.director import Profile, equilibrium
 from lcopa_bayes.optics.farfield import LinearPatterns, PlanarPattern, planar_patterns, steered_patterns
 from lcopa_bayes.optics.lobes import LobeRow, lobe_table, main_lobe, side_lobe_level
+from lcopa_bayes.optics.steering import linearisation_error, linearised_angle
 from lcopa_bayes.optics.tiltlaw import RANGES, TiltLawCheck, continuous_law, printed_law, tilt_law_check
 from lcopa_bayes.paper.opticsplan import OpticsPlan
 
@@ -190,16 +189,15 @@ def static_optics(plan: OpticsPlan) -> StaticOptics:
 
 def _chain(plan: OpticsPlan) -> ChainCurves:
     """Up to the knee of Eq. 24, or to where the phase steers to end-fire."""
-    array = plan.array
-    chain = paper_chain(plan.optics, array=array)
-    end = min(np.nextafter(chain.voltage_limit, 0), 2 * pi / array.period / chain.phase_per_volt)
-    voltage = finite(np.linspace(0.0, end, _CHAIN_POINTS), name="voltage")
-    phase = chain.phase(voltage)
+    array, optics = plan.array, plan.optics
+    end = min(np.nextafter(optics.knee_voltage, 0), 2 * pi / array.period / optics.phase_per_volt)
+    voltage = np.linspace(0.0, end, _CHAIN_POINTS)
+    phase = optics.phase_per_volt * voltage
     return ChainCurves(
         voltage,
-        chain.tilt(voltage),
+        optics.tilt_slope_low * voltage,
         phase,
-        chain.angle(voltage),
+        array.steering_angle(phase),
         linearised_angle(array, phase),
         linearisation_error(array, phase),
     )
