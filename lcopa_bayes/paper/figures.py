@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 import numpy as np
+import pandas as pd
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.data.drive import AxisDrive, axis_drives, first_change
@@ -66,6 +67,21 @@ class Panel:
     curves: tuple[Curve, ...]
     printed_level: float | None
     """Steady response that the text gives for this axis [response unit]; None when it gives none."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values without the samples."""
+        names = ("record", "axis", "unit", "held_out", "figure", "printed_level")
+        curves = [
+            {"model": curve.kind, "rmse": curve.rmse, "printed_rmse": curve.printed_rmse}
+            for curve in self.curves
+        ]
+        return {name: getattr(self, name) for name in names} | {"curves": curves}
+
+    def csv(self) -> str:
+        """Samples: time [time unit], observed, and each model [response unit]."""
+        columns = {"time": self.time, "observed": self.observed}
+        table = pd.DataFrame(columns | {curve.kind: curve.response for curve in self.curves})
+        return str(table.to_csv(index=False, float_format="%.9g"))
 
 
 def panels(study: Study, identified: Sequence[Identification], stated: Stated = PAPER) -> tuple[Panel, ...]:

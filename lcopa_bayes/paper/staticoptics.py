@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from math import pi
 from typing import Any, final
 
@@ -10,17 +10,15 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.estimate import plain
-from lcopa_bayes.optics.chain import linearisation_error, linearised_angle, paper_chain
-from lcopa_bayes.optics.checks import finite
+from lcopa_bayes.optics.cell import Field
 from lcopa_bayes.optics.director import Profile, equilibrium
 from lcopa_bayes.optics.farfield import LinearPatterns, PlanarPattern, planar_patterns, steered_patterns
 from lcopa_bayes.optics.lobes import LobeRow, lobe_table, main_lobe, side_lobe_level
+from lcopa_bayes.optics.steering import linearisation_error, linearised_angle
 from lcopa_bayes.optics.tiltlaw import RANGES, TiltLawCheck, continuous_law, printed_law, tilt_law_check
 from lcopa_bayes.paper.opticsplan import OpticsPlan
 
 _CHAIN_POINTS = 241
-_NOTHING = 1e-12
-"""Relative intensity that is zero but for rounding [-]."""
 
 
 @final
@@ -78,19 +76,34 @@ class StaticOptics:
         optics = self.plan.optics
         return np.array([law(self.plan.voltages) for law in (printed_law(optics), continuous_law(optics))])
 
+    @property
+    def verdict(self) -> str:
+        """Threshold and strongest grating lobe in a sentence."""
+        aside = [row for row in self.lobes if row.order]
+        best = max(aside, key=lambda row: row.with_element, default=None)
+        said = (
+            "no grating lobe propagates"
+            if best is None
+            else f"the strongest grating lobe has {best.with_element:.2g} of the main lobe, steered to "
+            f"{np.degrees(best.target):.3g} deg"
+        )
+        return f"The director tilts above {self.check.threshold:.4f} V; {said}."
+
     def as_json(self) -> dict[str, Any]:
         """Plain values; every number says its unit in its name or beside it."""
         optics, chain = self.plan.optics, self.chain
         fits = zip(RANGES, self.check.printed, self.check.continuous, self.check.best, strict=True)
         fields: dict[str, Any] = plain(
             {
+                "plan": asdict(self.plan),
+                "verdict": self.verdict,
                 "array": {
                     "elements": optics.elements,
                     "pitch_m": optics.pitch_in_wavelengths * optics.wavelength,
                     "wavelength_m": optics.wavelength,
                     "fill_factor": self.plan.fill_factor,
                 },
-                "field": self.plan.field.value,
+                "field": self.plan.field,
                 "pretilt_rad": self.plan.pretilt,
                 "threshold_voltage": {"value": self.check.threshold, "unit": "V"},
                 "mean_tilt": [
@@ -152,22 +165,6 @@ class StaticOptics:
         )
         return fields
 
-    def words(self) -> list[str]:
-        """A short table to read."""
-        lines = [
-            f"threshold voltage {self.check.threshold:.4f} V",
-            "",
-            "voltage [V]  mean tilt [rad]  Eq. 24",
-        ]
-        for profile, law in zip(self.profiles, self.laws[0], strict=True):
-            lines.append(f"{profile.voltage:11.4g}  {profile.mean:15.5f}  {law:.5f}")
-        lines += ["", "target [deg]  phase step [rad]  lobes: order, angle [deg], intensity over main lobe"]
-        for each in self.steered:
-            own = [row for row in self.lobes if row.target == each.target and row.order]
-            said = "; ".join(f"{r.order:+d}, {np.degrees(r.angle):.1f}, {_height(r):.2g}" for r in own)
-            lines.append(f"{np.degrees(each.target):12.4g}  {each.phase_step:16.4f}  {said or 'none'}")
-        return lines
-
 
 def static_optics(plan: OpticsPlan) -> StaticOptics:
     """Solve and evaluate everything; errors as in the optics modules."""
@@ -180,8 +177,8 @@ def static_optics(plan: OpticsPlan) -> StaticOptics:
         steered.append(Steered(float(target), step, lobe, side))
     return StaticOptics(
         plan,
-        tilt_law_check(optics, field=plan.field, pretilt=plan.pretilt),
-        tuple(equilibrium(plan.cell, volt, field=plan.field) for volt in plan.voltages),
+        tilt_law_check(optics, field=Field(plan.field), pretilt=plan.pretilt),
+        tuple(equilibrium(plan.cell, volt, field=Field(plan.field)) for volt in plan.voltages),
         steered_patterns(optics),
         planar_patterns(optics),
         tuple(steered),
@@ -190,22 +187,17 @@ def static_optics(plan: OpticsPlan) -> StaticOptics:
     )
 
 
-def _height(row: LobeRow) -> float:
-    return row.with_element if row.with_element > _NOTHING else 0.0
-
-
 def _chain(plan: OpticsPlan) -> ChainCurves:
     """Up to the knee of Eq. 24, or to where the phase steers to end-fire."""
-    array = plan.array
-    chain = paper_chain(plan.optics, array=array)
-    end = min(np.nextafter(chain.voltage_limit, 0), 2 * pi / array.period / chain.phase_per_volt)
-    voltage = finite(np.linspace(0.0, end, _CHAIN_POINTS), name="voltage")
-    phase = chain.phase(voltage)
+    array, optics = plan.array, plan.optics
+    end = min(np.nextafter(optics.knee_voltage, 0), 2 * pi / array.period / optics.phase_per_volt)
+    voltage = np.linspace(0.0, end, _CHAIN_POINTS)
+    phase = optics.phase_per_volt * voltage
     return ChainCurves(
         voltage,
-        chain.tilt(voltage),
+        optics.tilt_slope_low * voltage,
         phase,
-        chain.angle(voltage),
+        array.steering_angle(phase),
         linearised_angle(array, phase),
         linearisation_error(array, phase),
     )

@@ -104,5 +104,5 @@ def earlier(folder: Path, verb: str, needs: Sequence[str]) -> Mapping[str, Any]:
         ) from None
     absent = [key for key in needs if key not in results] if isinstance(results, dict) else list(needs)
     if absent:
-        raise InputError(f"{path}: lacks {', '.join(absent)}; run `{verb}` again with --resume")
+        raise InputError(f"{path}: lacks {', '.join(absent)}; run `{verb}` again")
     return results

@@ -9,8 +9,8 @@ import numpy as np
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.literature import PAPER, Stated
 from lcopa_bayes.optics.array import LinearArray, paper_array
-from lcopa_bayes.optics.chain import geometry_check, linearisation_error
 from lcopa_bayes.optics.lobes import strongest_grating_lobe
+from lcopa_bayes.optics.steering import geometry_check, linearisation_error
 from lcopa_bayes.optics.tiltlaw import continuous_law, printed_law
 from lcopa_bayes.paper.crosstalkclaims import crosstalk_rules
 from lcopa_bayes.paper.equation import response_to

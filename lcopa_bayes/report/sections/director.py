@@ -16,7 +16,7 @@ def sections(calculated: StaticOptics) -> list[Section]:
     plan = calculated.plan
     text = (
         "Tilt counts from the plates; the director lies in one plane and varies across the cell only "
-        f"(Eq. 20). Field: {plan.field.value}; pretilt {figures(plan.pretilt)} rad. Threshold "
+        f"(Eq. 20). Field: {plan.field}; pretilt {figures(plan.pretilt)} rad. Threshold "
         f"pi sqrt(k1 / deps) = {figures(calculated.check.threshold, 4)} V."
     )
     director = Section(
