@@ -15,8 +15,8 @@ from lcopa_bayes.bench.command import quiet, step, two_axis
 from lcopa_bayes.bench.device import PAPER_DEVICE, Device
 from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.core.files import told_as, writable_folder, write_text
-from lcopa_bayes.data.literature import PAPER
 from lcopa_bayes.data.record import Record, save_record
+from lcopa_bayes.model.literature import PAPER
 
 PAPER_DURATION = 25.0
 """Length of a record of Ta et al. 2026, Figs. 13 to 17 [ms], read off the figures."""

@@ -36,10 +36,12 @@ import numpy as np
 
 from lcopa_bayes.bench.acquisition import PAPER_BENCH, Bench, simulate
 from lcopa_bayes.bench.command import Command, on_off, prbs, quiet, staircase, step
-from lcopa_bayes.bench.device import PAPER_DEVICE, Device, TransferPath
+from lcopa_bayes.bench.device import PAPER_DEVICE, Device
+from lcopa_bayes.bench.inversion import unsuited
 from lcopa_bayes.bench.undeclared import UndeclaredPlan
 from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.model.path import TransferPath
 
 _TABLES = {"campaign", "bench", "path", "record", "undeclared"}
 _MEASURED = ("bench", "path", "record")
@@ -159,10 +161,12 @@ def _device(path: Path, entries: list[Mapping[str, Any]]) -> Device:
         values = {key: entry[key] for key in _PATH_KEYS - {"response", "drive"}}
         values |= {"etas": tuple(entry["etas"]), "orders": tuple(entry["orders"])}
         try:
-            path_model = TransferPath(**values)
+            listed = TransferPath(**values)
+            if problems := unsuited(listed):
+                raise InputError(problems)
         except InputError as error:
             raise InputError([f"{path}: [[path]] {problem}" for problem in error.problems]) from None
-        table[responses.index(entry["response"])][drives.index(entry["drive"])] = path_model
+        table[responses.index(entry["response"])][drives.index(entry["drive"])] = listed
     return Device(
         tuple(tuple(row) for row in table),
         tuple(Axis(name, "rad") for name in drives),

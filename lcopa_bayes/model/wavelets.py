@@ -18,8 +18,8 @@ The printed equations are inconsistent in three places; this module uses:
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
+import timeit
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import final
@@ -30,6 +30,7 @@ from scipy.linalg import solve_triangular
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.model.blockpulses import integration_matrix, shift_matrix
+from lcopa_bayes.model.path import TransferPath
 
 
 def legendre(degree: int, x: Array) -> Array:
@@ -125,54 +126,35 @@ def printed_shift(blocks: int, n: int) -> Matrix:
     return np.asarray(shift_matrix(blocks, n).T)
 
 
-@final
-@dataclass(frozen=True)
-class PrintedEquation:
-    """``b u(t - j1 h) = sum_i eta_i D^order_i y + k y`` for a record of length `span` (Eqs. 59-61)."""
+def wavelet_response(
+    path: TransferPath, drive: Vector, basis: WaveletBasis, span: float, blocks: int
+) -> Vector:
+    """Response at the nodes, (N,) [response unit], to block values of the drive (N,) [drive unit].
 
-    gain: float
-    """b [response unit per drive unit, times stiffness]."""
-    etas: Sequence[float]
-    """Viscosities [time unit^order]."""
-    orders: Sequence[float]
-    """Orders [-], the first one largest."""
-    stiffness: float
-    """k [-]."""
-    blocks: int
-    """j1, the delay in whole blocks [-]."""
-    span: float
-    """Tf [time unit]."""
+    Eq. 61 of `path` solved for ``Y^T`` over a record of length `span` [time unit], with `blocks` whole blocks
+    for its delay. Accuracy: `block_pulse_response` to rounding.
+    """
+    system = _system(path, lambda order: basis.integration(order, span))
+    forced = basis.delayed_integration(path.orders[0], blocks, span)
+    right = path.gain * basis.coefficients(drive) @ forced
+    return np.asarray(np.linalg.solve(system.T, right) @ basis.psi)
 
-    def wavelet_response(self, drive: Vector, basis: WaveletBasis) -> Vector:
-        """Response at the nodes, (N,) [response unit], for block values of the drive (N,) [drive unit].
 
-        Eq. 61 solved for ``Y^T``. Accuracy: `block_pulse_response` to rounding.
-        """
-        system = self._system(lambda order: basis.integration(order, self.span))
-        forced = basis.delayed_integration(self.orders[0], self.blocks, self.span)
-        right = self.gain * basis.coefficients(drive) @ forced
-        return np.asarray(np.linalg.solve(system.T, right) @ basis.psi)
+def block_pulse_response(path: TransferPath, drive: Vector, span: float, blocks: int) -> Vector:
+    """`wavelet_response` in block-pulse coordinates, where the system is triangular; any number of blocks."""
+    n = drive.size
+    system = _system(path, lambda order: printed_integration(order, n, span))
+    forced = printed_integration(path.orders[0], n, span)
+    late = np.concatenate((np.zeros(min(blocks, n)), drive[: max(0, n - blocks)]))
+    return np.asarray(solve_triangular(system, path.gain * (late @ forced), trans="T"))
 
-    def block_pulse_response(self, drive: Vector, *, triangular: bool = True) -> Vector:
-        """The same in block-pulse coordinates; any number of blocks.
 
-        The system is triangular there; `triangular` False solves it without using that.
-        """
-        n = drive.size
-        system = self._system(lambda order: printed_integration(order, n, self.span))
-        forced = printed_integration(self.orders[0], n, self.span)
-        late = np.concatenate((np.zeros(min(self.blocks, n)), drive[: max(0, n - self.blocks)]))
-        right = self.gain * (late @ forced)
-        if triangular:
-            return np.asarray(solve_triangular(system, right, trans="T"))
-        return np.asarray(np.linalg.solve(system.T, right))
-
-    def _system(self, integration: Callable[[float], Matrix]) -> Matrix:
-        top = self.orders[0]
-        system = self.stiffness * integration(top)
-        for eta, order in zip(self.etas, self.orders, strict=True):
-            system = system + eta * integration(top - order)
-        return system
+def _system(path: TransferPath, integration: Callable[[float], Matrix]) -> Matrix:
+    top = path.orders[0]
+    system = path.stiffness * integration(top)
+    for eta, order in zip(path.etas, path.orders, strict=True):
+        system = system + eta * integration(top - order)
+    return system
 
 
 @final
@@ -186,12 +168,8 @@ class FormCost:
     """Fastest wavelet-form solve [s]; Psi and its inverse are ready and not counted."""
     block_pulse_seconds: float
     """Fastest block-pulse solve [s]."""
-    general_seconds: float
-    """Fastest block-pulse solve that does not use the triangle [s]."""
     difference: float
     """Largest difference of the two responses over the largest response [-]."""
-    condition: float
-    """Condition number of Psi [-]."""
     largest_overlap: float
     """Largest inner product of two different basis functions [-]."""
 
@@ -200,41 +178,25 @@ class FormCost:
         """Cost of the wavelet form in block-pulse solves [-]."""
         return self.wavelet_seconds / self.block_pulse_seconds
 
-    @property
-    def general_ratio(self) -> float:
-        """Cost of the wavelet form in block-pulse solves that do not use the triangle [-]."""
-        return self.wavelet_seconds / self.general_seconds
 
+def form_cost(path: TransferPath, drive: float, span: float, n: int, *, repeats: int = 5) -> FormCost:
+    """Both forms of the response to a step of `drive` [drive unit] at time 0 on `n` blocks, timed.
 
-def form_costs(
-    equation: PrintedEquation, drive: float, sizes: Sequence[int] = (64, 128, 256, 512), *, repeats: int = 3
-) -> tuple[FormCost, ...]:
-    """Both forms of the response to a step of `drive` [drive unit] at time 0, timed for each size."""
-    out = []
-    for n in sizes:
-        basis, step = WaveletBasis(n), np.full(n, drive)
-        plain = partial(equation.block_pulse_response, step)
-        wavelet = partial(equation.wavelet_response, step, basis)
-        general = partial(plain, triangular=False)
-        reference = plain()
-        out.append(
-            FormCost(
-                n,
-                difference=float(np.abs(wavelet() - reference).max() / np.abs(reference).max()),
-                wavelet_seconds=_fastest(wavelet, repeats),
-                block_pulse_seconds=_fastest(plain, repeats),
-                general_seconds=_fastest(general, repeats),
-                condition=float(np.linalg.cond(basis.psi)),
-                largest_overlap=basis.largest_overlap,
-            )
-        )
-    return tuple(out)
+    The record lasts `span` [time unit]; the delay of the path is rounded to whole blocks.
+    """
+    basis, step = WaveletBasis(n), np.full(n, drive)
+    late = round(path.delay * n / span)
+    plain = partial(block_pulse_response, path, step, span, late)
+    wavelet = partial(wavelet_response, path, step, basis, span, late)
+    reference = plain()
+    return FormCost(
+        n,
+        difference=float(np.abs(wavelet() - reference).max() / np.abs(reference).max()),
+        wavelet_seconds=_fastest(wavelet, repeats),
+        block_pulse_seconds=_fastest(plain, repeats),
+        largest_overlap=basis.largest_overlap,
+    )
 
 
 def _fastest(work: Callable[[], object], repeats: int) -> float:
-    best = np.inf
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        work()
-        best = min(best, time.perf_counter() - begin)
-    return best
+    return min(timeit.repeat(work, number=1, repeat=repeats))

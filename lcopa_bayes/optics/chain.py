@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from lcopa_bayes.core.arrays import Array
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.literature import PAPER, Stated, StatedOptics
+from lcopa_bayes.model.literature import PAPER, Stated, StatedOptics
 from lcopa_bayes.optics.array import LinearArray, paper_array
 from lcopa_bayes.optics.checks import finite, unless_positive
 

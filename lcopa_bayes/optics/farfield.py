@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.literature import PAPER, StatedOptics
+from lcopa_bayes.model.literature import PAPER, StatedOptics
 from lcopa_bayes.optics.array import LinearArray, PlanarArray, paper_array
 from lcopa_bayes.optics.checks import finite
 

@@ -12,7 +12,7 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.special import spherical_jn
 
 from lcopa_bayes.core.arrays import Vector, frozen
-from lcopa_bayes.data.literature import PAPER, StatedOptics
+from lcopa_bayes.model.literature import PAPER, StatedOptics
 from lcopa_bayes.optics.array import LinearArray, PlanarArray, paper_array
 from lcopa_bayes.optics.checks import finite
 from lcopa_bayes.optics.farfield import element_factor, intensity

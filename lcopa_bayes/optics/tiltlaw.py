@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.literature import PAPER, StatedOptics
+from lcopa_bayes.model.literature import PAPER, StatedOptics
 from lcopa_bayes.optics.cell import Cell, Field, paper_cell
 from lcopa_bayes.optics.checks import finite
 from lcopa_bayes.optics.director import CELLS, equilibrium

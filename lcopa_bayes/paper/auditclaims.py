@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from lcopa_bayes.data.literature import Stated
+from lcopa_bayes.model.literature import Stated
 from lcopa_bayes.paper.posteriorclaims import needs_audit
 from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict, earlier
 

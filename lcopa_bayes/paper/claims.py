@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lcopa_bayes.data.literature import PAPER, Stated
+from lcopa_bayes.model.literature import PAPER, Stated
 from lcopa_bayes.paper import (
     auditclaims,
     comparisonclaims,

@@ -7,7 +7,7 @@ from math import hypot, log
 from pathlib import Path
 from typing import Any
 
-from lcopa_bayes.data.literature import Stated
+from lcopa_bayes.model.literature import Stated
 from lcopa_bayes.paper.posteriorclaims import needs_comparison
 from lcopa_bayes.paper.printedmodel import integer_rival
 from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict, earlier

@@ -14,10 +14,11 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.data.drive import AxisDrive, axis_drives, first_change
-from lcopa_bayes.data.literature import PAPER, Stated
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.paper.equation import PathModel, response_to
+from lcopa_bayes.model.literature import PAPER, Stated
+from lcopa_bayes.model.path import TransferPath
+from lcopa_bayes.paper.equation import response_to
 from lcopa_bayes.paper.identify import Identification, Identified
 from lcopa_bayes.paper.paths import resting_level
 
@@ -132,7 +133,7 @@ def _response(
     for each in identified:
         drive = AxisDrive.of_rows(record.time, record.drive[:, each.data.drive])
         if each.data.response == response and drive.moves:
-            model: PathModel = model_of(each, kind).model
+            model: TransferPath = model_of(each, kind).model
             out += response_to(drive, model, times, exposure=study.exposure)
     return out
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-from lcopa_bayes.data.literature import PAPER, Stated
-from lcopa_bayes.model.wavelets import FormCost, PrintedEquation, form_costs
+from lcopa_bayes.model.literature import PAPER, Stated
+from lcopa_bayes.model.wavelets import FormCost, form_cost
 from lcopa_bayes.paper.printedmodel import RECORD_LENGTH
 from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict
 from lcopa_bayes.paper.wholeblocks import DelayRounding, delay_rounding
@@ -39,10 +39,7 @@ def wavelets(stated: Stated, evidence: Evidence) -> Verdict:
 @lru_cache(maxsize=4)
 def wavelet_cost(stated: Stated = PAPER, blocks: int = WAVELET_BLOCKS) -> FormCost:
     """Both forms of the response of the direct path to the step of Fig. 13."""
-    path = stated.plant.xx
-    late = round(path.delay * blocks / RECORD_LENGTH)
-    equation = PrintedEquation(path.gain, path.etas, path.orders, path.stiffness, late, RECORD_LENGTH)
-    return form_costs(equation, stated.records.step_drive, (blocks,), repeats=5)[0]
+    return form_cost(stated.plant.xx, stated.records.step_drive, RECORD_LENGTH, blocks)
 
 
 def whole_blocks(stated: Stated, evidence: Evidence) -> Verdict:

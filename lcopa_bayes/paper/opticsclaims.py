@@ -7,7 +7,7 @@ from math import pi
 
 import numpy as np
 
-from lcopa_bayes.data.literature import PAPER, Stated, StatedOptics
+from lcopa_bayes.model.literature import PAPER, Stated, StatedOptics
 from lcopa_bayes.optics.array import LinearArray, paper_array
 from lcopa_bayes.optics.cell import Field
 from lcopa_bayes.optics.chain import geometry_check, linearisation_row

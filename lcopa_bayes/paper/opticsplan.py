@@ -8,7 +8,7 @@ from math import isfinite, pi
 from typing import final
 
 from lcopa_bayes.core.errors import InputError, nearest
-from lcopa_bayes.data.literature import PAPER, StatedOptics
+from lcopa_bayes.model.literature import PAPER, StatedOptics
 from lcopa_bayes.optics.array import LinearArray
 from lcopa_bayes.optics.cell import Cell, Field, paper_cell
 

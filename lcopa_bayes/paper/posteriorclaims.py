@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from lcopa_bayes.data.literature import Stated
+from lcopa_bayes.model.literature import Stated
 from lcopa_bayes.paper.printedmodel import integer_rival
 from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict
 

@@ -15,9 +15,10 @@ import numpy as np
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.data.drive import AxisDrive
-from lcopa_bayes.data.literature import PAPER, Stated
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.paper.equation import PathModel, response_to
+from lcopa_bayes.model.literature import PAPER, Stated
+from lcopa_bayes.model.path import TransferPath
+from lcopa_bayes.paper.equation import response_to
 from lcopa_bayes.paper.figures import KINDS, model_of, paper_figure
 from lcopa_bayes.paper.identify import Identification
 from lcopa_bayes.results.steps import crossing, settling
@@ -59,7 +60,7 @@ class Step:
     """Of the steady value [-]; 0 when the peak stays below it."""
 
 
-def step_of(model: PathModel, size: float, span: float) -> Step:
+def step_of(model: TransferPath, size: float, span: float) -> Step:
     """Metrics of the response to a step of `size` [drive unit] over a record of length `span` [time unit].
 
     Settling and rise are about the value the response tends to, as for a posterior.

@@ -11,7 +11,7 @@ from typing import Any, final
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import plain
-from lcopa_bayes.data.literature import Stated
+from lcopa_bayes.model.literature import Stated
 
 
 class Kind(Enum):

@@ -17,13 +17,13 @@ import numpy as np
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.drive import AxisDrive
-from lcopa_bayes.data.literature import PAPER, StatedPath
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.data.settings import ModelSettings
-from lcopa_bayes.model.element import PaperForm, from_paper
 from lcopa_bayes.model.forward import Dynamics, Experiment, ForwardModel
 from lcopa_bayes.model.grid import Mesh
 from lcopa_bayes.model.layout import Layout
+from lcopa_bayes.model.literature import PAPER
+from lcopa_bayes.model.path import TransferPath
 
 _FINE = 4000
 """Blocks of the response itself, so many that only the rounding of the delay shows [-]."""
@@ -73,7 +73,7 @@ class DelayRounding:
 
 
 def delay_rounding(
-    path: StatedPath = PAPER.plant.xx,
+    path: TransferPath = PAPER.plant.xx,
     *,
     blocks: int,
     delay: float | None = None,
@@ -140,13 +140,12 @@ def _sd(jacobian: Matrix) -> Vector:
     return np.asarray(np.linalg.norm(np.linalg.inv(factor), axis=1) / scale)
 
 
-def _response(path: StatedPath, times: Vector, drive: float, delay: float) -> tuple[Vector, Matrix]:
+def _response(path: TransferPath, times: Vector, drive: float, delay: float) -> tuple[Vector, Matrix]:
     """Response at `times` and its Jacobian in the gain, log times, orders and delay."""
-    gain, element = from_paper(PaperForm(path.gain, path.etas, path.orders, path.stiffness))
     axis = Axis("x", "rad")
     layout = Layout.of([axis], [axis], ModelSettings(terms=len(path.orders)))
     mesh = Mesh.of_samples(times, 0.0, blocks=_FINE)
     experiment = Experiment("step", mesh, (AxisDrive(np.zeros(1), np.array([drive])),), np.zeros(1))
-    dynamics = Dynamics((np.array([element.times]),), (np.array([element.orders]),), np.array([[delay]]))
+    dynamics = Dynamics((np.array([path.times]),), (np.array([path.orders]),), np.array([[delay]]))
     unit, slopes = ForwardModel(layout, (experiment,)).unit_slopes(dynamics)[0]
-    return gain * unit[0, 0], np.concatenate([unit[0], gain * slopes[0][:, 0]]).T
+    return path.steady * unit[0, 0], np.concatenate([unit[0], path.steady * slopes[0][:, 0]]).T

@@ -27,7 +27,7 @@ from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.bench.acquisition import Bench, truth
 from lcopa_bayes.bench.command import staircase
-from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.bench.device import Device
 from lcopa_bayes.calibration.simulation import measured
 from lcopa_bayes.comparison.candidates import candidates_of
 from lcopa_bayes.comparison.gains import by_evidence, simplest
@@ -38,6 +38,7 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.identifiability.curvature import curvature
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.likelihood import Landscape
+from lcopa_bayes.model.path import TransferPath
 from lcopa_bayes.results.prediction import responses
 from lcopa_bayes.sampling.draws import gather
 from lcopa_bayes.sampling.evidence import evidence

@@ -17,13 +17,13 @@ from scipy.linalg import solve_triangular
 from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.data.drive import AxisDrive
-from lcopa_bayes.data.literature import PAPER
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.model.blockpulses import integration_matrix
 from lcopa_bayes.model.forward import Dynamics, Experiment, ForwardModel
 from lcopa_bayes.model.grid import Mesh
 from lcopa_bayes.model.layout import Layout
+from lcopa_bayes.model.literature import PAPER
 
 SPAN = 25.0
 BATCH = 64

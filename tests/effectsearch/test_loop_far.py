@@ -9,7 +9,7 @@ import pytest
 
 from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import step
-from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.bench.device import Device
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Axis, Record
@@ -29,6 +29,7 @@ from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.model.effects import superposition
 from lcopa_bayes.model.effects.catalogue import catalogue
+from lcopa_bayes.model.path import TransferPath
 
 RECORDS = Path(os.environ.get("LCOPA_BAYES_DATA", Path(__file__).parents[2] / ".." / "shared")) / "records"
 AXIS = (Axis("x", "rad"),)

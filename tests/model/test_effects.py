@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from small import ONE, problem, record
 
 from lcopa_bayes.bench.command import on_off, prbs, staircase, two_axis
-from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.bench.device import Device
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Axis
@@ -32,6 +32,7 @@ from lcopa_bayes.model.effects.parallel import Backflow
 from lcopa_bayes.model.effects.response import OddCurvature
 from lcopa_bayes.model.effects.ripples import Vibration
 from lcopa_bayes.model.effects.sensor import SensorLag
+from lcopa_bayes.model.path import TransferPath
 from lcopa_bayes.results.prediction import responses
 
 NAMES = [

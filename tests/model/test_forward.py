@@ -12,15 +12,15 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from lcopa_bayes.bench.command import Command, prbs, staircase, step
-from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.bench.device import Device
 from lcopa_bayes.data.drive import AxisDrive
-from lcopa_bayes.data.literature import PAPER
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings
-from lcopa_bayes.model.element import PaperForm, from_paper
 from lcopa_bayes.model.forward import Dynamics, Experiment, ForwardModel, forward_model
 from lcopa_bayes.model.grid import Mesh
 from lcopa_bayes.model.layout import Layout
+from lcopa_bayes.model.literature import PAPER
+from lcopa_bayes.model.path import TransferPath
 
 X, Y = Axis("x", "rad"), Axis("y", "rad")
 UNIT_STEP = AxisDrive(np.zeros(1), np.ones(1))
@@ -42,10 +42,7 @@ def respond(element, delay: float, drive: AxisDrive, times: np.ndarray, **option
 
 
 def on_bench(element, delay: float, command: Command, times: np.ndarray, exposure: float = 0.0) -> np.ndarray:
-    etas: dict[float, float] = {}
-    for time, order in zip(*element, strict=True):
-        etas[order] = etas.get(order, 0.0) + time**order
-    path = TransferPath(1.0, delay, tuple(etas.values()), tuple(etas), 1.0)
+    path = TransferPath.of_times(1.0, delay, *element).merged()
     device = Device(((path,),), (X,), (X,), (0.0,))
     return device.response(command, times, exposure=exposure)[:, 0] - command.rest[0]
 
@@ -64,7 +61,6 @@ def order_of(errors: Sequence[float]) -> float:
 
 def test_reference_of_the_paper_at_1024_blocks():
     path = PAPER.plant.xx
-    gain, element = from_paper(PaperForm(path.gain, path.etas, path.orders, path.stiffness))
     exact = {
         3.5: 0.0008158871940552879,
         5.0: 0.006599891310313528,
@@ -73,7 +69,7 @@ def test_reference_of_the_paper_at_1024_blocks():
         25.0: 0.01739526378981913,
     }
     times = 0.5 * np.arange(1, 51)
-    both = (element.times, element.orders)
+    gain, both = path.steady, (path.times, path.orders)
     read = gain * respond(both, path.delay, UNIT_STEP, times, blocks=1024)
     off = [(read[round(2 * t) - 1] - value) / gain for t, value in exact.items()]
     assert np.abs(off).max() < 1e-5  # 6.3e-6 at 3.5, right after the onset

@@ -8,13 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lcopa_bayes.bench.device import TransferPath
+from lcopa_bayes.bench.inversion import unit_ramp, unit_step
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.model.forward import Dynamics, Experiment, ForwardModel
 from lcopa_bayes.model.grid import Mesh
 from lcopa_bayes.model.layout import Layout
+from lcopa_bayes.model.path import TransferPath
 from lcopa_bayes.model.powerseries import Circle
 from lcopa_bayes.model.stepresponse import StepResponse, step_response, taps
 from lcopa_bayes.model.superposition import phases
@@ -34,8 +35,8 @@ Element = tuple[tuple[float, ...], tuple[float, ...]]
 def exact(element: Element, time: np.ndarray, integral: bool = False) -> np.ndarray:
     """Zero up to the onset."""
     etas = tuple(time**order for time, order in zip(*element, strict=True))
-    compliance = TransferPath(1.0, 0.0, etas, element[1], 1.0).compliance
-    return np.asarray((compliance.ramp_response if integral else compliance.step_response)(time))
+    path = TransferPath(1.0, 0.0, etas, element[1], 1.0)
+    return (unit_ramp if integral else unit_step)(path, time)
 
 
 def solved(element: Element, *, step: float = STEP, slopes: bool = False) -> StepResponse:

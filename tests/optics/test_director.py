@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.special import ellipk
 
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.literature import PAPER
+from lcopa_bayes.model.literature import PAPER
 from lcopa_bayes.optics.cell import Cell, Field, paper_cell
 from lcopa_bayes.optics.director import NotConverged, equilibrium, grid_threshold
 from lcopa_bayes.optics.firstintegral import quadrature

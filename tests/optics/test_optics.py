@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.literature import PAPER
+from lcopa_bayes.model.literature import PAPER
 from lcopa_bayes.optics.array import LinearArray, PlanarArray, paper_array
 from lcopa_bayes.optics.chain import (
     geometry_check,

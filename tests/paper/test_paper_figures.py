@@ -13,11 +13,10 @@ from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import on_off, step
 from lcopa_bayes.bench.device import PAPER_DEVICE
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.literature import PAPER
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.model.element import PaperForm
-from lcopa_bayes.paper.equation import PathModel
+from lcopa_bayes.model.literature import PAPER
+from lcopa_bayes.model.path import TransferPath
 from lcopa_bayes.paper.figures import KINDS, panels, paper_figure
 from lcopa_bayes.paper.identify import identify
 from lcopa_bayes.paper.intervals import Interval, Scan
@@ -72,8 +71,8 @@ def test_a_pulse_is_no_step():
 # -- metrics ---------------------------------------------------------------------------------------
 
 
-def model(orders=(1.0,), etas=(2.0,), gain=0.3, delay=1.5) -> PathModel:
-    return PathModel(PaperForm(gain, etas, orders, 1.0), delay)
+def model(orders=(1.0,), etas=(2.0,), gain=0.3, delay=1.5) -> TransferPath:
+    return TransferPath(gain, delay, etas, orders, 1.0)
 
 
 def test_first_order_metrics():

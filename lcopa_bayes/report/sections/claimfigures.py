@@ -7,7 +7,7 @@ from math import pi
 import numpy as np
 
 from lcopa_bayes.data.drive import AxisDrive
-from lcopa_bayes.data.literature import PAPER, Stated
+from lcopa_bayes.model.literature import PAPER, Stated
 from lcopa_bayes.optics.array import LinearArray, paper_array
 from lcopa_bayes.optics.chain import geometry_check, linearisation_error
 from lcopa_bayes.optics.lobes import strongest_grating_lobe

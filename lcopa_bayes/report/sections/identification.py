@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lcopa_bayes.paper.equation import Convention
+from lcopa_bayes.model.path import Normalisation
 from lcopa_bayes.paper.figures import KINDS, Panel
 from lcopa_bayes.paper.identify import Identification
 from lcopa_bayes.paper.steptable import PRINTED, Row
@@ -34,7 +34,7 @@ def sections(
             ),
             tables=(
                 _errors(identified, time_unit),
-                *(_coefficients(identified, each) for each in Convention),
+                *(_coefficients(identified, each) for each in Normalisation),
             ),
         ),
         Section(
@@ -66,7 +66,7 @@ def _errors(identified: Sequence[Identification], time_unit: str) -> Table:
     )
     rows = tuple(
         (
-            *(each.data.name, result.method, ", ".join(figures(o) for o in result.model.form.orders)),
+            *(each.data.name, result.method, ", ".join(figures(o) for o in result.model.orders)),
             *(figures(result.model.delay, 4), figures(result.model.steady, 4), figures(result.equation_rmse)),
             *(figures(result.output_rmse), NONE if result.candidates is None else f"{result.candidates}"),
             "yes" if result.model.physical else "no",
@@ -82,7 +82,7 @@ def _errors(identified: Sequence[Identification], time_unit: str) -> Table:
     return Table(columns, rows, caption)
 
 
-def _coefficients(identified: Sequence[Identification], convention: Convention) -> Table:
+def _coefficients(identified: Sequence[Identification], normalisation: Normalisation) -> Table:
     columns = (
         *(Column("path"), Column("model"), Column("gain b", "number")),
         *(Column("viscosities", "interval"), Column("k", "number")),
@@ -91,12 +91,12 @@ def _coefficients(identified: Sequence[Identification], convention: Convention) 
     for each in identified:
         given = each.stiffness[0][0]
         for result in each.models:
-            form = result.model.scaled(convention, given)
-            etas = ", ".join(figures(eta) for eta in form.etas)
+            path = result.model.normalised(normalisation, given)
+            etas = ", ".join(figures(eta) for eta in path.etas)
             rows.append(
-                (each.data.name, result.method, figures(form.gain, 4), etas, figures(form.stiffness, 4))
+                (each.data.name, result.method, figures(path.gain, 4), etas, figures(path.stiffness, 4))
             )
-    return Table(columns, tuple(rows), f"Coefficients scaled so that: {convention.value}.")
+    return Table(columns, tuple(rows), f"Coefficients scaled so that: {normalisation.value}.")
 
 
 def _drawing(number: int, panel: Panel, time_unit: str) -> Drawing:
