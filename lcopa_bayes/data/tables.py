@@ -63,13 +63,13 @@ def prior_settings(
                 priors[name] = PriorSettings(name, fixed=value)
         except InputError as error:
             problems += [f"{where}: {problem}" for problem in error.problems]
-    wrong = [] if improper else [name for name, prior in priors.items() if prior.improper]
+    wrong = {} if improper else {name: prior for name, prior in priors.items() if prior.improper}
     problems += [
-        f"{where}: prior of {name!r}: {priors[name].dist} is no distribution; only a candidate of a "
-        "comparison may have such a prior"
-        for name in wrong
+        f"{where}: prior of {name!r}: {prior.dist} is no distribution; only a candidate of a comparison may "
+        "have such a prior"
+        for name, prior in wrong.items()
     ]
-    return priors
+    return {name: prior for name, prior in priors.items() if name not in wrong}
 
 
 def candidate_settings(rows: object, where: str, problems: list[str]) -> tuple[CandidateSettings, ...]:
