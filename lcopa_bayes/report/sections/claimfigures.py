@@ -160,9 +160,9 @@ def _delays(stated: Stated) -> str:
     panel = figure.subplots()
     for k, (cost, colour) in enumerate(zip(delay_costs(stated), (CYCLE[0], CYCLE[1]), strict=True)):
         at = np.arange(len(cost.shifts)) + 0.36 * (k - 0.5)
-        sizes = [abs(shift.in_sd) for shift in cost.shifts]
+        sizes = [abs(shift) for shift in cost.shifts.values()]
         panel.bar(at, sizes, 0.36, color=colour, label=f"{cost.delay:g} held at {cost.rounded:g} ms")
-    panel.set_xticks(range(len(cost.shifts)), [shift.name.replace("_", " ") for shift in cost.shifts])
+    panel.set_xticks(range(len(cost.shifts)), [name.replace("_", " ") for name in cost.shifts])
     panel.set_ylabel("shift [sd]")
     panel.set_ylim(top=panel.get_ylim()[1] * 1.25)
     panel.legend(loc="upper left", ncols=2)
