@@ -92,10 +92,12 @@ class Judged:
         return fields
 
 
-def earlier(folder: Path, verb: str, needs: Sequence[str]) -> Mapping[str, Any]:
-    """Results that `verb` wrote to a run folder; InputError when it cannot be read or lacks any of
-    `needs`."""
-    path = folder / f"{verb}.json"
+def earlier(folder: Path, verb: str, needs: Sequence[str], *, file: str | None = None) -> Mapping[str, Any]:
+    """Results that `verb` wrote to a run folder; InputError when they cannot be read or lack any of `needs`.
+
+    They are in `file`, by default the one named after the verb.
+    """
+    path = folder / (file or f"{verb}.json")
     try:
         results: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
