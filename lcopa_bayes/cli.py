@@ -111,12 +111,11 @@ def _reported(result: Reported, folder: Path) -> Outcome:
 
 def _source(options: argparse.Namespace) -> FitLike:
     """The study asked for, with the seed of the command line if one is given, or a finished fit."""
-    from lcopa_bayes.data.studyfile import load_study
-    from lcopa_bayes.verbs.sources import finished
+    from lcopa_bayes.verbs.sources import finished, study_of
 
     made = finished(options.source)
     if made is None:
-        study = load_study(options.source, held_out=options.held_out)
+        study = study_of(options.source, held_out=options.held_out)
         return study if options.seed is None else study.with_seed(options.seed)
     if options.held_out or options.seed is not None:
         raise InputError(

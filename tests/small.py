@@ -17,10 +17,6 @@ from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import (
     EffectsSettings,
-    ModelSettings,
-    NoiseSettings,
-    PriorSettings,
-    SamplerSettings,
 )
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
@@ -87,10 +83,8 @@ def study(
     seed: int = 5,
     **model: object,
 ) -> Study:
-    told = {
-        name: PriorSettings(name, dist=value[0], parameters=value[1])
-        if isinstance(value, tuple)
-        else PriorSettings(name, fixed=value)
+    stated = {
+        name: {"dist": value[0], **value[1]} if isinstance(value, tuple) else value
         for name, value in (priors or {}).items()
     }
     return Study(
@@ -100,10 +94,10 @@ def study(
         seed,
         tuple(fit),
         tuple(held_out),
-        model=ModelSettings(**model),
-        priors=told,
-        noise=NoiseSettings(noise),
-        sampler=SamplerSettings(**(sampler or {})),
+        model=model,
+        priors=stated,
+        noise={"kind": noise},
+        sampler=sampler,
     )
 
 

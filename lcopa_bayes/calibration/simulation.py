@@ -48,7 +48,7 @@ def exact_responses(problem: Problem, truth: Vector) -> list[Matrix]:
         return _simulated(problem.refined(_FINER), truth)
     return [
         device_of(posterior.table, truth, r, time_unit=study.time_unit).response(
-            command_of(samples.record), samples.times, exposure=study.model.exposure
+            command_of(samples.record), samples.times, exposure=study.exposure
         )
         for r, samples in enumerate(posterior.samples)
     ]

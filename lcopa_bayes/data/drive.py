@@ -19,7 +19,8 @@ from numpy.typing import ArrayLike
 
 from lcopa_bayes.core.arrays import Matrix, Vector, frozen
 from lcopa_bayes.core.errors import InputError, nearest
-from lcopa_bayes.data.record import TIME_UNITS, Axis, Columns, Driven, in_time_unit
+from lcopa_bayes.core.units import TIME_UNITS, in_time_unit
+from lcopa_bayes.data.record import Axis, Columns, Driven
 
 
 @final

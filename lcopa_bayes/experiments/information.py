@@ -88,7 +88,7 @@ class Bench:
     @cached_property
     def mesh(self) -> Mesh:
         """Blocks, and how samples are read from them."""
-        exposure = self.problem.study.model.exposure
+        exposure = self.problem.study.exposure
         return Mesh.of_samples(self.sample_times, 0.0, blocks=self.blocks, exposure=exposure)
 
     @cached_property

@@ -110,7 +110,7 @@ def _response(
         drive = AxisDrive.of_rows(record.time, record.drive[:, each.data.drive])
         if each.data.response == response and drive.moves:
             model: TransferPath = model_of(each, kind).model
-            out += response_to(drive, model, times, exposure=study.model.exposure)
+            out += response_to(drive, model, times, exposure=study.exposure)
     return out
 
 

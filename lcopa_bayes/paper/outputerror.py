@@ -53,7 +53,7 @@ def _posterior(
         study.time_unit,
         study.seed,
         tuple(each.record for each in data.records),
-        model=ModelSettings(terms=terms, orders=orders, offset="none", exposure=study.model.exposure),
+        model=ModelSettings(terms=terms, orders=orders, offset="none", exposure_ms=study.model.exposure_ms),
         noise=NoiseSettings("white"),
     )
     return problem_of(single).posterior

@@ -146,7 +146,7 @@ def path_data(study: Study) -> tuple[PathData, ...]:
                     f"{unknowns} unknowns; add samples or choose fewer terms under [model]"
                 )
             elif alone[j]:
-                records = tuple(_path_record(r, i, j, study.model.exposure) for r in usable)
+                records = tuple(_path_record(r, i, j, study.exposure) for r in usable)
                 if not any(np.any(each.blocks.response) for each in records):
                     problems.append(f"path {name}: the response never moves; leave its column out")
                 paths.append(PathData(i, j, name, response.unit, drive.unit, terms, records))

@@ -229,7 +229,7 @@ def test_two_axes_rests_exposure_and_missing_cells_are_kept():
     holes[3:9, 0] = np.nan
     holes[20, :] = np.nan
     holed = Record("holed", told.time, told.drive, holes, told.drive_axes, told.response_axes, "ms")
-    made = problem(told, holed, noise="ar1", terms={"direct": 2, "cross": 1}, exposure=0.1)
+    made = problem(told, holed, noise="ar1", terms={"direct": 2, "cross": 1}, exposure_ms=0.1)
     table = made.posterior.table
     truth = table.draw(1, np.random.default_rng(4))[0]
     exact = exact_responses(made, truth)

@@ -166,7 +166,7 @@ def test_a_copy_for_another_process_is_the_same_and_locked():
         (lambda: Drive.steps(x=[(0, np.nan)]), ["finite"]),
         (lambda: Drive.steps(x=[(0, 1.0)], until=-1.0), ["until"]),
         (lambda: Drive.steps(x=[(0, 1.0)], rest={"z": 0.0}, units={"w": "rad"}), ["'z'", "'w'"]),
-        (lambda: Drive.steps(x=[(0, 1.0)], time_unit="min"), ["time unit 'min'"]),
+        (lambda: Drive.steps(x=[(0, 1.0)], time_unit="day"), ["time unit 'day'"]),
         (lambda: Drive.steps(x=[(0, 1.0)], rest={"x": np.inf}), ["finite resting value"]),
         (lambda: Drive.of_arrays([0, 2, 1], x=[0, 0, 1]), ["1 comes after 2"]),
         (lambda: Drive.of_arrays([0, 1], x=[0, np.nan]), ["finite"]),
