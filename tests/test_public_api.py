@@ -265,7 +265,11 @@ def test_a_result_is_the_same_when_read_back(name, request, tmp_path):
     assert result.summary().shape[1] > 3
     values = result.to_json()
     assert json.loads(json.dumps(values, allow_nan=False)) == values
-    assert "<table" in result._repr_html_()
+    cells = re.findall(r"<td[^>]*>(.*?)</td>", html := result._repr_html_())
+    assert len(cells) == result.summary().size
+    assert html.count("<p>") == 1
+    numbers = [cell for cell in cells if re.fullmatch(r"-?\d*\.\d+", cell)]
+    assert all(len(cell.replace(".", "").lstrip("-0")) <= 4 or cell[-3] == "." for cell in numbers)
     assert result.verdict in str(result) or name == "loop"
     page = result.report(tmp_path / "run")
     assert page.is_file()
@@ -291,6 +295,12 @@ def test_a_design_and_a_loop_read_back_hold_drive_and_study(design, loop, tmp_pa
     assert found.name == loop.study.name
     assert found.effects == loop.study.effects
     np.testing.assert_array_equal(found.fit[0].response, loop.study.fit[0].response)
+
+
+def test_a_study_its_records_and_a_drive_show_what_they_hold_and_not_their_numbers():
+    assert repr(ON) == "Record('on', u [V], y [rad], 26 rows from -0.5 to 11.5 ms)"
+    assert repr(small()) == f"Study('small', fit=[{ON!r}], held_out=[{OFF!r}])"
+    assert repr(lb.Drive.steps(u=[(0, 1.57), (20, 0)])) == "Drive('drive', u, 2 rows from 0 to 20)"
 
 
 # ---- run folders

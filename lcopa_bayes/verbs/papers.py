@@ -22,6 +22,7 @@ from lcopa_bayes.paper.staticoptics import static_optics
 from lcopa_bayes.paper.steptable import load_posterior, step_table
 from lcopa_bayes.paper.verdict import Evidence
 from lcopa_bayes.report.paperpages import write_claims, write_identification, write_optics
+from lcopa_bayes.results.result import notebook_table
 from lcopa_bayes.verbs.sources import FitLike, study_of
 
 
@@ -64,7 +65,7 @@ class PaperResult:
         return "\n".join(self.lines)
 
     def _repr_html_(self) -> str:
-        return str(self.summary().to_html(index=False))
+        return notebook_table(self.summary())
 
 
 def optics(plan: OpticsPlan | None = None) -> PaperResult:
