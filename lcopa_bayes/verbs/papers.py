@@ -89,7 +89,7 @@ class ClaimsResult(StoredResult):
 
 def optics(plan: OpticsPlan | None = None) -> OpticsResult:
     """Far field, director and the chain from volts to angle; `plan` by default the paper's."""
-    return OpticsResult(static_optics(plan or OpticsPlan()).as_json(), provenance(None, "optics"))
+    return OpticsResult(static_optics(plan or OpticsPlan()).values, provenance(None, "optics"))
 
 
 def identify(
