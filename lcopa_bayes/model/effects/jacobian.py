@@ -1,4 +1,4 @@
-"""Derivatives of the responses with effects, in the coefficients and in what the plant is made of."""
+"""Derivatives of the responses with effects, in the coefficients and in the numbers of the plant."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ def coefficient_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[
     out = [np.zeros((*y.shape, simulator.size)) for y in here]
     first = 0
     for effect in simulator.effects:
-        told = effect.coefficients(simulator.ranges)
-        for k, coefficient in enumerate(told):
+        coefficients = effect.coefficients(simulator.ranges)
+        for k, coefficient in enumerate(coefficients):
             repeats = records if effect.card.per_record else 1
-            columns = first + k + len(told) * np.arange(repeats)
+            columns = first + k + len(coefficients) * np.arange(repeats)
             step = COEFFICIENT_STEP * coefficient.scale
 
             def at(change: float, columns: Index = columns) -> list[Matrix]:
@@ -60,7 +60,7 @@ def coefficient_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[
                 slopes = difference(at, step, upward=upward, here=here)
             for r, slope in enumerate(slopes):
                 out[r][..., columns[r if effect.card.per_record else 0]] = slope
-        first += len(told) * (records if effect.card.per_record else 1)
+        first += len(coefficients) * (records if effect.card.per_record else 1)
     return out
 
 
@@ -136,16 +136,16 @@ def _linear_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[dict
     layout, out = model.layout, []
     numbers = [number for number, _ in _numbers(simulator, plant)]
     for experiment, (units, slopes) in zip(model.experiments, model.unit_slopes(plant.dynamics), strict=True):
-        made = {number: np.zeros((units.shape[2], plant.gains.shape[0])) for number in numbers}
+        own = {number: np.zeros((units.shape[2], plant.gains.shape[0])) for number in numbers}
         for i, row in enumerate(layout.unit_of):
             for j, unit in enumerate(row):
                 element, gain = layout.element_of[i][j], plant.gains[i, j]
-                made["gain", i, j][:, i] = experiment.rest[j] + units[unit, 0]
+                own["gain", i, j][:, i] = experiment.rest[j] + units[unit, 0]
                 *shape, by_delay = slopes[unit][:, 0]
                 terms = len(shape) // 2
                 for k, (by_log_time, by_order) in enumerate(zip(shape[:terms], shape[terms:], strict=True)):
-                    made["time", element, k][:, i] += gain * by_log_time / plant.dynamics.times[element][0, k]
-                    made["order", element, k][:, i] += gain * by_order
-                made["delay", layout.delay_of[i][j], 0][:, i] += gain * by_delay
-        out.append(made)
+                    own["time", element, k][:, i] += gain * by_log_time / plant.dynamics.times[element][0, k]
+                    own["order", element, k][:, i] += gain * by_order
+                own["delay", layout.delay_of[i][j], 0][:, i] += gain * by_delay
+        out.append(own)
     return out
