@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.bench.marching import MarchError
+from lcopa_bayes.bench.hiddeneffects import MarchError
 from lcopa_bayes.bench.undeclared import NOISE, Campaign, campaign, drawn
 from lcopa_bayes.core.files import write_text
 from lcopa_bayes.data.settings import ModelSettings
