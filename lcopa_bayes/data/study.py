@@ -118,7 +118,11 @@ class Study:
         unit = time_unit or fitted[0].time_unit
         records = (*fitted, *apart)
         problems = together(fitted, apart)
-        problems += [f"record {r.name!r} is in {r.time_unit}" for r in records if r.time_unit != unit]
+        problems += [
+            f"record {r.name!r} is in {r.time_unit}, the study is in {unit}; convert its times"
+            for r in records
+            if r.time_unit != unit
+        ]
         if problems:
             raise InputError(problems)
         settings |= {
