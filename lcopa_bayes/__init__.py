@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from lcopa_bayes.core.errors import InputError as InputError
-    from lcopa_bayes.data.drives import Drive as Drive
+    from lcopa_bayes.data.drive import Drive as Drive
     from lcopa_bayes.data.record import Record as Record
     from lcopa_bayes.data.record import load_record as load_record
     from lcopa_bayes.data.study import Study as Study
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 _PLACES = {
     "core.errors": ("InputError",),
-    "data.drives": ("Drive",),
+    "data.drive": ("Drive",),
     "data.record": ("Record", "load_record"),
     "data.study": ("Study",),
     "data.studyfile": ("load_study",),

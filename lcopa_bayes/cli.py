@@ -111,12 +111,11 @@ def _reported(result: Reported, folder: Path) -> Outcome:
 
 def _source(options: argparse.Namespace) -> FitLike:
     """The study asked for, with the seed of the command line if one is given, or a finished fit."""
-    from lcopa_bayes.data.studyfile import load_study
-    from lcopa_bayes.verbs.sources import finished
+    from lcopa_bayes.verbs.sources import finished, study_of
 
     made = finished(options.source)
     if made is None:
-        study = load_study(options.source, held_out=options.held_out)
+        study = study_of(options.source, held_out=options.held_out)
         return study if options.seed is None else study.with_seed(options.seed)
     if options.held_out or options.seed is not None:
         raise InputError(
@@ -269,13 +268,13 @@ def _optics(options: argparse.Namespace) -> Outcome:
     from lcopa_bayes.paper.opticsplan import OpticsPlan
     from lcopa_bayes.verbs.papers import optics
 
-    plan = OpticsPlan.of(
+    plan = OpticsPlan(
         elements=options.elements,
         pitch=options.pitch,
         wavelength=options.wavelength,
         fill_factor=options.fill_factor,
-        targets_deg=options.targets,
-        voltages=options.voltages,
+        targets_deg=tuple(options.targets),
+        voltages=tuple(options.voltages),
         pretilt=options.pretilt,
         field=options.field,
     )

@@ -14,8 +14,8 @@ from lcopa_bayes.bench.command import Command
 from lcopa_bayes.bench.device import Responsive
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.literature import PAPER
 from lcopa_bayes.data.record import Record
+from lcopa_bayes.model.literature import PAPER
 
 _SAME = 1e-9
 """A change closer than this part of a camera period to a sample is at that sample."""

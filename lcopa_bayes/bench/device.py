@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import partial
 from math import inf, isfinite
 from typing import Protocol, final
 
@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lcopa_bayes.bench.command import Command
-from lcopa_bayes.bench.inversion import Compliance
+from lcopa_bayes.bench.inversion import unit_ramp, unit_step, unsuited
 from lcopa_bayes.bench.superposition import superposed
-from lcopa_bayes.core.arrays import Array, Matrix, frozen
+from lcopa_bayes.core.arrays import Matrix, frozen
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.literature import PAPER, StatedPath
 from lcopa_bayes.data.record import Axis
+from lcopa_bayes.model.literature import PAPER
+from lcopa_bayes.model.path import TransferPath
 
 ACCURACY = 1e-9
 """Error of a response [-], of the steady deflection per unit drive and per unit jump."""
@@ -36,59 +37,11 @@ class Responsive(Protocol):
 
 @final
 @dataclass(frozen=True)
-class TransferPath:
-    """``gain exp(-delay s) / (sum_i eta_i s^order_i + stiffness)`` (Ta et al. 2026, Eq. 31).
-
-    Raises InputError for a gain that is not finite, a delay that is negative or not finite, and as
-    `Compliance` does. A path of gain 0 has no effect.
-    """
-
-    gain: float
-    """b [response unit per drive unit]; the steady deflection per unit of drive is ``gain / stiffness``."""
-    delay: float
-    """tau [ms]; not negative."""
-    etas: tuple[float, ...]
-    """Viscosities [ms^order], one per order."""
-    orders: tuple[float, ...]
-    """Fractional orders [-]; positive and distinct."""
-    stiffness: float
-    """k [-]; positive."""
-
-    def __post_init__(self) -> None:
-        problems = []
-        if not isfinite(self.gain):
-            problems.append(f"a gain must be finite; got {self.gain}")
-        if not 0 <= self.delay < inf:
-            problems.append(f"a delay must be at least 0 and finite; got {self.delay}")
-        try:
-            Compliance(self.etas, self.orders, self.stiffness)
-        except InputError as error:
-            problems.extend(error.problems)
-        if problems:
-            raise InputError(problems)
-
-    @cached_property
-    def compliance(self) -> Compliance:
-        """The path without gain and delay."""
-        return Compliance(self.etas, self.orders, self.stiffness)
-
-    @property
-    def steady(self) -> float:
-        """Deflection under a unit drive held for ever [response unit per drive unit]."""
-        return self.gain / self.stiffness
-
-    def step_response(self, time: ArrayLike) -> Array:
-        """Deflection [response unit per drive unit] at `time` [ms] after a unit step, in its shape."""
-        return self.gain * self.compliance.step_response(np.asarray(time, dtype=float) - self.delay)
-
-
-@final
-@dataclass(frozen=True)
 class Device:
     """Responses that are sums over paths from all drives, each about a resting offset.
 
-    Raises InputError unless `paths` has one row per response axis and one column per drive axis and
-    there is one finite offset per response axis.
+    Raises InputError unless `paths` has one row per response axis and one column per drive axis, every path
+    is physical with distinct orders, and there is one finite offset per response axis.
     """
 
     paths: tuple[tuple[TransferPath, ...], ...]
@@ -105,6 +58,7 @@ class Device:
         problems = []
         if not (rows and columns and [len(row) for row in self.paths] == [columns] * rows):
             problems.append(f"a device needs {rows} x {columns} paths, one per response and drive axis")
+        problems += [problem for row in self.paths for path in row for problem in unsuited(path)]
         if len(self.offsets) != rows or not all(isfinite(offset) for offset in self.offsets):
             problems.append(f"one finite offset per response axis is needed; got {self.offsets}")
         if problems:
@@ -138,29 +92,22 @@ class Device:
                 if path.gain == 0 or not moved.any():
                     continue
                 changes, sizes = command.times[moved] + path.delay, path.gain * jumps[moved, j]
-                compliance, tolerance = path.compliance, ACCURACY / path.stiffness
+                tolerance = ACCURACY / path.stiffness
                 if exposure == 0:
-                    out[:, i] += superposed(
-                        compliance.step_response, time, changes, sizes, tolerance=tolerance
-                    )
+                    curve = partial(unit_step, path)
+                    out[:, i] += superposed(curve, time, changes, sizes, tolerance=tolerance)
                 else:
+                    curve = partial(unit_ramp, path)
                     end, start = (
-                        superposed(
-                            compliance.ramp_response, edge, changes, sizes, tolerance=tolerance * exposure
-                        )
+                        superposed(curve, edge, changes, sizes, tolerance=tolerance * exposure)
                         for edge in (time, time - exposure)
                     )
                     out[:, i] += (end - start) / exposure
         return out
 
 
-def _stated(path: StatedPath) -> TransferPath:
-    return TransferPath(path.gain, path.delay, path.etas, path.orders, path.stiffness)
-
-
-_PLANT = PAPER.plant
 PAPER_DEVICE = Device(
-    paths=((_stated(_PLANT.xx), _stated(_PLANT.xy)), (_stated(_PLANT.yx), _stated(_PLANT.yy))),
+    paths=PAPER.plant.paths,
     drive_axes=(Axis("x", "rad"), Axis("y", "rad")),
     response_axes=(Axis("x", "rad"), Axis("y", "rad")),
     offsets=(0.0, 0.0),

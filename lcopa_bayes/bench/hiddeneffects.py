@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
 from lcopa_bayes.bench.command import Command
-from lcopa_bayes.bench.device import Device, TransferPath
-from lcopa_bayes.bench.inversion import Compliance
+from lcopa_bayes.bench.device import Device
 from lcopa_bayes.bench.marching import Balance, marched, step_means
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.data.record import Axis
+from lcopa_bayes.model.path import Normalisation, TransferPath
 
 STEPS = 4
 """Steps of a march per camera period; halving them moves a response by less than 1e-5 of its range."""
@@ -172,9 +172,7 @@ def bent(
     level = rest
     for _ in range(400):  # at rest the force that acts holds the deflection
         level = 0.5 * (level + balance(rest, level, np.zeros_like(level), -1))
-    elements = tuple(
-        Compliance(tuple(eta / path.stiffness for eta in path.etas), path.orders, 1.0) for path in paths
-    )
+    elements = tuple(path.normalised(Normalisation.STIFFNESS) for path in paths)
     force = rest[:, None] + gains[:, None] * np.stack(means)
     y = marched(elements, force, balance, level, step)
     nodes = np.concatenate((edges[:1], edges[1:]))

@@ -7,8 +7,9 @@ from typing import TypeAlias
 
 import numpy as np
 
-from lcopa_bayes.bench.inversion import Compliance
+from lcopa_bayes.bench.inversion import unit_step
 from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.model.path import TransferPath
 
 Balance: TypeAlias = Callable[[Vector, Vector, Vector, int], Vector]
 """(force, deflection, its rate, each (axes,); number of the step) -> force that acts, (axes,)."""
@@ -34,7 +35,7 @@ def step_means(edges: Vector, times: Vector, levels: Vector) -> Vector:
 
 
 def marched(
-    elements: tuple[Compliance, ...], force: Matrix, balance: Balance, level: Vector, step: float
+    paths: tuple[TransferPath, ...], force: Matrix, balance: Balance, level: Vector, step: float
 ) -> Matrix:
     """Deflections at the end of every step, (axes, n), of paths that rest at `level` before the first.
 
@@ -45,7 +46,7 @@ def marched(
     """
     axes, n = force.shape
     lags = step * np.arange(n + 1)
-    kernel = np.stack([np.diff(element.step_response(lags)) for element in elements])
+    kernel = np.stack([np.diff(unit_step(path, lags)) for path in paths])
     backward = kernel[:, ::-1].copy()
     acting, y = np.zeros((axes, n)), np.zeros((axes, n))
     before = np.zeros(axes)

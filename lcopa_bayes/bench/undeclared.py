@@ -12,12 +12,13 @@ import numpy as np
 
 from lcopa_bayes.bench import driveeffects, planteffects, readingeffects, unnamedeffects
 from lcopa_bayes.bench.acquisition import Bench, truth
-from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.bench.device import Device
 from lcopa_bayes.bench.hiddeneffects import STEPS, Hidden, HiddenDevice, Shot
 from lcopa_bayes.bench.schedules import LARGEST, Schedule, plain_schedules, rich_schedules
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.model.path import TransferPath
 
 NOISE = 1.8e-4
 """Standard deviation of the noise of a sample [rad], Ta et al. 2026, Figs. 13 to 16."""
@@ -68,8 +69,8 @@ def steerer(rng: np.random.Generator) -> Device:
         return float(value * rng.uniform(1 - part, 1 + part))
 
     def path(gain: float, terms: Sequence[tuple[float, float]]) -> TransferPath:
-        etas = tuple(time**order for time, order in terms)
-        return TransferPath(gain, delay, etas, tuple(order for _, order in terms), 1.0)
+        times, orders = zip(*terms, strict=True)
+        return TransferPath.of_times(gain, delay, times, orders)
 
     delay = near(3.0)
     direct = ((near(1.8), near(1.75, 0.04)), (near(2.4), near(0.88, 0.04)))

@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple, final, get_args
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from lcopa_bayes.bench.inversion import step_response
 from lcopa_bayes.calibration.coverage import LEVELS
 from lcopa_bayes.calibration.ranks import rank_of
 from lcopa_bayes.calibration.simulation import device_of, exact_responses, measured, model_gap
@@ -232,7 +233,7 @@ class Replication:
         if posterior.simulation is not None:
             return self._true_with_effects(posterior, truth, times)
         device = device_of(table, truth, 0, time_unit=self.problem.study.time_unit)
-        steps = [path.step_response(times) for row in device.paths for path in row]
+        steps = [step_response(path, times) for row in device.paths for path in row]
         parameters = [value for value, row in zip(truth, table.rows, strict=True) if row.free]
         return [
             *map(float, parameters),

@@ -13,8 +13,7 @@ import numpy as np
 import xarray as xr
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.core.checks import refuse_if
-from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.core.errors import InputError, nearest, refuse_if
 from lcopa_bayes.inference.parameters import ParameterTable
 
 Stated: TypeAlias = float | tuple[float, float]

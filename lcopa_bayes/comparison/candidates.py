@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 from typing import final
 
 from lcopa_bayes.core.errors import InputError, nearest
-from lcopa_bayes.data.candidatesettings import CandidateSettings
-from lcopa_bayes.data.settings import ModelSettings, PriorSettings
+from lcopa_bayes.data.settings import CandidateSettings, ModelSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import table_of
 from lcopa_bayes.inference.defaultpriors import Scales
@@ -106,7 +105,9 @@ def derived(study: Study, settings: CandidateSettings) -> Candidate:
     if dropped:
         notes.append(f"has no {', '.join(dropped)}: the study's priors of these do not apply")
         priors = {name: prior for name, prior in priors.items() if name in names}
-    for name in settings.improper:
+    improper = tuple(name for name, prior in settings.priors.items() if prior.improper)
+    stated = {name: prior for name, prior in settings.priors.items() if not prior.improper}
+    for name in improper:
         if name not in names:
             raise InputError(f"candidate {settings.name!r}: no parameter {name!r}{nearest(name, names)}")
         priors.pop(name, None)
@@ -114,11 +115,11 @@ def derived(study: Study, settings: CandidateSettings) -> Candidate:
             f"the prior of {name} is improper, so the evidence is undefined; the other scores are under the "
             "default prior in its place"
         )
-    made = replace(made, priors=priors | dict(settings.priors) | fixed)
+    made = replace(made, priors=priors | stated | fixed)
     about = _about(study, model, settings.cross)
     if study.effects.use or made.effects.use:
         about += f", {', '.join(made.effects.use) or 'no effects'}"
-    return Candidate(settings.name, made, about, tuple(notes), settings.improper)
+    return Candidate(settings.name, made, about, tuple(notes), improper)
 
 
 def candidates_of(

@@ -18,21 +18,13 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
+from lcopa_bayes.core.arrays import Matrix, Vector, frozen
 from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.core.files import write_whole
+from lcopa_bayes.core.units import TIME_UNITS, in_time_unit
 from lcopa_bayes.data.cells import FORM, SUFFIXES, CellTable, frame_cells, read_cells, refuse
 
-TIME_UNITS = {"s": 0, "ms": -3, "us": -6}
-"""Each time unit as a power of ten of a second."""
 _ROLES = ("time", "drive", "response")
-
-
-def in_time_unit(time: Array | float, given: str, wanted: str) -> Array:
-    """`time` [given] in the unit `wanted`; one correctly rounded multiplication or division."""
-    power = TIME_UNITS[given] - TIME_UNITS[wanted]
-    with np.errstate(over="ignore"):  # an infinite time is refused by `Record`
-        return np.asarray(time * 10.0**power if power >= 0 else time / 10.0**-power)
 
 
 @final

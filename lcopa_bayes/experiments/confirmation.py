@@ -187,7 +187,7 @@ def _confirmed(made: Design, chosen: int, where: str, replicas: int, jobs: int) 
     """Both drives at one truth; a replica has the same noise whatever the number of processes."""
     problem, period = made.fit.problem, made.limits.period
     device = device_of(problem, made.draws[chosen])
-    camera = VirtualBench(camera=period, exposure=problem.study.model.exposure)
+    camera = VirtualBench(camera=period, exposure=problem.study.exposure)
     tasks = []
     for which, each in enumerate((made.winner, made.step)):
         clean = truth(device, camera, each.candidate.command, duration=each.time, name="simulated")

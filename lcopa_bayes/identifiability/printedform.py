@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.data.literature import PAPER, Stated
 from lcopa_bayes.identifiability.sensitivities import Sensitivities
 from lcopa_bayes.identifiability.symmetries import Structure, structure
+from lcopa_bayes.model.literature import PAPER, Stated
 
 SPRINGS = 4
 """Springs of the element, of which Eq. 16 adds up the stiffnesses."""

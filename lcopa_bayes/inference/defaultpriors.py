@@ -49,7 +49,7 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
-from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.drive import first_change
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.inference.observations import Observed, Samples, sampling_period
 from lcopa_bayes.inference.priors import Prior
@@ -90,9 +90,7 @@ class Scales:
         """Scales of the fit records."""
         spans = []
         for record in records:
-            drives = [Drive.of_rows(record.time, column) for column in record.drive.T]
-            begin = min((drive.times[0] for drive in drives if drive.moves), default=record.time[0])
-            spans.append(record.time[-1] - begin)
+            spans.append(record.time[-1] - first_change(record))
         response = np.concatenate([record.response for record in records])
         amplitude = np.nanmax(response, axis=0) - np.nanmin(response, axis=0)
         period = sampling_period(records)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from lcopa_bayes.core.arrays import Array
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.literature import PAPER, StatedOptics
+from lcopa_bayes.model.literature import PAPER, StatedOptics
 from lcopa_bayes.optics.checks import finite, unless_positive
 
 _ROUNDING = 4 * float(np.finfo(float).eps)

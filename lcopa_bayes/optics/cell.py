@@ -15,7 +15,7 @@ from math import isfinite, pi, sqrt
 from typing import final
 
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.literature import PAPER, StatedOptics
+from lcopa_bayes.model.literature import PAPER, StatedOptics
 from lcopa_bayes.optics.checks import unless_positive
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from itertools import permutations
 from math import floor, log10
 
-from lcopa_bayes.data.literature import Stated
+from lcopa_bayes.model.literature import Stated
 from lcopa_bayes.paper.printedmodel import RECORD_LENGTH, PrintedModel
 from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lcopa_bayes.data.literature import Stated
+from lcopa_bayes.model.literature import Stated
 from lcopa_bayes.paper.printedmodel import RECORD_LENGTH, SETTLING_BANDS, PrintedModel, integer_rival
 from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict
 

@@ -18,12 +18,9 @@ from tqdm import tqdm
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.model.blockpulses import integration_weights, lower_toeplitz
+from lcopa_bayes.model.path import Normalisation
 from lcopa_bayes.model.powerseries import Circle, Spectrum
-from lcopa_bayes.paper.equation import (
-    Convention,
-    differenced_integrals,
-    known_column,
-)
+from lcopa_bayes.paper.equation import differenced_integrals, known_column
 from lcopa_bayes.paper.intervals import Candidates
 from lcopa_bayes.paper.paths import Blocks
 
@@ -111,7 +108,7 @@ class _Ground:
 def evaluate(
     records: Sequence[Blocks],
     candidates: Candidates,
-    convention: Convention,
+    normalisation: Normalisation,
     bar: tqdm[None] | None = None,
 ) -> Evaluated:
     """Least squares and output error of every candidate.
@@ -144,7 +141,7 @@ def evaluate(
         gram[:, :-1, :-1] = own[at[:, :, None], at[:, None, :]]
         gram[:, -1, :-1] = gram[:, :-1, -1] = -cross[at, top[:, None], tau[:, None]]
         gram[:, -1, -1] = drive[top, tau]
-        coefficients[chunk] = _solved(gram, known_column(convention, orders.shape[1]))
+        coefficients[chunk] = _solved(gram, known_column(normalisation, orders.shape[1]))
         squares[chunk] = _output_squares(grounds, at, tau, coefficients[chunk])
         if bar is not None:
             bar.update(tau.size)

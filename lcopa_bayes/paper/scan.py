@@ -9,7 +9,8 @@ from typing import final
 import numpy as np
 from tqdm import tqdm
 
-from lcopa_bayes.paper.equation import Convention, PathModel, least_squares
+from lcopa_bayes.model.path import Normalisation, TransferPath
+from lcopa_bayes.paper.equation import least_squares
 from lcopa_bayes.paper.evaluation import evaluate
 from lcopa_bayes.paper.intervals import Scan
 from lcopa_bayes.paper.paths import Blocks
@@ -20,9 +21,9 @@ from lcopa_bayes.paper.paths import Blocks
 class Scanned:
     """The best candidates of a scan."""
 
-    model: PathModel
+    model: TransferPath
     """Least output error among candidates with positive viscosities and stiffness, or among all when there
-    is none (`PathModel.physical` is False); in the scan's convention, the fixed coefficient 1."""
+    is none (`TransferPath.physical` is False); as normalised in the scan, the fixed coefficient 1."""
     rmse: float
     """Its output error over the blocks [response unit]."""
     unconstrained_rmse: float
@@ -39,7 +40,7 @@ def scan(
     span: float,
     plan: Scan,
     *,
-    convention: Convention = Convention.STIFFNESS,
+    normalisation: Normalisation = Normalisation.STIFFNESS,
     bar: tqdm[None] | None = None,
 ) -> Scanned:
     """Scan the intervals, then refine around the best candidate, the least output error winning.
@@ -59,7 +60,7 @@ def scan(
         if bar is not None and bar.total is not None:
             bar.total += candidates.size
             bar.refresh()
-        evaluated = evaluate(records, candidates, convention, bar)
+        evaluated = evaluate(records, candidates, normalisation, bar)
         tried, physical = tried + candidates.size, physical + int(evaluated.physical.sum())
         unconstrained = min(unconstrained, float(evaluated.squares.min()))
         at = evaluated.best()
@@ -68,6 +69,6 @@ def scan(
             best = (rank, *evaluated.of(at))
     assert best is not None
     (_, squares), orders, delay = best
-    model = least_squares(records, orders, delay, convention=convention)
+    model = least_squares(records, orders, delay, normalisation=normalisation)
     rmse, unconstrained_rmse = (float(np.sqrt(value / samples)) for value in (squares, unconstrained))
     return Scanned(model, rmse, unconstrained_rmse, tried, physical)

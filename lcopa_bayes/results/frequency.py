@@ -1,8 +1,6 @@
 r"""Frequency response of every path, with bands: ``gain exp(-s delay) / (1 + sum_i (T_i s)^order_i)``.
 
-At ``s = i 2 pi f`` (Ta et al. 2026, Eq. 31, stiffness divided out). The denominator's terms have arguments
-within ``pi order / 2 <= pi``, so that it stays in one half plane: its principal argument is the continuous
-one."""
+At ``s = i 2 pi f`` (Ta et al. 2026, Eq. 31, stiffness divided out)."""
 
 from __future__ import annotations
 
@@ -17,6 +15,7 @@ from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import Estimate, plain
 from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.model.transfer import denominator
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS, pointwise, simultaneous
 from lcopa_bayes.results.result import notebook_table
 from lcopa_bayes.sampling.draws import Draws
@@ -162,16 +161,13 @@ def transfer_function(table: ParameterTable, values: Matrix, frequency: Vector) 
     angular = 2 * np.pi * frequency
     size = (len(layout.responses), len(layout.drives), values.shape[0], frequency.size)
     magnitude, phase = np.empty(size), np.empty(size)
-    below = [
-        1.0
-        + sum((1j * angular * time[:, None]) ** order[:, None] for time, order in zip(t.T, o.T, strict=True))
-        for t, o in zip(dynamics.times, dynamics.orders, strict=True)
-    ]
+    elements = zip(dynamics.times, dynamics.orders, strict=True)
+    below = [denominator(times, orders, angular) for times, orders in elements]
     for i, j in np.ndindex(size[:2]):
-        denominator = below[layout.element_of[i][j]]
+        element = below[layout.element_of[i][j]]
         gain, delay = gains[:, i, j, None], dynamics.delays[:, layout.delay_of[i][j], None]
-        magnitude[i, j] = np.abs(gain) / np.abs(denominator)
-        phase[i, j] = -angular * delay - np.angle(denominator) - np.pi * (gain < 0)
+        magnitude[i, j] = np.abs(gain) / np.abs(element)
+        phase[i, j] = -angular * delay - np.angle(element) - np.pi * (gain < 0)
     return magnitude, phase
 
 

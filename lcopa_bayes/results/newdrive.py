@@ -14,12 +14,12 @@ from lcopa_bayes.core.arrays import Array, Vector
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import save_json, save_table, writable_folder
-from lcopa_bayes.data.drives import Drive, drive_of
+from lcopa_bayes.data.drive import Drive, drive_of, first_change
 from lcopa_bayes.data.record import Record, load_columns, record_of
 from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
-from lcopa_bayes.results.fittedrange import FittedRange, Outside, beginning
+from lcopa_bayes.results.fittedrange import FittedRange, Outside
 from lcopa_bayes.results.frequency import Bands, named, transfer_function
 from lcopa_bayes.results.prediction import (
     Band,
@@ -294,7 +294,7 @@ def _times(drive: Drive, span: float, period: float) -> Vector:
     """Times to predict at: the rows where they are sampled as the records are, else a lattice of `period`."""
     if drive.until == drive.time[-1] and np.diff(drive.time).max(initial=0.0) <= 1.5 * period:
         return drive.time
-    begin = beginning(drive)
+    begin = first_change(drive)
     last = drive.time[-1] + span if drive.until is None else drive.until
     # the first change falls on the lattice, which lies between the first row and the end
     first = begin - np.floor((begin - drive.time[0]) / period + 1e-9) * period

@@ -15,7 +15,7 @@ from lcopa_bayes.comparison.candidatefit import CARD
 from lcopa_bayes.comparison.candidates import candidates_of, of_studies
 from lcopa_bayes.comparison.compare import compare as compared
 from lcopa_bayes.core.estimate import plain
-from lcopa_bayes.data.candidatesettings import CandidateSettings
+from lcopa_bayes.data.settings import CandidateSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_candidates
 from lcopa_bayes.inference.assembly import problem_of

@@ -9,7 +9,7 @@ from typing import final
 
 import pandas as pd
 
-from lcopa_bayes.data.drives import Drive, drive_of
+from lcopa_bayes.data.drive import Drive, drive_of
 from lcopa_bayes.data.record import columns_of
 from lcopa_bayes.experiments.confirmation import REPLICAS, confirmed
 from lcopa_bayes.experiments.design import DRAWS, checked

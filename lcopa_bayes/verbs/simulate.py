@@ -10,8 +10,7 @@ from typing import Any, final
 import numpy as np
 import pandas as pd
 
-from lcopa_bayes.bench.campaign import write_campaign
-from lcopa_bayes.bench.campaignfile import load_plan
+from lcopa_bayes.bench.campaignfile import load_plan, write_campaign
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.results.result import notebook_table

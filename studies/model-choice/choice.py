@@ -27,18 +27,18 @@ from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.bench.acquisition import Bench, truth
 from lcopa_bayes.bench.command import staircase
-from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.bench.device import Device
 from lcopa_bayes.calibration.simulation import measured
 from lcopa_bayes.comparison.candidates import candidates_of
 from lcopa_bayes.comparison.gains import by_evidence, simplest
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.files import writable_folder, write_text
 from lcopa_bayes.data.record import Axis
-from lcopa_bayes.data.settings import ModelSettings, NoiseSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.identifiability.curvature import curvature
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.likelihood import Landscape
+from lcopa_bayes.model.path import TransferPath
 from lcopa_bayes.results.prediction import responses
 from lcopa_bayes.sampling.draws import gather
 from lcopa_bayes.sampling.evidence import evidence
@@ -71,19 +71,15 @@ def template() -> Study:
         "delay": {"dist": "uniform", "loc": 0.0, "scale": 3.0},
         "sigma": {"dist": "loguniform", "a": NOISE / 10, "b": 10 * NOISE},
     }
-    made = {
-        name: PriorSettings(name, dist=str(told.pop("dist")), parameters=told)  # type: ignore[arg-type]
-        for name, told in priors.items()
-    }
     return Study(
         "model-choice",
         None,
         "ms",
         SEED,
         (record,),
-        model=ModelSettings(terms=3, offset="none", blocks=480, exposure=1 / 3),
-        priors=made,
-        noise=NoiseSettings("white"),
+        model={"terms": 3, "offset": "none", "blocks": 480, "exposure_ms": 1 / 3},
+        priors=priors,
+        noise={"kind": "white"},
     )
 
 

@@ -167,7 +167,7 @@ def test_another_comparison_gives_another_verdict(claim, change):
 
 
 def test_m2_reads_the_distance_of_the_steady_states():
-    from lcopa_bayes.data.literature import PAPER
+    from lcopa_bayes.model.literature import PAPER
     from lcopa_bayes.paper.comparisonclaims import same_steady_state
 
     def kind(told: dict) -> str:

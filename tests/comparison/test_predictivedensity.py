@@ -19,7 +19,7 @@ from lcopa_bayes.comparison.lineardensity import linear_densities
 from lcopa_bayes.comparison.predictivedensity import left_out_weights, predictions
 from lcopa_bayes.comparison.priorwidth import widths
 from lcopa_bayes.comparison.sequentialdensity import known_before, log_densities
-from lcopa_bayes.data.candidatesettings import CandidateSettings
+from lcopa_bayes.data.settings import CandidateSettings
 from lcopa_bayes.inference.noise import AR1, Student, White
 from lcopa_bayes.inference.observations import Observed, Samples
 from lcopa_bayes.results.fit import fit

@@ -9,7 +9,7 @@ import pytest
 
 from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import on_off, staircase, step
-from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.bench.device import Device
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
@@ -28,6 +28,7 @@ from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.effect import UnstableError
+from lcopa_bayes.model.path import TransferPath
 
 NOISE = 5e-3
 NAMES = ("odd_curvature", "even_curvature", "gain_drift", "unmodelled_smooth")

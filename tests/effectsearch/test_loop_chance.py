@@ -13,7 +13,7 @@ from scipy.stats import t as student
 
 from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import on_off, staircase, step
-from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.bench.device import Device
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
@@ -28,6 +28,7 @@ from lcopa_bayes.effectsearch.trace import threshold_of
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.model.effects.catalogue import catalogue
+from lcopa_bayes.model.path import TransferPath
 
 PARTIAL = st.lists(st.floats(-0.95, 0.95), max_size=5).map(np.array)
 AXIS = (Axis("x", "rad"),)

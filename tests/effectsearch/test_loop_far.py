@@ -9,9 +9,9 @@ import pytest
 
 from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import step
-from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.bench.device import Device
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.data.study import Study
@@ -29,6 +29,7 @@ from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.model.effects import superposition
 from lcopa_bayes.model.effects.catalogue import catalogue
+from lcopa_bayes.model.path import TransferPath
 
 RECORDS = Path(os.environ.get("LCOPA_BAYES_DATA", Path(__file__).parents[2] / ".." / "shared")) / "records"
 AXIS = (Axis("x", "rad"),)
@@ -73,7 +74,7 @@ def resonant(seed=2, n=1500):
 @pytest.mark.parametrize("delay", [0.0, 0.1, 0.66])
 def test_many_even_changes_are_one_convolution(delay, monkeypatch):
     rng, times = np.random.default_rng(0), np.arange(400) * 0.1 + 0.3
-    drive = Drive(times[1:], rng.normal(size=399))
+    drive = AxisDrive(times[1:], rng.normal(size=399))
     jumps, shape = superposition.jumps_of(drive), relaxing
     fast = superposition.summed(times, drive, delay, jumps, shape)
     monkeypatch.setattr(superposition, "_MANY", 10**9)
@@ -87,7 +88,7 @@ def test_changes_between_samples_are_shared_to_second_order():
     for period in (0.2, 0.1, 0.05):
         times = np.arange(int(20 / period)) * period
         at = times[1:] + 0.4 * period
-        drive = Drive(at, np.sin(at))
+        drive = AxisDrive(at, np.sin(at))
         exact = sum(
             jump * -np.expm1(-np.maximum(times - t, 0) / 2.0)
             for t, jump in zip(at, superposition.jumps_of(drive), strict=True)

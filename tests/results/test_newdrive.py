@@ -14,7 +14,7 @@ from small import ONE, TRUTH, TWO, draws_of, problem, record, row_values, study
 from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import Command, on_off, step
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.drives import Drive
+from lcopa_bayes.data.drive import Drive
 from lcopa_bayes.data.record import save_record
 from lcopa_bayes.results.fit import Fit, fit
 from lcopa_bayes.results.fittedrange import energies

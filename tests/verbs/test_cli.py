@@ -12,9 +12,10 @@ import pytest
 
 from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import on_off
-from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.bench.device import Device
 from lcopa_bayes.cli import main
 from lcopa_bayes.data.record import Axis, save_record
+from lcopa_bayes.model.path import TransferPath
 
 DEVICE = Device(
     ((TransferPath(2.0, 0.5, (1.5,), (1.2,), 1.0),),), (Axis("in", "V"),), (Axis("out", "mm"),), (0.3,)
