@@ -268,13 +268,13 @@ def _optics(options: argparse.Namespace) -> Outcome:
     from lcopa_bayes.paper.opticsplan import OpticsPlan
     from lcopa_bayes.verbs.papers import optics
 
-    plan = OpticsPlan.of(
+    plan = OpticsPlan(
         elements=options.elements,
         pitch=options.pitch,
         wavelength=options.wavelength,
         fill_factor=options.fill_factor,
-        targets_deg=options.targets,
-        voltages=options.voltages,
+        targets_deg=tuple(options.targets),
+        voltages=tuple(options.voltages),
         pretilt=options.pretilt,
         field=options.field,
     )

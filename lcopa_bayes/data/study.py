@@ -152,6 +152,10 @@ class Study:
         """The same study with another seed."""
         return replace(self, seed=seed)
 
+    def __repr__(self) -> str:
+        """Its records, without their numbers and the settings."""
+        return f"Study({self.name!r}, fit={list(self.fit)}, held_out={list(self.held_out)})"
+
     __reduce__ = rebuilt
 
 

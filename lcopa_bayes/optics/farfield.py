@@ -1,4 +1,4 @@
-"""Far fields of linear and planar arrays, by sum and in closed form (Ta et al. 2026, Eqs. 2-4, 7-12).
+"""Far fields of linear and planar arrays in closed form (Ta et al. 2026, Eqs. 2-4, 7-12).
 
 Directions are direction cosines, ``u = sin th cos ph`` and ``v = sin th sin ph`` (``u = sin th`` on one
 axis), where a planar pattern is a product of two linear ones. The obliquity factor of Eq. 1 is omitted, as
@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import pi
-from typing import TypeAlias, final
+from typing import final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
 from lcopa_bayes.core.errors import InputError
@@ -20,33 +20,13 @@ from lcopa_bayes.model.literature import PAPER, StatedOptics
 from lcopa_bayes.optics.array import LinearArray, PlanarArray, paper_array
 from lcopa_bayes.optics.checks import finite
 
-ComplexArray: TypeAlias = NDArray[np.complex128]
-
-
-def array_sum(
-    array: LinearArray, u: ArrayLike, phases: ArrayLike, amplitudes: ArrayLike | None = None
-) -> ComplexArray:
-    """``sum_n A_n exp(j phi_n) exp(-j k n d u) / sum_n A_n`` (Ta et al. 2026, Eq. 3, normalised).
-
-    Parameters: `array`; `u` [-] in [-1, 1], any shape; `phases` [rad] and `amplitudes` [-], (elements,) each.
-    Returns: complex, shape of `u`; element factor not included. Raises InputError for other shapes.
-    Accuracy: about ``elements * 1e-16 * (1 + k d)``; memory does not grow with the element count.
-    """
-    direction = finite(u, name="u", lower=-1.0, upper=1.0)
-    weights = _weights((array.elements,), phases, amplitudes)
-    z = np.exp(-2j * pi / array.period * direction)
-    total = np.zeros(direction.shape, dtype=complex)
-    for weight in weights[::-1]:
-        total = total * z + weight
-    return total
-
 
 def array_factor(array: LinearArray, u: ArrayLike, step: float) -> Array:
     """``sin(N psi/2) / (N sin(psi/2))`` with ``psi = dphi - k d u`` (Ta et al. 2026, Eq. 4).
 
     `array`; `u` [-] in [-1, 1], any shape; `step` dphi [rad]. Real, signed, exactly +-1 where psi is a
-    multiple of 2 pi. `array_sum` with ``phi_n = n dphi`` is this times ``exp(j (N-1) psi / 2)``. Absolute
-    accuracy about ``elements * 1e-16 * (1 + k d)``, also next to a lobe.
+    multiple of 2 pi. The sum of Eq. 3 with ``phi_n = n dphi`` is this times ``exp(j (N-1) psi / 2)``.
+    Absolute accuracy about ``elements * 1e-16 * (1 + k d)``, also next to a lobe.
     """
     direction = finite(u, name="u", lower=-1.0, upper=1.0)
     psi = float(finite(step, name="step", unit="rad")) - 2 * pi / array.period * direction
@@ -89,37 +69,6 @@ def planar_intensity(array: PlanarArray, u: ArrayLike, v: ArrayLike, steps: tupl
     pattern = np.outer(intensity(array.x, across, steps[0]), intensity(array.y, along, steps[1]))
     pattern[np.add.outer(across**2, along**2) > 1] = np.nan
     return pattern
-
-
-def planar_intensity_at(
-    array: PlanarArray, polar: ArrayLike, azimuth: ArrayLike, steps: tuple[float, float]
-) -> Array:
-    """`planar_intensity` of `array` at scattered directions, with phase `steps` [rad].
-
-    `polar` angles [rad] in [0, pi/2] and `azimuth` [rad] broadcast together. Errors as in `intensity`.
-    """
-    array.steering_angles(*steps)
-    sine = np.sin(finite(polar, name="polar", lower=0.0, upper=pi / 2, unit="rad"))
-    turn = finite(azimuth, name="azimuth", unit="rad")
-    along_x = intensity(array.x, sine * np.cos(turn), steps[0])
-    return np.asarray(along_x * intensity(array.y, sine * np.sin(turn), steps[1]))
-
-
-def planar_sum(
-    array: PlanarArray, u: ArrayLike, v: ArrayLike, phases: ArrayLike, amplitudes: ArrayLike | None = None
-) -> ComplexArray:
-    """``sum_mn A_mn exp(j phi_mn) exp(-j k (m dx u + n dy v)) / sum_mn A_mn`` (Ta et al. 2026, Eq. 10).
-
-    `array`; `u` (nu,) and `v` (nv,) [-]; `phases` [rad] and `amplitudes` [-] (x.elements, y.elements), free
-    of any separability. Returns complex (nu, nv), element factor not included; points outside the unit
-    circle too.
-    """
-    across = finite(u, name="u", lower=-1.0, upper=1.0)
-    along = finite(v, name="v", lower=-1.0, upper=1.0)
-    weights = _weights((array.x.elements, array.y.elements), phases, amplitudes)
-    along_x = np.exp(-2j * pi / array.x.period * np.outer(across, np.arange(array.x.elements)))
-    along_y = np.exp(-2j * pi / array.y.period * np.outer(np.arange(array.y.elements), along))
-    return np.asarray(along_x @ weights @ along_y)
 
 
 @final
@@ -185,19 +134,3 @@ def _dirichlet(psi: Array, n: int) -> Array:
     at_lobe = half == 0
     safe = np.where(at_lobe, 1.0, half)
     return np.asarray(sign * np.where(at_lobe, 1.0, np.sin(n * safe) / (n * np.sin(safe))))
-
-
-def _weights(shape: tuple[int, ...], phases: ArrayLike, amplitudes: ArrayLike | None) -> ComplexArray:
-    """``A exp(j phi) / sum A``, shape `shape`; InputError for another shape or a vanishing sum."""
-    phi = finite(phases, name="phases", unit="rad")
-    size = np.ones(shape) if amplitudes is None else finite(amplitudes, name="amplitudes", lower=0.0)
-    problems = [
-        f"`{name}` must have one entry per element, shape {shape}; got {given.shape}."
-        for name, given in (("phases", phi), ("amplitudes", size))
-        if given.shape != shape
-    ]
-    if size.sum() <= 0:
-        problems.append("`amplitudes` must not all be zero: no light leaves the array.")
-    if problems:
-        raise InputError(problems)
-    return np.asarray(size * np.exp(1j * phi) / size.sum())

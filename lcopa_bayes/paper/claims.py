@@ -12,8 +12,7 @@ from lcopa_bayes.paper import (
     opticsclaims,
 )
 from lcopa_bayes.paper.auditclaims import from_audit
-from lcopa_bayes.paper.comparisonclaims import from_comparison, jointly
-from lcopa_bayes.paper.posteriorclaims import uncompared
+from lcopa_bayes.paper.comparisonclaims import from_comparison, jointly, uncompared
 from lcopa_bayes.paper.verdict import Claim, Evidence, Judged
 
 CLAIMS: tuple[Claim, ...] = (

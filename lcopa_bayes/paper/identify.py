@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, final
 
@@ -109,19 +108,6 @@ def scannable(study: Study, plan: Scan | None = None) -> tuple[PathData, ...]:
     return paths
 
 
-def words_of(values: Mapping[str, Any]) -> list[str]:
-    """Lines for a reader: a row per model of each path."""
-    words = [f"{'path':8}{'model':30}{'orders':24}{'delay':>8}{'steady':>12}{'RMSE':>11}  unit"]
-    for path in values["paths"]:
-        for model in path["models"]:
-            orders = ", ".join(f"{order:.3g}" for order in model["orders"])
-            words.append(
-                f"{path['path']:8}{model['method']:30}{orders:24}{model['delay']:8.4g}{model['steady']:12.5g}"
-                f"{model['output_rmse']:11.3g}  {path['response_unit']}"
-            )
-    return words
-
-
 def integer_orders(terms: int) -> tuple[float, ...]:
     """Orders 2, 1, 1 of the integer rival, the equal ones merged: their terms act as one."""
     return (2.0, 1.0) if terms > 1 else (1.0,)
@@ -198,10 +184,21 @@ def results(study: Study, identified: tuple[Identification, ...], plan: Scan | N
         {
             "study": study.name,
             "time_unit": study.time_unit,
+            "verdict": " ".join(_sentence(each, study.time_unit) for each in identified),
             "paths": [_path(each, stiffness, study.time_unit) for each in identified],
         }
     )
     return fields
+
+
+def _sentence(identified: Identification, time_unit: str) -> str:
+    """What the scan found for one path, and how much worse integer orders are."""
+    best, whole, unit = identified.scan, identified.integer, identified.data.response_unit
+    orders = ", ".join(f"{order:.3g}" for order in best.model.orders)
+    return (
+        f"Path {identified.data.name}: orders {orders}, delay {best.model.delay:.4g} {time_unit}, RMSE "
+        f"{best.output_rmse:.3g} {unit}; with integer orders {whole.output_rmse:.3g}."
+    )
 
 
 def _path(identified: Identification, stiffness: float, time_unit: str) -> dict[str, Any]:

@@ -15,11 +15,15 @@ from lcopa_bayes.verbs.calibrate import CalibrationResult
 from lcopa_bayes.verbs.compare import Comparison
 from lcopa_bayes.verbs.design import DesignResult
 from lcopa_bayes.verbs.loop import LoopResult
+from lcopa_bayes.verbs.papers import ClaimsResult, IdentifyResult, OpticsResult
 from lcopa_bayes.verbs.predict import SavedPrediction
 
 _KINDS: Mapping[str, type[StoredResult]] = {
     kind.verb: kind
-    for kind in (AuditResult, DesignResult, Comparison, LoopResult, CalibrationResult, SavedPrediction)
+    for kind in (
+        *(AuditResult, DesignResult, Comparison, LoopResult, CalibrationResult, SavedPrediction),
+        *(OpticsResult, IdentifyResult, ClaimsResult),
+    )
 }
 
 

@@ -147,7 +147,7 @@ def test_the_equation_holds_on_exact_data_to_second_order():
 
 def test_a_sample_with_an_exposure_stands_for_its_middle():
     exposed = truth(DEVICE, Bench(camera=0.1, exposure=0.1), step(1.0, at=1.0), duration=12.0, name="exposed")
-    told, untold = (data_of(exposed, exposure=exposure) for exposure in (0.1, 0.0))
+    told, untold = (data_of(exposed, exposure_ms=exposure) for exposure in (0.1, 0.0))
     found, late = (least_squares(blocks_of(data), ORDERS, DELAY) for data in (told, untold))
     assert_allclose(found.etas, ETAS, rtol=0.01)
     assert np.abs(np.array(late.etas) / ETAS - 1).max() > 0.03

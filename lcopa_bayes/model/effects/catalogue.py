@@ -15,22 +15,19 @@ from pathlib import Path
 
 from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.model.effects import (
-    acquisition,
     commands,
-    crossfade,
     dynamics,
     generic,
     parallel,
     records,
     response,
-    ripples,
     sensor,
 )
 from lcopa_bayes.model.effects.effect import Card, Effect
 
 GROUP = "lcopa_bayes.effects"
 """Entry point group of effects in installed packages."""
-_MODULES = (acquisition, commands, dynamics, parallel, crossfade, response, sensor, records, ripples, generic)
+_MODULES = (commands, dynamics, parallel, response, sensor, records, generic)
 
 
 def bundled() -> dict[str, type[Effect]]:
