@@ -168,7 +168,7 @@ def _falling(
     project: Projection,
 ) -> Callable[[float], float]:
     def cost(log_value: float) -> float:
-        moved: Any = replace(effect, **{name: float(np.exp(log_value))})  # type: ignore[type-var]
+        moved: Any = replace(effect, **{name: float(np.exp(log_value))})
         try:
             tried[float(log_value)] = signature_of(model, x, whitening, project, moved)
         except ArithmeticError:
@@ -180,5 +180,5 @@ def _falling(
 
 def constants_of(effect: Effect) -> list[str]:
     """Names of the internal constants that are real numbers."""
-    listed = [field.name for field in fields(effect)]  # type: ignore[arg-type]
+    listed = [field.name for field in fields(effect)]
     return [name for name in listed if isinstance(getattr(effect, name), float)]

@@ -2,7 +2,7 @@ r"""Legendre wavelets and their operational matrices, dense and as printed (Ta e
 
 Vectors of basis functions are on the left in the paper, ``(I^a Phi)(t) = P^a Phi(t)``, so that the
 coefficients of a function are rows and its matrices the transposes of those in `blockpulses`:
-``F^a = integration_matrix(a).T`` and ``E = shift_matrix(j).T``, both upper triangular.
+``F^a = integration_matrix(a).T`` and the delay E by j1 blocks, ones above the diagonal, upper triangular.
 
 The printed equations are inconsistent in three places; this module uses:
 
@@ -27,20 +27,10 @@ from typing import final
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.model.blockpulses import integration_matrix, shift_matrix
+from lcopa_bayes.model.blockpulses import integration_matrix
 from lcopa_bayes.model.path import TransferPath
-
-
-def legendre(degree: int, x: Array) -> Array:
-    """P_degree(x) by the three-term recurrence (Eq. 33); any shape, degree >= 0."""
-    if degree < 0:
-        raise InputError(f"a Legendre polynomial has a degree of at least 0; got {degree}")
-    before, value = np.zeros_like(x), np.ones_like(x)
-    for m in range(degree):
-        before, value = value, ((2 * m + 1) * x * value - m * before) / (m + 1)
-    return value
 
 
 @final
@@ -66,10 +56,8 @@ class WaveletBasis:
         rows = [np.ones_like(t)]
         for level in range(1, self.n.bit_length()):
             for place in range(1, 2 ** (level - 1) + 1):
-                centre = 2 * place - 1
-                x = 2.0**level * t - centre
-                inside = (x >= -1) & (x < 1)
-                rows.append(np.where(inside, np.sqrt(1.5) * 2 ** (level / 2) * legendre(1, x), 0.0))
+                x = 2.0**level * t - (2 * place - 1)  # P_1(x) = x
+                rows.append(np.where((x >= -1) & (x < 1), np.sqrt(1.5) * 2 ** (level / 2) * x, 0.0))
         return np.array(rows)
 
     @cached_property
@@ -79,51 +67,28 @@ class WaveletBasis:
 
     @cached_property
     def inverse(self) -> Matrix:
-        """``Psi^-1`` [-]."""
+        """``Psi^-1`` [-]; ``c^T = f^T Psi^-1`` are the coefficients of values f at the nodes."""
         return np.asarray(np.linalg.inv(self.psi))
 
     @cached_property
     def gram(self) -> Matrix:
         """Inner products on [0, 1), (N, N) [-], exact: two Gauss points on each half of a finest wavelet."""
-        cells = self.n
         offsets = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)
-        at = self.functions(((np.arange(cells)[:, None] + offsets) / cells).ravel())
-        return np.asarray(at @ at.T / (2 * cells))
+        at = self.functions(((np.arange(self.n)[:, None] + offsets) / self.n).ravel())
+        return np.asarray(at @ at.T / (2 * self.n))
 
     @property
     def largest_overlap(self) -> float:
         """Largest absolute inner product of two different functions [-]; 0 for an orthogonal basis."""
         return float(np.abs(self.gram - np.diag(np.diag(self.gram))).max())
 
-    def coefficients(self, values: Vector) -> Vector:
-        """c of Eq. 38 for values at the nodes, ``c^T = f^T Psi^-1``; (N,) in the unit of `values`."""
-        return np.asarray(values @ self.inverse)
-
-    def similar(self, matrix: Matrix) -> Matrix:
-        """A block-pulse matrix of the paper in wavelet coordinates, ``Psi M Psi^-1`` (Eqs. 49, 57)."""
-        return np.asarray(self.psi @ matrix @ self.inverse)
-
     def integration(self, order: float, span: float) -> Matrix:
         """P^a of Eq. 49 over a record of length `span` [time unit]; (N, N) [time unit^order]."""
-        return self.similar(printed_integration(order, self.n, span))
+        return np.asarray(self.psi @ integration_matrix(order, self.n, span / self.n).T @ self.inverse)
 
     def shift(self, blocks: int) -> Matrix:
         """Z of Eq. 57, a delay of whole blocks; (N, N) [-]."""
-        return self.similar(printed_shift(blocks, self.n))
-
-    def delayed_integration(self, order: float, blocks: int, span: float) -> Matrix:
-        """``Z P^a`` of Eq. 58; (N, N) [time unit^order]."""
-        return np.asarray(self.shift(blocks) @ self.integration(order, span))
-
-
-def printed_integration(order: float, n: int, span: float) -> Matrix:
-    """F^a of Eqs. 44 and 45, upper triangular, (n, n) [time unit^order]; ``integration_matrix(...).T``."""
-    return np.asarray(integration_matrix(order, n, span / n).T)
-
-
-def printed_shift(blocks: int, n: int) -> Matrix:
-    """E of Eq. 53: ones `blocks` above the diagonal, (n, n) [-]; ``shift_matrix(...).T``."""
-    return np.asarray(shift_matrix(blocks, n).T)
+        return np.asarray(self.psi @ np.eye(self.n, k=blocks) @ self.inverse)
 
 
 def wavelet_response(
@@ -135,18 +100,18 @@ def wavelet_response(
     for its delay. Accuracy: `block_pulse_response` to rounding.
     """
     system = _system(path, lambda order: basis.integration(order, span))
-    forced = basis.delayed_integration(path.orders[0], blocks, span)
-    right = path.gain * basis.coefficients(drive) @ forced
+    forced = basis.shift(blocks) @ basis.integration(path.orders[0], span)
+    right = path.gain * (drive @ basis.inverse) @ forced
     return np.asarray(np.linalg.solve(system.T, right) @ basis.psi)
 
 
 def block_pulse_response(path: TransferPath, drive: Vector, span: float, blocks: int) -> Vector:
     """`wavelet_response` in block-pulse coordinates, where the system is triangular; any number of blocks."""
     n = drive.size
-    system = _system(path, lambda order: printed_integration(order, n, span))
-    forced = printed_integration(path.orders[0], n, span)
+    system = _system(path, lambda order: integration_matrix(order, n, span / n).T)
     late = np.concatenate((np.zeros(min(blocks, n)), drive[: max(0, n - blocks)]))
-    return np.asarray(solve_triangular(system, path.gain * (late @ forced), trans="T"))
+    right = path.gain * (late @ integration_matrix(path.orders[0], n, span / n).T)
+    return np.asarray(solve_triangular(system, right, trans="T"))
 
 
 def _system(path: TransferPath, integration: Callable[[float], Matrix]) -> Matrix:

@@ -101,40 +101,6 @@ def side_lobe_level(array: LinearArray, step: float) -> float:
     return max(-float(top.fun), float(level[best]))
 
 
-@final
-@dataclass(frozen=True)
-class LobeRow:
-    """A lobe of the array of Section 2 at one steering angle (claim S2)."""
-
-    target: float
-    """Steering angle [rad]."""
-    order: int
-    """[-]."""
-    angle: float
-    """[rad]."""
-    isotropic: float
-    """Intensity relative to the main lobe, isotropic elements [-]."""
-    with_element: float
-    """Intensity relative to the main lobe, elements of finite width [-]."""
-
-
-def lobe_table(
-    targets: ArrayLike, optics: StatedOptics = PAPER.optics, *, fill_factor: float = 1.0
-) -> tuple[LobeRow, ...]:
-    """All lobes at steering angles `targets` [rad], with and without the element factor (claim S2).
-
-    `optics` holds the printed numbers; `fill_factor` [-] sets the slit; 1 is the largest possible element
-    and suppresses grating lobes most.
-    """
-    bare, slit = paper_array(optics), paper_array(optics, fill_factor=fill_factor)
-    rows = []
-    for goal in np.ravel(finite(targets, name="targets", unit="rad")):
-        step = float(bare.phase_step(goal))
-        pairs = zip(lobes(bare, step), lobes(slit, step), strict=True)
-        rows += [LobeRow(float(goal), a.order, a.angle, a.intensity, b.intensity) for a, b in pairs]
-    return tuple(rows)
-
-
 def strongest_grating_lobe(
     targets: ArrayLike, optics: StatedOptics = PAPER.optics, *, fill_factor: float = 1.0
 ) -> Vector:

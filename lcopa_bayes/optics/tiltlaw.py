@@ -130,6 +130,14 @@ class FitQuality:
     largest_error: float
     """[rad]."""
 
+    def as_json(self) -> dict[str, float]:
+        """What is reported beside the range; every number says its unit."""
+        return {
+            "r_squared": self.r_squared,
+            "largest_relative_error": self.largest_relative_error,
+            "largest_error_rad": self.largest_error,
+        }
+
 
 def fit_quality(curve: DirectorCurve, law: TiltLaw, lower: float, upper: float) -> FitQuality:
     """Compare `law` with `curve` at its solved voltages in ``[lower, upper]`` [V].

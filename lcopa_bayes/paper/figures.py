@@ -7,8 +7,7 @@ says; any other record has the same curves and no printed numbers beside them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -35,60 +34,18 @@ def model_of(identified: Identification, kind: str) -> Identified:
     return dict(zip(KINDS, models, strict=True))[kind]
 
 
-@final
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """One model on one axis of one record."""
-
-    kind: str
-    response: Vector
-    """At the samples [response unit]."""
-    rmse: float
-    """Of the samples about it [response unit]."""
-    printed_rmse: str = ""
-    """What the text says of this model on such a record, in words; empty when nothing."""
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Panel:
-    """One response axis of one record."""
-
-    record: str
-    axis: str
-    unit: str
-    held_out: bool
-    figure: str
-    """Figure of the paper that shows such a record, such as "Fig. 13"; empty when none does."""
-    time: Vector
-    """Of the samples [time unit]."""
-    observed: Vector
-    """[response unit]."""
-    curves: tuple[Curve, ...]
-    printed_level: float | None
-    """Steady response that the text gives for this axis [response unit]; None when it gives none."""
-
-    def as_json(self) -> dict[str, Any]:
-        """Plain values without the samples."""
-        names = ("record", "axis", "unit", "held_out", "figure", "printed_level")
-        curves = [
-            {"model": curve.kind, "rmse": curve.rmse, "printed_rmse": curve.printed_rmse}
-            for curve in self.curves
-        ]
-        return {name: getattr(self, name) for name in names} | {"curves": curves}
-
-    def csv(self) -> str:
-        """Samples: time [time unit], observed, and each model [response unit]."""
-        columns = {"time": self.time, "observed": self.observed}
-        table = pd.DataFrame(columns | {curve.kind: curve.response for curve in self.curves})
-        return str(table.to_csv(index=False, float_format="%.9g"))
-
-
-def panels(study: Study, identified: Sequence[Identification], stated: Stated = PAPER) -> tuple[Panel, ...]:
+def panels(
+    study: Study, identified: Sequence[Identification], stated: Stated = PAPER
+) -> list[tuple[dict[str, Any], pd.DataFrame]]:
     """Every response axis of every record, fitted records first, with the models of `KINDS`.
 
-    `found` are the paths of the study. A model of an axis is the sum over the drives that move; its resting
-    level is that of the record, as in the identification.
+    `identified` are the paths of the study. A model of an axis is the sum over the drives that move; its
+    resting level is that of the record, as in the identification.
+
+    Returns: for each, plain values (record, axis, unit, held_out; figure of the paper that shows such a
+    record, empty when none does; printed_level, the steady response the text gives [response unit] or None;
+    curves with model, RMSE [response unit] and what the text prints for it), and a table of the samples:
+    time [time unit], observed and each model [response unit].
     """
     out = []
     for held, records in ((False, study.fit), (True, study.held_out)):
@@ -96,22 +53,25 @@ def panels(study: Study, identified: Sequence[Identification], stated: Stated = 
             figure = paper_figure(record, stated)
             for i, axis in enumerate(study.response_axes):
                 taken = np.isfinite(record.response[:, i])
-                if taken.any() and any(drive.moves for drive in axis_drives(record)):
-                    time, seen = record.time[taken], record.response[taken, i]
-                    sums = {kind: _response(study, identified, record, i, kind) for kind in KINDS}
-                    curves = tuple(
-                        Curve(
-                            kind,
-                            response,
-                            float(np.sqrt(np.mean((seen - response) ** 2))),
-                            _printed_rmse(figure, kind, stated),
-                        )
-                        for kind, response in sums.items()
-                    )
-                    level = _printed_level(figure, axis.name, stated)
-                    panel = (record.name, axis.name, axis.unit, held, figure, time, seen, curves, level)
-                    out.append(Panel(*panel))
-    return tuple(out)
+                if not (taken.any() and any(drive.moves for drive in axis_drives(record))):
+                    continue
+                time, seen = record.time[taken], record.response[taken, i]
+                models = {kind: _response(study, identified, record, i, kind) for kind in KINDS}
+                curves = [
+                    {
+                        "model": kind,
+                        "rmse": float(np.sqrt(np.mean((seen - response) ** 2))),
+                        "printed_rmse": _printed_rmse(figure, kind, stated),
+                    }
+                    for kind, response in models.items()
+                ]
+                values = {
+                    **{"record": record.name, "axis": axis.name, "unit": axis.unit, "held_out": held},
+                    **{"figure": figure, "printed_level": _printed_level(figure, axis.name, stated)},
+                    "curves": curves,
+                }
+                out.append((values, pd.DataFrame({"time": time, "observed": seen} | models)))
+    return out
 
 
 def paper_figure(record: Record, stated: Stated = PAPER) -> str:

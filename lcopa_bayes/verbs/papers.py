@@ -89,7 +89,7 @@ class ClaimsResult(StoredResult):
 
 def optics(plan: OpticsPlan | None = None) -> OpticsResult:
     """Far field, director and the chain from volts to angle; `plan` by default the paper's."""
-    return OpticsResult(static_optics(plan or OpticsPlan()).as_json(), provenance(None, "optics"))
+    return OpticsResult(static_optics(plan or OpticsPlan()).values, provenance(None, "optics"))
 
 
 def identify(
@@ -104,7 +104,7 @@ def identify(
     """The paper's least-squares scan of every path, with the integer rival and its Table 1.
 
     Parameters: `study`, or a fit of it; `scan`, intervals and spacing; `posterior`, the run folder of a fit
-    whose intervals stand beside; `folder`, a run folder to write into; `jobs`, processes to use; `quiet`, no
+    whose intervals are shown too; `folder`, a run folder to write into; `jobs`, processes to use; `quiet`, no
     progress bar. InputError when records, intervals or folders cannot be used.
     """
     wanted, plan = study_of(study), scan or Scan()
@@ -114,11 +114,11 @@ def identify(
         writable_folder(Path(folder))
     models = identified(wanted, plan=plan, quiet=quiet, jobs=jobs)
     shown, texts = [], {}
-    for number, panel in enumerate(panels(wanted, models), start=1):
-        stem = re.sub(r"[^A-Za-z0-9_-]+", "_", f"identify_{number:02d}_{panel.record}_{panel.axis}")
-        shown.append(panel.as_json() | {"samples": f"tables/{stem}.csv"})
-        texts[f"tables/{stem}.csv"] = panel.csv()
-    table = [row.as_json() for row in step_table(wanted, models, posterior=beside)]
+    for number, (entry, samples) in enumerate(panels(wanted, models), start=1):
+        stem = re.sub(r"[^A-Za-z0-9_-]+", "_", f"identify_{number:02d}_{entry['record']}_{entry['axis']}")
+        shown.append(entry | {"samples": f"tables/{stem}.csv"})
+        texts[f"tables/{stem}.csv"] = str(samples.to_csv(index=False, float_format="%.9g"))
+    table = step_table(wanted, models, posterior=beside)
     values = results(wanted, models, plan) | {"step_metrics": table, "records": shown}
     result = IdentifyResult(values, provenance(wanted, "identify"), texts)
     if folder is not None:

@@ -18,11 +18,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.special import erfcx
 
 import lcopa_bayes.bench
-from lcopa_bayes.bench import inversion, superposition
+from lcopa_bayes.bench import device as bench_device
+from lcopa_bayes.bench import inversion
 from lcopa_bayes.bench.acquisition import PAPER_BENCH, Bench, simulate, truth
-from lcopa_bayes.bench.campaign import paper_step_records, write_campaign
+from lcopa_bayes.bench.campaignfile import load_plan, write_campaign
 from lcopa_bayes.bench.command import Command, on_off, prbs, quiet, staircase, step, two_axis
-from lcopa_bayes.bench.device import PAPER_DEVICE, Device
+from lcopa_bayes.bench.device import PAPER_DEVICE, Device, TableError, superposed, tabulated
 from lcopa_bayes.bench.inversion import (
     InversionError,
     PoleSearchError,
@@ -31,9 +32,8 @@ from lcopa_bayes.bench.inversion import (
     unit_ramp,
     unit_step,
 )
-from lcopa_bayes.bench.superposition import TableError, superposed, tabulated
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.record import Axis, load_record
+from lcopa_bayes.data.record import Axis, Record, load_record
 from lcopa_bayes.model.path import TransferPath
 
 XX = PAPER_DEVICE.paths[0][0]
@@ -240,7 +240,7 @@ def test_table_and_direct_sums_agree(path, rng, monkeypatch):
     changes, jumps = np.sort(rng.uniform(0, 50, 13)), rng.normal(size=13)
     response = partial(unit_step, path)
     direct = superposed(response, time, changes, jumps, tolerance=0.0)  # a table could not reach 0
-    monkeypatch.setattr(superposition, "_DISTINCT", 0)
+    monkeypatch.setattr(bench_device, "_DISTINCT", 0)
     table = superposed(response, time, changes, jumps, tolerance=1e-9 / path.stiffness)
     assert 0 < np.abs(direct - table).max() < 1e-8 * np.abs(jumps).sum() / path.stiffness
 
@@ -500,6 +500,11 @@ def test_bad_durations_and_noise_shapes_are_refused(rng):
 # ---------------------------------------------------------------- campaign
 
 
+def paper_step_records(rng) -> tuple[Record, ...]:
+    """The step records of the paper's Section 5, as the bundled campaign describes them."""
+    return load_plan(Path(__file__).parents[2] / "studies/paper-step/campaign.toml").run(rng)
+
+
 def test_paper_records_are_the_stated_experiments(rng):
     records = {record.name: record for record in paper_step_records(rng)}
     assert list(records) == ["x_on", "x_off", "x_quarter", "y_quarter", "xy"]
@@ -529,10 +534,9 @@ def test_paper_records_are_the_stated_experiments(rng):
 def test_campaign_on_disk(tmp_path, rng):
     records = paper_step_records(rng)
     folder = tmp_path / "new" / "paper"
-    paths = write_campaign(folder, records, held_out=("xy",), seed=7, note='a "bench"\nof paper')
+    paths = write_campaign(folder, records, held_out=("xy",), seed=7)
     assert sorted(folder.iterdir()) == sorted(paths)
     text = paths[-1].read_text(encoding="utf-8")
-    assert text.startswith('# a "bench"\n# of paper\n')
     assert tomllib.loads(text) == {
         "study": {"name": "paper", "time_unit": "ms", "seed": 7},
         "records": {
@@ -580,7 +584,7 @@ def test_campaign_leaves_no_part_behind_when_interrupted(tmp_path, rng, monkeypa
         path.write_text("half")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("lcopa_bayes.bench.campaign.save_record", fail)
+    monkeypatch.setattr("lcopa_bayes.bench.campaignfile.save_record", fail)
     with pytest.raises(KeyboardInterrupt):
         write_campaign(tmp_path, paper_step_records(rng)[:1])
     assert not list(tmp_path.iterdir())

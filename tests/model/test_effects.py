@@ -29,8 +29,8 @@ from lcopa_bayes.model.effects.dynamics import (
 )
 from lcopa_bayes.model.effects.effect import UnstableError
 from lcopa_bayes.model.effects.parallel import Backflow
+from lcopa_bayes.model.effects.records import Vibration
 from lcopa_bayes.model.effects.response import OddCurvature
-from lcopa_bayes.model.effects.ripples import Vibration
 from lcopa_bayes.model.effects.sensor import SensorLag
 from lcopa_bayes.model.path import TransferPath
 from lcopa_bayes.results.prediction import responses

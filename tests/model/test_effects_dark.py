@@ -15,9 +15,8 @@ from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.inference.effects import Effected, carried, effected
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.model.effects.catalogue import bundled
-from lcopa_bayes.model.effects.crossfade import CrossFade
-from lcopa_bayes.model.effects.parallel import relaxing
-from lcopa_bayes.model.effects.superposition import jumps_of, summed
+from lcopa_bayes.model.effects.parallel import jumps_of, relaxing, summed
+from lcopa_bayes.model.effects.response import CrossFade
 from lcopa_bayes.model.forward import forward_model
 
 ALL = bundled()

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from small import record
 
-from lcopa_bayes.bench.campaign import write_campaign
+from lcopa_bayes.bench.campaignfile import write_campaign
 from lcopa_bayes.cli import main
 from lcopa_bayes.core import files
 from lcopa_bayes.core.errors import InputError

@@ -150,10 +150,13 @@ class Scene:
         return self.drives[j], float(self.rest[j]), float(self.gains[axis, j]), float(self.delays[axis, j])
 
 
+@dataclass(frozen=True)
 class Effect(ABC):
     """An addition to the linear plant; concrete effects subclass one of the classes below."""
 
     card: ClassVar[Card]
+    estimated: ClassVar[tuple[Coefficient, ...]] = ()
+    """Coefficients whose scales are the same on any records."""
     per_command: ClassVar[bool] = False
     """Whether it is computed command by command, which takes long on records of thousands."""
     linear: ClassVar[bool] = False
@@ -178,7 +181,7 @@ class Effect(ABC):
         """Internal constants, in the order of the fields; they reach from end to end of `grid`, and what has
         a default value is fixed there."""
         listed, out = cls.grid(ranges), []
-        for field in fields(cls):  # type: ignore[arg-type]
+        for field in fields(cls):
             values = [getattr(one, field.name) for one in listed]
             if isinstance(values[0], bool):
                 out.append(Constant(field.name, "-", 0.0, 0.0, "choice"))
@@ -192,12 +195,12 @@ class Effect(ABC):
     @classmethod
     def with_constants(cls, ranges: Ranges, values: Sequence[float]) -> Self:
         """The instance with internal constants as numbers, in the order of `internal`."""
-        told = cls.internal(ranges)
-        return cls(*(bool(v) if one.kind == "choice" else v for one, v in zip(told, values, strict=True)))
+        pairs = zip(cls.internal(ranges), values, strict=True)
+        return cls(*(bool(v) if one.kind == "choice" else v for one, v in pairs))
 
-    @abstractmethod
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """Coefficients, of one record when the card says `per_record`."""
+        """Coefficients, of one record when the card says `per_record`; by default those of `estimated`."""
+        return self.estimated
 
     @classmethod
     def applies(cls, layout: Layout) -> bool:
@@ -212,7 +215,7 @@ class Effect(ABC):
     @property
     def constants(self) -> dict[str, Any]:
         """Internal constants by name."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
 class DriveEffect(Effect):
