@@ -5,6 +5,8 @@ import lcopa_bayes as lb
 study = lb.load_study("studies/paper-step")
 fit = lb.fit(study, jobs=2)
 fit.summary()
+
+`docs/python.md` is a session with its output, which the tests run.
 """
 
 from importlib import import_module

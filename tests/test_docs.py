@@ -1,15 +1,12 @@
 """The documentation says what the code does: keys, defaults, limits of grades, verbs, examples and links."""
 
-import ast
 import dataclasses
 import re
 import tomllib
 from pathlib import Path
 
 import pytest
-from small import record
 
-import lcopa_bayes as lb
 from lcopa_bayes.cli import main
 from lcopa_bayes.comparison.candidates import KNOWN, VARIANTS
 from lcopa_bayes.core.errors import InputError
@@ -215,34 +212,6 @@ def test_examples_are_read_as_they_stand(tmp_path):
             else:
                 (tmp_path / "study.toml").write_text(text)
                 assert load_study(tmp_path).fit[0].name in ("on", "both")
-
-
-def test_the_lines_of_the_readme_use_public_names():
-    (text,) = blocks(ROOT / "README.md", "python")
-    used = {
-        (node.value.id, node.attr)
-        for node in ast.walk(ast.parse(text))
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)
-    }
-    assert {name for owner, name in used if owner == "lb"} <= set(lb.__all__)
-    assert all(hasattr(lb.Fit, name) for owner, name in used if owner == "fit")
-    assert len(used) > 8
-
-
-@pytest.mark.slow
-def test_the_lines_of_the_readme_work(tmp_path, monkeypatch):
-    """On a small study in place of the bundled one, sampled too shortly for numbers that hold."""
-    made = record(1, camera=0.5, name="on")
-    columns = {"time_ms": made.time, "drive_x_rad": made.drive[:, 0], "response_x_rad": made.response[:, 0]}
-    sampler = {"ensembles": 2, "walkers": 16, "steps": 40, "thin": 1, "target_ess": 20}
-    study = lb.Study("small", fit=[columns], terms=1, noise={"kind": "white"}, sampler=sampler, seed=5)
-    monkeypatch.setattr(lb, "load_study", lambda folder: study)
-    monkeypatch.chdir(tmp_path)
-    (text,) = blocks(ROOT / "README.md", "python")
-    names: dict[str, object] = {}
-    exec(compile(text, "README.md", "exec"), names)
-    assert names["study"] is study
-    assert len(list((tmp_path / "runs").rglob("*.html"))) == 1
 
 
 def slug(heading: str) -> str:

@@ -308,6 +308,13 @@ class Drive:
             partial=False,
         )
 
+    def __repr__(self) -> str:
+        """What it holds, without the numbers."""
+        pairs = zip(self.axes, self.units, strict=True)
+        axes = ", ".join(axis if unit is None else f"{axis} [{unit}]" for axis, unit in pairs)
+        span = f"{self.time[0]:.6g} to {self.time[-1]:.6g} {self.time_unit or ''}".rstrip()
+        return f"Drive({self.name!r}, {axes}, {self.time.size} rows from {span})"
+
     def __reduce__(self) -> tuple[object, ...]:
         """Rebuild rather than restore, so that a copy in another process is locked too."""
         arrays = (self.name, self.time, self.values, self.axes, self.units)

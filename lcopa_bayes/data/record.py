@@ -98,6 +98,12 @@ class Record:
         if any(is_so for is_so, _ in wrong):
             raise InputError([f"record {self.name!r}: {what}" for is_so, what in wrong if is_so])
 
+    def __repr__(self) -> str:
+        """What it holds, without the numbers."""
+        axes = ", ".join(f"{one.name} [{one.unit}]" for one in (*self.drive_axes, *self.response_axes))
+        span = f"{self.time[0]:.6g} to {self.time[-1]:.6g} {self.time_unit}"
+        return f"Record({self.name!r}, {axes}, {self.time.size} rows from {span})"
+
     def __reduce__(self) -> tuple[object, ...]:
         """Rebuild rather than restore, so that a copy in another process is locked too."""
         arrays = (self.time, self.drive, self.response)

@@ -118,7 +118,11 @@ class Study:
         unit = time_unit or (fitted[0].time_unit if fitted else "")
         records = (*fitted, *apart)
         problems = together(fitted, apart) if fitted else ["a study needs one or more records to fit"]
-        problems += [f"record {r.name!r} is in {r.time_unit}" for r in records if r.time_unit != unit]
+        problems += [
+            f"record {r.name!r} is in {r.time_unit}, the study is in {unit}; convert its times"
+            for r in records
+            if r.time_unit != unit
+        ]
         refuse_if(problems)
         settings |= {
             "name": name or default_name(fitted),
@@ -151,6 +155,10 @@ class Study:
     def with_seed(self, seed: int) -> Study:
         """The same study with another seed."""
         return replace(self, seed=seed)
+
+    def __repr__(self) -> str:
+        """Its records, without their numbers and the settings."""
+        return f"Study({self.name!r}, fit={list(self.fit)}, held_out={list(self.held_out)})"
 
     __reduce__ = rebuilt
 

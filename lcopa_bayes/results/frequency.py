@@ -17,6 +17,7 @@ from lcopa_bayes.core.estimate import Estimate, plain
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.model.transfer import denominator
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS, pointwise, simultaneous
+from lcopa_bayes.results.result import notebook_table
 from lcopa_bayes.sampling.draws import Draws
 
 _DRAWS = 2000
@@ -137,7 +138,7 @@ class FrequencyResponse:
         return out
 
     def _repr_html_(self) -> str:
-        return str(self.summary().to_html())
+        return notebook_table(self.summary())
 
 
 def named(name: str, bands: Bands) -> dict[str, Vector]:

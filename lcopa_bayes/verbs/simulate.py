@@ -13,6 +13,7 @@ import pandas as pd
 from lcopa_bayes.bench.campaignfile import load_plan, write_campaign
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
+from lcopa_bayes.results.result import notebook_table
 
 
 @final
@@ -90,7 +91,7 @@ class Simulation:
         )
 
     def _repr_html_(self) -> str:
-        return str(self.summary().to_html(index=False))
+        return notebook_table(self.summary())
 
 
 def simulate(campaign: Path | str, *, seed: int | None = None) -> Simulation:

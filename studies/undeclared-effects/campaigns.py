@@ -47,7 +47,7 @@ def study_of(made: Campaign, seed: int) -> Study:
     return Study("hidden", None, "ms", seed, made.fit, made.held_out, ModelSettings(terms=TERMS))
 
 
-def play(task: Task, folder: Path) -> dict[str, Any]:
+def play(folder: Path, task: Task) -> dict[str, Any]:
     """Make, loop and judge; the row is kept in `folder`, and read back when it is there."""
     path = folder / f"{task.name}.json"
     if path.exists():

@@ -98,6 +98,15 @@ def test_a_drive_that_does_not_suit_is_refused_and_nothing_written(folder, capsy
     assert sorted(folder.rglob("*")) == before
 
 
+def test_a_fitted_record_is_refused_and_nothing_written(fitted, folder, capsys, tmp_path):
+    save_record(fitted.study.fit[0], tmp_path / "step.csv")
+    before = sorted(folder.rglob("*"))
+    assert main(["predict", str(folder), str(tmp_path / "step.csv")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "record 'step' is 'step' of the fit" in line
+    assert sorted(folder.rglob("*")) == before
+
+
 def other_version(folder: Path) -> None:
     values = json.loads((folder / "fit.json").read_text()) | {"version": "0.0.1"}
     (folder / "fit.json").write_text(json.dumps(values))
