@@ -192,7 +192,7 @@ def results(study: Study, identified: tuple[Identification, ...], plan: Scan | N
 
 
 def _sentence(identified: Identification, time_unit: str) -> str:
-    """What the scan found for one path, and how much worse integer orders are."""
+    """Result of the scan for one path, and how much worse integer orders are."""
     best, whole, unit = identified.scan, identified.integer, identified.data.response_unit
     orders = ", ".join(f"{order:.3g}" for order in best.model.orders)
     return (

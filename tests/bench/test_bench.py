@@ -18,11 +18,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.special import erfcx
 
 import lcopa_bayes.bench
-from lcopa_bayes.bench import inversion, superposition
+from lcopa_bayes.bench import device as bench_device
+from lcopa_bayes.bench import inversion
 from lcopa_bayes.bench.acquisition import PAPER_BENCH, Bench, simulate, truth
 from lcopa_bayes.bench.campaignfile import load_plan, write_campaign
 from lcopa_bayes.bench.command import Command, on_off, prbs, quiet, staircase, step, two_axis
-from lcopa_bayes.bench.device import PAPER_DEVICE, Device
+from lcopa_bayes.bench.device import PAPER_DEVICE, Device, TableError, superposed, tabulated
 from lcopa_bayes.bench.inversion import (
     InversionError,
     PoleSearchError,
@@ -31,7 +32,6 @@ from lcopa_bayes.bench.inversion import (
     unit_ramp,
     unit_step,
 )
-from lcopa_bayes.bench.superposition import TableError, superposed, tabulated
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.record import Axis, Record, load_record
 from lcopa_bayes.model.path import TransferPath
@@ -240,7 +240,7 @@ def test_table_and_direct_sums_agree(path, rng, monkeypatch):
     changes, jumps = np.sort(rng.uniform(0, 50, 13)), rng.normal(size=13)
     response = partial(unit_step, path)
     direct = superposed(response, time, changes, jumps, tolerance=0.0)  # a table could not reach 0
-    monkeypatch.setattr(superposition, "_DISTINCT", 0)
+    monkeypatch.setattr(bench_device, "_DISTINCT", 0)
     table = superposed(response, time, changes, jumps, tolerance=1e-9 / path.stiffness)
     assert 0 < np.abs(direct - table).max() < 1e-8 * np.abs(jumps).sum() / path.stiffness
 

@@ -33,12 +33,11 @@ from lcopa_bayes.paper.equation import (
     output_rmse,
     responses,
 )
-from lcopa_bayes.paper.evaluation import evaluate
 from lcopa_bayes.paper.identify import identify, integer_orders, results
 from lcopa_bayes.paper.intervals import Candidates, Interval, Scan, decreasing
 from lcopa_bayes.paper.outputerror import output_error_fit
 from lcopa_bayes.paper.paths import MOST_BLOCKS, PathData, path_data
-from lcopa_bayes.paper.scan import scan
+from lcopa_bayes.paper.scan import evaluate, scan
 
 PAPER_STEP = Path(__file__).parents[2] / "studies" / "paper-step"
 U, Y = Axis("u", "V"), Axis("y", "rad")

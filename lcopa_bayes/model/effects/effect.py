@@ -195,8 +195,8 @@ class Effect(ABC):
     @classmethod
     def with_constants(cls, ranges: Ranges, values: Sequence[float]) -> Self:
         """The instance with internal constants as numbers, in the order of `internal`."""
-        told = cls.internal(ranges)
-        return cls(*(bool(v) if one.kind == "choice" else v for one, v in zip(told, values, strict=True)))
+        pairs = zip(cls.internal(ranges), values, strict=True)
+        return cls(*(bool(v) if one.kind == "choice" else v for one, v in pairs))
 
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
         """Coefficients, of one record when the card says `per_record`; by default those of `estimated`."""
