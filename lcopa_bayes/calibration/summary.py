@@ -88,8 +88,7 @@ def results(made: Calibration) -> dict[str, Any]:
         "thin": plan.thin,
         "target_ess": plan.target_ess,
     }
-    out: dict[str, Any] = plain(told)
-    return out
+    return plain(told)
 
 
 def over(outcomes: Sequence[Outcome], quantities: Sequence[Quantity]) -> dict[str, Any]:

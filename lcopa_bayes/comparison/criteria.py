@@ -44,7 +44,7 @@ class Criteria:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        told: dict[str, Any] = plain(
+        return plain(
             {
                 "max_log_likelihood": self.log_likelihood,
                 "parameters": self.parameters,
@@ -53,7 +53,6 @@ class Criteria:
                 "bic": self.bic,
             }
         )
-        return told
 
 
 def criteria(fit: Fit, also: Sequence[Peak] = ()) -> Criteria:

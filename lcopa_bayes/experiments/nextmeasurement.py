@@ -42,7 +42,7 @@ def next_measurement(fit: Predictive, parameters: Sequence[Mapping[str, Any]]) -
                 "expected_relative_sd_step": None if reason else made.estimate(made.step, name).as_json(),
             }
         )
-    told: dict[str, Any] = plain(
+    return plain(
         {
             "drive": made.winner.candidate.name if made.determined.any() else None,
             "words": made.winner.candidate.words if made.determined.any() else "",
@@ -52,4 +52,3 @@ def next_measurement(fit: Predictive, parameters: Sequence[Mapping[str, Any]]) -
             "parameters": rows,
         }
     )
-    return told

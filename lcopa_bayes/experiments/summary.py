@@ -16,7 +16,7 @@ def as_json(made: Design) -> dict[str, Any]:
     """Every number of a design; what is infinite or undefined is None and has a reason in words."""
     study, table = made.fit.study, made.fit.draws.table
     determined = bool(made.determined.any())
-    told: dict[str, Any] = plain(
+    return plain(
         {
             "study": study.name,
             "verdict": made.sentence,
@@ -46,7 +46,6 @@ def as_json(made: Design) -> dict[str, Any]:
             "structure": [one.as_json() for one in made.structure.symmetries],
         }
     )
-    return told
 
 
 def _row(made: Design, promise: Promise) -> dict[str, Any]:

@@ -81,7 +81,7 @@ class Audit:
     def as_json(self) -> dict[str, Any]:
         """Every number of the audit; what is open, infinite or undefined is None."""
         draws = self.fit.draws
-        fields: dict[str, Any] = plain(
+        return plain(
             {
                 "study": self.fit.study.name,
                 "verdict": self.sentence,
@@ -102,7 +102,6 @@ class Audit:
                 "next_measurement": None,
             }
         )
-        return fields
 
 
 def _structure(structure: Structure) -> dict[str, Any]:

@@ -43,7 +43,7 @@ class Belief:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        fields: dict[str, Any] = plain(
+        return plain(
             {
                 "parameter": self.parameter,
                 "contraction": self.contraction,
@@ -52,7 +52,6 @@ class Belief:
                 "power_scaling": None if self.sensitivity is None else self.sensitivity.diagnosis,
             }
         )
-        return fields
 
 
 @final

@@ -63,7 +63,7 @@ class Curvature:
     def as_json(self) -> dict[str, Any]:
         """Plain values without the spectrum; infinite values are None."""
         pairs = sorted(combinations(range(len(self.names)), 2), key=lambda ab: -abs(self.overlap[ab]))
-        fields: dict[str, Any] = plain(
+        return plain(
             {
                 "relative_sd": dict(zip(self.names, self.relative_sd, strict=True)),
                 "collinearity": self.collinearity,
@@ -79,7 +79,6 @@ class Curvature:
                 "correlations": self.correlations,
             }
         )
-        return fields
 
     def spectrum(self) -> list[dict[str, Any]]:
         """Directions by falling precision with the parameters that make them up."""
@@ -94,8 +93,7 @@ class Curvature:
                     "prior_knows_more": bool(value < 1),
                 }
             )
-        fields: list[dict[str, Any]] = plain(out)
-        return fields
+        return out
 
 
 def curvature(landscape: Landscape, values: Vector, prior_sd: Vector) -> Curvature:

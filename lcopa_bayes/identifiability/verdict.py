@@ -48,7 +48,7 @@ class Finding:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        fields: dict[str, Any] = plain(
+        return plain(
             {
                 "name": self.profile.parameter,
                 "unit": self.profile.unit,
@@ -63,7 +63,6 @@ class Finding:
                 "disagreements": self.disagreements,
             }
         )
-        return fields
 
 
 def judged(

@@ -146,7 +146,7 @@ def _priors(results: Mapping[str, Any]) -> Section:
                     *(str(row["name"]), f"{prior_width['factor']:g}"),
                     _with_error(prior_width["log_evidence"], prior_width["sd"]),
                     NONE if change is None else f"{change:+.2f}",
-                    str(prior_width["road"]),
+                    str(prior_width["method"]),
                     f"{prior_width['ess']:.0f}",
                     figures(prior_width["pareto_k"], 2),
                     ", ".join(prior_width["parameters"]) or "none",
@@ -176,7 +176,7 @@ def _predicted(results: Mapping[str, Any]) -> Section:
             _with_error(prediction["elpd"], prediction["monte_carlo_sd"], 1),
             *(
                 _plain(prediction["in_sample"], 1),
-                str(prediction["road"]),
+                str(prediction["method"]),
                 figures(prediction["pareto_k"], 2),
             ),
             *(f"{prediction['ess']:.0f}", str(prediction["grade"]), "; ".join(prediction["level_from"])),
@@ -230,7 +230,13 @@ def _orders(results: Mapping[str, Any]) -> Section:
             (
                 *(str(entry["model"]), str(entry["parameter"]), to_spread(estimate["value"], spread)),
                 interval(estimate["lower"], estimate["upper"], spread),
-                *(str(entry["nearest"]), said, str(entry["road"]), str(entry["answer"]), str(entry["grade"])),
+                *(
+                    str(entry["nearest"]),
+                    said,
+                    str(entry["method"]),
+                    str(entry["answer"]),
+                    str(entry["grade"]),
+                ),
             )
         )
     text = (
