@@ -10,8 +10,7 @@ import numpy as np
 import pandas as pd
 
 from lcopa_bayes.calibration.calibrate import Calibration
-from lcopa_bayes.calibration.coverage import LEVELS, Coverage
-from lcopa_bayes.calibration.ranks import SIMULTANEOUS, bin_limits, corridor, p_uniform
+from lcopa_bayes.calibration.ranks import LEVELS, SIMULTANEOUS, Coverage, bin_limits, corridor, p_uniform
 from lcopa_bayes.calibration.replica import ENGINES, RANKED, Outcome, Quantity
 from lcopa_bayes.calibration.truths import Truths
 from lcopa_bayes.core.estimate import plain
