@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.identifiability.sensitivities import Sensitivities
+from lcopa_bayes.identifiability.curvature import Sensitivities
 from lcopa_bayes.identifiability.symmetries import Structure, structure
 from lcopa_bayes.model.literature import PAPER, Stated
 from lcopa_bayes.model.path import Normalisation, TransferPath
