@@ -12,8 +12,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.bench.inversion import step_response
-from lcopa_bayes.calibration.coverage import LEVELS
-from lcopa_bayes.calibration.ranks import rank_of
+from lcopa_bayes.calibration.ranks import LEVELS, rank_of
 from lcopa_bayes.calibration.simulation import device_of, exact_responses, measured, model_gap
 from lcopa_bayes.calibration.truths import Truths
 from lcopa_bayes.core.arrays import Matrix, Vector

@@ -10,8 +10,7 @@ import numpy as np
 import pandas as pd
 
 from lcopa_bayes.calibration.calibrate import Calibration
-from lcopa_bayes.calibration.coverage import LEVELS, Coverage
-from lcopa_bayes.calibration.ranks import SIMULTANEOUS, bin_limits, corridor, p_uniform
+from lcopa_bayes.calibration.ranks import LEVELS, SIMULTANEOUS, Coverage, bin_limits, corridor, p_uniform
 from lcopa_bayes.calibration.replica import ENGINES, RANKED, Outcome, Quantity
 from lcopa_bayes.calibration.truths import Truths
 from lcopa_bayes.core.estimate import plain
@@ -88,8 +87,7 @@ def results(made: Calibration) -> dict[str, Any]:
         "thin": plan.thin,
         "target_ess": plan.target_ess,
     }
-    out: dict[str, Any] = plain(told)
-    return out
+    return plain(told)
 
 
 def over(outcomes: Sequence[Outcome], quantities: Sequence[Quantity]) -> dict[str, Any]:

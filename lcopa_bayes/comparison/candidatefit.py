@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import log
 from pathlib import Path
 from typing import Any, final
 
@@ -15,22 +16,77 @@ import pandas as pd
 from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.comparison.candidates import Candidate
-from lcopa_bayes.comparison.criteria import criteria
 from lcopa_bayes.comparison.integerorder import integer_orders
 from lcopa_bayes.comparison.predictivedensity import Predicted, predictions
 from lcopa_bayes.comparison.priorwidth import widths
-from lcopa_bayes.core.arrays import Matrix
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import save_json, save_table, writable_folder
 from lcopa_bayes.data.settings import SamplerSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
-from lcopa_bayes.inference.likelihood import Peak
+from lcopa_bayes.inference.likelihood import Landscape, Peak
 from lcopa_bayes.results.fit import Fit, fit, plan_of
 from lcopa_bayes.results.provenance import digest, fingerprint, settings_of
 from lcopa_bayes.results.summary import residual_rms, scores
 from lcopa_bayes.sampling.convergence import Grade
+
+_CLIMBED = 4
+"""Draws the maximum is sought from."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Criteria:
+    """AIC and BIC, for those who want them: they know neither priors nor ridges."""
+
+    values: Vector
+    """Table values at the maximum, (rows,)."""
+    log_likelihood: float
+    """Maximum [nat]."""
+    parameters: int
+    """Free parameters, noise and offsets included [-]."""
+    samples: int
+    """Observed samples [-]."""
+
+    @property
+    def aic(self) -> float:
+        """``2 k - 2 log L`` (Akaike 1974) [-]."""
+        return 2 * self.parameters - 2 * self.log_likelihood
+
+    @property
+    def bic(self) -> float:
+        """``k log n - 2 log L`` (Schwarz 1978) [-]; n counts samples as if they were independent."""
+        return self.parameters * log(self.samples) - 2 * self.log_likelihood
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return plain(
+            {
+                "max_log_likelihood": self.log_likelihood,
+                "parameters": self.parameters,
+                "samples": self.samples,
+                "aic": self.aic,
+                "bic": self.bic,
+            }
+        )
+
+
+def criteria(fit: Fit, also: Sequence[Peak] = ()) -> Criteria:
+    """From the highest of a few draws, climbed, and maxima `also` known."""
+    landscape = Landscape(fit.problem.posterior)
+    peak = max([highest(landscape, fit.draws.thinned(200)), *also], key=lambda one: one.log_likelihood)
+    return Criteria(peak.values, peak.log_likelihood, len(landscape.free), fit.problem.posterior.size)
+
+
+def highest(landscape: Landscape, values: Matrix) -> Peak:
+    """The highest maximum of the likelihood reached from the best of some table values (n, rows)."""
+    heights = landscape.log_likelihood(values)
+    best = np.argsort(-heights)[:_CLIMBED]
+    peaks = [landscape.maximise(values[k]) for k in best]
+    return max([Peak(values[best[0]], float(heights[best[0]])), *peaks], key=lambda one: one.log_likelihood)
+
 
 CARD = "candidate.json"
 """File of a candidate's scores inside its folder."""

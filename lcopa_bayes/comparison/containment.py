@@ -17,9 +17,8 @@ import numpy as np
 from scipy.special import logsumexp
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.comparison.candidatefit import Contender
+from lcopa_bayes.comparison.candidatefit import Contender, criteria, highest
 from lcopa_bayes.comparison.candidates import Candidate
-from lcopa_bayes.comparison.criteria import criteria, highest
 from lcopa_bayes.core.arrays import Flags, Matrix
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.inference.assembly import Problem, problem_of

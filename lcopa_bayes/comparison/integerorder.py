@@ -26,7 +26,7 @@ _FEWEST = 10.0
 _PRIOR_DRAWS = 200_000
 
 Answer = Literal["integer", "not an integer", "undecided"]
-Road = Literal["draws at the integer", "normal tail", "undefined"]
+Method = Literal["draws at the integer", "normal tail", "undefined"]
 
 
 @final
@@ -41,7 +41,7 @@ class IntegerOrder:
     """Of the integer against a free order [nat]; above 0 favours the integer."""
     log_sd: float
     """Its Monte Carlo standard error [nat]."""
-    road: Road
+    method: Method
     window: float
     """Distance from the integer within which draws are counted [-]."""
     estimate: Estimate
@@ -63,7 +63,7 @@ class IntegerOrder:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        told: dict[str, Any] = plain(
+        return plain(
             {key: value for key, value in asdict(self).items() if key != "estimate"}
             | {
                 "bayes_factor": self.bayes_factor,
@@ -72,7 +72,6 @@ class IntegerOrder:
                 "estimate": self.estimate.as_json(),
             }
         )
-        return told
 
 
 def integer_orders(fit: Fit) -> tuple[IntegerOrder, ...]:

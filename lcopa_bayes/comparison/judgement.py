@@ -31,7 +31,7 @@ def judged(cards: Sequence[Card], study: Study) -> dict[str, Any]:
     _predictions(rows)
     found = decided(rows)
     fractional = [row for row in rows if not row["integer"]]
-    told: dict[str, Any] = plain(
+    return plain(
         {
             "study": study.name,
             "time_unit": study.time_unit,
@@ -48,7 +48,6 @@ def judged(cards: Sequence[Card], study: Study) -> dict[str, Any]:
             ],
         }
     )
-    return told
 
 
 def _evidences(rows: Sequence[dict[str, Any]], seed: int) -> None:

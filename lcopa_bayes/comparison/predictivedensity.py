@@ -28,7 +28,7 @@ _DRAWS = 600
 _BEYOND = 3.0
 """Standard errors by which a density of what was left out may exceed that of what was fitted [-]."""
 
-Road = Literal["exact", "importance weights", "refit"]
+Method = Literal["exact", "importance weights", "refit"]
 
 
 @final
@@ -45,7 +45,7 @@ class Predicted:
     """Of each sample given the known samples and those of its record before it, (n,) [nat]."""
     error: float
     """Monte Carlo standard error of the sum, by the spread between parts of the draws [nat]."""
-    road: Road
+    method: Method
     pareto_k: float
     """Of the importance weights [-]; NaN where none were tried."""
     ess: float
@@ -74,13 +74,13 @@ class Predicted:
         out is predicted better than it was fitted, and where the Monte Carlo error is larger than an evidence
         may have."""
         known = known_to(self.error)
-        agree = self.road != "refit" or (self.rhat <= TENTATIVE_RHAT and self.ess >= FEWEST_EFFECTIVE)
+        agree = self.method != "refit" or (self.rhat <= TENTATIVE_RHAT and self.ess >= FEWEST_EFFECTIVE)
         own: Level = "reliable" if agree and self.plausible else "tentative"
         return Grade.worst([Grade(level, "") for level in (fitted, own, known)]).level
 
     def as_json(self) -> dict[str, Any]:
         """Plain values, without the samples."""
-        told: dict[str, Any] = plain(
+        return plain(
             {
                 "part": self.part.name,
                 "kind": self.part.kind,
@@ -89,14 +89,13 @@ class Predicted:
                 "monte_carlo_sd": self.error,
                 "in_sample": self.in_sample,
                 "plausible": self.plausible,
-                "road": self.road,
+                "method": self.method,
                 "pareto_k": self.pareto_k,
                 "ess": self.ess,
                 "rhat": self.rhat,
                 "level_from": list(dict.fromkeys(self.level_from)),
             }
         )
-        return told
 
 
 def predictions(fit: Fit, *, held_out_only: bool = False) -> tuple[Predicted, ...]:
@@ -177,7 +176,7 @@ class _Scored:
         self,
         values: Matrix,
         log_weights: Vector | None,
-        road: Road,
+        method: Method,
         *,
         k: float = np.nan,
         ess: float | None = None,
@@ -206,7 +205,7 @@ class _Scored:
             np.concatenate(times) if times else np.empty(0),
             logsumexp(every + level[:, None], axis=0),
             _error(every, level),
-            road,
+            method,
             k,
             min(effective(level), ess if ess is not None else self.fit.draws.ess),
             rhat,

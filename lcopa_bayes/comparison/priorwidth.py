@@ -36,7 +36,7 @@ class Width:
     """[nat]; None when it could not be had."""
     sd: float | None
     """Standard error [nat]."""
-    road: Literal["importance weights", "refit", "undefined"]
+    method: Literal["importance weights", "refit", "undefined"]
     ess: float
     """Effective number of draws behind it [-]."""
     pareto_k: float
@@ -46,8 +46,7 @@ class Width:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        told: dict[str, Any] = plain(asdict(self))
-        return told
+        return plain(asdict(self))
 
 
 def widths(fit: Fit) -> tuple[Width, ...]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from lcopa_bayes.bench.command import Command
 from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.experiments.limits import Limits
 
 PLAIN = "step"
@@ -154,3 +155,23 @@ def _multisine(ticks: int, rng: np.random.Generator) -> Vector:
     turn = 2 * np.pi * np.arange(ticks)[:, None] / ticks * harmonics
     wave = np.cos(turn - np.pi * k * (k + 1) / harmonics.size + rng.uniform(0, 2 * np.pi)).sum(axis=1)
     return np.asarray((wave - wave.min()) / np.ptp(wave))
+
+
+def template(study: Study, limits: Limits, command: Command, time: float) -> str:
+    """A record table (CSV) of a drive for `time` [time unit] with empty responses.
+
+    One row a camera period before time 0 under the resting drive, then one per camera sample; drives change
+    only at rows. Filled in, the file is a record of the study.
+    """
+    ticks = np.arange(-1, max(2, round(time / limits.period)))
+    at = np.round(limits.period * ticks, 9)
+    drive = command.at(at + 1e-6 * limits.period)
+    heads = [f"time_{study.time_unit}"]
+    heads += [f"drive_{axis.name}_{axis.unit}" for axis in study.drive_axes]
+    heads += [f"response_{axis.name}_{axis.unit}" for axis in study.response_axes]
+    empty = "," * len(study.response_axes)
+    rows = [
+        ",".join(repr(float(value)) for value in (moment, *levels)) + empty
+        for moment, levels in zip(at, drive, strict=True)
+    ]
+    return "\n".join([",".join(heads), *rows]) + "\n"

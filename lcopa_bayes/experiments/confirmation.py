@@ -97,7 +97,7 @@ class Confirmation:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; infinite ones are None."""
-        told: dict[str, Any] = plain(
+        return plain(
             {
                 "confirmed": self.confirmed,
                 "sentence": self.sentence,
@@ -123,7 +123,6 @@ class Confirmation:
                 ],
             }
         )
-        return told
 
 
 def _row(achieved: Achieved, k: int) -> dict[str, Any]:

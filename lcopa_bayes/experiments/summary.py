@@ -1,22 +1,25 @@
-"""A design as plain values, every open or undefined number with its reason in words."""
+"""A design as plain values, and what an audit advises to measure next; open numbers have a reason."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import Estimate, plain
-from lcopa_bayes.experiments.design import Design
+from lcopa_bayes.experiments.design import Design, design
 from lcopa_bayes.experiments.precision import Promise, median
+from lcopa_bayes.results.predictive import Predictive
 
 
 def as_json(made: Design) -> dict[str, Any]:
     """Every number of a design; what is infinite or undefined is None and has a reason in words."""
     study, table = made.fit.study, made.fit.draws.table
     determined = bool(made.determined.any())
-    told: dict[str, Any] = plain(
+    return plain(
         {
             "study": study.name,
             "verdict": made.sentence,
@@ -46,7 +49,6 @@ def as_json(made: Design) -> dict[str, Any]:
             "structure": [one.as_json() for one in made.structure.symmetries],
         }
     )
-    return told
 
 
 def _row(made: Design, promise: Promise) -> dict[str, Any]:
@@ -114,3 +116,47 @@ def _curve(made: Design) -> list[dict[str, Any]]:
             }
         )
     return out
+
+
+_DRAWS = 8
+"""Draws averaged over: enough to rank drives."""
+
+
+def next_measurement(fit: Predictive, parameters: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+    """The drive to play next and, per parameter that is not identified, the best drive for it.
+
+    `parameters`: rows of an audit with `name` and `verdict`. None when every one is identified. Bounds are
+    those of one new record of 40 spans alone, at 8 draws; the verb `design` tries more and confirms.
+    """
+    left = [row["name"] for row in parameters if row["verdict"] != "identified"]
+    if not left:
+        return None
+    try:
+        made = design(fit, draws=_DRAWS, ladder=False)
+    except InputError as error:
+        return {"drive": None, "reason": "; ".join(error.problems), "parameters": []}
+    rows = []
+    for name in left:
+        if name not in made.names:
+            rows.append({"name": name, "drive": None, "reason": "no parameter of the plant"})
+            continue
+        best, reason = made.best(name, made.here), made.reason(name)
+        rows.append(
+            {
+                "name": name,
+                "drive": None if reason else best.candidate.name,
+                "reason": reason,
+                "expected_relative_sd": None if reason else made.estimate(best, name).as_json(),
+                "expected_relative_sd_step": None if reason else made.estimate(made.step, name).as_json(),
+            }
+        )
+    return plain(
+        {
+            "drive": made.winner.candidate.name if made.determined.any() else None,
+            "words": made.winner.candidate.words if made.determined.any() else "",
+            "reason": made.sentence,
+            "time": made.time,
+            "time_unit": fit.study.time_unit,
+            "parameters": rows,
+        }
+    )

@@ -8,7 +8,7 @@ from typing import final
 
 import pandas as pd
 
-from lcopa_bayes.experiments.nextmeasurement import next_measurement
+from lcopa_bayes.experiments.summary import next_measurement
 from lcopa_bayes.identifiability.audit import audit as audited
 from lcopa_bayes.results.stored import StoredResult, origin_of
 from lcopa_bayes.verbs.fit import basis

@@ -40,8 +40,15 @@ def fit(parser: argparse.ArgumentParser) -> None:
 def compare(parser: argparse.ArgumentParser) -> None:
     """Of `compare`."""
     sampled(parser)
-    parser.add_argument("--candidates", type=Path, metavar="FILE", help="[compare] and [[candidates]] (TOML)")
-    parser.add_argument("--pick", nargs="+", metavar="NAME", help="candidates by name")
+    parser.add_argument(
+        "--candidates",
+        type=Path,
+        default=(),
+        dest="described",
+        metavar="FILE",
+        help="[compare] and [[candidates]] (TOML)",
+    )
+    parser.add_argument("--pick", nargs="+", dest="candidates", metavar="NAME", help="candidates by name")
 
 
 def loop(parser: argparse.ArgumentParser) -> None:
@@ -101,7 +108,12 @@ def simulate(parser: argparse.ArgumentParser) -> None:
 def design(parser: argparse.ArgumentParser) -> None:
     """Of `design`."""
     sampled(parser)
-    parser.add_argument("--time", type=float, help="bench time [time unit of the study] (default: 40 spans)")
+    parser.add_argument(
+        "--time",
+        type=float,
+        dest="bench_time",
+        help="bench time [time unit of the study] (default: 40 spans)",
+    )
     parser.add_argument("--repeats", type=int, default=1, help="records to take (default: 1)")
     parser.add_argument(
         "--amplitude", type=float, help="largest deviation from rest [drive unit] (default: the records')"

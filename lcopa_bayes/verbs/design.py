@@ -11,11 +11,11 @@ import pandas as pd
 
 from lcopa_bayes.data.drive import Drive, drive_of
 from lcopa_bayes.data.record import columns_of
+from lcopa_bayes.experiments.candidates import template
 from lcopa_bayes.experiments.confirmation import REPLICAS, confirmed
 from lcopa_bayes.experiments.design import DRAWS, checked
 from lcopa_bayes.experiments.design import design as designed
 from lcopa_bayes.experiments.summary import as_json
-from lcopa_bayes.experiments.template import template
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.results.stored import StoredResult, origin_of
 from lcopa_bayes.verbs.fit import basis

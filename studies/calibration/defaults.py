@@ -29,7 +29,7 @@ from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import step
 from lcopa_bayes.bench.device import Device
 from lcopa_bayes.calibration.calibrate import Calibration, calibrate
-from lcopa_bayes.calibration.coverage import LEVELS, Coverage
+from lcopa_bayes.calibration.ranks import LEVELS, Coverage
 from lcopa_bayes.calibration.summary import results
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import save_json, writable_folder, write_text

@@ -116,7 +116,7 @@ def judged(found: Loop, made: Campaign) -> dict[str, Any]:
         "leading": [[one.name, one.log_bayes_factor] for one in trace.traced[:6]] if trace else [],
         "of_truth": {name: _evidence(found, name) for name in truth},
         "refits": refits,
-        "orders": [one.process.order for one in found.base.noise],
+        "correlations": [one.law.share * one.law.rho for one in found.base.noise],
         "quiet_samples": [one.samples if one.known else 0 for one in found.base.noise],
         "base_failed": found.base.failed,
         "before": errors(found.before, made),

@@ -24,8 +24,7 @@ from small import ONE, TRUTH, TWO, check_page, problem, record, row_values, same
 from lcopa_bayes.bench.command import on_off
 from lcopa_bayes.bench.inversion import step_response
 from lcopa_bayes.calibration.calibrate import Calibration, calibrate
-from lcopa_bayes.calibration.coverage import Coverage
-from lcopa_bayes.calibration.ranks import bin_limits, corridor, p_uniform, rank_of
+from lcopa_bayes.calibration.ranks import Coverage, bin_limits, corridor, p_uniform, rank_of
 from lcopa_bayes.calibration.replica import ENGINES, RANKED, Failure, Outcome, Replication, holds
 from lcopa_bayes.calibration.simulation import command_of, device_of, exact_responses, measured, model_gap
 from lcopa_bayes.calibration.store import Store

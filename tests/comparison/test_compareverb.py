@@ -73,7 +73,7 @@ def test_every_score_has_its_error_and_grade(told):
         for one in row["predictions"]:
             assert one["plausible"]
             assert (one["in_sample"] is None) == (one["kind"] == "held-out record")
-            assert one["road"] in ("exact", "importance weights", "refit")
+            assert one["method"] in ("exact", "importance weights", "refit")
             assert one["monte_carlo_sd"] >= 0
 
 

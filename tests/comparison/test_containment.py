@@ -11,11 +11,10 @@ from small import TWO, path, problem, record, row_values, study
 from lcopa_bayes.bench.command import prbs
 from lcopa_bayes.bench.device import Device
 from lcopa_bayes.comparison import candidatefit
-from lcopa_bayes.comparison.candidatefit import Contender
+from lcopa_bayes.comparison.candidatefit import Contender, highest
 from lcopa_bayes.comparison.candidates import candidates_of, derived, known_settings
 from lcopa_bayes.comparison.compare import compare
 from lcopa_bayes.comparison.containment import Check, reached
-from lcopa_bayes.comparison.criteria import highest
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.inference.assembly import problem_of

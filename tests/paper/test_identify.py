@@ -512,3 +512,9 @@ def test_the_study_is_left_as_it_was(identified):
     once, _ = identified
     assert isinstance(once, Study)
     assert np.isnan(once.fit[0].response[0]).all()
+
+
+def test_a_study_with_effects_is_refused():
+    made = study(clean())
+    with pytest.raises(InputError, match="uses odd_curvature, and the paper's model has no effects"):
+        identify(replace(made, effects=replace(made.effects, use=("odd_curvature",))))

@@ -294,13 +294,11 @@ def single(name: str, scale: float, unit: str = "-", *, one_signed: bool = False
     return (Coefficient(name, unit, scale, one_signed),)
 
 
-def per_axis(
-    ranges: Ranges, names: Sequence[str], part: float, *, one_signed: bool = False
-) -> tuple[Coefficient, ...]:
+def per_axis(ranges: Ranges, names: Sequence[str], part: float) -> tuple[Coefficient, ...]:
     """Coefficients [response unit] for every axis in turn; their scale is a `part` of its deflection."""
     return tuple(
         Coefficient(
-            f"{name}_{axis}" if ranges.axes > 1 else name, "response", part * float(size), one_signed, number
+            f"{name}_{axis}" if ranges.axes > 1 else name, "response", part * float(size), axis=number
         )
         for number, (axis, size) in enumerate(zip(ranges.names, ranges.response, strict=True))
         for name in names
