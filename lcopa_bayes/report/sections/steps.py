@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 from matplotlib.axes import Axes
 
-from lcopa_bayes.report.decimation import extremes
+from lcopa_bayes.report.decimation import draw_band, draw_line
 from lcopa_bayes.report.formatting import NOT_REACHED, OPEN, figures, interval, to_spread
 from lcopa_bayes.report.savedrun import SavedRun
 from lcopa_bayes.report.section import Section, Table, paged
@@ -57,11 +57,8 @@ def _path(panel: Axes, rows: pd.DataFrame) -> None:
     time = rows["time"].to_numpy()
     for low, high, alpha, name in (("05", "95", 0.30, "90 %"), ("25", "75", 0.45, "50 %")):
         lower, upper = rows[f"response_{low}"].to_numpy(), rows[f"response_{high}"].to_numpy()
-        at = extremes(lower, upper)
-        panel.fill_between(time[at], lower[at], upper[at], color=BAND, alpha=alpha, lw=0, label=name)
-    middle = rows["response_50"].to_numpy()
-    at = extremes(middle)
-    panel.plot(time[at], middle[at], color=BAND, label="median")
+        draw_band(panel, time, lower, upper, color=BAND, alpha=alpha, label=name)
+    draw_line(panel, time, rows["response_50"].to_numpy(), color=BAND, label="median")
     for quantile, width, name in (("50", 1.1, "steady state"), ("05", 0.7, ""), ("95", 0.7, "")):
         level = float(rows[f"steady_{quantile}"].iloc[0])
         panel.axhline(level, color=STEADY, lw=width, ls=(0, (4, 3)), label=name or None)
