@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
+import pandas as pd
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.data.record import Axis
@@ -15,7 +16,7 @@ from lcopa_bayes.inference.observations import Observed, Samples
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.simulation import Simulation
 from lcopa_bayes.model.forward import ForwardModel
-from lcopa_bayes.results.bands import LEVELS, POINTWISE, pointwise, simultaneous
+from lcopa_bayes.results.bands import LEVELS, POINTWISE, Bands, named
 from lcopa_bayes.sampling.draws import Draws
 
 _CELLS = 2_000_000
@@ -56,6 +57,19 @@ class Band:
     """Samples of a held-out record that its own offset was taken from [-]; 0 for an offset of the fit."""
     draws: int
     """Draws behind the quantiles."""
+
+    def table(self) -> pd.DataFrame:
+        """One row per time: what was observed, and the ends of the bands by kind [`unit`]."""
+        columns: dict[str, Any] = {
+            "record": self.record,
+            "axis": self.axis,
+            "unit": self.unit,
+            "held_out": self.held_out,
+            "time": self.time,
+            "observed": self.observed,
+        }
+        columns |= named("plant", Bands(self.plant, self.plant_simultaneous))
+        return pd.DataFrame(columns | named("noisy", Bands(self.noisy, self.noisy_simultaneous)))
 
     @property
     def own_offset(self) -> bool:
@@ -202,7 +216,7 @@ def band_of(
     level, source, used = offset
     response = response + level[:, None]
     noisy = response + noises
-    plant_quantiles, noisy_quantiles = pointwise(response), pointwise(noisy)
+    plant, with_noise = Bands.of(response), Bands.of(noisy)
     return Band(
         name,
         axis.name,
@@ -210,10 +224,10 @@ def band_of(
         held_out,
         times,
         observed,
-        plant_quantiles,
-        noisy_quantiles,
-        simultaneous(response, plant_quantiles),
-        simultaneous(noisy, noisy_quantiles),
+        plant.pointwise,
+        with_noise.pointwise,
+        plant.simultaneous,
+        with_noise.simultaneous,
         source,
         used,
         response.shape[0],
