@@ -82,7 +82,7 @@ def test_a_record_is_scored_as_it_was_when_held_out_from_the_start(fitted, folde
         ("time_ms,drive_u_V\n0,0.5\n1,1\n", ["is at 0.5 V before its first change"]),
         ("time_ms,drive_u_V\n0,0\n2,1\n1,0\n", ["line 4, column 'time_ms': 1.0 does not come after"]),
         ("time_ms,drive_u_V\n0,0\n2,\n", ["line 3, column 'drive_u_V': the cell is empty"]),
-        ("time_min,drive_u_V\n0,0\n2,1\n", ["the time unit 'min' is not known"]),
+        ("time_day,drive_u_V\n0,0\n2,1\n", ["the time unit 'day' is not known"]),
         ("time_ms\n0\n2\n", ["has no drive column"]),
     ],
 )
