@@ -30,7 +30,7 @@ import json
 import os
 import tempfile
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar, final
@@ -226,22 +226,20 @@ def write_campaign(
     folder: Path,
     records: Sequence[Record],
     *,
-    held_out: Iterable[str] = (),
-    name: str | None = None,
-    seed: int | None = None,
+    name: str,
+    seed: int,
+    held_out: Sequence[str] = (),
     settings: str = "",
     overwrite: bool = False,
 ) -> tuple[Path, ...]:
     """Write one CSV per record and a ``study.toml`` that names them; return the paths, study last.
 
-    Parameters: `held_out`, names of records not for fitting; `name` of the study, by default that of the
-    folder; `seed` of the study, omitted when None; `settings`, further tables of the study file.
-    Everything is written beside its place first and then renamed, the study last: a campaign cut
-    short leaves no file half written and no new study without its records. Raises InputError when a file
-    is there already (unless `overwrite`), names repeat or cannot be file names, time units differ, a
-    held-out name is unknown, no record remains to fit, or the folder or a file in it cannot be written.
+    Parameters: `name` and `seed` of the study; `held_out`, names of records not for fitting; `settings`,
+    further tables of the study file. Everything is written beside its place first and then renamed, the study
+    last: a campaign cut short leaves no file half written and no new study without its records. Raises
+    InputError when a file is there already (unless `overwrite`), names repeat or cannot be file names, no
+    record remains to fit, or the folder or a file in it cannot be written.
     """
-    held_out = tuple(held_out)
     names = [record.name for record in records]
     fit = [each for each in names if each not in held_out]
     targets = [folder / f"{each}.csv" for each in names] + [folder / "study.toml"]
@@ -255,33 +253,19 @@ def write_campaign(
         for each in names
         if not each.replace("-", "").replace("_", "").isalnum()
     ]
-    problems += [
-        f"held_out names {each!r}, which is no record{nearest(each, names)}"
-        for each in held_out
-        if each not in names
-    ]
     if not fit:
         problems.append("no record remains to fit; hold out fewer")
-    if len({record.time_unit for record in records}) > 1:
-        problems.append("all records of a study must have the same time unit")
-    if folder.exists() and not folder.is_dir():
-        problems.append(f"{folder} is not a folder")
-    elif not overwrite:
-        problems += [
-            f"{path} is there already; choose another folder or allow to overwrite"
-            for path in targets
-            if path.exists()
-        ]
+    problems += [
+        f"{path} is there already; choose another folder or allow to overwrite"
+        for path in targets
+        if path.exists() and not overwrite
+    ]
     if problems:
         raise InputError(problems)
-
-    lines = ["[study]", f"name = {_toml(name or folder.resolve().name)}"]
-    lines += [f"time_unit = {_toml(records[0].time_unit)}"]
-    lines += [] if seed is None else [f"seed = {seed}"]
-    lines += ["", "[records]", f"fit = {_toml([f'{each}.csv' for each in fit])}"]
-    lines += (
-        [f"held_out = {_toml([f'{each}.csv' for each in names if each in held_out])}"] if held_out else []
-    )
+    lines = ["[study]", f"name = {json.dumps(name, ensure_ascii=False)}"]
+    lines += [f'time_unit = "{records[0].time_unit}"', f"seed = {seed}", "", "[records]"]
+    roles = {"fit": fit, "held_out": [each for each in names if each in held_out]}
+    lines += [f"{role} = {json.dumps([f'{each}.csv' for each in own])}" for role, own in roles.items() if own]
     lines += ["", settings] if settings else []
     writable_folder(folder)
     with writing(folder), tempfile.TemporaryDirectory(prefix=".campaign-", dir=folder) as beside:
@@ -295,7 +279,3 @@ def write_campaign(
             with writing(target):
                 os.replace(Path(beside) / target.name, target)
     return tuple(targets)
-
-
-def _toml(value: str | list[str]) -> str:
-    return json.dumps(value, ensure_ascii=False)

@@ -24,6 +24,8 @@ _NODES = (24, 32)
 """Nodes of the two contours compared; each alone is good to about ``exp(-1.36 nodes)`` before rounding."""
 _NEAR = 0.3
 """A pole with ``|pole| time`` below this lies deep inside either contour and is not removed."""
+_TOLERANCE = 1e-9
+"""Largest relative difference of the two contours [-]."""
 _BLOCK = 1 << 15
 """Times treated at once."""
 
@@ -77,24 +79,24 @@ def step_response(path: TransferPath, time: ArrayLike) -> Array:
     return path.gain * unit_step(path, np.asarray(time, dtype=float) - path.delay)
 
 
-def unit_step(path: TransferPath, time: ArrayLike, *, tolerance: float = 1e-9) -> Array:
+def unit_step(path: TransferPath, time: ArrayLike) -> Array:
     """Response of a path of gain 1 and no delay to a unit step at time 0, in the shape of `time` [ms].
 
-    Zero up to time 0. Raises InversionError where two contours differ by more than `tolerance` times the
+    Zero up to time 0. Raises InversionError where two contours differ by more than 1e-9 times the
     larger of the response and ``1 / stiffness``, and as `poles`. Accuracy about 1e-12 of that.
     """
-    return _inverse(path, time, 0, tolerance)
+    return _inverse(path, time, 0)
 
 
-def unit_ramp(path: TransferPath, time: ArrayLike, *, tolerance: float = 1e-9) -> Array:
+def unit_ramp(path: TransferPath, time: ArrayLike) -> Array:
     """Integral of `unit_step` from 0 [ms], in the shape of `time` [ms]; zero up to time 0.
 
     Raises InversionError as `unit_step` does, relative to ``time / stiffness``.
     """
-    return _inverse(path, time, 1, tolerance)
+    return _inverse(path, time, 1)
 
 
-def _inverse(path: TransferPath, time: ArrayLike, integrals: int, tolerance: float) -> Array:
+def _inverse(path: TransferPath, time: ArrayLike, integrals: int) -> Array:
     """Inverse transform of ``1 / (s^(1 + integrals) (sum_i eta_i s^order_i + stiffness))``."""
     time = np.asarray(time, dtype=float)
     flat = frozen(time.ravel(), name="time")
@@ -105,7 +107,7 @@ def _inverse(path: TransferPath, time: ArrayLike, integrals: int, tolerance: flo
         t = flat[block]
         coarse, fine = (_contour_integral(path, t, integrals, nodes) for nodes in _NODES)
         difference = np.abs(fine - coarse)
-        allowed = tolerance * np.maximum(np.abs(fine), t**integrals / path.stiffness)
+        allowed = _TOLERANCE * np.maximum(np.abs(fine), t**integrals / path.stiffness)
         if not (difference <= allowed).all():
             worst = int(np.argmax(np.where(np.isnan(difference), inf, difference / allowed)))
             raise InversionError(float(t[worst]), float(difference[worst]), float(allowed[worst]))

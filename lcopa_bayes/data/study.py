@@ -118,7 +118,11 @@ class Study:
         unit = time_unit or (fitted[0].time_unit if fitted else "")
         records = (*fitted, *apart)
         problems = together(fitted, apart) if fitted else ["a study needs one or more records to fit"]
-        problems += [f"record {r.name!r} is in {r.time_unit}" for r in records if r.time_unit != unit]
+        problems += [
+            f"record {r.name!r} is in {r.time_unit}, the study is in {unit}; convert its times"
+            for r in records
+            if r.time_unit != unit
+        ]
         refuse_if(problems)
         settings |= {
             "name": name or default_name(fitted),

@@ -12,8 +12,7 @@ from scipy.optimize import minimize_scalar
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.gaussnewton import Optimum, Regression
-from lcopa_bayes.effectsearch.scoreevidence import Projection
-from lcopa_bayes.effectsearch.signature import Signature, signature_of
+from lcopa_bayes.effectsearch.signature import Projection, Signature, signature_of
 from lcopa_bayes.effectsearch.trace import LEVEL, Trace, Traced
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.model.effects.effect import Effect

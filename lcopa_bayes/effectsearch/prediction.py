@@ -10,9 +10,8 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.data.record import Record
-from lcopa_bayes.effectsearch.autoregression import Autoregression
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
-from lcopa_bayes.effectsearch.noisesamples import quiet_samples
+from lcopa_bayes.effectsearch.noise import Law, quiet_samples
 from lcopa_bayes.effectsearch.whitening import parts, stacked
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.declared import campaign_places
@@ -131,7 +130,7 @@ FLAT = LevelPrior(0.0, np.inf)
 
 
 def levelled(
-    record: Samples, axis: int, misfit: Vector, noise: Autoregression, delay: float, prior: LevelPrior = FLAT
+    record: Samples, axis: int, misfit: Vector, noise: Law, delay: float, prior: LevelPrior = FLAT
 ) -> tuple[float, float, str]:
     """Level of a record that is not known from the fit, its variance and where it comes from.
 
@@ -142,7 +141,8 @@ def levelled(
     count = quiet_samples(record, axis, delay)
     source = "samples before the drive acts" if count >= 3 else "the record itself"
     used = misfit[:count] if count >= 3 else misfit
-    white, ones = noise.whiten(np.stack([used, np.ones_like(used)]))
+    gaps = record.axes[axis].gaps[: used.size]
+    white, ones = noise.whiten(np.stack([used, np.ones_like(used)]), gaps)
     power = float(ones @ ones) + 1.0 / prior.variance
     pull = float(ones @ white) + (prior.mean / prior.variance if np.isfinite(prior.variance) else 0.0)
     if np.isfinite(prior.variance):

@@ -10,7 +10,6 @@ import numpy as np
 from scipy.stats import norm
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.effectsearch.autoregression import Autoregression
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.crossvalidation import groups, shifts
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
@@ -159,7 +158,7 @@ def _scores(
         observed = record.axes[part.axis]
         if not observed.values.size:
             continue
-        noise: Autoregression = whitening.noise[part.axis]
+        noise = whitening.noise[part.axis]
         centre, spread, source = mean[part.rows], variance[part.rows], level_from
         if delay is not None:
             prior = priors[part.axis] if priors else FLAT

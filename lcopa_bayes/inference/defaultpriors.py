@@ -148,7 +148,7 @@ class Scales:
         """Noise of an axis as its samples at rest give it; None where these are too few."""
         if response not in self._quiet:
             pieces = [piece for piece in self.at_rest[response] if piece.values.size > 1]
-            self._quiet[response] = quiet_noise(pieces, self._correlations)
+            self._quiet[response] = quiet_noise(pieces, self.correlations)
         return self._quiet[response]
 
     @cached_property
@@ -156,7 +156,7 @@ class Scales:
         return {}
 
     @property
-    def _correlations(self) -> tuple[float, float]:
+    def correlations(self) -> tuple[float, float]:
         """Least and largest correlation of noise that is neither white nor a trend [-]."""
         longest = max(self.span / self.period / _TIMES, _SHORT)
         return float(np.exp(-1 / _SHORTEST)), float(np.exp(-1 / longest))
@@ -179,7 +179,7 @@ class Scales:
 
     def rho_short(self) -> Prior:
         """Prior of a correlation that is forgotten well within a record."""
-        least, largest = self._correlations
+        least, largest = self.correlations
         return Prior("uniform", {"loc": least, "scale": largest - least})
 
     @staticmethod

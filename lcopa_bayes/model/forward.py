@@ -196,7 +196,7 @@ class ForwardModel:
 
     @cached_property
     def _alike(self) -> list[list[tuple[int, int, float]]]:
-        """First experiment and axis with a proportional drive read in the same way, and the factor.
+        """First experiment and axis with a proportional drive read at the same positions, and the factor.
 
         Steps of several heights are then simulated once, not once per record.
         """

@@ -52,8 +52,6 @@ class StatedOptics:
     """Polar and azimuthal steering angle of Fig. 5b [deg]."""
     k1: float = 11.1e-12
     """Splay constant [N]."""
-    k2: float = 7.4e-12
-    """Twist constant [N]."""
     k3: float = 17.1e-12
     """Bend constant [N]."""
     permittivity: float = 4.6e-11
@@ -130,8 +128,6 @@ class StatedRecords:
     """Crosstalk gains said to follow from Eq. 65 [-]."""
     two_axis_drive: tuple[float, float] = (pi / 3, pi / 5)
     """Drives of Fig. 17, x and y [rad]."""
-    two_axis_ideal: tuple[float, float] = (0.0181, 0.0109)
-    """Ideal responses of Fig. 17 [rad]."""
     two_axis_steady: tuple[float, float] = (0.0184, 0.0124)
     """Measured steady responses of Fig. 17 [rad]."""
     refresh_rate: float = 1.0

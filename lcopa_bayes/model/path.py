@@ -67,21 +67,19 @@ class TransferPath:
         delay: float,
         times: Sequence[float],
         orders: Sequence[float],
-        *,
-        stiffness: float = 1.0,
     ) -> Self:
         """``gain exp(-delay s) / (1 + sum_i (T_i s)^order_i)``, the form in which a plant is fitted.
 
-        Parameters: gain at rest [response unit per drive unit]; delay and times T_i [time unit]; orders [-];
-        stiffness k of the result [-]. Then ``eta_i = k T_i^order_i``. InputError unless times and stiffness
-        are positive and finite, and as the class.
+        Parameters: gain at rest [response unit per drive unit]; delay and times T_i [time unit]; orders [-].
+        The stiffness is 1, and ``eta_i = T_i^order_i``. InputError unless times are positive and finite, one
+        per order, and as the class.
         """
-        if not all(0 < value < inf for value in (*times, stiffness)):
-            raise InputError(f"times and stiffness must be positive and finite; got {times}, {stiffness}")
+        if not all(0 < value < inf for value in times):
+            raise InputError(f"times must be positive and finite; got {times}")
         if len(times) != len(orders):
             raise InputError(f"one time constant per order is needed; got {times} and orders {orders}")
-        etas = (stiffness * time**order for time, order in zip(times, orders, strict=True))
-        return cls(stiffness * gain, delay, tuple(etas), tuple(orders), stiffness)
+        etas = (time**order for time, order in zip(times, orders, strict=True))
+        return cls(gain, delay, tuple(etas), tuple(orders), 1.0)
 
     @property
     def physical(self) -> bool:

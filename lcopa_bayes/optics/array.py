@@ -1,4 +1,4 @@
-"""Linear and planar arrays of phase elements and the law that steers them (Ta et al. 2026, Eqs. 5, 13)."""
+"""A linear array of phase elements and the law that steers it (Ta et al. 2026, Eq. 5)."""
 
 from __future__ import annotations
 
@@ -69,37 +69,6 @@ class LinearArray:
         """
         theta = finite(angle, name="angle", lower=-pi / 2, upper=pi / 2, unit="rad")
         return np.asarray(2 * pi * np.sin(theta) / self.period)
-
-
-@final
-@dataclass(frozen=True)
-class PlanarArray:
-    """Two crossed linear arrays of one wavelength, ``x.elements * y.elements`` elements (Eqs. 6-13)."""
-
-    x: LinearArray
-    y: LinearArray
-
-    def __post_init__(self) -> None:
-        if self.x.wavelength != self.y.wavelength:
-            raise InputError(
-                f"both axes of a planar array share one wavelength; got {self.x.wavelength} m along x and "
-                f"{self.y.wavelength} m along y: give the same."
-            )
-
-    def phase_steps(self, polar: float, azimuth: float) -> tuple[float, float]:
-        """``(dphi_x, dphi_y)`` [rad] for a polar angle [rad] in [0, pi/2] and an azimuth [rad] (Eq. 13)."""
-        sine = np.sin(finite(polar, name="polar", lower=0.0, upper=pi / 2, unit="rad"))
-        turn = finite(azimuth, name="azimuth", unit="rad")
-        u, v = sine * np.cos(turn), sine * np.sin(turn)
-        return float(2 * pi * u / self.x.period), float(2 * pi * v / self.y.period)
-
-    def steering_angles(self, step_x: float, step_y: float) -> tuple[float, float]:
-        """Polar angle and azimuth [rad] for phase steps `step_x`, `step_y` [rad]; inverse of Eq. 13.
-
-        Raises InputError where ``u^2 + v^2 > 1``. The azimuth of a beam along the normal is 0.
-        """
-        u, v = float(self.x.direction_cosine(step_x)), float(self.y.direction_cosine(step_y))
-        return float(np.arcsin(_propagating(np.hypot(u, v)))), float(np.arctan2(v, u))
 
 
 def paper_array(optics: StatedOptics = PAPER.optics, *, fill_factor: float = 0.0) -> LinearArray:

@@ -1,4 +1,4 @@
-"""Far fields of linear and planar arrays in closed form (Ta et al. 2026, Eqs. 2-4, 7-12).
+"""Far fields of linear and square arrays in closed form (Ta et al. 2026, Eqs. 2-4, 7-12).
 
 Directions are direction cosines, ``u = sin th cos ph`` and ``v = sin th sin ph`` (``u = sin th`` on one
 axis), where a planar pattern is a product of two linear ones. The obliquity factor of Eq. 1 is omitted, as
@@ -14,10 +14,10 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.model.literature import PAPER, StatedOptics
-from lcopa_bayes.optics.array import LinearArray, PlanarArray, paper_array
+from lcopa_bayes.optics.array import LinearArray, paper_array
 from lcopa_bayes.optics.checks import finite
 
 
@@ -58,19 +58,6 @@ def intensity(array: LinearArray, u: ArrayLike, step: float) -> Array:
     return np.asarray(array_factor(array, u, step) ** 2 * element_factor(array, u) / main)
 
 
-def planar_intensity(array: PlanarArray, u: ArrayLike, v: ArrayLike, steps: tuple[float, float]) -> Matrix:
-    """Product of two linear patterns on the grid ``u x v`` (Ta et al. 2026, Eq. 12), one per axis of `array`.
-
-    `u` (nu,) and `v` (nv,) [-] in [-1, 1]; `steps` ``(dphi_x, dphi_y)`` [rad]. Returns (nu, nv) [-], 1 at the
-    main lobe and NaN where ``u^2 + v^2 > 1``, where nothing propagates. Errors as in `intensity`.
-    """
-    array.steering_angles(*steps)
-    across, along = frozen(u, name="u"), frozen(v, name="v")
-    pattern = np.outer(intensity(array.x, across, steps[0]), intensity(array.y, along, steps[1]))
-    pattern[np.add.outer(across**2, along**2) > 1] = np.nan
-    return pattern
-
-
 @final
 @dataclass(frozen=True)
 class LinearPatterns:
@@ -87,16 +74,14 @@ class LinearPatterns:
 @final
 @dataclass(frozen=True)
 class PlanarPattern:
-    """Pattern of a planar array: the data of one panel of Fig. 5."""
+    """Pattern of a square array: the data of one panel of Fig. 5."""
 
-    u: Vector
-    """``sin th cos ph``, (nu,) [-]."""
-    v: Vector
-    """``sin th sin ph``, (nv,) [-]."""
+    axis: Vector
+    """Direction cosines ``sin th cos ph`` and ``sin th sin ph``, (n,) [-]."""
     target: tuple[float, float]
     """Polar angle and azimuth [rad]."""
     intensity: Matrix
-    """(nu, nv) [-], 1 at the target, NaN outside the unit circle."""
+    """(n, n) [-], 1 at the target, NaN outside the unit circle."""
 
 
 def steered_patterns(optics: StatedOptics = PAPER.optics, *, points: int = 4001) -> LinearPatterns:
@@ -116,14 +101,25 @@ def planar_patterns(optics: StatedOptics = PAPER.optics, *, points: int = 801) -
 
     `optics` holds the printed numbers; `points` direction cosines [-] per axis from -1 to 1.
     """
-    array = PlanarArray(paper_array(optics), paper_array(optics))
     axis = np.linspace(-1.0, 1.0, points)
-    polar, azimuth = np.radians(optics.target_2d_deg)
-    targets = ((0.0, 0.0), (float(polar), float(azimuth)))
-    return tuple(
-        PlanarPattern(axis, axis, goal, planar_intensity(array, axis, axis, array.phase_steps(*goal)))
-        for goal in targets
-    )
+    polar, azimuth = map(float, np.radians(optics.target_2d_deg))
+    array = paper_array(optics)
+    return tuple(planar_pattern(array, axis, target) for target in ((0.0, 0.0), (polar, azimuth)))
+
+
+def planar_pattern(array: LinearArray, axis: Vector, target: tuple[float, float]) -> PlanarPattern:
+    """Two crossed arrays steered to a polar angle and azimuth [rad] (Ta et al. 2026, Eqs. 12, 13).
+
+    The product of two linear patterns on the grid of direction cosines `axis` (n,) [-], each steered by
+    ``2 pi d sin th cos ph / lambda`` or with ``sin ph``; NaN where nothing propagates. Errors as in
+    `intensity`.
+    """
+    polar, azimuth = target
+    cosines = np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth)
+    along_x, along_y = (intensity(array, axis, float(2 * pi * u / array.period)) for u in cosines)
+    pattern = np.outer(along_x, along_y)
+    pattern[np.add.outer(axis**2, axis**2) > 1] = np.nan
+    return PlanarPattern(axis, target, pattern)
 
 
 def _dirichlet(psi: Array, n: int) -> Array:

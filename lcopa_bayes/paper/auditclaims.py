@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from lcopa_bayes.model.literature import Stated
-from lcopa_bayes.paper.verdict import Evidence, Kind, Test, Verdict, earlier, undecided, waiting
+from lcopa_bayes.paper.verdict import Evidence, Kind, Test, Verdict, undecided, waiting
+from lcopa_bayes.results.stored import stored_values
 
 COLLINEAR = 10.0
 """Collinearity index from which sensitivities count as coupled [-] (Brun et al. 2001)."""
@@ -22,7 +23,7 @@ Reading = Callable[[Stated, Mapping[str, Any]], Verdict]
 
 def load_audit(folder: Path) -> Mapping[str, Any]:
     """`audit.json` of a run folder; InputError when there is none or it cannot be used."""
-    return earlier(folder, "audit", _NEEDS)
+    return stored_values(folder, "audit", _NEEDS)
 
 
 def from_audit(reading: Reading, question: str) -> Test:

@@ -10,7 +10,8 @@ from typing import Any
 
 from lcopa_bayes.model.literature import Stated
 from lcopa_bayes.paper.printedmodel import integer_rival
-from lcopa_bayes.paper.verdict import Evidence, Kind, Test, Verdict, earlier, undecided, waiting
+from lcopa_bayes.paper.verdict import Evidence, Kind, Test, Verdict, undecided, waiting
+from lcopa_bayes.results.stored import stored_values
 
 STRONG = log(20)
 """Difference of log evidence from which a term is needed [nat] (Kass and Raftery 1995)."""
@@ -25,7 +26,7 @@ Model = Mapping[str, Any]
 
 def load_comparison(folder: Path) -> Mapping[str, Any]:
     """`compare.json` of a run folder; InputError when there is none or it cannot be used."""
-    return earlier(folder, "compare", _NEEDS)
+    return stored_values(folder, "compare", _NEEDS)
 
 
 def from_comparison(

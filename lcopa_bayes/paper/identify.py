@@ -77,7 +77,8 @@ def identify(
     """Identify every path of a study, row by row; the same for any number of `jobs`.
 
     A path is identified from the fit records in which its drive alone moves. Its number of terms, and
-    its orders if fixed, are the study's. InputError when records or intervals cannot be used.
+    its orders if fixed, are the study's. InputError when records or intervals cannot be used, or the study
+    uses effects.
     """
     paths = scannable(study, plan)
     plan = _within_study(plan or Scan(), study)
@@ -94,7 +95,13 @@ def _identified(shared: tuple[Study, Scan], data: PathData) -> Identification:
 
 
 def scannable(study: Study, plan: Scan | None = None) -> tuple[PathData, ...]:
-    """Every path of a study that the plan can scan; InputError when records or intervals cannot be used."""
+    """Every path of a study that the plan can scan; InputError when records or intervals cannot be used, or
+    the study uses effects."""
+    if study.effects.use:
+        raise InputError(
+            f"{study.name}: uses {', '.join(study.effects.use)}, and the paper's model has no effects: its "
+            "paths would take them up; leave `use` out of [effects], or `fit` the study"
+        )
     plan = _within_study(plan or Scan(), study)
     paths = path_data(study)
     problems: list[str] = []
@@ -192,7 +199,7 @@ def results(study: Study, identified: tuple[Identification, ...], plan: Scan | N
 
 
 def _sentence(identified: Identification, time_unit: str) -> str:
-    """What the scan found for one path, and how much worse integer orders are."""
+    """Result of the scan for one path, and how much worse integer orders are."""
     best, whole, unit = identified.scan, identified.integer, identified.data.response_unit
     orders = ", ".join(f"{order:.3g}" for order in best.model.orders)
     return (

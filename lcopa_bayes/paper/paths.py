@@ -190,7 +190,7 @@ def resting_level(times: Vector, values: Vector, begin: float) -> tuple[float, s
     """Mean of the samples up to the first drive change, or of the first samples that do not leave it.
 
     Parameters: times [time unit] and values [response unit] of the samples; begin [time unit], the change.
-    Returns: the level [response unit] and the samples it is the mean of, in words.
+    Returns: the level [response unit] and a description of the samples it is the mean of.
     """
     before = int(np.searchsorted(times, begin, side="right"))
     if before >= _RESTING:

@@ -19,8 +19,8 @@ from lcopa_bayes.model.path import TransferPath
 from lcopa_bayes.paper.equation import response_to
 from lcopa_bayes.paper.figures import KINDS, model_of, paper_figure
 from lcopa_bayes.paper.identify import Identification
-from lcopa_bayes.paper.verdict import earlier
 from lcopa_bayes.results.steps import crossing, settling
+from lcopa_bayes.results.stored import stored_values
 
 METRICS: Mapping[str, tuple[str, str, str]] = {
     "rise": ("time", "rise", "rise_10_90"),
@@ -108,7 +108,7 @@ def step_table(
 
 def load_posterior(folder: Path, study: Study) -> Mapping[str, Any]:
     """`results.json` of the run folder of a fit of this study; InputError when it is not one."""
-    results = earlier(folder, "fit", ("step_metrics",), file="results.json")
+    results = stored_values(folder, "fit", ("step_metrics",), file="results.json")
     if results.get("study") != study.name:
         raise InputError(
             f"{folder / 'results.json'}: is of the study {results.get('study')!r}, not {study.name!r}; fit "

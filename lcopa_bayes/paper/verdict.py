@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from pathlib import Path
 from typing import Any, TypeAlias, final
 
-from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.model.literature import Stated
 
@@ -101,21 +98,3 @@ class Judged:
             }
         )
         return fields
-
-
-def earlier(folder: Path, verb: str, needs: Sequence[str], *, file: str | None = None) -> Mapping[str, Any]:
-    """Results that `verb` wrote to a run folder; InputError when they cannot be read or lack any of `needs`.
-
-    They are in `file`, by default the one named after the verb.
-    """
-    path = folder / (file or f"{verb}.json")
-    try:
-        results: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: cannot be read ({error}); give the run folder that `{verb}` wrote"
-        ) from None
-    absent = [key for key in needs if key not in results] if isinstance(results, dict) else list(needs)
-    if absent:
-        raise InputError(f"{path}: lacks {', '.join(absent)}; run `{verb}` again")
-    return results

@@ -11,12 +11,12 @@ import pandas as pd
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.paper.opticsplan import OpticsPlan
 from lcopa_bayes.paper.staticoptics import static_optics
-from lcopa_bayes.paper.verdict import earlier
 from lcopa_bayes.report.formatting import figures
 from lcopa_bayes.report.page import write_page
 from lcopa_bayes.report.section import Column, Section, Table
 from lcopa_bayes.report.sections import claimfigures, director, farfields, identification
 from lcopa_bayes.report.theme import look
+from lcopa_bayes.results.stored import stored_values
 
 
 def write_optics(folder: Path) -> Path:
@@ -24,7 +24,7 @@ def write_optics(folder: Path) -> Path:
 
     All is solved again for the plan in `optics.json`; InputError when that file cannot be used.
     """
-    plan = earlier(folder, "optics", ("plan",))["plan"]
+    plan = stored_values(folder, "optics", ("plan",))["plan"]
     try:
         calculated = static_optics(OpticsPlan(**plan))
     except TypeError as error:
@@ -39,7 +39,7 @@ def write_identification(folder: Path) -> Path:
 
     InputError when `identify.json` or a table of samples cannot be used.
     """
-    values = earlier(folder, "identify", ("study", "time_unit", "paths", "step_metrics", "records"))
+    values = stored_values(folder, "identify", ("study", "time_unit", "paths", "step_metrics", "records"))
     try:
         samples = [pd.read_csv(folder / entry["samples"]) for entry in values["records"]]
     except (OSError, ValueError) as error:
@@ -54,7 +54,7 @@ def write_claims(folder: Path) -> Path:
 
     InputError when `claims.json` cannot be used.
     """
-    values = earlier(folder, "claims", ("verdict", "claims"))
+    values = stored_values(folder, "claims", ("verdict", "claims"))
     with look():
         sections = [_verdicts(values), *claimfigures.sections()]
     return write_page(folder, "Claims of the paper", sections, name="claims.html")

@@ -29,7 +29,7 @@ from lcopa_bayes.results.prediction import (
     named_rng,
     plant_draws,
 )
-from lcopa_bayes.results.provenance import provenance
+from lcopa_bayes.results.provenance import digest, provenance
 from lcopa_bayes.results.result import Result
 from lcopa_bayes.results.runfolder import add_origin, opened
 from lcopa_bayes.sampling.draws import Draws
@@ -241,14 +241,24 @@ def _squared(draws: Draws, frequency: Vector) -> Array:
 
 
 def _recorded(problem: Problem, draws: Draws, record: Record) -> tuple[Record, list[Band]]:
-    """Bands of a held-out record: what a fit gives that had it from the start."""
-    study = replace(problem.study, held_out=(record,))
+    """Bands of a held-out record: what a fit gives that had it from the start, whatever its name."""
+    name, fitted = record.name, problem.study.fit
+    while name in {one.name for one in fitted}:
+        name += "-new"
+    study = replace(problem.study, held_out=(replace(record, name=name),))
+    same = [one.name for one in fitted if digest(one) == digest(study.held_out[0])]
+    if same:
+        raise InputError(
+            f"record {record.name!r} is {same[0]!r} of the fit, where errors are not those of a prediction; "
+            "give another record, or leave out its responses for bands under its drive"
+        )
     if problems := unmet(study):
         raise InputError(problems)
     (held,) = study.held_out
     samples, model = problem.simulated(study.held_out)
     noise = problem.posterior.noise
-    return held, bands(draws, model, samples, noise, held_out=True, seed=problem.study.seed)
+    shown = bands(draws, model, samples, noise, held_out=True, seed=problem.study.seed)
+    return replace(held, name=record.name), [replace(band, record=record.name) for band in shown]
 
 
 def _unmeasured(problem: Problem, draws: Draws, drive: Drive, level: Level) -> tuple[Drive, list[Band]]:

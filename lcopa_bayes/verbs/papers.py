@@ -104,7 +104,7 @@ def identify(
     """The paper's least-squares scan of every path, with the integer rival and its Table 1.
 
     Parameters: `study`, or a fit of it; `scan`, intervals and spacing; `posterior`, the run folder of a fit
-    whose intervals stand beside; `folder`, a run folder to write into; `jobs`, processes to use; `quiet`, no
+    whose intervals are shown too; `folder`, a run folder to write into; `jobs`, processes to use; `quiet`, no
     progress bar. InputError when records, intervals or folders cannot be used.
     """
     wanted, plan = study_of(study), scan or Scan()

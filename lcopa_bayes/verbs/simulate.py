@@ -98,7 +98,7 @@ def simulate(campaign: Path | str, *, seed: int | None = None) -> Simulation:
     """Measure the campaign file `campaign` on the virtual bench, by numerics that share nothing with the
     forward model.
 
-    `seed` replaces that of the campaign. InputError with everything wrong in the file.
+    `seed` replaces the campaign's. InputError with everything wrong in the file.
     """
     plan = load_plan(Path(campaign))
     chosen = plan.seed if seed is None else seed

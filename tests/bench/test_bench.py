@@ -18,11 +18,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.special import erfcx
 
 import lcopa_bayes.bench
-from lcopa_bayes.bench import inversion, superposition
+from lcopa_bayes.bench import device as bench_device
+from lcopa_bayes.bench import inversion
 from lcopa_bayes.bench.acquisition import PAPER_BENCH, Bench, simulate, truth
 from lcopa_bayes.bench.campaignfile import load_plan, write_campaign
 from lcopa_bayes.bench.command import Command, on_off, prbs, quiet, staircase, step, two_axis
-from lcopa_bayes.bench.device import PAPER_DEVICE, Device
+from lcopa_bayes.bench.device import PAPER_DEVICE, Device, TableError, superposed, tabulated
 from lcopa_bayes.bench.inversion import (
     InversionError,
     PoleSearchError,
@@ -31,7 +32,6 @@ from lcopa_bayes.bench.inversion import (
     unit_ramp,
     unit_step,
 )
-from lcopa_bayes.bench.superposition import TableError, superposed, tabulated
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.record import Axis, Record, load_record
 from lcopa_bayes.model.path import TransferPath
@@ -153,7 +153,7 @@ def test_agrees_with_high_precision_inversion(etas, orders, stiffness):
 @given(elements)
 def test_any_plant_starts_at_zero_ends_at_rest_and_passes_its_own_check(path):
     time = np.array([-1.0, 0.0, *np.geomspace(1e-5, 1e5, 60)])
-    response = unit_step(path, time, tolerance=1e-10)
+    response = unit_step(path, time)
     assert_array_equal(response[:2], 0.0)
     assert (response[2:] * path.stiffness < 2 + 1e-9).all()  # undamped: twice the rest
     assert len(poles(path)) <= 1
@@ -240,7 +240,7 @@ def test_table_and_direct_sums_agree(path, rng, monkeypatch):
     changes, jumps = np.sort(rng.uniform(0, 50, 13)), rng.normal(size=13)
     response = partial(unit_step, path)
     direct = superposed(response, time, changes, jumps, tolerance=0.0)  # a table could not reach 0
-    monkeypatch.setattr(superposition, "_DISTINCT", 0)
+    monkeypatch.setattr(bench_device, "_DISTINCT", 0)
     table = superposed(response, time, changes, jumps, tolerance=1e-9 / path.stiffness)
     assert 0 < np.abs(direct - table).max() < 1e-8 * np.abs(jumps).sum() / path.stiffness
 
@@ -534,7 +534,7 @@ def test_paper_records_are_the_stated_experiments(rng):
 def test_campaign_on_disk(tmp_path, rng):
     records = paper_step_records(rng)
     folder = tmp_path / "new" / "paper"
-    paths = write_campaign(folder, records, held_out=("xy",), seed=7)
+    paths = write_campaign(folder, records, name="paper", held_out=("xy",), seed=7)
     assert sorted(folder.iterdir()) == sorted(paths)
     text = paths[-1].read_text(encoding="utf-8")
     assert tomllib.loads(text) == {
@@ -554,28 +554,28 @@ def test_campaign_on_disk(tmp_path, rng):
 
 def test_campaign_overwrites_only_when_told(tmp_path, rng):
     first, second = paper_step_records(rng)[:2]
-    write_campaign(tmp_path, [first], name="one")
+    write_campaign(tmp_path, [first], name="one", seed=1)
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     with pytest.raises(InputError) as caught:
-        write_campaign(tmp_path, [second, first], name="two")
+        write_campaign(tmp_path, [second, first], name="two", seed=1)
     assert len(caught.value.problems) == 2  # x_on.csv and study.toml
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
-    write_campaign(tmp_path, [second, first], name="two", overwrite=True)
+    write_campaign(tmp_path, [second, first], name="two", seed=1, overwrite=True)
     assert tomllib.loads((tmp_path / "study.toml").read_text())["study"]["name"] == "two"
 
 
 def test_campaign_tells_every_problem_and_writes_nothing(tmp_path, rng):
     first = paper_step_records(rng)[0]
-    records = [first, first, replace(first, name="../up", time_unit="s")]
+    records = [first, first, replace(first, name="../up")]
     with pytest.raises(InputError) as caught:
-        write_campaign(tmp_path / "new", records, held_out=("x_of",))
+        write_campaign(tmp_path / "new", records, name="new", seed=1)
     told = "\n".join(caught.value.problems)
-    for words in ("occurs 2 times", "'../up' cannot be", "did you mean 'x_on'", "same time unit"):
+    for words in ("occurs 2 times", "'../up' cannot be"):
         assert words in told
     with pytest.raises(InputError, match="no record remains"):
-        write_campaign(tmp_path / "new", [first], held_out=("x_on",))
+        write_campaign(tmp_path / "new", [first], name="new", seed=1, held_out=("x_on",))
     with pytest.raises(InputError, match="no record remains"):
-        write_campaign(tmp_path / "new", [])
+        write_campaign(tmp_path / "new", [], name="new", seed=1)
     assert not list(tmp_path.iterdir())
 
 
@@ -586,7 +586,7 @@ def test_campaign_leaves_no_part_behind_when_interrupted(tmp_path, rng, monkeypa
 
     monkeypatch.setattr("lcopa_bayes.bench.campaignfile.save_record", fail)
     with pytest.raises(KeyboardInterrupt):
-        write_campaign(tmp_path, paper_step_records(rng)[:1])
+        write_campaign(tmp_path, paper_step_records(rng)[:1], name="new", seed=1)
     assert not list(tmp_path.iterdir())
 
 

@@ -12,10 +12,20 @@ from scipy.integrate import solve_ivp
 from lcopa_bayes.bench.campaignfile import load_plan
 from lcopa_bayes.bench.command import on_off
 from lcopa_bayes.bench.driveeffects import by_axis, joined
+from lcopa_bayes.bench.hiddeneffects import MarchError, marched, step_means
 from lcopa_bayes.bench.inversion import unit_step
-from lcopa_bayes.bench.marching import MarchError, marched, step_means
-from lcopa_bayes.bench.schedules import LARGEST, plain_schedules, rich_schedules
-from lcopa_bayes.bench.undeclared import NAMED, NOISE, OUTSIDE, UndeclaredPlan, campaign, drawn, steerer
+from lcopa_bayes.bench.undeclared import (
+    LARGEST,
+    NAMED,
+    NOISE,
+    OUTSIDE,
+    UndeclaredPlan,
+    campaign,
+    drawn,
+    plain_schedules,
+    rich_schedules,
+    steerer,
+)
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.model.path import TransferPath

@@ -33,12 +33,11 @@ from lcopa_bayes.paper.equation import (
     output_rmse,
     responses,
 )
-from lcopa_bayes.paper.evaluation import evaluate
 from lcopa_bayes.paper.identify import identify, integer_orders, results
 from lcopa_bayes.paper.intervals import Candidates, Interval, Scan, decreasing
 from lcopa_bayes.paper.outputerror import output_error_fit
 from lcopa_bayes.paper.paths import MOST_BLOCKS, PathData, path_data
-from lcopa_bayes.paper.scan import scan
+from lcopa_bayes.paper.scan import evaluate, scan
 
 PAPER_STEP = Path(__file__).parents[2] / "studies" / "paper-step"
 U, Y = Axis("u", "V"), Axis("y", "rad")
@@ -513,3 +512,9 @@ def test_the_study_is_left_as_it_was(identified):
     once, _ = identified
     assert isinstance(once, Study)
     assert np.isnan(once.fit[0].response[0]).all()
+
+
+def test_a_study_with_effects_is_refused():
+    made = study(clean())
+    with pytest.raises(InputError, match="uses odd_curvature, and the paper's model has no effects"):
+        identify(replace(made, effects=replace(made.effects, use=("odd_curvature",))))

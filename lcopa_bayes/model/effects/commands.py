@@ -162,7 +162,7 @@ class Hysteresis(DriveEffect):
         formula="u -> u + h (p - u), p_k = max(u - r, min(u + r, p_(k-1))), r = width umax",
         source="play operator of Prandtl and Ishlinskii; ions, surface memory",
         reveals="sign reversal, staircases up and down",
-        mistaken_for="gain; invisible when every record goes one way",
+        mistaken_for="gain; invisible when every record goes in one direction",
     )
 
     @classmethod

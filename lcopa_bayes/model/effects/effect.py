@@ -195,8 +195,8 @@ class Effect(ABC):
     @classmethod
     def with_constants(cls, ranges: Ranges, values: Sequence[float]) -> Self:
         """The instance with internal constants as numbers, in the order of `internal`."""
-        told = cls.internal(ranges)
-        return cls(*(bool(v) if one.kind == "choice" else v for one, v in zip(told, values, strict=True)))
+        pairs = zip(cls.internal(ranges), values, strict=True)
+        return cls(*(bool(v) if one.kind == "choice" else v for one, v in pairs))
 
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
         """Coefficients, of one record when the card says `per_record`; by default those of `estimated`."""
@@ -294,13 +294,11 @@ def single(name: str, scale: float, unit: str = "-", *, one_signed: bool = False
     return (Coefficient(name, unit, scale, one_signed),)
 
 
-def per_axis(
-    ranges: Ranges, names: Sequence[str], part: float, *, one_signed: bool = False
-) -> tuple[Coefficient, ...]:
+def per_axis(ranges: Ranges, names: Sequence[str], part: float) -> tuple[Coefficient, ...]:
     """Coefficients [response unit] for every axis in turn; their scale is a `part` of its deflection."""
     return tuple(
         Coefficient(
-            f"{name}_{axis}" if ranges.axes > 1 else name, "response", part * float(size), one_signed, number
+            f"{name}_{axis}" if ranges.axes > 1 else name, "response", part * float(size), axis=number
         )
         for number, (axis, size) in enumerate(zip(ranges.names, ranges.response, strict=True))
         for name in names

@@ -61,7 +61,7 @@ class UnmodelledSmooth(ParallelEffect):
         place="generic",
         formula="y += sum_k c_k cos(pi k (t - start) / length), k = 1..8, per record and axis",
         source="cosine series",
-        reveals="any record; repeats tell it from what the drive causes",
+        reveals="any record; repeats separate it from what the drive causes",
         mistaken_for="everything slow",
         per_record=True,
         disturbance=True,

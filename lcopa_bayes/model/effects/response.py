@@ -175,7 +175,7 @@ class CrossFade(ReadoutEffect):
     """The far field passes from one diffraction order to the next: the centroid waits, then hurries.
 
     Homogeneous of degree 1, so that an amplitude series does not show it. A transition that is
-    interrupted starts anew from the director's deflection; what the centroid lacks then fades with it.
+    interrupted starts anew from the director's deflection; its distance from the director then fades with it.
     """
 
     per_command: ClassVar[bool] = True
@@ -201,16 +201,18 @@ class CrossFade(ReadoutEffect):
             origins = np.interp(starts, scene.times, y[:, axis])
             firsts = np.searchsorted(scene.times, starts)
             lasts = np.append(firsts[1:], scene.times.size)
-            left = 0.0  # what the centroid still lacks of the director's deflection when a segment begins
+            distance = 0.0  # distance of the centroid from the director as a segment begins
             for start, origin, change, first, last in zip(
                 starts, origins, changes, firsts, lasts, strict=True
             ):
-                way = _target(scene, axis, float(change)) - origin
-                out[first:last, axis] += _lack(y[first:last, axis] - origin, way, left, float(psi[0]))
+                travel = _target(scene, axis, float(change)) - origin
+                out[first:last, axis] += _distance(
+                    y[first:last, axis] - origin, travel, distance, float(psi[0])
+                )
                 later = starts[starts > start]
                 if later.size:
                     there = np.interp(later[:1], scene.times, y[:, axis]) - origin
-                    left = float(_lack(there, way, left, float(psi[0]))[0])
+                    distance = float(_distance(there, travel, distance, float(psi[0]))[0])
         return out
 
 
@@ -224,11 +226,11 @@ def _target(scene: Scene, axis: int, change: float) -> float:
     return total
 
 
-def _lack(moved: Array, way: float, left: float, strength: float) -> Array:
-    """Centroid minus director after `moved` of a `way`; `left` at its begin."""
-    a = moved / way if way != 0.0 else np.ones(moved.shape)
+def _distance(moved: Array, travel: float, distance: float, strength: float) -> Array:
+    """Centroid minus director after `moved` of a `travel`; `distance` is that at its begin."""
+    a = moved / travel if travel != 0.0 else np.ones(moved.shape)
     inside = (a > 0) & (a < 1)
     q, other = np.sinc(1 - a[inside]) ** 2, np.sinc(a[inside]) ** 2
-    out = left * (1 - np.clip(a, 0.0, 1.0))
-    out[inside] += strength * way * (q / (q + other) - a[inside])
+    out = distance * (1 - np.clip(a, 0.0, 1.0))
+    out[inside] += strength * travel * (q / (q + other) - a[inside])
     return np.asarray(out)

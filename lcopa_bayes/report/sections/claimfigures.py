@@ -12,8 +12,8 @@ from lcopa_bayes.optics.array import LinearArray, paper_array
 from lcopa_bayes.optics.lobes import strongest_grating_lobe
 from lcopa_bayes.optics.steering import geometry_check, linearisation_error
 from lcopa_bayes.optics.tiltlaw import continuous_law, printed_law
-from lcopa_bayes.paper.crosstalkclaims import crosstalk_rules
 from lcopa_bayes.paper.equation import response_to
+from lcopa_bayes.paper.modelclaims import crosstalk_rules
 from lcopa_bayes.paper.numericsclaims import delay_costs
 from lcopa_bayes.paper.opticsclaims import FAR_WEAKER, tilt_checks
 from lcopa_bayes.paper.printedmodel import RECORD_LENGTH, SETTLING_BANDS, PrintedModel, integer_rival

@@ -78,7 +78,7 @@ def _planar(calculated: StaticOptics) -> str:
     figure = blank(3.7)
     panels = figure.subplots(1, len(calculated.planar), squeeze=False)[0]
     for panel, pattern in zip(panels, calculated.planar, strict=True):
-        ends = (pattern.u[0], pattern.u[-1], pattern.v[0], pattern.v[-1])
+        ends = (pattern.axis[0], pattern.axis[-1]) * 2
         shown = panel.imshow(
             _decibel(pattern.intensity).T, origin="lower", extent=ends, vmin=_FLOOR, vmax=0, cmap="viridis"
         )

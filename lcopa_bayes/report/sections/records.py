@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from lcopa_bayes.report.decimation import extremes, said
 from lcopa_bayes.report.formatting import figures, percent
 from lcopa_bayes.report.savedrun import SavedRun
-from lcopa_bayes.report.section import Column, Drawing, Section, Table
+from lcopa_bayes.report.section import Drawing, Section, Table, score_columns
 from lcopa_bayes.report.theme import BAND, CYCLE, HELD_OUT, NOISE, SEEN, blank, label, plain, svg_of
 from lcopa_bayes.results.bands import POINTWISE
 
@@ -133,24 +133,18 @@ def _before(run: SavedRun, rows: pd.DataFrame, record: str) -> str:
 
 
 def _scores(run: SavedRun) -> Table:
-    columns = (
-        *(Column("record"), Column("axis"), Column("use"), Column("RMSE", "number"), Column("unit")),
-        *(Column("in 50 % band", "number"), Column("in 90 % band", "number"), Column("samples", "number")),
-        Column("offset from", "prose"),
-    )
-    rows = tuple(
-        (
-            *(str(row["record"]), str(row["axis"]), use, figures(row["rmse"]), str(row["unit"])),
-            *(percent(row["coverage_50"]), percent(row["coverage_90"]), str(row["samples"])),
-            str(row["offset_from"]),
-        )
+    rows = [
+        row | {"use": use}
         for key, use in (("fit_scores", "fit"), ("held_out", "held out"))
         for row in run.results[key]
-    )
-    return Table(
-        columns,
+    ]
+    return Table.of(
         rows,
-        f"RMSE is against the median of the plant; coverage is by the {POINTWISE} bands with noise. Where an "
-        "offset comes from all samples of a held-out record, a constant error is not visible in its "
+        ("record", "text", "record"),
+        ("axis", "text", "axis"),
+        ("use", "text", "use"),
+        *score_columns(),
+        caption=f"RMSE is against the median of the plant; coverage is by the {POINTWISE} bands with noise. "
+        "Where an offset comes from all samples of a held-out record, a constant error is not visible in its "
         "scores.",
     )
