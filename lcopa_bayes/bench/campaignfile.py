@@ -44,7 +44,7 @@ from lcopa_bayes.bench.device import PAPER_DEVICE, Device
 from lcopa_bayes.bench.inversion import unsuited
 from lcopa_bayes.bench.undeclared import UndeclaredPlan
 from lcopa_bayes.core.errors import InputError, nearest
-from lcopa_bayes.core.files import told_as, writable_folder, write_text
+from lcopa_bayes.core.files import writable_folder, write_text, writing
 from lcopa_bayes.core.rules import FLAG, Rule, is_number, whole
 from lcopa_bayes.data.record import Axis, Record, save_record
 from lcopa_bayes.model.path import TransferPath
@@ -293,7 +293,7 @@ def write_campaign(
     lines += [f"{role} = {json.dumps([f'{each}.csv' for each in own])}" for role, own in roles.items() if own]
     lines += ["", settings] if settings else []
     writable_folder(folder)
-    with told_as(folder), tempfile.TemporaryDirectory(prefix=".campaign-", dir=folder) as beside:
+    with writing(folder), tempfile.TemporaryDirectory(prefix=".campaign-", dir=folder) as beside:
         try:
             for record, target in zip(records, targets, strict=False):
                 save_record(record, Path(beside) / target.name)
@@ -301,6 +301,6 @@ def write_campaign(
         except InputError as error:  # name the file that was wanted
             raise InputError([p.replace(beside, str(folder)) for p in error.problems]) from error
         for target in targets:
-            with told_as(target):
+            with writing(target):
                 os.replace(Path(beside) / target.name, target)
     return tuple(targets)
