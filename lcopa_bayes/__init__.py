@@ -5,6 +5,8 @@ import lcopa_bayes as lb
 study = lb.load_study("studies/paper-step")
 fit = lb.fit(study, jobs=2)
 fit.summary()
+
+`docs/python.md` is a session with its output, which the tests run.
 """
 
 from importlib import import_module
@@ -12,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from lcopa_bayes.core.errors import InputError as InputError
-    from lcopa_bayes.data.drives import Drive as Drive
+    from lcopa_bayes.data.drive import Drive as Drive
     from lcopa_bayes.data.record import Record as Record
     from lcopa_bayes.data.record import load_record as load_record
     from lcopa_bayes.data.study import Study as Study
@@ -38,7 +40,7 @@ if TYPE_CHECKING:
 
 _PLACES = {
     "core.errors": ("InputError",),
-    "data.drives": ("Drive",),
+    "data.drive": ("Drive",),
     "data.record": ("Record", "load_record"),
     "data.study": ("Study",),
     "data.studyfile": ("load_study",),
@@ -55,7 +57,7 @@ _PLACES = {
     "verbs.simulate": ("Simulation", "simulate"),
     "verbs.stored": ("load_result",),
 }
-"""Where the public names stand; a module is imported when one of its names is first used."""
+"""Modules of the public names; a module is imported when one of its names is first used."""
 _OF = {name: place for place, names in _PLACES.items() for name in names}
 __all__ = sorted(_OF)
 

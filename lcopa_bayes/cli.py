@@ -7,12 +7,13 @@ import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, final
 
 import lcopa_bayes
 
-# verbs are imported when they are carried out, so that help and refusals come at once
+# verbs are imported when they run, so that help and refusals come at once
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.verbs import choices
 from lcopa_bayes.verbs.choices import RUNS
@@ -38,6 +39,10 @@ class Reported(Protocol):
     def report(self, folder: Path | str) -> Path: ...  # noqa: D102
 
 
+Derived = Callable[[argparse.Namespace, Any], object]
+"""An argument of a public function from the options and the study or fit."""
+
+
 @final
 @dataclass(frozen=True)
 class Outcome:
@@ -57,15 +62,15 @@ class Verb:
     text: str
     """What it does, in a line."""
     options: Callable[[argparse.ArgumentParser], None]
-    carry_out: Callable[[argparse.Namespace], Outcome]
+    perform: Callable[[argparse.Namespace], Outcome]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Carry out one verb; returns the exit code."""
+    """Run one verb; returns the exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     options = _parser(given[:1]).parse_args(given)
     try:
-        outcome = _carried_out(options, ["lcopa-bayes", *given])
+        outcome = _outcome(options, ["lcopa-bayes", *given])
     except InputError as error:
         for problem in error.problems:
             print(f"error: {problem}", file=sys.stderr)
@@ -83,11 +88,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _carried_out(options: argparse.Namespace, command: Sequence[str]) -> Outcome:
+def _outcome(options: argparse.Namespace, command: Sequence[str]) -> Outcome:
     from lcopa_bayes.results.provenance import commanded
 
     with commanded(command):
-        return VERBS[options.verb].carry_out(options)
+        return VERBS[options.verb].perform(options)
 
 
 def _parser(wanted: Sequence[str]) -> argparse.ArgumentParser:
@@ -111,19 +116,18 @@ def _reported(result: Reported, folder: Path) -> Outcome:
 
 def _source(options: argparse.Namespace) -> FitLike:
     """The study asked for, with the seed of the command line if one is given, or a finished fit."""
-    from lcopa_bayes.data.studyfile import load_study
-    from lcopa_bayes.verbs.sources import finished
+    from lcopa_bayes.verbs.sources import finished, study_of
 
-    made = finished(options.source)
-    if made is None:
-        study = load_study(options.source, held_out=options.held_out)
+    fitted = finished(options.source)
+    if fitted is None:
+        study = study_of(options.source, held_out=options.held_out)
         return study if options.seed is None else study.with_seed(options.seed)
     if options.held_out or options.seed is not None:
         raise InputError(
             f"{options.source[0]}: is the run folder of a finished fit, which --held-out and --seed do not "
             "change; score a record with `predict`, or name the study to fit it again"
         )
-    return made
+    return fitted
 
 
 def _folder(options: argparse.Namespace, source: FitLike, *inside: str) -> Path:
@@ -142,104 +146,38 @@ def _jobs(options: argparse.Namespace) -> int:
     return options.jobs or cores()
 
 
-def _fit(options: argparse.Namespace, *, stages: bool = False) -> Outcome:
-    from lcopa_bayes.verbs.fit import fit
-    from lcopa_bayes.verbs.sources import study_of
+def _on_study(
+    verb: str, *keys: str, module: str = "", inside: str = "", anew: bool = False, **derived: Derived
+) -> Callable[[argparse.Namespace], Outcome]:
+    """What runs a public function of a study or a finished fit.
 
-    study = study_of(_source(options))
-    folder = _folder(options, study)
-    result = fit(
-        study,
-        folder=folder,
-        jobs=_jobs(options),
-        cross_check=options.cross_check,
-        rival=stages and "rival" in study.stages,
-        **_sampling(options),
-    )
-    return _reported(result, folder)
+    `keys` are options that it takes by their names, `derived` gives others from the options and the source,
+    `module` is that of the function where it is not public; `anew` calls it with the study alone, and the run
+    folder is then one `inside` another by the name of the study.
+    """
 
+    def perform(options: argparse.Namespace) -> Outcome:
+        from lcopa_bayes.verbs.sources import study_of
 
-def _run(options: argparse.Namespace) -> Outcome:
-    return _fit(options, stages=True)
+        source = _source(options)
+        source = study_of(source) if anew else source
+        function = getattr(import_module(f"lcopa_bayes.verbs.{module}") if module else lcopa_bayes, verb)
+        given = {key: getattr(options, key) for key in keys}
+        given |= {key: of(options, source) for key, of in derived.items()}
+        folder = _folder(options, source, *filter(None, [inside]))
+        return _reported(function(source, folder=folder, jobs=_jobs(options), **given), folder)
 
-
-def _sampling(options: argparse.Namespace) -> dict[str, bool]:
-    return {key: getattr(options, key) for key in ("resume", "quick", "quiet")}
-
-
-def _audit(options: argparse.Namespace) -> Outcome:
-    from lcopa_bayes.verbs.audit import audit
-
-    source = _source(options)
-    folder = _folder(options, source)
-    return _reported(audit(source, folder=folder, jobs=_jobs(options), **_sampling(options)), folder)
+    return perform
 
 
-def _design(options: argparse.Namespace) -> Outcome:
-    from lcopa_bayes.verbs.design import design
-
-    source = _source(options)
-    folder = _folder(options, source)
-    result = design(
-        source,
-        bench_time=options.time,
-        repeats=options.repeats,
-        amplitude=options.amplitude,
-        refresh=options.refresh,
-        with_prior=options.with_prior,
-        folder=folder,
-        jobs=_jobs(options),
-        **_sampling(options),
-    )
-    return _reported(result, folder)
+def _rival(options: argparse.Namespace, study: Any) -> bool:
+    return "rival" in study.stages
 
 
-def _compare(options: argparse.Namespace) -> Outcome:
-    from lcopa_bayes.verbs.compare import compare
-
-    source = _source(options)
-    folder = _folder(options, source)
-    result = compare(
-        source,
-        options.pick,
-        described=options.candidates or (),
-        folder=folder,
-        jobs=_jobs(options),
-        **_sampling(options),
-    )
-    return _reported(result, folder)
-
-
-def _loop(options: argparse.Namespace) -> Outcome:
-    from lcopa_bayes.verbs.loop import loop
-
-    source = _source(options)
-    folder = _folder(options, source)
-    result = loop(
-        source, as_stated=options.as_stated, folder=folder, jobs=_jobs(options), quick=options.quick
-    )
-    return _reported(result, folder)
-
-
-def _calibrate(options: argparse.Namespace) -> Outcome:
+def _truth(options: argparse.Namespace, study: Any) -> object:
     from lcopa_bayes.calibration.truths import stated_values
-    from lcopa_bayes.verbs.calibrate import calibrate
-    from lcopa_bayes.verbs.sources import study_of
 
-    study = study_of(_source(options))
-    folder = _folder(options, study, "calibration")
-    result = calibrate(
-        study,
-        replicas=options.replicas,
-        around=options.around,
-        truth=stated_values(options.truth),
-        engine=options.engine,
-        dask=options.dask,
-        folder=folder,
-        jobs=_jobs(options),
-        **_sampling(options),
-    )
-    return _reported(result, folder)
+    return stated_values(options.truth)
 
 
 def _predict(options: argparse.Namespace) -> Outcome:
@@ -249,33 +187,17 @@ def _predict(options: argparse.Namespace) -> Outcome:
     return _reported(result, options.out or options.folder / "predict" / options.drive.stem)
 
 
-def _identify(options: argparse.Namespace) -> Outcome:
-    from lcopa_bayes.verbs.papers import identify
-
-    source = _source(options)
-    folder = _folder(options, source)
-    result = identify(
-        source,
-        scan=_scan(options),
-        posterior=options.posterior,
-        folder=folder,
-        jobs=_jobs(options),
-        quiet=options.quiet,
-    )
-    return _reported(result, folder)
-
-
 def _optics(options: argparse.Namespace) -> Outcome:
     from lcopa_bayes.paper.opticsplan import OpticsPlan
     from lcopa_bayes.verbs.papers import optics
 
-    plan = OpticsPlan.of(
+    plan = OpticsPlan(
         elements=options.elements,
         pitch=options.pitch,
         wavelength=options.wavelength,
         fill_factor=options.fill_factor,
-        targets_deg=options.targets,
-        voltages=options.voltages,
+        targets_deg=tuple(options.targets),
+        voltages=tuple(options.voltages),
         pretilt=options.pretilt,
         field=options.field,
     )
@@ -293,8 +215,8 @@ def _claims(options: argparse.Namespace) -> Outcome:
 def _bundled(file: str) -> list[Path]:
     """Run folders of the bundled studies that hold a file, one's own before the published ones."""
     places = ([RUNS / name, PUBLISHED / name] for name in BUNDLED)
-    found = (next((place for place in each if (place / file).is_file()), None) for each in places)
-    return [place for place in found if place is not None]
+    matches = (next((place for place in each if (place / file).is_file()), None) for each in places)
+    return [place for place in matches if place is not None]
 
 
 def _report(options: argparse.Namespace) -> Outcome:
@@ -310,13 +232,13 @@ def _report(options: argparse.Namespace) -> Outcome:
 def _simulate(options: argparse.Namespace) -> Outcome:
     from lcopa_bayes.verbs.simulate import simulate
 
-    made = simulate(options.campaign, seed=options.seed)
-    paths = made.save(options.out, overwrite=options.overwrite)
-    verdict = f"{len(made.records)} records in {options.out}"
+    simulation = simulate(options.campaign, seed=options.seed)
+    paths = simulation.save(options.out, overwrite=options.overwrite)
+    verdict = f"{len(simulation.records)} records in {options.out}"
     return Outcome({"verdict": verdict, "files": [str(path) for path in paths]}, verdict)
 
 
-def _scan(options: argparse.Namespace) -> Scan:
+def _scan(options: argparse.Namespace, study: Any) -> Scan:
     """The scan of the command line; an order without an interval is scanned up to the one above it."""
     from lcopa_bayes.paper.intervals import Interval, Scan
 
@@ -336,20 +258,55 @@ def _scan(options: argparse.Namespace) -> Scan:
     )
 
 
+_SAMPLING = ("resume", "quick", "quiet")
+"""Options of every verb that samples."""
 VERBS: Mapping[str, Verb] = {
-    "run": Verb("all stages the study names, then the report", choices.fit, _run),
-    "fit": Verb("posterior, bands and step metrics, with a report", choices.fit, _fit),
-    "audit": Verb("what the records determine, parameter by parameter", choices.sampled, _audit),
-    "design": Verb("which drive to measure next", choices.design, _design),
-    "compare": Verb("integer against fractional orders, number of terms", choices.compare, _compare),
-    "loop": Verb("what the model lacks: residual, effect, errors after", choices.loop, _loop),
+    "run": Verb(
+        "all stages the study names, then the report",
+        choices.fit,
+        _on_study("fit", *_SAMPLING, "cross_check", anew=True, rival=_rival),
+    ),
+    "fit": Verb(
+        "posterior, bands and step metrics, with a report",
+        choices.fit,
+        _on_study("fit", *_SAMPLING, "cross_check", anew=True),
+    ),
+    "audit": Verb(
+        "what the records determine, parameter by parameter", choices.sampled, _on_study("audit", *_SAMPLING)
+    ),
+    "design": Verb(
+        "which drive to measure next",
+        choices.design,
+        _on_study("design", *_SAMPLING, "bench_time", "repeats", "amplitude", "refresh", "with_prior"),
+    ),
+    "compare": Verb(
+        "integer against fractional orders, number of terms",
+        choices.compare,
+        _on_study("compare", *_SAMPLING, "candidates", "described"),
+    ),
+    "loop": Verb(
+        "what the model lacks: residual, effect, errors after",
+        choices.loop,
+        _on_study("loop", "quick", "as_stated"),
+    ),
     "calibrate": Verb(
         "simulation-based calibration and coverage of the whole inference of a study, with a report",
         choices.calibrate,
-        _calibrate,
+        _on_study(
+            "calibrate",
+            *_SAMPLING,
+            *("replicas", "around", "engine", "dask"),
+            inside="calibration",
+            anew=True,
+            truth=_truth,
+        ),
     ),
     "predict": Verb("bands for a drive nobody has measured, by a finished fit", choices.predict, _predict),
-    "identify": Verb("the paper's own least-squares scan, with a report", choices.identify, _identify),
+    "identify": Verb(
+        "the paper's own least-squares scan, with a report",
+        choices.identify,
+        _on_study("identify", "posterior", "quiet", module="papers", scan=_scan),
+    ),
     "optics": Verb("far field, director, chain from volts to angle, with figures", choices.optics, _optics),
     "claims": Verb("the paper's claims, each with a computed verdict", choices.claims, _claims),
     "report": Verb("render the pages of a run folder again", choices.report, _report),

@@ -12,21 +12,18 @@ import numpy as np
 
 from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import Command, on_off, step
-from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.bench.device import Device
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import (
     EffectsSettings,
-    ModelSettings,
-    NoiseSettings,
-    PriorSettings,
-    SamplerSettings,
 )
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.priors import Prior
+from lcopa_bayes.model.path import TransferPath
 from lcopa_bayes.sampling.convergence import Quality
 from lcopa_bayes.sampling.draws import Draws
 
@@ -35,8 +32,7 @@ TRUTH = {"gain": 2.0, "time_1": 1.5, "order_1": 0.8, "delay": 0.73, "offset": 0.
 
 
 def path(gain: float, delay: float, times: Sequence[float], orders: Sequence[float]) -> TransferPath:
-    etas = tuple(time**order for time, order in zip(times, orders, strict=True))
-    return TransferPath(gain, delay, etas, tuple(orders), 1.0)
+    return TransferPath.of_times(gain, delay, times, orders)
 
 
 ONE = Device(
@@ -87,10 +83,8 @@ def study(
     seed: int = 5,
     **model: object,
 ) -> Study:
-    told = {
-        name: PriorSettings(name, dist=value[0], parameters=value[1])
-        if isinstance(value, tuple)
-        else PriorSettings(name, fixed=value)
+    stated = {
+        name: {"dist": value[0], **value[1]} if isinstance(value, tuple) else value
         for name, value in (priors or {}).items()
     }
     return Study(
@@ -100,10 +94,10 @@ def study(
         seed,
         tuple(fit),
         tuple(held_out),
-        model=ModelSettings(**model),
-        priors=told,
-        noise=NoiseSettings(noise),
-        sampler=SamplerSettings(**(sampler or {})),
+        model=model,
+        priors=stated,
+        noise={"kind": noise},
+        sampler=sampler,
     )
 
 

@@ -13,7 +13,8 @@ MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.name != "__init_
 ORDER = (
     ("core",),
     ("data",),
-    ("model", "bench", "optics"),
+    ("model",),
+    ("bench", "optics"),
     ("inference",),
     ("sampling",),
     ("results",),
@@ -101,10 +102,12 @@ def test_only_the_report_plots(path: Path):
     assert place(path) == "report" or not used & PLOTTING
 
 
-@pytest.mark.parametrize("room", ["model", "inference"])
-def test_the_bench_shares_no_numerics_with_the_model(room: str):
-    for path in (PACKAGE / "bench").glob("*.py"):
-        assert not any(name.startswith(f"lcopa_bayes.{room}") for name in imports(path.read_text()))
+@pytest.mark.parametrize("name", ["path", "literature"])
+def test_what_model_and_bench_share_calculates_no_response(name: str):
+    source = (PACKAGE / "model" / f"{name}.py").read_text()
+    used = {".".join(each.split(".")[:3]) for each in imports(source) if each.startswith("lcopa_bayes.")}
+    assert used <= {"lcopa_bayes.core.errors", "lcopa_bayes.model.path"}
+    assert not {each.split(".")[0] for each in imports(source)} & {"numpy", "scipy"}
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))

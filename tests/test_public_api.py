@@ -5,6 +5,7 @@ import dataclasses
 import inspect
 import json
 import os
+import re
 import subprocess
 import sys
 import textwrap
@@ -25,6 +26,7 @@ from lcopa_bayes.results.provenance import provenance
 from lcopa_bayes.results.runfolder import LOCK, opened
 from lcopa_bayes.verbs.choices import RUNS
 
+README = Path(__file__).parents[1] / "README.md"
 TINY = {"ensembles": 2, "walkers": 16, "steps": 60, "thin": 1, "target_ess": 50}
 """Too short for numbers that hold, long enough for every table."""
 ON = record(1, camera=0.5, name="on")
@@ -133,18 +135,65 @@ def test_all_that_is_wrong_with_a_study_is_told_at_once(tmp_path):
         assert word in said, word
 
 
-def test_the_lines_of_a_session(fit, folder):
-    """The README's Python section."""
-    table = fit.summary()
-    assert list(table["parameter"]) == ["gain", "time_1", "offset", "sigma"]
-    assert {"value", "lower", "upper", "unit", "ess", "rhat", "grade"} <= set(table.columns)
-    assert ((table["lower"] <= table["value"]) & (table["value"] <= table["upper"])).all()
-    shown = arviz_stats.summary(fit.to_datatree(), var_names=["gain"])
-    assert shown.shape[0] == 1
-    predicted = fit.predict(lb.Drive.steps(u=[(0, 1.57), (20, 0.0)]))
+def bent_lag(height: float, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """A first-order lag of 2 ms under a step, read by a sensor that adds a fifth of the cube."""
+    time_ms = np.arange(-15.0, 12.0, 0.25)
+    lag = height * -np.expm1(-np.maximum(time_ms, 0) / 2)
+    reading = lag + 0.2 * lag**3 + 0.01 * rng.normal(size=time_ms.size)
+    return {"time_ms": time_ms, "drive_x_rad": height * (time_ms >= 0), "response_x_rad": reading}
+
+
+def test_the_lines_that_must_work(tmp_path, monkeypatch):
+    """The README's Python section, line by line, on a small study and a short bench time."""
+    (text,) = re.findall(r"^```python\n(.*?)^```$", README.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
+    rng = np.random.default_rng(1)
+    study = lb.Study(
+        "bench",
+        fit=[bent_lag(height, rng) for height in (1.0, -1.0, 0.5)],
+        model={"orders": [1], "offset": "none"},
+        noise=NOISE,
+        sampler={**TINY, "steps": 20, "target_ess": 20},
+        priors={"delay": 0.0},
+        seed=1,
+    )
+    text = text.replace("bench_time=1000", "bench_time=20, quick=True")
+    monkeypatch.setattr(lb, "load_study", lambda folder: study)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    results = {}
+    for line in ast.parse(text).body:
+        source = ast.unparse(line)
+        if isinstance(line, ast.Expr):
+            results[source] = eval(source, names)
+        else:
+            exec(source, names)
+    fit, better = names["fit"], names["better"]
+    assert fit.study is study
+    summary = results["fit.summary()"]
+    assert {"value", "lower", "upper", "unit", "ess", "rhat", "grade"} <= set(summary.columns)
+    assert ((summary["lower"] <= summary["value"]) & (summary["value"] <= summary["upper"])).all()
+    assert arviz_stats.summary(results["fit.to_datatree()"], var_names=["gain"]).shape[0] == 1
+    (predicted,) = (one for one in results.values() if isinstance(one, lb.Prediction))
     assert (predicted.table()["plant_pointwise_05"] <= predicted.table()["plant_pointwise_95"]).all()
-    assert fit.frequency_response([0.01, 0.1]).table().shape[0] == 2
-    assert (folder / "report.html").is_file()
+    assert results["fit.frequency_response([0.01, 0.1])"].table().shape[0] == 2
+    verdicts = results["lb.audit(fit).summary()"]
+    assert set(verdicts["parameter"]) == {"gain", "time_1", "sigma"}
+    tables = [one for source, one in results.items() if source.startswith("lb.compare")]
+    assert [list(one["name"]) for one in tables] == [
+        ["fractional-2", "second-order"],
+        ["bench", "bench-explained"],
+    ]
+    # the effect that the records hold is named, and with it the time constant is that of the lag
+    assert names["search"].study.effects.use == better.study.effects.use == ("odd_curvature",)
+    assert tables[1]["log_evidence"].diff().iloc[1] > 100
+    times = {one: names[one].summary().set_index("parameter").loc["time_1"] for one in ("fit", "better")}
+    assert times["fit"]["lower"] > 2.1
+    assert times["better"]["lower"] < 2.05
+    drive = next(one for one in results.values() if isinstance(one, lb.Drive))
+    assert drive.axes == ("x",)
+    assert len(list((tmp_path / "runs").rglob("*.html"))) == 1
+    again = next(one for source, one in results.items() if source.startswith("lb.load_result"))
+    pd.testing.assert_frame_equal(again.summary(), better.summary())
 
 
 def test_a_fit_does_not_depend_on_processes(fit):
@@ -216,7 +265,11 @@ def test_a_result_is_the_same_when_read_back(name, request, tmp_path):
     assert result.summary().shape[1] > 3
     values = result.to_json()
     assert json.loads(json.dumps(values, allow_nan=False)) == values
-    assert "<table" in result._repr_html_()
+    cells = re.findall(r"<td[^>]*>(.*?)</td>", html := result._repr_html_())
+    assert len(cells) == result.summary().size
+    assert html.count("<p>") == 1
+    numbers = [cell for cell in cells if re.fullmatch(r"-?\d*\.\d+", cell)]
+    assert all(len(cell.replace(".", "").lstrip("-0")) <= 4 or cell[-3] == "." for cell in numbers)
     assert result.verdict in str(result) or name == "loop"
     page = result.report(tmp_path / "run")
     assert page.is_file()
@@ -242,6 +295,12 @@ def test_a_design_and_a_loop_read_back_hold_drive_and_study(design, loop, tmp_pa
     assert found.name == loop.study.name
     assert found.effects == loop.study.effects
     np.testing.assert_array_equal(found.fit[0].response, loop.study.fit[0].response)
+
+
+def test_a_study_its_records_and_a_drive_show_what_they_hold_and_not_their_numbers():
+    assert repr(ON) == "Record('on', u [V], y [rad], 26 rows from -0.5 to 11.5 ms)"
+    assert repr(small()) == f"Study('small', fit=[{ON!r}], held_out=[{OFF!r}])"
+    assert repr(lb.Drive.steps(u=[(0, 1.57), (20, 0)])) == "Drive('drive', u, 2 rows from 0 to 20)"
 
 
 # ---- run folders

@@ -1,4 +1,4 @@
-"""Step response of a fractional compliance by numerical inverse Laplace transform.
+"""Step response of a transfer path by numerical inverse Laplace transform.
 
 The Bromwich integral is taken on Talbot's cotangent contour with the optimal parameters of Weideman,
 SIAM J. Numer. Anal. 44 (2006) 2342, scaled to each time. Poles that the contour could cut off (lightly
@@ -8,16 +8,15 @@ their residues, so that one short contour is enough for every time.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from functools import lru_cache
 from math import inf, isfinite, pi
-from typing import final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lcopa_bayes.core.arrays import Array, Vector, frozen
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.model.path import TransferPath
 
 _Complex = NDArray[np.complex128]
 
@@ -25,6 +24,8 @@ _NODES = (24, 32)
 """Nodes of the two contours compared; each alone is good to about ``exp(-1.36 nodes)`` before rounding."""
 _NEAR = 0.3
 """A pole with ``|pole| time`` below this lies deep inside either contour and is not removed."""
+_TOLERANCE = 1e-9
+"""Largest relative difference of the two contours [-]."""
 _BLOCK = 1 << 15
 """Times treated at once."""
 
@@ -50,91 +51,83 @@ class PoleSearchError(ArithmeticError):
         )
 
 
-@final
-@dataclass(frozen=True)
-class Compliance:
-    """``1 / (sum_i eta_i s^order_i + stiffness)``, Ta et al. 2026, Eq. 31 without gain and delay.
+def unsuited(path: TransferPath) -> list[str]:
+    """Sentences on what keeps the response of a path from being inverted: it must be a physical element."""
+    problems = []
+    if not path.physical:
+        problems.append(f"viscosities and stiffness must be positive; got {path}")
+    if len(set(path.orders)) != len(path.orders):
+        problems.append(f"orders must be distinct: add the viscosities of equal orders; got {path.orders}")
+    return problems
 
-    Raises InputError unless there are as many viscosities as orders, at least one, all numbers are
-    positive and finite, and no order occurs twice. Orders above 2 are allowed.
+
+@lru_cache(maxsize=256)
+def poles(path: TransferPath) -> _Complex:
+    """Poles [1/ms] of a path above the real axis, up to an argument of about 0.9 pi, (n_poles,).
+
+    With orders in (0, 2] there is at most one. Poles nearer to the negative axis are not listed: wherever a
+    contour could cut them off they have died out. Raises InputError for a path that is `unsuited`, and
+    PoleSearchError.
     """
-
-    etas: tuple[float, ...]
-    """Viscosities [ms^order], one per order; positive."""
-    orders: tuple[float, ...]
-    """Fractional orders [-]; positive and distinct."""
-    stiffness: float
-    """k [-]; positive."""
-
-    def __post_init__(self) -> None:
-        problems = []
-        if not self.orders or len(self.etas) != len(self.orders):
-            problems.append(f"one viscosity per order is needed; got {self.etas} and orders {self.orders}")
-        if not all(0 < value < inf for value in (*self.etas, *self.orders, self.stiffness)):
-            problems.append(f"viscosities, orders and stiffness must be positive and finite; got {self}")
-        if len(set(self.orders)) != len(self.orders):
-            problems.append(
-                f"orders must be distinct: add the viscosities of equal orders; got {self.orders}"
-            )
-        if problems:
-            raise InputError(problems)
-
-    @cached_property
-    def poles(self) -> _Complex:
-        """Poles [1/ms] above the real axis, up to an argument of about 0.9 pi, (n_poles,).
-
-        With orders in (0, 2] there is at most one. Poles nearer to the negative axis are not listed:
-        wherever a contour could cut them off they have died out. Raises PoleSearchError.
-        """
-        return _poles(self)
-
-    def step_response(self, time: ArrayLike, *, tolerance: float = 1e-9) -> Array:
-        """Response to a unit step at time 0, in the shape of `time` [ms]; zero up to time 0.
-
-        Raises InversionError where two contours differ by more than `tolerance` times the larger of
-        the response and ``1 / stiffness``. Accuracy about 1e-12 of that.
-        """
-        return self._inverse(time, 0, tolerance)
-
-    def ramp_response(self, time: ArrayLike, *, tolerance: float = 1e-9) -> Array:
-        """Integral of the step response from 0 [ms], in the shape of `time` [ms]; zero up to time 0.
-
-        Raises InversionError as `step_response` does, relative to ``time / stiffness``.
-        """
-        return self._inverse(time, 1, tolerance)
-
-    def _inverse(self, time: ArrayLike, integrals: int, tolerance: float) -> Array:
-        """Inverse transform of ``compliance / s^(1 + integrals)``."""
-        time = np.asarray(time, dtype=float)
-        flat = frozen(time.ravel(), name="time")
-        out = np.zeros(flat.shape)
-        later = np.flatnonzero(flat > 0)
-        for first in range(0, later.size, _BLOCK):
-            block = later[first : first + _BLOCK]
-            t = flat[block]
-            coarse, fine = (_contour_integral(self, t, integrals, nodes) for nodes in _NODES)
-            difference = np.abs(fine - coarse)
-            allowed = tolerance * np.maximum(np.abs(fine), t**integrals / self.stiffness)
-            if not (difference <= allowed).all():
-                worst = int(np.argmax(np.where(np.isnan(difference), inf, difference / allowed)))
-                raise InversionError(float(t[worst]), float(difference[worst]), float(allowed[worst]))
-            out[block] = fine
-        return out.reshape(time.shape)
+    if problems := unsuited(path):
+        raise InputError(problems)
+    return _poles(path)
 
 
-def _contour_integral(compliance: Compliance, time: Vector, integrals: int, nodes: int) -> Vector:
+def step_response(path: TransferPath, time: ArrayLike) -> Array:
+    """Response [response unit per drive unit] of a path at `time` [ms] after a unit step, in its shape."""
+    return path.gain * unit_step(path, np.asarray(time, dtype=float) - path.delay)
+
+
+def unit_step(path: TransferPath, time: ArrayLike) -> Array:
+    """Response of a path of gain 1 and no delay to a unit step at time 0, in the shape of `time` [ms].
+
+    Zero up to time 0. Raises InversionError where two contours differ by more than 1e-9 times the
+    larger of the response and ``1 / stiffness``, and as `poles`. Accuracy about 1e-12 of that.
+    """
+    return _inverse(path, time, 0)
+
+
+def unit_ramp(path: TransferPath, time: ArrayLike) -> Array:
+    """Integral of `unit_step` from 0 [ms], in the shape of `time` [ms]; zero up to time 0.
+
+    Raises InversionError as `unit_step` does, relative to ``time / stiffness``.
+    """
+    return _inverse(path, time, 1)
+
+
+def _inverse(path: TransferPath, time: ArrayLike, integrals: int) -> Array:
+    """Inverse transform of ``1 / (s^(1 + integrals) (sum_i eta_i s^order_i + stiffness))``."""
+    time = np.asarray(time, dtype=float)
+    flat = frozen(time.ravel(), name="time")
+    out = np.zeros(flat.shape)
+    later = np.flatnonzero(flat > 0)
+    for first in range(0, later.size, _BLOCK):
+        block = later[first : first + _BLOCK]
+        t = flat[block]
+        coarse, fine = (_contour_integral(path, t, integrals, nodes) for nodes in _NODES)
+        difference = np.abs(fine - coarse)
+        allowed = _TOLERANCE * np.maximum(np.abs(fine), t**integrals / path.stiffness)
+        if not (difference <= allowed).all():
+            worst = int(np.argmax(np.where(np.isnan(difference), inf, difference / allowed)))
+            raise InversionError(float(t[worst]), float(difference[worst]), float(allowed[worst]))
+        out[block] = fine
+    return out.reshape(time.shape)
+
+
+def _contour_integral(path: TransferPath, time: Vector, integrals: int, nodes: int) -> Vector:
     """Midpoint rule on the cotangent contour, poles beyond `_NEAR` by their residues."""
     theta = pi * (2 * np.arange(nodes // 2) + 1) / nodes  # upper half; the lower one is its conjugate
     cot, turn = 1 / np.tan(0.6407 * theta), 0.6407 * theta / np.sin(0.6407 * theta) ** 2
     z = nodes * (-0.6122 + 0.5017 * theta * cot + 0.2645j * theta)
     weight = 2 / nodes * np.exp(z) * nodes * (0.5017 * (cot - turn) + 0.2645j)
 
-    order, eta = np.array(compliance.orders), np.array(compliance.etas)
+    order, eta = np.array(path.orders), np.array(path.etas)
     # with s = z / time every power separates into one of the node and one of the time
-    system = (eta * time[:, None] ** -order) @ z ** order[:, None] + compliance.stiffness
+    system = (eta * time[:, None] ** -order) @ z ** order[:, None] + path.stiffness
     transform = time[:, None] ** integrals / (z ** (1 + integrals) * system)  # divided by time
     residues = np.zeros(time.shape)
-    for pole in compliance.poles:
+    for pole in poles(path):
         residue = 1 / (pole ** (1 + integrals) * np.sum(eta * order * pole ** (order - 1)))
         far = abs(pole) * time > _NEAR
         q = pole * time[far, None]
@@ -143,14 +136,14 @@ def _contour_integral(compliance: Compliance, time: Vector, integrals: int, node
     return np.asarray((transform @ weight).imag + residues)
 
 
-def _poles(compliance: Compliance) -> _Complex:
+def _poles(path: TransferPath) -> _Complex:
     """Zeros of ``sum_i eta_i s^order_i + stiffness`` in a sector above the real axis.
 
     Works with ``w = log s``. Terms whose phases differ by less than a right angle within the sector
     cannot cancel, which bounds ``log |s|`` from both sides.
     """
-    order = np.array([0.0, *compliance.orders])
-    log_weight = np.log([compliance.stiffness, *compliance.etas])
+    order = np.array([0.0, *path.orders])
+    log_weight = np.log([path.stiffness, *path.etas])
     top, widest = int(np.argmax(order)), 0.95 * pi
     opposing = pi / (2 * widest)
 
@@ -191,5 +184,5 @@ def _poles(compliance: Compliance) -> _Complex:
     if len(located) != counted:
         raise PoleSearchError(counted, tuple(complex(np.exp(zero)) for zero in located))
     if not all(isfinite(abs(np.exp(zero))) for zero in located):
-        raise InputError(f"time scales beyond the range of floating point; got {compliance}")
+        raise InputError(f"time scales beyond the range of floating point; got {path}")
     return np.asarray(np.exp(np.array(located, dtype=complex)))

@@ -8,8 +8,7 @@ import numpy as np
 
 from lcopa_bayes.bench.command import Command
 from lcopa_bayes.bench.driveeffects import by_axis, signed, unsigned
-from lcopa_bayes.bench.hiddeneffects import Hidden, Shot
-from lcopa_bayes.bench.marching import Balance
+from lcopa_bayes.bench.hiddeneffects import Balance, Hidden, Shot
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 
 

@@ -13,9 +13,9 @@ from tqdm import tqdm
 from lcopa_bayes.calibration.replica import ENGINES, Engine, Failure, Outcome, Replication
 from lcopa_bayes.calibration.store import Store
 from lcopa_bayes.calibration.truths import Stated, Truths, truths_around, truths_stated
-from lcopa_bayes.core.checks import one_of, refuse_if, whole_number
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.rules import whole, word_of
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.results.fit import plan_of
@@ -69,7 +69,9 @@ def calibrate(
     done.
     """
     both = ["`around` and `truth` both say where truths come from; give one"] if around and truth else []
-    refuse_if([*whole_number("replicas", replicas, 1, MOST), *one_of("engine", engine, ENGINES), *both])
+    refuse_if(
+        [*whole(1, MOST).problems("replicas", replicas), *word_of(*ENGINES).problems("engine", engine), *both]
+    )
     problem = problem_of(study)
     table = problem.posterior.table
     if around is not None:

@@ -11,16 +11,17 @@ from typing import Literal, NamedTuple, final, get_args
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.calibration.coverage import LEVELS
-from lcopa_bayes.calibration.ranks import rank_of
+from lcopa_bayes.bench.inversion import step_response
+from lcopa_bayes.calibration.ranks import LEVELS, rank_of
 from lcopa_bayes.calibration.simulation import device_of, exact_responses, measured, model_gap
 from lcopa_bayes.calibration.truths import Truths
-from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.model.effects.effect import UnstableError
 from lcopa_bayes.results.discretisation import discretisation, resolved
 from lcopa_bayes.results.steps import StepCurves, curves_of, step_curves
 from lcopa_bayes.sampling.draws import Draws, gather, weighted_draws
@@ -40,6 +41,8 @@ ensembles."""
 ENGINES: tuple[Engine, ...] = get_args(Engine)
 _LOOK = ImportancePlan((Effort(3_000, 1_000, 6), Effort(8_000, 3_000, 6), Effort(8_000, 4_000, 6)), starts=3)
 """Work for importance sampling of a replica."""
+_TRIES = 100
+"""Truths drawn until one has bounded responses."""
 _STREAM = 4
 """Marks the randomness of truth, noise and ranks apart from that of sampling."""
 
@@ -139,7 +142,7 @@ class Replication:
         return (*out, Quantity("log_likelihood", "log likelihood", "nat"))
 
     def attempt(self, number: int) -> Outcome | Failure:
-        """The replica, or what went wrong with it: the others go on, and it is told with its seed."""
+        """The replica, or what went wrong with it: the others go on, and it is reported with its seed."""
         try:
             with threadpool_limits(1):
                 return self(number)
@@ -155,8 +158,7 @@ class Replication:
         start, seed = time.thread_time(), self.seed_of(number)
         streams = np.random.SeedSequence([seed, _STREAM]).spawn(4)
         drawing, noise, ranking, looking = map(np.random.default_rng, streams)
-        truth = self.truths.draw(drawing)
-        exact = exact_responses(self.problem, truth)
+        truth, exact = self._bounded(drawing)
         records = measured(self.problem, truth, exact, noise)
         problem, draws, engine, pareto_k = self._inferred(self._measured_again(records), seed, looking)
         posterior = problem.posterior
@@ -190,6 +192,21 @@ class Replication:
             width.negligible,
         )
 
+    def _bounded(self, rng: np.random.Generator) -> tuple[Vector, list[Matrix]]:
+        """A truth, and the responses it gives the study's records without noise.
+
+        Where effects leave no bounded response the likelihood of any record is 0, and no inference draws such
+        parameters: a truth like that is drawn again. UnstableError when none of `_TRIES` is bounded.
+        """
+        for left in reversed(range(1 if self.truths.fixed else _TRIES)):
+            truth = self.truths.draw(rng)
+            try:
+                return truth, exact_responses(self.problem, truth)
+            except UnstableError:
+                if not left:
+                    raise
+        raise AssertionError("a truth is drawn at least once")
+
     def _measured_again(self, records: tuple[Record, ...]) -> Problem:
         """The problem of a replica's records.
 
@@ -209,9 +226,9 @@ class Replication:
         look = None
         if self.engine == "importance" and problem.posterior.simulation is not None:
             problem = resolved(problem)
-            found = weighted_run(problem.posterior, replace(self.plan, seed=seed), quick=True)
-            if found is not None and found[0].weighted is not None:
-                return problem, found[1], "importance", found[0].weighted.pareto_k
+            result = weighted_run(problem.posterior, replace(self.plan, seed=seed), quick=True)
+            if result is not None and result[0].weighted is not None:
+                return problem, result[1], "importance", result[0].weighted.pareto_k
         elif self.engine == "importance":
             optima = find_optima(problem.posterior, rng, starts=_LOOK.starts)
             problem = resolved(problem, optima)
@@ -227,35 +244,19 @@ class Replication:
         return problem, draws, "sampling", tried
 
     def _true(self, posterior: Posterior, truth: Vector, times: Vector) -> list[float]:
-        """True value of each quantity; step responses by the bench."""
+        """True value of each quantity; step responses by the bench, or by the model where the plant has
+        effects, which no device of the bench has."""
         table = posterior.table
-        if posterior.simulation is not None:
-            return self._true_with_effects(posterior, truth, times)
-        device = device_of(table, truth, 0, time_unit=self.problem.study.time_unit)
-        steps = [path.step_response(times) for row in device.paths for path in row]
+        if posterior.simulation is None:
+            device = device_of(table, truth, 0, time_unit=self.problem.study.time_unit)
+            steps = [step_response(path, times) for row in device.paths for path in row]
+        else:
+            curves = curves_of(table, truth[None], self.problem.scales.span)
+            at = [int(np.abs(curves.time - moment).argmin()) for moment in times]
+            steps = _heights(curves, at)
         parameters = [value for value, row in zip(truth, table.rows, strict=True) if row.free]
-        return [
-            *map(float, parameters),
-            *map(float, np.concatenate(steps)),
-            float(posterior.joint_log_likelihood(truth[None])[0]),
-        ]
-
-    def _true_with_effects(self, posterior: Posterior, truth: Vector, times: Vector) -> list[float]:
-        """The same where the plant has effects, which no device of the bench has: steps by the model."""
-        table = posterior.table
-        curves = curves_of(table, truth[None], self.problem.scales.span)
-        at = [int(np.abs(curves.time - moment).argmin()) for moment in times]
-        steps = [
-            curves.gains[0, i, j] * curves.normalised[k][0, at]
-            for i, row in enumerate(curves.curve_of)
-            for j, k in enumerate(row)
-        ]
-        parameters = [value for value, row in zip(truth, table.rows, strict=True) if row.free]
-        return [
-            *map(float, parameters),
-            *map(float, np.concatenate(steps)),
-            float(posterior.joint_log_likelihood(truth[None])[0]),
-        ]
+        likelihood = posterior.joint_log_likelihood(truth[None])
+        return [float(value) for value in np.concatenate([parameters, *steps, likelihood])]
 
     def _drawn(
         self,
@@ -268,14 +269,19 @@ class Replication:
         """Draws of each quantity; step responses at the positions `at` of the curves."""
         table = draws.table
         parameters = [draws.flat[:, k] for k, row in enumerate(table.rows) if row.free]
-        steps = [
-            curves.gains[:, i, j] * curves.normalised[unit][:, k]
-            for i, row in enumerate(curves.curve_of)
-            for j, unit in enumerate(row)
-            for k in at
-        ]
+        steps = _heights(curves, at)
         picked = draws.flat[rng.choice(draws.flat.shape[0], RANKED, replace=False)]
         return [*parameters, *steps, posterior.joint_log_likelihood(picked)]
+
+
+def _heights(curves: StepCurves, at: Sequence[int]) -> list[Vector]:
+    """Step responses of every path at positions of the curves, one array (draws,) each."""
+    return [
+        curves.gains[:, i, j] * curves.normalised[unit][:, k]
+        for i, row in enumerate(curves.curve_of)
+        for j, unit in enumerate(row)
+        for k in at
+    ]
 
 
 def holds(draws: Vector, truth: float, level: float) -> bool:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lcopa_bayes.bench.command import Command
-from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.bench.device import Device
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.inference.assembly import Problem
@@ -26,31 +26,14 @@ def command_of(record: Record) -> Command:
 
 
 def device_of(table: ParameterTable, truth: Vector, record: int, *, time_unit: str) -> Device:
-    """The plant with the table values `truth`, (rows,), and the offsets it has on a fit record."""
-    layout, values = table.layout, truth[None]
-    gains, dynamics = table.gains(values)[0], table.dynamics(values)
-    paths = tuple(
-        tuple(
-            _path(
-                float(gains[i, j]),
-                float(dynamics.delays[0, layout.delay_of[i][j]]),
-                dynamics.times[layout.element_of[i][j]][0],
-                dynamics.orders[layout.element_of[i][j]][0],
-            )
-            for j in range(len(layout.drives))
-        )
-        for i in range(len(layout.responses))
-    )
-    offsets = tuple(float(table.offset(values, i, record)[0]) for i in range(len(layout.responses)))
+    """The plant with the table values `truth`, (rows,), and the offsets it has on a fit record.
+
+    Terms of equal orders are added up.
+    """
+    layout = table.layout
+    paths = tuple(tuple(path.merged() for path in row) for row in table.paths(truth))
+    offsets = tuple(float(table.offset(truth[None], i, record)[0]) for i in range(len(layout.responses)))
     return Device(paths, layout.drives, layout.responses, offsets, time_unit)
-
-
-def _path(gain: float, delay: float, times: Vector, orders: Vector) -> TransferPath:
-    """Path of stiffness 1; terms of one order act as one whose viscosity is their sum."""
-    etas: dict[float, float] = {}
-    for time, order in zip(times.tolist(), orders.tolist(), strict=True):
-        etas[order] = etas.get(order, 0.0) + time**order
-    return TransferPath(gain, delay, tuple(etas.values()), tuple(etas), 1.0)
 
 
 def exact_responses(problem: Problem, truth: Vector) -> list[Matrix]:
@@ -65,7 +48,7 @@ def exact_responses(problem: Problem, truth: Vector) -> list[Matrix]:
         return _simulated(problem.refined(_FINER), truth)
     return [
         device_of(posterior.table, truth, r, time_unit=study.time_unit).response(
-            command_of(samples.record), samples.times, exposure=study.model.exposure
+            command_of(samples.record), samples.times, exposure=study.exposure
         )
         for r, samples in enumerate(posterior.samples)
     ]

@@ -3,10 +3,99 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import hypot
 from typing import Any
 
-from lcopa_bayes.comparison.fractional import fractional, undecided
-from lcopa_bayes.comparison.gains import Gain, Row, by_evidence, by_prediction, simplest
+from lcopa_bayes.comparison.gains import ERRORS, STRONG, TIE, Gain, Row, by_evidence, by_prediction, simplest
+from lcopa_bayes.comparison.priorwidth import FACTORS
+
+
+def fractional(usable: Sequence[Row]) -> dict[str, Any]:
+    """Whether the best fractional candidate is warranted against the best integer one.
+
+    The best is the simplest that none of its kind beats beyond chance.
+    """
+    weighed = [row for row in usable if row["log_evidence"] is not None]
+    kinds = [[row for row in weighed if row["integer"] is kind] for kind in (False, True)]
+    if not all(kinds):
+        return undecided("a fractional and an integer candidate with evidence are needed")
+    free, whole = (simplest(rows, by_evidence, "log_evidence") for rows in kinds)
+    assert free is not None
+    assert whole is not None
+    gain, predicted = by_evidence(free, whole), by_prediction(free, whole)
+    assert gain is not None
+    others, unknown = _other_widths(free, whole)
+    gains = [gain, *others]
+    least = min(gains, key=lambda one: one.nats - ERRORS * one.sd)
+    most = max(gains, key=lambda one: one.nats + ERRORS * one.sd)
+    entries = {
+        "fractional": free["name"],
+        "integer": whole["name"],
+        "log_bayes_factor": gain.nats,
+        "log_bayes_factor_sd": gain.sd,
+        "least_over_priors": least.nats,
+        "most_over_priors": most.nats,
+        "prior_widths_unknown": unknown,
+        "elpd_difference": None if predicted is None else predicted.nats,
+        "elpd_difference_sd": None if predicted is None else predicted.sd,
+    }
+    said = f"{free['name']} against {whole['name']}: log evidence {gain}"
+    if predicted is not None:
+        said += f", log predictive density {predicted}"
+    strong = least.nats - ERRORS * least.sd > STRONG
+    denied = predicted is not None and -predicted.nats > max(TIE, ERRORS * predicted.sd)
+    shown = predicted is None or predicted.nats > predicted.sd  # the evidence is strong by itself
+    if strong and shown and not unknown:
+        return entries | {
+            "verdict": "warranted",
+            "sentence": (
+                f"Fractional orders are warranted. {said}; least over priors half and twice as wide {least}."
+            ),
+        }
+    if denied or most.nats + ERRORS * most.sd < 0:
+        return entries | {
+            "verdict": "not warranted",
+            "sentence": f"Fractional orders are not warranted. {said}.",
+        }
+    lacking = (
+        "the evidence, or its prior's part, does not suffice"
+        if not strong
+        else "what was left out is predicted no better by more than a standard error"
+        if not shown
+        else f"whether the evidence hangs on the width of the priors is not known: {'; '.join(unknown)}"
+    )
+    return entries | {
+        "verdict": "not shown",
+        "sentence": f"No win of fractional orders is claimed: {lacking}. {said}.",
+    }
+
+
+def _other_widths(free: Row, whole: Row) -> tuple[list[Gain], list[str]]:
+    """Differences of log evidence under other prior widths, and in words those that could not be had."""
+    out, unknown = [], []
+    known = {one["factor"]: one for one in whole["prior_widths"]}
+    for factor in FACTORS:
+        pair = next((one for one in free["prior_widths"] if one["factor"] == factor), None), known.get(factor)
+        missing = [
+            row["name"]
+            for row, one in zip((free, whole), pair, strict=True)
+            if one is None or one["log_evidence"] is None
+        ]
+        if missing:
+            names = " and ".join(missing)
+            unknown.append(f"under priors {factor:g} times as wide {names} gave no evidence")
+            continue
+        one, other = pair
+        assert one is not None
+        assert other is not None
+        out.append(Gain(one["log_evidence"] - other["log_evidence"], hypot(one["sd"], other["sd"])))
+    return out, unknown
+
+
+def undecided(why: str) -> dict[str, Any]:
+    """A verdict that waits."""
+    return {"verdict": "undecided", "sentence": f"Undecided: {why}."}
+
 
 RESONANT = 1.5
 """Order from which a single term overshoots visibly [-]."""
@@ -28,10 +117,10 @@ def decided(rows: Sequence[Row]) -> dict[str, Any]:
     ]
     usable = [row for row in rows if row["usable"]]
     weighed = [row for row in usable if row["log_evidence"] is not None]
-    told = {"unranked": unranked, "evidence_undefined": undefined, "flags": flags(rows)}
+    entries = {"unranked": unranked, "evidence_undefined": undefined, "flags": flags(rows)}
     if len(usable) < 2:
         why = "fewer than two candidates have a usable posterior: nothing can be compared"
-        return told | {
+        return entries | {
             "preferred": None,
             "why": why,
             "agreement": {"agree": None, "sentence": why},
@@ -52,7 +141,7 @@ def decided(rows: Sequence[Row]) -> dict[str, Any]:
         for row in rows
         if not row["containment"]["met"]
     )
-    return told | {
+    return entries | {
         "preferred": None if preferred is None else preferred["name"],
         "why": why,
         "agreement": {"agree": agree, "sentence": sentence},
@@ -65,7 +154,7 @@ def decided(rows: Sequence[Row]) -> dict[str, Any]:
 def _agreement(evident: Row | None, predictive: Row | None, usable: Sequence[Row]) -> tuple[bool | None, str]:
     """Whether the records left out contradict the evidence, in words."""
     if evident is None or predictive is None or evident["elpd"] is None:
-        return None, "Either evidence or prediction is missing; one stands alone."
+        return None, "Either evidence or prediction is missing; only one of them decides."
     best = max((row for row in usable if row["elpd"] is not None), key=lambda row: row["elpd"])
     if best is evident:
         return True, f"Evidence and prediction agree: {evident['name']} also predicts best."
@@ -105,15 +194,15 @@ def _why(
     richer = [row for row in usable if row["parameters"] > preferred["parameters"]]
     others = [row for row in usable if row is not preferred and row not in richer]
     parts = [f"{row['name']}, with more parameters, gains {gain}" for row, gain in _gains(richer, preferred)]
-    parts += [f"{row['name']} stands at {gain}" for row, gain in _gains(others, preferred)]
+    parts += [f"{row['name']} has {gain}" for row, gain in _gains(others, preferred)]
     word = "suffices" if richer else "is preferred"
     return f"{name} {word}: in log evidence {'; '.join(parts)}. {sentence}"
 
 
 def _gains(rows: Sequence[Row], against: Row) -> list[tuple[Row, Gain]]:
     """Rows with what they gain over another, the best first; those without evidence are left out."""
-    told = [(row, by_evidence(row, against)) for row in rows]
-    return sorted(((row, gain) for row, gain in told if gain is not None), key=lambda pair: -pair[1].nats)
+    entries = [(row, by_evidence(row, against)) for row in rows]
+    return sorted(((row, gain) for row, gain in entries if gain is not None), key=lambda pair: -pair[1].nats)
 
 
 def flags(rows: Sequence[Row]) -> list[dict[str, str]]:

@@ -22,23 +22,23 @@ Card = Mapping[str, Any]
 
 
 def judged(cards: Sequence[Card], study: Study) -> dict[str, Any]:
-    """What `compare` tells, as plain values.
+    """The result of `compare` as plain values.
 
     Unusable candidates keep their card and the reason, but are ranked nowhere.
     """
     rows = [dict(card) for card in cards]
     _evidences(rows, study.seed)
     _predictions(rows)
-    found = decided(rows)
+    result = decided(rows)
     fractional = [row for row in rows if not row["integer"]]
-    told: dict[str, Any] = plain(
+    return plain(
         {
             "study": study.name,
             "time_unit": study.time_unit,
             "seed": study.seed,
             "fit": [record.name for record in study.fit],
             "held_out": [record.name for record in study.held_out],
-            **found,
+            **result,
             "order_is_integer": [
                 {"model": row["name"]} | dict(one) for row in fractional for one in row["order_is_integer"]
             ],
@@ -48,7 +48,6 @@ def judged(cards: Sequence[Card], study: Study) -> dict[str, Any]:
             ],
         }
     )
-    return told
 
 
 def _evidences(rows: Sequence[dict[str, Any]], seed: int) -> None:

@@ -1,4 +1,4 @@
-"""Expected log predictive density of what was left out, and the way by which it was computed."""
+"""Expected log predictive density of what was left out, and the method by which it was computed."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _DRAWS = 600
 _BEYOND = 3.0
 """Standard errors by which a density of what was left out may exceed that of what was fitted [-]."""
 
-Road = Literal["exact", "importance weights", "refit"]
+Method = Literal["exact", "importance weights", "refit"]
 
 
 @final
@@ -45,7 +45,7 @@ class Predicted:
     """Of each sample given the known samples and those of its record before it, (n,) [nat]."""
     error: float
     """Monte Carlo standard error of the sum, by the spread between parts of the draws [nat]."""
-    road: Road
+    method: Method
     pareto_k: float
     """Of the importance weights [-]; NaN where none were tried."""
     ess: float
@@ -63,7 +63,7 @@ class Predicted:
     @property
     def plausible(self) -> bool:
         """Whether the density is no larger than where the samples themselves were fitted; else the draws
-        do not stand for the posterior without them."""
+        do not represent the posterior without them."""
         if np.isnan(self.in_sample):
             return True
         excess = float(self.log_density.sum()) - self.in_sample
@@ -74,13 +74,13 @@ class Predicted:
         out is predicted better than it was fitted, and where the Monte Carlo error is larger than an evidence
         may have."""
         known = known_to(self.error)
-        agree = self.road != "refit" or (self.rhat <= TENTATIVE_RHAT and self.ess >= FEWEST_EFFECTIVE)
+        agree = self.method != "refit" or (self.rhat <= TENTATIVE_RHAT and self.ess >= FEWEST_EFFECTIVE)
         own: Level = "reliable" if agree and self.plausible else "tentative"
         return Grade.worst([Grade(level, "") for level in (fitted, own, known)]).level
 
     def as_json(self) -> dict[str, Any]:
         """Plain values, without the samples."""
-        told: dict[str, Any] = plain(
+        return plain(
             {
                 "part": self.part.name,
                 "kind": self.part.kind,
@@ -89,14 +89,13 @@ class Predicted:
                 "monte_carlo_sd": self.error,
                 "in_sample": self.in_sample,
                 "plausible": self.plausible,
-                "road": self.road,
+                "method": self.method,
                 "pareto_k": self.pareto_k,
                 "ess": self.ess,
                 "rhat": self.rhat,
                 "level_from": list(dict.fromkeys(self.level_from)),
             }
         )
-        return told
 
 
 def predictions(fit: Fit, *, held_out_only: bool = False) -> tuple[Predicted, ...]:
@@ -128,7 +127,7 @@ def predictions(fit: Fit, *, held_out_only: bool = False) -> tuple[Predicted, ..
         if k <= usable_k(len(values)) and effective(weights) >= FEWEST_EFFECTIVE:
             # gains and levels are drawn anew: those of the draws have seen what is to be predicted
             values = target.complete(posterior.coordinates(values), rng)
-            found = scored(values, weights, "importance weights", k=k, known=target)
+            result = scored(values, weights, "importance weights", k=k, known=target)
         else:
             seed = fit.run.plan.seed + 7_000 + len(out)
             moved = transferred(source, target, positions, seed, jump=False)
@@ -137,9 +136,9 @@ def predictions(fit: Fit, *, held_out_only: bool = False) -> tuple[Predicted, ..
             flat = moved.coordinates.reshape(-1, posterior.dimension)
             chosen = np.linspace(0, len(flat) - 1, min(_DRAWS, len(flat))).astype(int)
             values = target.complete(flat[chosen], rng)
-            found = scored(values, None, "refit", k=k, ess=moved.ess, rhat=moved.rhat, known=target)
+            result = scored(values, None, "refit", k=k, ess=moved.ess, rhat=moved.rhat, known=target)
         total = float(seen.log_density.sum())
-        out.append(replace(found, in_sample=total, in_sample_error=seen.error))
+        out.append(replace(result, in_sample=total, in_sample_error=seen.error))
     return tuple(out)
 
 
@@ -177,7 +176,7 @@ class _Scored:
         self,
         values: Matrix,
         log_weights: Vector | None,
-        road: Road,
+        method: Method,
         *,
         k: float = np.nan,
         ess: float | None = None,
@@ -206,7 +205,7 @@ class _Scored:
             np.concatenate(times) if times else np.empty(0),
             logsumexp(every + level[:, None], axis=0),
             _error(every, level),
-            road,
+            method,
             k,
             min(effective(level), ess if ess is not None else self.fit.draws.ess),
             rhat,

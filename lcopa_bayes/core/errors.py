@@ -1,4 +1,4 @@
-"""What is wrong with the user's input, told all at once."""
+"""What is wrong with the user's input, all at once."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 
 
 class InputError(ValueError):
-    """Input that cannot be used; carries every problem found, one sentence each.
+    """Input that cannot be used; with every problem, one sentence each.
 
     The command line prints the problems and exits with code 2.
     """
@@ -15,6 +15,12 @@ class InputError(ValueError):
     def __init__(self, problems: str | Sequence[str]) -> None:
         self.problems: tuple[str, ...] = (problems,) if isinstance(problems, str) else tuple(problems)
         super().__init__("\n".join(self.problems))
+
+
+def refuse_if(problems: Sequence[str]) -> None:
+    """Raise InputError when there are problems."""
+    if problems:
+        raise InputError(problems)
 
 
 def nearest(word: str, known: Iterable[str]) -> str:

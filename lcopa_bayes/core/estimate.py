@@ -67,8 +67,7 @@ class Estimate:
             "ess": self.ess,
             "grade": self.grade,
         }
-        told: dict[str, Any] = plain(out | ({"note": self.note} if self.note else {}))
-        return told
+        return plain(out | ({"note": self.note} if self.note else {}))
 
 
 def _quantile(draws: Vector, probability: float) -> float:
@@ -77,14 +76,18 @@ def _quantile(draws: Vector, probability: float) -> float:
     return float(np.quantile(draws, probability, method=method))  # type: ignore[call-overload]
 
 
-def plain(value: Any) -> Any:
-    """Nested dicts and lists of plain JSON values; numbers that are not finite become None."""
+def plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values that JSON can hold, nested ones too; numbers that are not finite become None."""
+    return {str(key): _plain(item) for key, item in values.items()}
+
+
+def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return plain(value)
     if isinstance(value, np.ndarray):
-        return plain(value.tolist())
+        return _plain(value.tolist())
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [_plain(item) for item in value]
     if isinstance(value, bool | np.bool_):
         return bool(value)
     if isinstance(value, int | np.integer):

@@ -26,7 +26,7 @@ def unmet_apart_from_rest(study: Study) -> list[str]:
     """The same without the question whether records begin at rest."""
     problems = [*_drives(study), *_responses(study)]
     for record in (*study.fit, *study.held_out):
-        problems += _exposure(record, study.model.exposure) + _twins(record)
+        problems += _exposure(record, study.exposure) + _twins(record)
     if not any(_sampled(record).size > 1 for record in study.fit):
         problems.append("no fit record has more than one response sample; give records with two or more")
     return problems

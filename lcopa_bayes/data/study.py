@@ -7,29 +7,25 @@ from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, TypeVar, final
+from typing import Any, final
 
 import numpy as np
 
-from lcopa_bayes.core.checks import rebuilt
-from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.candidatesettings import CandidateSettings, CompareSettings
+from lcopa_bayes.core.errors import InputError, refuse_if
+from lcopa_bayes.core.rules import rebuilt
+from lcopa_bayes.core.units import in_time_unit
 from lcopa_bayes.data.record import Axis, Record, RecordLike, records_of, several
 from lcopa_bayes.data.settings import (
-    STAGES,
+    CandidateSettings,
+    CompareSettings,
     EffectsSettings,
     HeadingSettings,
     ModelSettings,
     NoiseSettings,
     PriorSettings,
     SamplerSettings,
-    prior_settings,
-    settings_from,
 )
-
-DEFAULT_STAGES: Mapping[str, Mapping[str, object]] = MappingProxyType(
-    {name: MappingProxyType({}) for name in STAGES if name != "claims"}  # claims concern one paper
-)
+from lcopa_bayes.data.tables import settings_from, study_settings
 
 
 @final
@@ -40,7 +36,7 @@ class Study:
     ``Study(fit=["on.csv", frame], held_out=[record], terms=3, priors={"delay": 5.0})`` is the study that a
     study file with these keys describes: records are `Record`, paths, frames or arrays (`records_of`), tables
     of settings are their keys and values. Raises InputError with every problem unless the records have
-    distinct names, one time unit and the same axes, those to fit can tell something about the dynamics (a
+    distinct names, one time unit and the same axes, those to fit hold information on the dynamics (a
     drive changes before a sample), and every setting is known and allowed.
     """
 
@@ -64,8 +60,8 @@ class Study:
     """Kind of noise."""
     sampler: SamplerSettings
     """How long to sample."""
-    stages: Mapping[str, Mapping[str, object]]
-    """Settings of every stage to run, by name."""
+    stages: tuple[str, ...]
+    """Stages that `run` carries out."""
     inputs: Mapping[str, str]
     """SHA-256 of each input file, by file name."""
     compare: CompareSettings
@@ -87,15 +83,18 @@ class Study:
         priors: Mapping[str, Any] | None = None,
         noise: NoiseSettings | Mapping[str, object] | None = None,
         sampler: SamplerSettings | Mapping[str, object] | None = None,
-        stages: Mapping[str, Mapping[str, object]] = DEFAULT_STAGES,
+        stages: Sequence[str] | None = None,
         inputs: Mapping[str, str] | None = None,
-        compare: CompareSettings | None = None,
-        candidates: tuple[CandidateSettings, ...] = (),
+        compare: CompareSettings | Mapping[str, object] | None = None,
+        candidates: Sequence[CandidateSettings | Mapping[str, object]] | None = None,
         effects: EffectsSettings | Mapping[str, object] | None = None,
         *,
         terms: int | Mapping[str, int] | None = None,
     ) -> None:
         problems: list[str] = []
+        heading = {"name": name or None, "time_unit": time_unit, "seed": seed}
+        if settings_from(HeadingSettings, heading, "study", problems) is None:
+            time_unit = None
         fitted, apart = _records(fit, held_out, time_unit, problems)
         if terms is not None:
             model = (
@@ -103,24 +102,28 @@ class Study:
                 if isinstance(model, ModelSettings)
                 else {**(model or {}), "terms": terms}
             )
-        settings: dict[str, Any] = {
-            "model": _settings(ModelSettings, model, "model", problems),
-            "noise": _settings(NoiseSettings, noise, "noise", problems),
-            "sampler": _settings(SamplerSettings, sampler, "sampler", problems),
-            "effects": _settings(EffectsSettings, effects, "effects", problems),
-            "priors": prior_settings(priors or {}, "priors", problems),
+        given = {
+            "model": model,
+            "priors": priors,
+            "noise": noise,
+            "sampler": sampler,
+            "effects": effects,
+            "stages": stages,
+            "compare": compare,
+            "candidates": candidates,
         }
-        HeadingSettings(name or None, None, seed)
-        if problems:
-            raise InputError(problems)
-        if not fitted:
-            raise InputError("a study needs one or more records to fit")
-        unit = time_unit or fitted[0].time_unit
+        given = {key: value for key, value in given.items() if value is not None}
+        settings = study_settings(given, "`{}`".format, problems)
+        refuse_if(problems)
+        unit = time_unit or (fitted[0].time_unit if fitted else "")
         records = (*fitted, *apart)
-        problems = together(fitted, apart)
-        problems += [f"record {r.name!r} is in {r.time_unit}" for r in records if r.time_unit != unit]
-        if problems:
-            raise InputError(problems)
+        problems = together(fitted, apart) if fitted else ["a study needs one or more records to fit"]
+        problems += [
+            f"record {r.name!r} is in {r.time_unit}, the study is in {unit}; convert its times"
+            for r in records
+            if r.time_unit != unit
+        ]
+        refuse_if(problems)
         settings |= {
             "name": name or default_name(fitted),
             "folder": folder,
@@ -128,14 +131,16 @@ class Study:
             "seed": seed,
             "fit": tuple(_in_order(r, fitted[0]) for r in fitted),
             "held_out": tuple(_in_order(r, fitted[0]) for r in apart),
-            "stages": {key: MappingProxyType(dict(value)) for key, value in stages.items()},
             "inputs": inputs or {},
-            "compare": compare or CompareSettings(),
-            "candidates": candidates,
         }
         for key, value in settings.items():
             locked = MappingProxyType(dict(value)) if isinstance(value, Mapping) else value
             object.__setattr__(self, key, locked)
+
+    @property
+    def exposure(self) -> float:
+        """Time over which a response sample is a mean [time unit]."""
+        return float(in_time_unit(self.model.exposure_ms, "ms", self.time_unit))
 
     @property
     def drive_axes(self) -> tuple[Axis, ...]:
@@ -150,6 +155,10 @@ class Study:
     def with_seed(self, seed: int) -> Study:
         """The same study with another seed."""
         return replace(self, seed=seed)
+
+    def __repr__(self) -> str:
+        """Its records, without their numbers and the settings."""
+        return f"Study({self.name!r}, fit={list(self.fit)}, held_out={list(self.held_out)})"
 
     __reduce__ = rebuilt
 
@@ -178,18 +187,6 @@ def _records(
         as_given = read and all(isinstance(one, Record) for one in given)
         out.append(read if as_given else records_of(read, unit))
     return out[0], out[1]
-
-
-S = TypeVar("S")
-
-
-def _settings(
-    kind: type[S], given: S | Mapping[str, object] | None, where: str, problems: list[str]
-) -> S | None:
-    """Settings as given, or of their keys; None when a value is wrong, which joins `problems`."""
-    if isinstance(given, kind):
-        return given
-    return settings_from(kind, given or {}, f"`{where}`", problems)  # type: ignore[arg-type]
 
 
 def _axes(record: Record, role: str) -> dict[str, Axis]:

@@ -5,31 +5,18 @@ from __future__ import annotations
 import hashlib
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
-from lcopa_bayes.core.errors import InputError, nearest
-from lcopa_bayes.data.candidatesettings import CandidateSettings, compare_settings
+from lcopa_bayes.core.errors import InputError, nearest, refuse_if
 from lcopa_bayes.data.cells import SUFFIXES
-from lcopa_bayes.data.record import Record, in_time_unit, load_record
-from lcopa_bayes.data.settings import (
-    STAGES,
-    EffectsSettings,
-    HeadingSettings,
-    ModelSettings,
-    NoiseSettings,
-    RecordsSettings,
-    SamplerSettings,
-    prior_settings,
-    settings_from,
-)
-from lcopa_bayes.data.study import DEFAULT_STAGES, Study, together
+from lcopa_bayes.data.record import Record, load_record
+from lcopa_bayes.data.settings import CandidateSettings, CompareSettings, HeadingSettings, RecordsSettings
+from lcopa_bayes.data.study import Study, together
+from lcopa_bayes.data.tables import TABLES, candidate_settings, settings_from, study_settings
 
-_KNOWN = ("compare", "candidates")
-
-_TABLES = ("study", "records", "model", "priors", "noise", "sampler", "effects", "stages")
-_COMPARED = ("compare", "candidates")
+_TABLES = ("study", "records", "priors", "stages", "candidates", *TABLES)
+"""Tables of a study file."""
 
 
 def _read(
@@ -69,62 +56,26 @@ def _document(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: cannot be read as UTF-8 text ({error})") from error
 
 
-def _stages(table: object, where: str, problems: list[str]) -> dict[str, Mapping[str, object]]:
-    """Stages to run: a list of names, or a table of ``name = true``, ``name = false`` and settings."""
-    if table == {}:
-        return dict(DEFAULT_STAGES)
-    chosen = dict.fromkeys(map(str, table), True) if isinstance(table, list) else table
-    if not isinstance(chosen, dict):
-        problems.append(f"{where}: must be a table or a list of stages; got {table!r}")
-        return {}
-    problems += [
-        f"{where}: unknown stage {name!r}{nearest(name, STAGES)}" for name in chosen if name not in STAGES
-    ]
-    for name, value in chosen.items():
-        if not isinstance(value, (bool, dict)):
-            problems.append(f"{where}: `{name}` must be true, false or a table of settings; got {value!r}")
-        elif isinstance(value, dict) and name in STAGES:
-            problems += [
-                f"{where}: {name} has no setting {key!r}{nearest(key, STAGES[name])}"
-                for key in value
-                if key not in STAGES[name]
-            ]
-    if not any(value is not False for value in chosen.values()):
-        problems.append(f"{where}: names no stage to run; name one or more of {', '.join(STAGES)}")
-    return {
-        name: value if isinstance(value, dict) else {} for name, value in chosen.items() if value is not False
-    }
+@final
+class BrokenStudyError(InputError):
+    """A study file with problems whose plant and records can be used: more may be wrong with these."""
+
+    def __init__(self, problems: Sequence[str], study: Study) -> None:
+        super().__init__(problems)
+        self.study = study
 
 
 def _from_file(path: Path, held_out: list[Path]) -> Study:
     document, folder = _document(path), path.parent
-    problems = [
-        f"{path}: unknown table [{key}]{nearest(key, (*_TABLES, *_COMPARED))}"
-        for key in document
-        if key not in (*_TABLES, *_COMPARED)
-    ]
-    where = {name: f"{path}, [{name}]" for name in _TABLES}
-    tables: dict[str, Any] = {name: document.get(name, {}) for name in _TABLES}
-    for name in _TABLES[:-1]:
-        if not isinstance(tables[name], dict):
-            problems.append(f"{where[name]}: must be a table of settings; got {tables[name]!r}")
-            tables[name] = {}
-    if isinstance(tables["model"].get("orders"), list):
-        tables["model"].setdefault("terms", max(1, len(tables["model"]["orders"])))
-    heading = settings_from(HeadingSettings, tables["study"], where["study"], problems) or HeadingSettings()
-    named = settings_from(RecordsSettings, tables["records"], where["records"], problems)
-    model = settings_from(ModelSettings, tables["model"], where["model"], problems) or ModelSettings()
-    noise = settings_from(NoiseSettings, tables["noise"], where["noise"], problems) or NoiseSettings()
-    sampler = (
-        settings_from(SamplerSettings, tables["sampler"], where["sampler"], problems) or SamplerSettings()
-    )
-    effects = (
-        settings_from(EffectsSettings, tables["effects"], where["effects"], problems) or EffectsSettings()
-    )
-    priors = prior_settings(tables["priors"], where["priors"], problems)
-    stages = _stages(tables["stages"], where["stages"], problems)
-    compare, candidates = compare_settings(document, str(path), problems)
-    fit, apart = [], held_out
+    problems = _unknown_tables(document, path, _TABLES)
+
+    def where(name: str) -> str:
+        return f"{path}, [{name}]"
+
+    heading = settings_from(HeadingSettings, document.get("study", {}), where("study"), problems)
+    named = settings_from(RecordsSettings, document.get("records", {}), where("records"), problems)
+    settings = study_settings(document, where, problems)
+    heading, fit, apart = heading or HeadingSettings(), [], held_out
     if named:
         apart = [*(folder / name for name in named.held_out), *held_out]
         kept = {file.resolve() for file in apart}
@@ -132,29 +83,30 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
         fit = [folder / k for k in named.fit or ()] or [file for file in beside if file.resolve() not in kept]
         if not fit:
             problems.append(
-                f"{where['records']}: no record to fit; name one, or put one beside the study file"
+                f"{where('records')}: no record to fit; name one, or put one beside the study file"
             )
+    before = len(problems)
     records = _read(fit, apart, heading.time_unit, problems)
-    if problems:
+    plant = all(settings[key] is not None for key in ("model", "noise", "effects"))
+    if problems and not (plant and records["fit"] and before == len(problems)):
         raise InputError(problems)
-    time_unit = records["fit"][0].time_unit  # stated, or that of the first fit record
-    return Study(
+    study = Study(
         heading.name or folder.resolve().name,
         folder,
-        time_unit,
+        records["fit"][0].time_unit,  # stated, or that of the first fit record
         heading.seed,
         tuple(records["fit"]),
         tuple(records["held_out"]),
-        replace(model, exposure=float(in_time_unit(model.exposure, "ms", time_unit))),
-        priors,
-        noise,
-        sampler,
-        stages,
-        _hashes([path, *fit, *apart]),
-        compare,
-        candidates,
-        effects,
+        inputs=_hashes([path, *fit, *apart]),
+        **settings | ({} if settings["stages"] else {"stages": None}),
     )
+    if problems:
+        raise BrokenStudyError(problems, study)
+    return study
+
+
+def _unknown_tables(document: Mapping[str, object], path: Path, known: Sequence[str]) -> list[str]:
+    return [f"{path}: unknown table [{key}]{nearest(key, known)}" for key in document if key not in known]
 
 
 def load_study(source: Path | Sequence[Path], *, held_out: Sequence[Path] = ()) -> Study:
@@ -173,8 +125,7 @@ def load_study(source: Path | Sequence[Path], *, held_out: Sequence[Path] = ()) 
         raise InputError("no study: name a folder with a study.toml, or one or more record files")
     problems: list[str] = []
     records = _read(sources, apart, None, problems)
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     fit, kept = tuple(records["fit"]), tuple(records["held_out"])
     return Study(fit=fit, held_out=kept, inputs=_hashes([*sources, *apart]))
 
@@ -184,16 +135,11 @@ def load_candidates(path: Path) -> tuple[tuple[str, ...] | None, tuple[Candidate
 
     InputError with all that is wrong.
     """
-    try:
-        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as TOML ({error}); give a file of candidates") from None
-    problems = [
-        f"{path}: unknown table [{key}]{nearest(key, _KNOWN)}" for key in document if key not in _KNOWN
-    ]
-    chosen, made = compare_settings(document, str(path), problems)
+    document = _document(path)
+    problems = _unknown_tables(document, path, ("compare", "candidates"))
+    chosen = settings_from(CompareSettings, document.get("compare", {}), f"{path}, [compare]", problems)
+    described = candidate_settings(document.get("candidates", []), f"{path}, [[candidates]]", problems)
     if not document:
         problems.append(f"{path}: names no candidate; write [[candidates]] or [compare] pick")
-    if problems:
-        raise InputError(problems)
-    return chosen.pick, made
+    refuse_if(problems)
+    return (chosen or CompareSettings()).pick, described

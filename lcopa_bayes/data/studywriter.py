@@ -1,4 +1,4 @@
-"""A study written as a study file with its records beside, so that reading it gives the same study."""
+"""A study written exactly: as a study file with its records beside, or as plain values with all it needs."""
 
 from __future__ import annotations
 
@@ -9,64 +9,117 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from lcopa_bayes.core.files import writable_folder, write_text, write_whole
-from lcopa_bayes.data.record import in_time_unit, save_record
-from lcopa_bayes.data.settings import EffectsSettings, PriorSettings
+import numpy as np
+
+from lcopa_bayes.core.files import writable_folder, write_text
+from lcopa_bayes.data.record import Axis, Record, save_record
+from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.data.study import Study
+from lcopa_bayes.data.tables import TABLES
+
+
+def _tables(study: Study) -> dict[str, Any]:
+    """Tables of a study file, without those of records."""
+    return {
+        "study": {"name": study.name, "time_unit": study.time_unit, "seed": study.seed},
+        **{name: _given(getattr(study, name)) for name in TABLES},
+        "priors": {name: _prior(prior) for name, prior in study.priors.items()},
+    }
 
 
 def write_study(study: Study, path: Path, *, note: str = "") -> tuple[Path, ...]:
     """Write a study file, with `note` as a comment at its head, and the records in a folder of its name.
 
-    Numbers are written to the last digit. Tables of candidates and stages are not written. Returns the paths,
-    the study file last; InputError when one of them cannot be written.
+    Numbers are written to the last digit. Candidates and stages are not written. Returns the paths, the study
+    file last; InputError when one of them cannot be written.
     """
     folder = writable_folder(path.parent / path.stem)
     files = {}
     for role, records in (("fit", study.fit), ("held_out", study.held_out)):
         files[role] = [folder / f"{record.name}.csv" for record in records]
         for record, file in zip(records, files[role], strict=True):
-            write_whole(file, lambda beside, record=record: save_record(record, beside))  # type: ignore[misc]
-    named = {role: [f"{folder.name}/{file.name}" for file in each] for role, each in files.items()}
-    model = _given(study.model)
-    model["exposure_ms"] = float(in_time_unit(model.pop("exposure"), study.time_unit, "ms"))
-    tables: dict[str, dict[str, Any]] = {
-        "study": {"name": study.name, "time_unit": study.time_unit, "seed": study.seed},
-        "records": {role: each for role, each in named.items() if each},
-        "model": model,
-        "noise": _given(study.noise),
-        "sampler": _given(study.sampler),
-        "effects": _effects(study.effects, study.folder, path.parent),
-        "priors": {name: _prior(prior) for name, prior in study.priors.items()},
-    }
+            save_record(record, file)
+    named = {role: [f"{folder.name}/{file.name}" for file in each] for role, each in files.items() if each}
+    tables = _tables(study)
+    tables = {"study": tables.pop("study"), "records": named, **tables}
+    if study.effects.add:  # files of the user's own by their paths from the new folder
+        own, after = (study.folder or Path()).resolve(), path.parent.resolve()
+        tables["effects"]["add"] = [os.path.relpath(own / text, after) for text in study.effects.add]
     lines = [f"# {line}".rstrip() for line in note.splitlines()]
     for name, table in tables.items():
-        if table:
-            lines += ["", f"[{name}]", *(f"{_key(key)} = {_toml(value)}" for key, value in table.items())]
+        if name != "compare":
+            rows = [f"{_key(key)} = {_toml(value)}" for key, value in table.items() if value not in ([], {})]
+            lines += ["", f"[{name}]", *rows] if rows else []
     write_text(path, "\n".join(lines).lstrip("\n") + "\n")
     return (*files["fit"], *files["held_out"], path)
 
 
+def study_to_json(study: Study) -> dict[str, Any]:
+    """Everything a study says, its records included; `study_from_json` gives the same study."""
+    candidates = [
+        _given(one) | {"priors": {name: _prior(prior) for name, prior in one.priors.items()}}
+        for one in study.candidates
+    ]
+    return _tables(study) | {
+        "folder": str(study.folder) if study.folder and study.effects.add else None,  # of its own effects
+        "fit": [_record(record) for record in study.fit],
+        "held_out": [_record(record) for record in study.held_out],
+        "stages": list(study.stages),
+        "inputs": dict(study.inputs),
+        "candidates": candidates,
+    }
+
+
+def study_from_json(values: Mapping[str, Any]) -> Study:
+    """The study of `study_to_json`; KeyError, TypeError or ValueError (InputError too) for other values."""
+    return Study(
+        folder=None if values["folder"] is None else Path(values["folder"]),
+        fit=[_record_of(record) for record in values["fit"]],
+        held_out=[_record_of(record) for record in values["held_out"]],
+        **values["study"],
+        **{key: values[key] for key in (*TABLES, "priors", "stages", "inputs", "candidates")},
+    )
+
+
+def _record(record: Record) -> dict[str, Any]:
+    response = [[None if np.isnan(v) else v for v in row] for row in record.response.T.tolist()]
+    return {
+        "name": record.name,
+        "time": record.time.tolist(),
+        "drive": record.drive.T.tolist(),
+        "response": response,
+        "drive_axes": [[axis.name, axis.unit] for axis in record.drive_axes],
+        "response_axes": [[axis.name, axis.unit] for axis in record.response_axes],
+        "time_unit": record.time_unit,
+    }
+
+
+def _record_of(values: Mapping[str, Any]) -> Record:
+    response = [[np.nan if v is None else v for v in column] for column in values["response"]]
+    return Record(
+        values["name"],
+        np.array(values["time"], dtype=float),
+        np.array(values["drive"], dtype=float).T,
+        np.array(response, dtype=float).T,
+        tuple(Axis(*axis) for axis in values["drive_axes"]),
+        tuple(Axis(*axis) for axis in values["response_axes"]),
+        values["time_unit"],
+    )
+
+
 def _given(settings: Any) -> dict[str, Any]:
-    """Settings that say something."""
+    """Settings that say something, by key."""
     values = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}
-    return {key: value for key, value in values.items() if value is not None}
+    return {key: _plain(value) for key, value in values.items() if value is not None}
 
 
-def _effects(effects: EffectsSettings, before: Path | None, after: Path) -> dict[str, Any]:
-    """Settings of effects; files of the user's own by their paths from the new folder."""
-    given = {key: value for key, value in _given(effects).items() if value not in ((), {})}
-    if effects.add:
-        own = (before or Path()).resolve()
-        given["add"] = [os.path.relpath(own / text, after.resolve()) for text in effects.add]
-    return given
+def _plain(value: Any) -> Any:
+    """Mappings as dictionaries, tuples as lists."""
+    return dict(value) if isinstance(value, Mapping) else list(value) if isinstance(value, tuple) else value
 
 
-def _prior(prior: PriorSettings) -> float | dict[str, Any]:
-    if prior.dist is None:
-        assert prior.fixed is not None
-        return prior.fixed
-    return {"dist": prior.dist, **prior.parameters}
+def _prior(prior: PriorSettings) -> float | dict[str, Any] | None:
+    return prior.fixed if prior.dist is None else {"dist": prior.dist, **prior.parameters}
 
 
 def _key(key: str) -> str:

@@ -9,7 +9,7 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Flags, Vector
-from lcopa_bayes.effectsearch.autoregression import Autoregression
+from lcopa_bayes.effectsearch.noise import Law
 from lcopa_bayes.effectsearch.whitening import parts
 from lcopa_bayes.inference.observations import Samples
 
@@ -42,7 +42,7 @@ class Widening:
     """Smallest and largest value of every drive on the fit records, (drives, 2) [drive unit]."""
 
     @classmethod
-    def of(cls, samples: Sequence[Samples], residual: Vector, noise: Sequence[Autoregression]) -> Widening:
+    def of(cls, samples: Sequence[Samples], residual: Vector, noise: Sequence[Law]) -> Widening:
         """From the stacked residual of the fit records [response unit]."""
         times = [since_command(record) for record in samples]
         pooled = np.concatenate([t[np.isfinite(t)] for t in times])

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
-from lcopa_bayes.effectsearch.autoregression import Autoregression, unbroken
 from lcopa_bayes.effectsearch.basemodel import BaseModel
 from lcopa_bayes.effectsearch.gaussnewton import Optimum, Regression
-from lcopa_bayes.effectsearch.noisesamples import AxisNoise, axis_noise, joint_noise, quiet_pieces
+from lcopa_bayes.effectsearch.noise import AxisNoise, Law, axis_noise, joint_noise, quiet_pieces
 from lcopa_bayes.effectsearch.starts import screened
 from lcopa_bayes.effectsearch.whitening import Whitening, parts
+from lcopa_bayes.inference.defaultpriors import Scales
+from lcopa_bayes.inference.observations import Observed
 from lcopa_bayes.inference.posterior import Posterior
 
 _STARTS = 8
@@ -85,31 +86,32 @@ def base_fit(
     return BaseFit(model, noise, regression, optimum, _failure(model, optimum), _cautions(noise, optimum))
 
 
-def _guessed(posterior: Posterior) -> tuple[Autoregression, ...]:
-    """White noise of a hundredth of each response's spread, to find the hill with."""
+def _guessed(posterior: Posterior) -> tuple[Law, ...]:
+    """White noise of a hundredth of each response's spread, to find the mode with."""
     axes = range(len(posterior.table.layout.responses))
     pooled = [np.concatenate([s.axes[axis].values for s in posterior.samples]) for axis in axes]
-    return tuple(Autoregression(np.empty(0), 0.01 * (float(values.std()) or 1.0)) for values in pooled)
+    return tuple(Law(0.01 * (float(values.std()) or 1.0)) for values in pooled)
 
 
 def measured(posterior: Posterior, residual: Vector, delay: float) -> tuple[AxisNoise, ...]:
     """Noise of every axis; from the stacked `residual` [response unit] where nothing else gives it."""
     out = []
+    scales = Scales.of([one.record for one in posterior.samples])
     for axis, response in enumerate(posterior.table.layout.responses):
-        found = axis_noise(posterior.samples, axis, delay, response.name)
+        found = axis_noise(posterior.samples, axis, delay, response.name, scales)
         if found is None:
-            quiet = sum(p.size for p in quiet_pieces(posterior.samples, axis, delay))
-            found = joint_noise(axis_pieces(posterior, residual, axis), response.name, quiet)
+            quiet = sum(p.values.size for p in quiet_pieces(posterior.samples, axis, delay))
+            found = joint_noise(axis_pieces(posterior, residual, axis), response.name, quiet, scales)
         out.append(found)
     return tuple(out)
 
 
 def whitening(model: BaseModel, noise: Sequence[AxisNoise]) -> Whitening:
     """The whitening operator of the fit records."""
-    processes = tuple(one.process for one in noise)
+    laws = tuple(one.law for one in noise)
     known = tuple(one.posterior for one in noise)
     dependence = () if all(one.known for one in noise) else tuple(one.dependence for one in noise)
-    return Whitening(model.posterior.samples, processes, dependence, known)
+    return Whitening(model.posterior.samples, laws, dependence, known)
 
 
 def renewed(model: BaseModel, optimum: Optimum, known: Whitening) -> Whitening:
@@ -120,16 +122,13 @@ def renewed(model: BaseModel, optimum: Optimum, known: Whitening) -> Whitening:
     return whitening(model, measured(model.posterior, optimum.residual, delay))
 
 
-def axis_pieces(posterior: Posterior, stacked: Vector, axis: int) -> list[Vector]:
-    """Unbroken stretches of one axis of stacked values."""
-    out, start = [], 0
-    for record in posterior.samples:
-        for number, observed in enumerate(record.axes):
-            part = stacked[start : start + observed.values.size]
-            start += observed.values.size
-            if number == axis and observed.values.size:
-                out += [part[piece] for piece in unbroken(observed.gaps)]
-    return out
+def axis_pieces(posterior: Posterior, stacked: Vector, axis: int) -> list[Observed]:
+    """Stacked values of one axis, record by record."""
+    return [
+        replace(posterior.samples[part.record].axes[axis], values=stacked[part.rows])
+        for part in parts(posterior.samples)
+        if part.axis == axis and part.rows.stop > part.rows.start
+    ]
 
 
 def _other_delays(model: BaseModel, x: Vector) -> list[Vector]:
@@ -146,8 +145,7 @@ def _other_delays(model: BaseModel, x: Vector) -> list[Vector]:
 
 
 def _alike(one: AxisNoise, other: AxisNoise) -> bool:
-    a, b = one.process, other.process
-    return one.samples == other.samples and a.order == b.order and abs(a.sd / b.sd - 1) < 0.01
+    return one.samples == other.samples and abs(one.law.sd / other.law.sd - 1) < 0.01
 
 
 def _failure(model: BaseModel, optimum: Optimum) -> str:

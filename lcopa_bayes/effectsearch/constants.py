@@ -12,8 +12,7 @@ from scipy.optimize import minimize_scalar
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.gaussnewton import Optimum, Regression
-from lcopa_bayes.effectsearch.scoreevidence import Projection
-from lcopa_bayes.effectsearch.signature import Signature, signature_of
+from lcopa_bayes.effectsearch.signature import Projection, Signature, signature_of
 from lcopa_bayes.effectsearch.trace import LEVEL, Trace, Traced
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.model.effects.effect import Effect
@@ -169,7 +168,7 @@ def _falling(
     project: Projection,
 ) -> Callable[[float], float]:
     def cost(log_value: float) -> float:
-        moved: Any = replace(effect, **{name: float(np.exp(log_value))})  # type: ignore[type-var]
+        moved: Any = replace(effect, **{name: float(np.exp(log_value))})
         try:
             tried[float(log_value)] = signature_of(model, x, whitening, project, moved)
         except ArithmeticError:
@@ -181,5 +180,5 @@ def _falling(
 
 def constants_of(effect: Effect) -> list[str]:
     """Names of the internal constants that are real numbers."""
-    listed = [field.name for field in fields(effect)]  # type: ignore[arg-type]
+    listed = [field.name for field in fields(effect)]
     return [name for name in listed if isinstance(getattr(effect, name), float)]

@@ -109,7 +109,7 @@ def _moved(
     tried = {float(np.log(here)): best}
 
     def cost(log_value: float) -> float:
-        moved: Any = replace(best[0], **{name: float(np.exp(log_value))})  # type: ignore[type-var]
+        moved: Any = replace(best[0], **{name: float(np.exp(log_value))})
         nearest = tried[min(tried, key=lambda one: abs(one - log_value))]
         found = _descent(state, moved, [nearest[1].x])
         if found is None:

@@ -11,21 +11,24 @@ from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
+from lcopa_bayes.effectsearch.outliers import NAME, Outlying
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.declared import coefficient_prior
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.effect import Effect
+from lcopa_bayes.model.effects.records import Outliers
 from lcopa_bayes.results.discretisation import resolved
 from lcopa_bayes.results.fit import plan_of
 from lcopa_bayes.sampling.draws import Draws
 from lcopa_bayes.sampling.weightedrun import weighted_run
 
 
-def explained_study(study: Study, model: ExtendedModel) -> Study:
+def explained_study(study: Study, model: ExtendedModel, outliers: Outlying | None = None) -> Study:
     """The study with the effects of a model declared, named as the study and ``-explained``.
 
     Scales and priors of the effects are stated as the loop used them; their internal constants, which it
-    chose from a list and moved, are held where they came to lie.
+    chose from a list and moved, are held where they came to lie. With `outliers` the samples that were left
+    out return, and the noise is declared to hold them, unless the study states such noise already.
     """
     ranges, effects = model.effected.ranges, model.effects
     priors: dict[str, PriorSettings] = {}
@@ -36,9 +39,13 @@ def explained_study(study: Study, model: ExtendedModel) -> Study:
         for key, value in effect.constants.items():
             name = f"{effect.name}.{key}"
             priors[name] = PriorSettings(name, fixed=float(value))
+    names = tuple(effect.name for effect in effects)
+    if outliers is not None:
+        study = outliers.returned(study)
+        names += (NAME,) if study.noise.kind != Outliers.noise else ()
     declared = replace(
         study.effects,
-        use=tuple(effect.name for effect in effects),
+        use=names,
         deflection=dict(zip(ranges.names, ranges.response.tolist(), strict=True)) if effects else {},
         speed=ranges.speed if effects else None,
     )

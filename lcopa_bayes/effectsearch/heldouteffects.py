@@ -11,11 +11,10 @@ from scipy.stats import chi2, norm
 
 from lcopa_bayes.core.arrays import Index, Vector
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.effectsearch.autoregression import Autoregression
 from lcopa_bayes.effectsearch.basefit import axis_pieces
-from lcopa_bayes.effectsearch.noisepieces import NoisePieces
-from lcopa_bayes.effectsearch.noiseposterior import NoisePosterior
+from lcopa_bayes.effectsearch.noise import Law, laws, plausible
 from lcopa_bayes.effectsearch.scores import Score, State, pooled_rmse
+from lcopa_bayes.inference.defaultpriors import Scales
 
 _ROOM = 0.05
 """Share of the range of a drive beyond which a model extrapolates [-]."""
@@ -85,7 +84,7 @@ class Errors:
         """Squared error beyond that of the noise, over the noise variance [-]."""
         return float((self.power - self.counts).sum())
 
-    def p_value(self, noise: Sequence[Sequence[Autoregression]]) -> float:
+    def p_value(self, noise: Sequence[Sequence[Law]]) -> float:
         """Probability of as much power by noise alone, averaged over the processes of each axis [-].
 
         A sum of squares of correlated normal samples is nearly a multiple of chi-squared with the same mean
@@ -106,25 +105,26 @@ class Errors:
         return float(np.mean(chi2.sf(self.power.sum() / multiple, freedom)))
 
 
-def _independent(state: State) -> list[list[Autoregression]]:
+def _independent(state: State) -> list[list[Law]]:
     """Noise of independent samples: what it explains, correlated noise of that sd explains too."""
-    return [[Autoregression(np.empty(0), process.sd)] for process in state.whitening.noise]
+    return [[Law(process.sd)] for process in state.whitening.noise]
 
 
-def _measured(state: State) -> list[list[Autoregression]]:
+def _measured(state: State) -> list[list[Law]]:
     """Noise that the samples it was measured from leave plausible, per axis."""
     white, rng = state.whitening, np.random.default_rng(_SEED)
     if not white.posterior:
         return [[process] for process in white.noise]
-    return [one.draw(_PROCESSES, rng) for one in white.posterior]
+    return [laws(one.draw(_PROCESSES, rng)) for one in white.posterior]
 
 
-def _left_by_fit(state: State) -> list[list[Autoregression]]:
+def _left_by_fit(state: State) -> list[list[Law]]:
     """Noise that the residual of the fit leaves plausible, per axis."""
     posterior, rng = state.model.base.posterior, np.random.default_rng(_SEED)
     axes = range(len(state.whitening.noise))
-    pieces = [NoisePieces.of(axis_pieces(posterior, state.optimum.residual, axis)) for axis in axes]
-    return [NoisePosterior(one).draw(_PROCESSES, rng) for one in pieces]
+    scales = Scales.of([one.record for one in posterior.samples])
+    pieces = [axis_pieces(posterior, state.optimum.residual, axis) for axis in axes]
+    return [laws(plausible(one, scales).draw(_PROCESSES, rng)) for one in pieces]
 
 
 def _errors(

@@ -118,8 +118,9 @@ class Loop:
 
     @property
     def study(self) -> Study:
-        """The study with the effects that were found declared: what a fit, an audit or a comparison takes."""
-        return explained_study(self.problem.study, self.after.state.model)
+        """The study with the effects that were found declared, outliers among them: what a fit, an audit or a
+        comparison takes."""
+        return explained_study(self.problem.study, self.after.state.model, self.outliers)
 
     @property
     def trace(self) -> Trace | None:
@@ -215,7 +216,8 @@ def _looped(
         white, residual = last_state.whitening, last_state.optimum.residual
         last_state = replace(last_state, widening=Widening.of(white.samples, residual, white.noise))
     if sample and declarable(study, last_state.model.effects):
-        sampled = explained_draws(explained_study(problem.study, last_state.model), jobs=jobs, quick=quick)
+        explained = explained_study(problem.study, last_state.model, outliers)
+        sampled = explained_draws(explained, jobs=jobs, quick=quick)
     if sampled is not None:
         covariance = np.cov(coordinates_of(last_state.model, sampled).T)
         last_state = replace(last_state, covariance=np.asarray(covariance))

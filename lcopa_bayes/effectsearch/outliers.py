@@ -18,8 +18,7 @@ from lcopa_bayes.core.arrays import Flags, Vector
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basefit import BaseFit
-from lcopa_bayes.effectsearch.noisesamples import quiet_samples
-from lcopa_bayes.effectsearch.scatter import scatter_evidence
+from lcopa_bayes.effectsearch.noise import quiet_samples, scatter_evidence
 from lcopa_bayes.effectsearch.whitening import parts
 from lcopa_bayes.inference.observations import Samples
 
@@ -43,6 +42,9 @@ class Outlying:
     """Outliers of a study, and the study without them."""
 
     study: Study
+    """The study without them."""
+    original: tuple[Record, ...]
+    """Fit records with them."""
     count: int
     """Outliers among the fit samples [-]."""
     share: float
@@ -51,6 +53,15 @@ class Outlying:
     """Root mean square of the outliers over the noise [-]."""
     log_bayes_factor: float
     """Of rare wide outliers against normal noise, in the residual of the base fit [nat]."""
+
+    def returned(self, study: Study) -> Study:
+        """A study of these records, perhaps with rows before their first, with the outliers in place."""
+        out = []
+        for record, whole in zip(study.fit, self.original, strict=True):
+            response = record.response.copy()
+            response[np.searchsorted(record.time, whole.time)] = whole.response
+            out.append(replace(record, response=response))
+        return replace(study, fit=tuple(out))
 
     @property
     def sentence(self) -> str:
@@ -86,6 +97,7 @@ def outlying(study: Study, fit: BaseFit) -> Outlying | None:
     told = np.concatenate(sizes)
     return Outlying(
         replace(study, fit=tuple(_without(one, number, far) for number, one in enumerate(samples))),
+        study.fit,
         told.size,
         float(told.size / counts[:, 0].sum()),
         float(np.sqrt(np.mean(told**2))),

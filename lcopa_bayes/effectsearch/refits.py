@@ -16,7 +16,7 @@ from lcopa_bayes.effectsearch.constants import polished
 from lcopa_bayes.effectsearch.crossvalidation import groups, log_scores
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.gaussnewton import Optimum, Regression
-from lcopa_bayes.effectsearch.noisesamples import quiet_samples
+from lcopa_bayes.effectsearch.noise import quiet_samples
 from lcopa_bayes.effectsearch.signature import Scale
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.effects import Placed

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
-from lcopa_bayes.core.checks import refuse_if
+from lcopa_bayes.core.errors import refuse_if
 from lcopa_bayes.data.requirements import unmet_apart_from_rest
 from lcopa_bayes.data.rest import not_at_rest
 from lcopa_bayes.data.settings import PriorSettings

@@ -12,10 +12,9 @@ from scipy.special import logsumexp
 from scipy.stats import binom
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.effectsearch.scatter import scatter_evidence
-from lcopa_bayes.effectsearch.scoreevidence import Projection
+from lcopa_bayes.effectsearch.noise import scatter_evidence
 from lcopa_bayes.effectsearch.scores import State
-from lcopa_bayes.effectsearch.signature import Scale, Signature, signature_of
+from lcopa_bayes.effectsearch.signature import Projection, Scale, Signature, signature_of
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.model.effects.effect import Card, Effect, ScatterEffect
 

@@ -9,13 +9,14 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
-from lcopa_bayes.effectsearch.autoregression import Autoregression, unbroken
-from lcopa_bayes.effectsearch.noiseposterior import NoisePosterior
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.effectsearch.noise import Law
+from lcopa_bayes.inference.mixednoise import WhiteAR1
 from lcopa_bayes.inference.observations import Samples
+from lcopa_bayes.inference.restnoise import PlausibleNoise
 
-_PER_PROCESS = 4
-"""Draws of noise from each plausible process [-]."""
+_PER_LAW = 4
+"""Draws of noise from each plausible law [-]."""
 _SEED = 7
 
 
@@ -54,14 +55,14 @@ def stacked(samples: Sequence[Samples], responses: Sequence[Array]) -> Matrix:
 @final
 @dataclass(frozen=True, eq=False)
 class Whitening:
-    """Noise of every axis applied to stacked samples; stretches apart by missing samples are independent."""
+    """Noise of every axis applied to stacked samples; records are independent of each other."""
 
     samples: tuple[Samples, ...]
-    noise: tuple[Autoregression, ...]
+    noise: tuple[Law, ...]
     """One per response axis."""
     dependence: tuple[float, ...] = ()
     """Samples that count as one independent sample, per response axis; 1 by default [-]."""
-    posterior: tuple[NoisePosterior, ...] = ()
+    posterior: tuple[PlausibleNoise, ...] = ()
     """What is known of the noise of each response axis; by default it is `noise`."""
 
     @cached_property
@@ -80,59 +81,47 @@ class Whitening:
         return np.concatenate([one.values for record in self.samples for one in record.axes])
 
     @cached_property
-    def _stretches(self) -> list[tuple[int, Index]]:
-        """Axis and rows of unbroken stretches, those of one axis and length together, (stretches, n)."""
-        found: dict[tuple[int, int], list[Index]] = {}
-        for part in self.parts:
-            gaps = self.samples[part.record].axes[part.axis].gaps
-            for piece in unbroken(gaps) if gaps.size else ():
-                rows = np.arange(piece.start, piece.stop) + part.rows.start
-                found.setdefault((part.axis, rows.size), []).append(rows)
-        return [(axis, np.array(rows)) for (axis, _), rows in found.items()]
+    def _filled(self) -> list[tuple[Part, Vector]]:
+        """Parts that hold samples, with their gaps [sampling periods]."""
+        gaps = [self.samples[part.record].axes[part.axis].gaps for part in self.parts]
+        return [(part, gap) for part, gap in zip(self.parts, gaps, strict=True) if gap.size]
 
     def __call__(self, columns: Array) -> Array:
         """Whitened columns (..., n), same shape [-]."""
         out = np.empty_like(columns, dtype=float)
-        for axis, rows in self._stretches:
-            out[..., rows] = self.noise[axis].whiten(columns[..., rows])
+        for part, gaps in self._filled:
+            out[..., part.rows] = self.noise[part.axis].whiten(columns[..., part.rows], gaps)
             if self.dependence:
-                out[..., rows] /= np.sqrt(self.dependence[axis])
+                out[..., part.rows] /= np.sqrt(self.dependence[part.axis])
         return out
 
-    def adjoint(self, columns: Array) -> Array:
-        """Adjoint of whitening of columns (..., n), same shape [1 / response unit]."""
+    def adjoint(self, columns: Matrix) -> Matrix:
+        """Adjoint of whitening of columns (k, n), same shape [1 / response unit]."""
         out = np.empty_like(columns, dtype=float)
-        for axis, rows in self._stretches:
-            out[..., rows] = self.noise[axis].adjoint(columns[..., rows])
+        for part, gaps in self._filled:
+            parameters = self.noise[part.axis].parameters
+            out[:, part.rows] = WhiteAR1().adjoint(columns[:, part.rows], parameters, gaps)
             if self.dependence:
-                out[..., rows] /= np.sqrt(self.dependence[axis])
+                out[:, part.rows] /= np.sqrt(self.dependence[part.axis])
         return out
 
     def covariances(self, columns: Matrix, count: int) -> Array:
-        """Covariance of products of whitened noise with columns (n, k), under `count` plausible processes,
+        """Covariance of products of whitened noise with columns (n, k), under `count` plausible laws,
         (count, k, k) [-]; the estimate is right once where the noise is known, (1, k, k)."""
         if not self.posterior:
             return (columns.T @ columns)[None]
         back, k = self.adjoint(columns.T), columns.shape[1]
         rng, out = np.random.default_rng(_SEED), np.zeros((count, k, k))
         for axis, posterior in enumerate(self.posterior):
-            lagged = self._lagged(back, axis)
-            for one, process in zip(out, posterior.draw(count, rng), strict=True):
-                one += np.einsum("l,lij->ij", process.autocovariance(len(lagged) - 1), lagged)
-        return out
-
-    def _lagged(self, columns: Matrix, axis: int) -> Array:
-        """Products of columns (k, n) a lag apart within stretches of an axis, either way, (lags, k, k)."""
-        own = [rows for number, rows in self._stretches if number == axis]
-        longest = max(rows.shape[1] for rows in own)
-        out = np.zeros((longest, len(columns), len(columns)))
-        for rows in own:
-            n = rows.shape[1]
-            spectra = np.fft.rfft(columns[:, rows], 2 * n)
-            power = np.einsum("igf,jgf->ijf", spectra.conj(), spectra)
-            lags = np.moveaxis(np.fft.irfft(power, 2 * n), -1, 0)[:n]
-            out[:n] += lags + lags.transpose(0, 2, 1)
-        out[0] /= 2
+            drawn = posterior.draw(count, rng)
+            rho, which = np.unique(drawn[:, 2], return_inverse=True)
+            white, correlated = np.zeros((k, k)), np.zeros((rho.size, k, k))
+            for part, gaps in self._filled:
+                if part.axis == axis:
+                    white += back[:, part.rows] @ back[:, part.rows].T
+                    correlated += _correlated_products(back[:, part.rows], rho, gaps)
+            out += drawn[:, 0, None, None] ** 2 * white
+            out += drawn[:, 1, None, None] ** 2 * correlated[which]
         return out
 
     @cached_property
@@ -145,9 +134,8 @@ class Whitening:
     @cached_property
     def log_scale(self) -> float:
         """Sum over samples of log sd of the prediction errors [nat]."""
-        return float(
-            sum(len(rows) * self.noise[axis].log_scale(rows.shape[1]) for axis, rows in self._stretches)
-        )
+        laws = [(self.noise[part.axis].parameters[None], gaps) for part, gaps in self._filled]
+        return float(sum(WhiteAR1().log_scales(law, gaps).sum() for law, gaps in laws))
 
     def excess(self, residual: Vector) -> float:
         """Root mean square of a stacked residual over the noise's [-]."""
@@ -162,13 +150,23 @@ class Whitening:
         if not self.posterior:
             return rng.standard_normal((self.size, count))
         raw = np.empty((count, self.size))
-        several = -(-count // _PER_PROCESS)
+        several = -(-count // _PER_LAW)
         for axis, posterior in enumerate(self.posterior):
-            own = [rows for number, rows in self._stretches if number == axis]
-            for k, process in enumerate(posterior.draw(several, rng)):
-                some = slice(k * _PER_PROCESS, min((k + 1) * _PER_PROCESS, count))
-                number = some.stop - some.start
-                for rows in own:
-                    drawn = process.draw(number * len(rows), rows.shape[1], rng)
-                    raw[some, rows.ravel()] = drawn.reshape(number, -1)
+            drawn = np.repeat(posterior.draw(several, rng), _PER_LAW, axis=0)[:count]
+            for part, gaps in self._filled:
+                if part.axis == axis:
+                    raw[:, part.rows] = WhiteAR1().draw(drawn, gaps, rng)
         return np.ascontiguousarray(self(raw).T)
+
+
+def _correlated_products(columns: Matrix, rho: Vector, gaps: Vector) -> Array:
+    """``columns R columns'`` of columns (k, n), R the correlation ``rho^gap`` of samples, (rho, k, k)."""
+    k, n = columns.shape
+    past, out = np.zeros((rho.size, k)), np.empty((rho.size, k, n))
+    link = rho[:, None] ** gaps
+    for i in range(n):
+        past *= link[:, i, None]
+        out[..., i] = past
+        past += columns[:, i]
+    cross = out @ columns.T
+    return np.asarray(columns @ columns.T + cross + cross.swapaxes(1, 2))

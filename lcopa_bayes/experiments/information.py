@@ -12,7 +12,7 @@ import numpy as np
 
 from lcopa_bayes.bench.command import Command
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
-from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.effectslopes import effect_slopes
 from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
@@ -88,7 +88,7 @@ class Bench:
     @cached_property
     def mesh(self) -> Mesh:
         """Blocks, and how samples are read from them."""
-        exposure = self.problem.study.model.exposure
+        exposure = self.problem.study.exposure
         return Mesh.of_samples(self.sample_times, 0.0, blocks=self.blocks, exposure=exposure)
 
     @cached_property
@@ -156,7 +156,7 @@ class Bench:
             for axis in range(slopes.shape[1])
         ]
 
-    def _unit(self, values: Vector, element: Prepared, slot: int, drive: Drive) -> Matrix:
+    def _unit(self, values: Vector, element: Prepared, slot: int, drive: AxisDrive) -> Matrix:
         """A unit response and its slopes in log times, orders and delay, (2 terms + 2, samples)."""
         response, superposition = element
         out = np.zeros((response.coarse.shape[0] + 1, self.sample_times.size))
@@ -201,7 +201,7 @@ def effected_model(
     return ForwardModel(layout, (experiment,), over)
 
 
-def _drive(command: Command, axis: int) -> Drive:
+def _drive(command: Command, axis: int) -> AxisDrive:
     """Deviation from rest of one axis of a command."""
     moved = command.jumps[:, axis] != 0
-    return Drive(command.times[moved], command.values[moved, axis] - command.rest[axis])
+    return AxisDrive(command.times[moved], command.values[moved, axis] - command.rest[axis])

@@ -10,9 +10,9 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.literature import PAPER
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.observations import sampling_period
+from lcopa_bayes.model.literature import PAPER
 
 MOST_SAMPLES = 100_000
 """Samples of the longest bench time tried: 10 s at 10 kHz."""

@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from lcopa_bayes.bench.command import Command
-from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.bench.device import Device
+from lcopa_bayes.calibration import simulation
 from lcopa_bayes.core.arrays import Flags, Matrix, Vector
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import PriorSettings
@@ -21,8 +22,6 @@ from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.simulation import Simulation
 from lcopa_bayes.model.grid import Mesh
 
-_SAME = 1e-9
-"""Orders closer than this are one term [-]."""
 _CONVERGED = 1e-11
 """Relative tolerances of a fit [-]."""
 _EVALUATIONS = 400
@@ -46,8 +45,8 @@ class Trial:
         """Relative errors, and which estimates lean on a bound."""
         problem, values, rng = self.bench.problem, self.truth, np.random.default_rng(self.seed)
         again = refit(problem, _noisy(problem, self.clean, values, rng), self.bench)
-        found = _solve(again, _moved(problem, again, values))
-        return _errors(problem, again, found, values, self.names), _leaning(again, found, self.names)
+        result = _solve(again, _moved(problem, again, values))
+        return _errors(problem, again, result, values, self.names), _leaning(again, result, self.names)
 
 
 @final
@@ -89,34 +88,11 @@ class EffectedDevice:
 
 
 def device_of(problem: Problem, values: Vector) -> Device | EffectedDevice:
-    """The plant of table values as a device of the virtual bench; terms of equal orders are added up."""
+    """The plant of table values as a device of the virtual bench."""
     table, study = problem.posterior.table, problem.study
     if table.effects is not None:
         return EffectedDevice(problem, values)
-    gains = table.gains(values[None])[0]
-    rows = []
-    for i in range(len(table.layout.responses)):
-        row = []
-        for j in range(len(table.layout.drives)):
-            e, d = table.layout.element_of[i][j], table.layout.delay_of[i][j]
-            row.append(_path(table, values, float(gains[i, j]), e, float(values[table.at("delay", d)])))
-        rows.append(tuple(row))
-    offsets = [float(table.offset(values[None], i, 0)[0]) for i in range(len(table.layout.responses))]
-    return Device(tuple(rows), study.drive_axes, study.response_axes, tuple(offsets), study.time_unit)
-
-
-def _path(table: ParameterTable, values: Vector, gain: float, element: int, delay: float) -> TransferPath:
-    etas: list[float] = []
-    orders: list[float] = []
-    for term in range(table.layout.elements[element].terms):
-        order = float(values[table.at("order", element, term)])
-        eta = float(values[table.at("time", element, term)]) ** order
-        if orders and orders[-1] - order < _SAME:
-            etas[-1] += eta
-        else:
-            etas.append(eta)
-            orders.append(order)
-    return TransferPath(gain, delay, tuple(etas), tuple(orders), 1.0)
+    return simulation.device_of(table, values, 0, time_unit=study.time_unit)
 
 
 def _noisy(problem: Problem, clean: Record, values: Vector, rng: np.random.Generator) -> Record:
@@ -175,7 +151,7 @@ def _solve(problem: Problem, start: Vector) -> Vector:
     least = LeastSquares(problem.posterior)
     low, high = least.bounds
     near = np.clip(least.coordinates(start), low, high)  # a start only
-    found = least_squares(
+    result = least_squares(
         *least.functions(start, near),
         bounds=(low, high),
         x_scale="jac",
@@ -184,16 +160,16 @@ def _solve(problem: Problem, start: Vector) -> Vector:
         gtol=_CONVERGED,
         max_nfev=_EVALUATIONS,
     )
-    return np.asarray(problem.posterior.table.canonical(least.values(found.x, start)[None])[0])
+    return np.asarray(problem.posterior.table.canonical(least.values(result.x, start)[None])[0])
 
 
 def _errors(
-    before: Problem, problem: Problem, found: Vector, values: Vector, names: tuple[str, ...]
+    before: Problem, problem: Problem, result: Vector, values: Vector, names: tuple[str, ...]
 ) -> Vector:
     table, old = problem.posterior.table, before.posterior.table
     out = []
     for name in names:
-        estimate, true = found[table.names.index(name)], values[old.names.index(name)]
+        estimate, true = result[table.names.index(name)], values[old.names.index(name)]
         if old.rows[old.names.index(name)].kind == "time":
             out.append(np.log(estimate / true))
         else:
@@ -201,11 +177,11 @@ def _errors(
     return np.array(out)
 
 
-def _leaning(problem: Problem, found: Vector, names: tuple[str, ...]) -> Flags:
-    """Whether each parameter stands at an end of its search, (parameters,)."""
+def _leaning(problem: Problem, result: Vector, names: tuple[str, ...]) -> Flags:
+    """Whether each parameter is at an end of its search, (parameters,)."""
     least, table = LeastSquares(problem.posterior), problem.posterior.table
     low, high = least.bounds
-    at = least.coordinates(found)
+    at = least.coordinates(result)
     close = np.minimum(at - low, high - at) < _AT_BOUND
     leaning = {table.names[k]: bool(one) for k, one in zip(least.columns, close, strict=True)}
     return np.array([leaning[name] for name in names])

@@ -12,16 +12,21 @@ from threadpoolctl import threadpool_limits
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.parallel import workers
-from lcopa_bayes.identifiability.contraction import Known, beliefs, known_best, prior_draws, prior_spread
-from lcopa_bayes.identifiability.curvature import Curvature, curvature
+from lcopa_bayes.identifiability.contraction import (
+    Known,
+    Tolerance,
+    beliefs,
+    known_best,
+    prior_draws,
+    prior_spread,
+)
+from lcopa_bayes.identifiability.curvature import Curvature, Sensitivities, curvature, sensitivities
 from lcopa_bayes.identifiability.delays import Delays, delays
 from lcopa_bayes.identifiability.printedform import printed_structure
 from lcopa_bayes.identifiability.profile import Profile
 from lcopa_bayes.identifiability.profilepath import profile
 from lcopa_bayes.identifiability.radial import Radial, radial
-from lcopa_bayes.identifiability.sensitivities import Sensitivities, sensitivities
 from lcopa_bayes.identifiability.symmetries import DIFFERENCED, TOLERANCES, Structure, exchanges, structure
-from lcopa_bayes.identifiability.tolerance import Tolerance
 from lcopa_bayes.identifiability.verdict import Finding, judged
 from lcopa_bayes.inference.likelihood import Landscape, Peak
 from lcopa_bayes.inference.optimum import find_optima
@@ -81,7 +86,7 @@ class Audit:
     def as_json(self) -> dict[str, Any]:
         """Every number of the audit; what is open, infinite or undefined is None."""
         draws = self.fit.draws
-        fields: dict[str, Any] = plain(
+        return plain(
             {
                 "study": self.fit.study.name,
                 "verdict": self.sentence,
@@ -102,7 +107,6 @@ class Audit:
                 "next_measurement": None,
             }
         )
-        return fields
 
 
 def _structure(structure: Structure) -> dict[str, Any]:

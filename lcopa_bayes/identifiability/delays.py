@@ -44,7 +44,7 @@ class Delays:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; what is infinite is None."""
-        fields: dict[str, Any] = plain(
+        return plain(
             {
                 "paths": [
                     {"path": path, "sd": sd, "unit": self.time_unit}
@@ -57,7 +57,6 @@ class Delays:
                 "sentence": self.sentence,
             }
         )
-        return fields
 
 
 def delays(study: Study, table: ParameterTable, values: Vector) -> Delays:

@@ -3,15 +3,17 @@ parametrisation."""
 
 from __future__ import annotations
 
-from math import asin
 from typing import NamedTuple
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.data.literature import PAPER, Stated
-from lcopa_bayes.identifiability.sensitivities import Sensitivities
+from lcopa_bayes.identifiability.curvature import Sensitivities
 from lcopa_bayes.identifiability.symmetries import Structure, structure
+from lcopa_bayes.model.literature import PAPER, Stated
+from lcopa_bayes.model.path import Normalisation, TransferPath
+from lcopa_bayes.optics.array import paper_array
+from lcopa_bayes.optics.steering import linearised_angle
 
 SPRINGS = 4
 """Springs of the element, of which Eq. 16 adds up the stiffnesses."""
@@ -38,9 +40,10 @@ def printed_form(
     optics = stated.optics
     springs = rng.uniform(0.5, 2.0, SPRINGS)
     k = float(springs.sum())
-    etas = k * times**orders
-    lever = asin(1 / (2 * np.pi * optics.pitch_in_wavelengths)) / optics.tilt_slope_low
-    j = gain * k / lever * optics.element_width / optics.charge
+    path = TransferPath.of_times(gain, delay, times.tolist(), orders.tolist())
+    path = path.normalised(Normalisation.STIFFNESS, k)
+    lever = float(linearised_angle(paper_array(optics), 1.0)) / optics.tilt_slope_low
+    j = path.gain / lever * optics.element_width / optics.charge
     terms = times.size
     names = (
         *("j", "q", "x"),
@@ -49,7 +52,7 @@ def printed_form(
         "delay",
         *(f"k{i + 1}" for i in range(SPRINGS)),
     )
-    values = np.concatenate([[j, optics.charge, optics.element_width], etas, orders, [delay], springs])
+    values = np.concatenate([[j, optics.charge, optics.element_width], path.etas, orders, [delay], springs])
     slopes = np.zeros((2 * terms + 2, len(names)))
     slopes[0, :3] = gain * np.array([1.0, 1.0, -1.0])
     slopes[0, -SPRINGS:] = -gain * springs / k

@@ -123,7 +123,7 @@ class Profile:
     def as_json(self) -> dict[str, Any]:
         """Plain values; an open side is None."""
         lower, upper = self.intervals[LEVEL]
-        fields: dict[str, Any] = plain(
+        return plain(
             {
                 "lower": lower,
                 "upper": upper,
@@ -141,4 +141,3 @@ class Profile:
                 "fall": self.fall,
             }
         )
-        return fields

@@ -34,8 +34,7 @@ class Radial:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        fields: dict[str, Any] = plain(vars(self))
-        return fields
+        return plain(vars(self))
 
 
 def radial(landscape: Landscape, peak: Peak, prior_sd: Vector, direction: Vector, radius: float) -> Radial:

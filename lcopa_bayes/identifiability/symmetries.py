@@ -47,7 +47,7 @@ class Symmetry:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        fields: dict[str, Any] = plain(
+        return plain(
             {
                 "kind": self.kind,
                 "parameters": self.parameters,
@@ -55,7 +55,6 @@ class Symmetry:
                 "sentence": self.sentence,
             }
         )
-        return fields
 
 
 @final

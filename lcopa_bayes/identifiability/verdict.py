@@ -8,11 +8,10 @@ from typing import Any, Literal, final
 import numpy as np
 
 from lcopa_bayes.core.estimate import LEVEL, plain
-from lcopa_bayes.identifiability.contraction import Belief
+from lcopa_bayes.identifiability.contraction import Belief, Tolerance
 from lcopa_bayes.identifiability.curvature import Curvature
 from lcopa_bayes.identifiability.profile import Profile
 from lcopa_bayes.identifiability.symmetries import Structure
-from lcopa_bayes.identifiability.tolerance import Tolerance
 
 Verdict = Literal[
     "identified",
@@ -48,7 +47,7 @@ class Finding:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        fields: dict[str, Any] = plain(
+        return plain(
             {
                 "name": self.profile.parameter,
                 "unit": self.profile.unit,
@@ -63,7 +62,6 @@ class Finding:
                 "disagreements": self.disagreements,
             }
         )
-        return fields
 
 
 def judged(

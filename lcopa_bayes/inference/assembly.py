@@ -64,7 +64,7 @@ class Problem:
             [drive],
             [times],
             blocks=wanted.blocks,
-            exposure=wanted.exposure,
+            exposure=self.study.exposure,
             refinement=self.refinement,
         )
         if own is None:
@@ -137,7 +137,7 @@ def prepared(
         records,
         [one.times for one in samples],
         blocks=study.model.blocks,
-        exposure=study.model.exposure,
+        exposure=study.exposure,
         refinement=refinement,
     )
     return samples, model

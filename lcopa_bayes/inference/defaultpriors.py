@@ -49,7 +49,7 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
-from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.drive import first_change
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.inference.observations import Observed, Samples, sampling_period
 from lcopa_bayes.inference.priors import Prior
@@ -90,9 +90,7 @@ class Scales:
         """Scales of the fit records."""
         spans = []
         for record in records:
-            drives = [Drive.of_rows(record.time, column) for column in record.drive.T]
-            begin = min((drive.times[0] for drive in drives if drive.moves), default=record.time[0])
-            spans.append(record.time[-1] - begin)
+            spans.append(record.time[-1] - first_change(record))
         response = np.concatenate([record.response for record in records])
         amplitude = np.nanmax(response, axis=0) - np.nanmin(response, axis=0)
         period = sampling_period(records)
@@ -150,7 +148,7 @@ class Scales:
         """Noise of an axis as its samples at rest give it; None where these are too few."""
         if response not in self._quiet:
             pieces = [piece for piece in self.at_rest[response] if piece.values.size > 1]
-            self._quiet[response] = quiet_noise(pieces, self._correlations)
+            self._quiet[response] = quiet_noise(pieces, self.correlations)
         return self._quiet[response]
 
     @cached_property
@@ -158,7 +156,7 @@ class Scales:
         return {}
 
     @property
-    def _correlations(self) -> tuple[float, float]:
+    def correlations(self) -> tuple[float, float]:
         """Least and largest correlation of noise that is neither white nor a trend [-]."""
         longest = max(self.span / self.period / _TIMES, _SHORT)
         return float(np.exp(-1 / _SHORTEST)), float(np.exp(-1 / longest))
@@ -181,7 +179,7 @@ class Scales:
 
     def rho_short(self) -> Prior:
         """Prior of a correlation that is forgotten well within a record."""
-        least, largest = self._correlations
+        least, largest = self.correlations
         return Prior("uniform", {"loc": least, "scale": largest - least})
 
     @staticmethod

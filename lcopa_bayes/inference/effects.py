@@ -127,17 +127,11 @@ class Effected:
         slopes = plant_slopes(self.simulator, self.plant(values), at)
         out = []
         for r, slope in enumerate(slopes):
-            made = np.zeros((*slope.gains.shape[:2], len(table.rows)))
+            made = np.zeros((*next(iter(slope.values())).shape, len(table.rows)))
             for k, row in enumerate(table.rows):
                 first, second = row.place
-                if row.kind == "gain":
-                    made[..., k] = slope.gains[..., first, second]
-                elif row.kind == "time":
-                    made[..., k] = slope.times[first][..., second]
-                elif row.kind == "order":
-                    made[..., k] = slope.orders[first][..., second]
-                elif row.kind == "delay":
-                    made[..., k] = slope.delays[..., first]
+                if row.kind in ("gain", "time", "order", "delay"):
+                    made[..., k] = slope[row.kind, first, second]
                 elif row.kind == "offset" and self.offsets is not None and second in (-1, self.offsets[r]):
                     made[:, first, k] = 1.0
             out.append(made)

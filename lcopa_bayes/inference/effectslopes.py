@@ -58,7 +58,7 @@ def _moved(model: Effected, effect: int, position: int, value: float) -> tuple[E
     """The effects with one constant of one of them at another value."""
     effects = list(model.effects)
     name = list(effects[effect].constants)[position]
-    effects[effect] = replace(effects[effect], **{name: value})  # type: ignore[type-var]
+    effects[effect] = replace(effects[effect], **{name: value})
     return tuple(effects)
 
 

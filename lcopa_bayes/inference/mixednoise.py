@@ -55,6 +55,14 @@ class WhiteAR1(GaussianNoise):
         logs = 0.5 * np.log(variances).reshape(batch, n).sum(axis=1)
         return out.reshape(k, batch, n).swapaxes(0, 1), logs[: parameters.shape[0]]
 
+    def adjoint(self, columns: Matrix, parameters: Vector, gaps: Vector) -> Matrix:
+        """Adjoint of `whiten` at one parameter set (3,): columns (k, n), same shape [1 / response unit]."""
+        link, variances, lower = self._factors(parameters[None], gaps)
+        work = columns * np.sqrt(variances)
+        work[:, 1:] += lower[: gaps.size - 1] * work[:, :-1]
+        out = np.asarray(dpttrs(variances, lower, work.T)[0].T)
+        return np.concatenate([out[:, :-1] - link[0] * out[:, 1:], out[:, -1:]], axis=1)
+
     def log_scales(self, parameters: Matrix, gaps: Vector) -> Matrix:
         """Log innovation sd of each sample, (batch, n)."""
         variances = self._factors(parameters, gaps)[1] if gaps.size else np.empty(0)

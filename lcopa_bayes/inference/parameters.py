@@ -21,6 +21,7 @@ from lcopa_bayes.inference.priors import Prior
 from lcopa_bayes.model.effects.declared import Declared
 from lcopa_bayes.model.forward import Dynamics
 from lcopa_bayes.model.layout import Layout
+from lcopa_bayes.model.path import TransferPath
 
 _ORDERED_DRAWS = 200_000
 """Prior draws that measure how much mass an unexchangeable prior has where orders decrease."""
@@ -173,6 +174,23 @@ class ParameterTable:
         """Gains, (batch, responses, drives) [response unit per drive unit]."""
         shape = (len(self.layout.responses), len(self.layout.drives))
         return values[:, self.of_kind("gain")].reshape(-1, *shape)
+
+    def paths(self, values: Vector) -> tuple[tuple[TransferPath, ...], ...]:
+        """Paths of the linear plant at canonical values (rows,), ``[response][drive]``, of stiffness 1."""
+        dynamics, gains, layout = self.dynamics(values[None]), self.gains(values[None])[0], self.layout
+        shapes = [
+            (times[0].tolist(), orders[0].tolist())
+            for times, orders in zip(dynamics.times, dynamics.orders, strict=True)
+        ]
+        return tuple(
+            tuple(
+                TransferPath.of_times(
+                    float(gains[i, j]), float(dynamics.delays[0, layout.delay_of[i][j]]), *shapes[element]
+                )
+                for j, element in enumerate(row)
+            )
+            for i, row in enumerate(layout.element_of)
+        )
 
     def offset(self, values: Matrix, response: int, record: int) -> Vector:
         """Offset of a response axis on a fit record, (batch,) [response unit]; 0 when the model has none."""

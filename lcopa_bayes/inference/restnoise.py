@@ -44,33 +44,83 @@ class QuietNoise:
     """97.5 % limit of the correlated part's standard deviation [response unit]."""
 
 
+@final
+@dataclass(frozen=True, eq=False)
+class PlausibleNoise:
+    """Posterior of `WhiteAR1` given pieces of it, over a grid of shares and correlations.
+
+    Flat priors of the level of each piece and of the logarithm of the standard deviation, both integrated out
+    in closed form.
+    """
+
+    shapes: Matrix
+    """Parameters of unit variance, (grid, 3): standard deviation of the white and of the correlated part,
+    correlation."""
+    weights: Vector
+    """Probability of each, (grid,) [-]."""
+    squares: Vector
+    """Squares of the whitened pieces about their levels under each, (grid,) [response unit^2]."""
+    count: int
+    """Samples less one level for each piece [-]."""
+
+    @classmethod
+    def of(cls, pieces: Sequence[Observed], shapes: Matrix, log_prior: Vector) -> PlausibleNoise:
+        """From pieces of two samples or more; ValueError with none."""
+        count = sum(piece.values.size - 1 for piece in pieces)
+        if not count:
+            raise ValueError("a noise scale needs a piece of two samples or more")
+        level, squares = np.zeros(len(shapes)), np.zeros(len(shapes))
+        for piece in pieces:
+            portions = np.array_split(
+                np.arange(len(shapes)), max(1, len(shapes) * piece.values.size // _CELLS)
+            )
+            told = [_about_own_level(piece, shapes[portion]) for portion in portions if portion.size]
+            level += np.concatenate([one[0] for one in told])
+            squares += np.concatenate([one[1] for one in told])
+        weight = level - 0.5 * count * np.log(squares) + log_prior
+        weight = np.exp(weight - weight.max())
+        return cls(shapes, weight / weight.sum(), squares, count)
+
+    @property
+    def estimate(self) -> Vector:
+        """The parameters of largest probability, (3,)."""
+        k = int(np.argmax(self.weights))
+        scale = np.sqrt(self.squares[k : k + 1] / self.count)
+        return np.asarray(self._scaled(self.shapes[k : k + 1], scale)[0])
+
+    def draw(self, size: int, rng: np.random.Generator) -> Matrix:
+        """Parameters, (size, 3)."""
+        chosen = rng.choice(len(self.weights), size, p=self.weights)
+        scale = np.sqrt(self.squares[chosen] / rng.chisquare(self.count, size))
+        return self._scaled(self.shapes[chosen], scale)
+
+    @staticmethod
+    def _scaled(shapes: Matrix, scale: Vector) -> Matrix:
+        return np.column_stack([scale * shapes[:, 0], scale * shapes[:, 1], shapes[:, 2]])
+
+
+def mixed_shapes(correlations: tuple[float, float]) -> tuple[Matrix, Vector]:
+    """Grid of shares of the correlated part and of its correlation between two `correlations`, (grid, 3), and
+    the logarithm of a prior that is uniform in both, (grid,)."""
+    tried = np.linspace(*correlations, _CORRELATIONS)
+    shares, rho = (grid.ravel() for grid in np.meshgrid(_SHARES, tried))
+    shapes = np.column_stack([np.sqrt(1 - shares), np.sqrt(shares), rho])
+    return shapes, np.log(shares * (1 - shares))
+
+
 def quiet_noise(pieces: Sequence[Observed], correlations: tuple[float, float]) -> QuietNoise | None:
     """Posterior of `WhiteAR1` from samples at rest, the level of each piece unknown; None where too few.
 
-    With flat priors on the level of each piece, on the logarithm of the standard deviation, on the share of
-    the correlated part in the variance and on its correlation between two `correlations`: level and scale are
-    integrated out in closed form, share and correlation over a grid.
+    The share of the correlated part in the variance and its correlation between two `correlations` have
+    uniform priors (`mixed_shapes`).
     """
     count = sum(piece.values.size - 1 for piece in pieces)
     readings = {value for piece in pieces for value in piece.values}
     if count < FEWEST or len(readings) < _LEVELS:
         return None
-    tried = np.linspace(*correlations, _CORRELATIONS)
-    shares, rho = (grid.ravel() for grid in np.meshgrid(_SHARES, tried))
-    parameters = np.column_stack([np.sqrt(1 - shares), np.sqrt(shares), rho])
-    level, squares = np.zeros(len(rho)), np.zeros(len(rho))
-    for piece in pieces:
-        portions = np.array_split(np.arange(len(rho)), max(1, len(rho) * piece.values.size // _CELLS))
-        told = [_about_own_level(piece, parameters[portion]) for portion in portions if portion.size]
-        level += np.concatenate([one[0] for one in told])
-        squares += np.concatenate([one[1] for one in told])
-    weight = level - 0.5 * count * np.log(squares) + np.log(shares * (1 - shares))  # uniform in the share
-    weight = np.exp(weight - weight.max())
-    rng = np.random.default_rng(0)
-    chosen = rng.choice(len(rho), _DRAWS, p=weight / weight.sum())
-    scale = np.sqrt(squares[chosen] / rng.chisquare(count, _DRAWS))
-    sigma = scale * parameters[chosen, 0]
-    limit = float(np.quantile(scale * parameters[chosen, 1], _UPPER))
+    drawn = PlausibleNoise.of(pieces, *mixed_shapes(correlations)).draw(_DRAWS, np.random.default_rng(0))
+    sigma, sigma_ar = drawn[:, 0], drawn[:, 1]
+    limit = float(np.quantile(sigma_ar, _UPPER))
     return QuietNoise(count, float(np.median(sigma)), float(np.log(sigma).std()), limit)
 
 

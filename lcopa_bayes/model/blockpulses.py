@@ -104,10 +104,3 @@ def integration_matrix(order: float, n: int, step: float) -> Matrix:
 def lower_toeplitz(column: Array) -> Matrix:
     """Lower triangular Toeplitz matrix with this first column."""
     return toeplitz(column, np.zeros_like(column))
-
-
-def shift_matrix(blocks: int, n: int) -> Matrix:
-    """Delay by whole blocks (Ta et al. 2026, Eq. 53, transposed): ``(E @ f)[i] = f[i - blocks]``."""
-    if blocks < 0:
-        raise ValueError(f"a delay of {blocks} blocks looks into the future; need blocks >= 0")
-    return np.eye(n, k=-blocks)

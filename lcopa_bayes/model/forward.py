@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
-from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.drive import AxisDrive, axis_drives
 from lcopa_bayes.data.record import Driven
 from lcopa_bayes.model.grid import Mesh
 from lcopa_bayes.model.layout import Layout
@@ -62,7 +62,7 @@ class Experiment:
 
     name: str
     mesh: Mesh
-    drives: tuple[Drive, ...]
+    drives: tuple[AxisDrive, ...]
     rest: Vector
     """Drive before the first change, one per drive axis [drive unit]."""
 
@@ -77,7 +77,7 @@ class Experiment:
         refinement: int = 1,
     ) -> Experiment:
         """For reading `record` at `times` [time unit]; see `Mesh.of_samples` for the options."""
-        drives = tuple(Drive.of_rows(record.time, column) for column in record.drive.T)
+        drives = axis_drives(record)
         begin = min((drive.times[0] for drive in drives if drive.moves), default=times[0])
         mesh = Mesh.of_samples(times, float(begin), blocks=blocks, exposure=exposure, refinement=refinement)
         return cls(record.name, mesh, drives, record.drive[0])
@@ -196,7 +196,7 @@ class ForwardModel:
 
     @cached_property
     def _alike(self) -> list[list[tuple[int, int, float]]]:
-        """First experiment and axis with a proportional drive read in the same way, and the factor.
+        """First experiment and axis with a proportional drive read at the same positions, and the factor.
 
         Steps of several heights are then simulated once, not once per record.
         """

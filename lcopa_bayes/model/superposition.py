@@ -11,7 +11,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from lcopa_bayes.core.arrays import Array, Index, Vector
-from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.grid import Lattice
 from lcopa_bayes.model.powerseries import Circle, Spectrum
 from lcopa_bayes.model.stepresponse import Kind, StepResponse
@@ -42,7 +42,7 @@ class Phase:
     """Change of the drive at each [drive unit]."""
 
 
-def phases(drive: Drive, step: float) -> tuple[Phase, ...]:
+def phases(drive: AxisDrive, step: float) -> tuple[Phase, ...]:
     """The changes of a drive by phase on blocks of width `step` [time unit]."""
     jumps = np.diff(drive.values, prepend=0.0)
     place = (drive.times - drive.times[0]) / step

@@ -28,6 +28,19 @@ class TransferSlopes:
     """In each order."""
 
 
+def denominator(times: Matrix, orders: Matrix, angular: Vector) -> Spectrum:
+    """``1 + sum_i (i w T_i)^order_i``, (batch, frequencies), at angular frequencies w (frequencies,).
+
+    Parameters: times [time unit] and orders [-], (batch, terms); angular [1 / time unit].
+    Its terms have arguments within ``pi order / 2 <= pi``, so that it stays in one half plane: its principal
+    argument is the continuous one.
+    """
+    out = np.ones((times.shape[0], angular.size), dtype=np.complex128)
+    for time, order in zip(times.T, orders.T, strict=True):
+        out += (1j * angular * time[:, None]) ** order[:, None]
+    return out
+
+
 def transfer(times: Array, orders: Matrix, circle: Circle, step: float) -> Spectrum:
     r"""``1 / (1 + sum_i (T_i s)^order_i)`` integrated order_1 times (Ta et al. 2026, Eqs. 59-61).
 

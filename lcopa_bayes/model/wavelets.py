@@ -2,7 +2,7 @@ r"""Legendre wavelets and their operational matrices, dense and as printed (Ta e
 
 Vectors of basis functions are on the left in the paper, ``(I^a Phi)(t) = P^a Phi(t)``, so that the
 coefficients of a function are rows and its matrices the transposes of those in `blockpulses`:
-``F^a = integration_matrix(a).T`` and ``E = shift_matrix(j).T``, both upper triangular.
+``F^a = integration_matrix(a).T`` and the delay E by j1 blocks, ones above the diagonal, upper triangular.
 
 The printed equations are inconsistent in three places; this module uses:
 
@@ -18,28 +18,19 @@ The printed equations are inconsistent in three places; this module uses:
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
+import timeit
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.model.blockpulses import integration_matrix, shift_matrix
-
-
-def legendre(degree: int, x: Array) -> Array:
-    """P_degree(x) by the three-term recurrence (Eq. 33); any shape, degree >= 0."""
-    if degree < 0:
-        raise InputError(f"a Legendre polynomial has a degree of at least 0; got {degree}")
-    before, value = np.zeros_like(x), np.ones_like(x)
-    for m in range(degree):
-        before, value = value, ((2 * m + 1) * x * value - m * before) / (m + 1)
-    return value
+from lcopa_bayes.model.blockpulses import integration_matrix
+from lcopa_bayes.model.path import TransferPath
 
 
 @final
@@ -65,10 +56,8 @@ class WaveletBasis:
         rows = [np.ones_like(t)]
         for level in range(1, self.n.bit_length()):
             for place in range(1, 2 ** (level - 1) + 1):
-                centre = 2 * place - 1
-                x = 2.0**level * t - centre
-                inside = (x >= -1) & (x < 1)
-                rows.append(np.where(inside, np.sqrt(1.5) * 2 ** (level / 2) * legendre(1, x), 0.0))
+                x = 2.0**level * t - (2 * place - 1)  # P_1(x) = x
+                rows.append(np.where((x >= -1) & (x < 1), np.sqrt(1.5) * 2 ** (level / 2) * x, 0.0))
         return np.array(rows)
 
     @cached_property
@@ -78,163 +67,84 @@ class WaveletBasis:
 
     @cached_property
     def inverse(self) -> Matrix:
-        """``Psi^-1`` [-]."""
+        """``Psi^-1`` [-]; ``c^T = f^T Psi^-1`` are the coefficients of values f at the nodes."""
         return np.asarray(np.linalg.inv(self.psi))
 
     @cached_property
     def gram(self) -> Matrix:
         """Inner products on [0, 1), (N, N) [-], exact: two Gauss points on each half of a finest wavelet."""
-        cells = self.n
         offsets = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)
-        at = self.functions(((np.arange(cells)[:, None] + offsets) / cells).ravel())
-        return np.asarray(at @ at.T / (2 * cells))
+        at = self.functions(((np.arange(self.n)[:, None] + offsets) / self.n).ravel())
+        return np.asarray(at @ at.T / (2 * self.n))
 
     @property
     def largest_overlap(self) -> float:
         """Largest absolute inner product of two different functions [-]; 0 for an orthogonal basis."""
         return float(np.abs(self.gram - np.diag(np.diag(self.gram))).max())
 
-    def coefficients(self, values: Vector) -> Vector:
-        """c of Eq. 38 for values at the nodes, ``c^T = f^T Psi^-1``; (N,) in the unit of `values`."""
-        return np.asarray(values @ self.inverse)
-
-    def similar(self, matrix: Matrix) -> Matrix:
-        """A block-pulse matrix of the paper in wavelet coordinates, ``Psi M Psi^-1`` (Eqs. 49, 57)."""
-        return np.asarray(self.psi @ matrix @ self.inverse)
-
     def integration(self, order: float, span: float) -> Matrix:
         """P^a of Eq. 49 over a record of length `span` [time unit]; (N, N) [time unit^order]."""
-        return self.similar(printed_integration(order, self.n, span))
+        return np.asarray(self.psi @ integration_matrix(order, self.n, span / self.n).T @ self.inverse)
 
     def shift(self, blocks: int) -> Matrix:
         """Z of Eq. 57, a delay of whole blocks; (N, N) [-]."""
-        return self.similar(printed_shift(blocks, self.n))
-
-    def delayed_integration(self, order: float, blocks: int, span: float) -> Matrix:
-        """``Z P^a`` of Eq. 58; (N, N) [time unit^order]."""
-        return np.asarray(self.shift(blocks) @ self.integration(order, span))
+        return np.asarray(self.psi @ np.eye(self.n, k=blocks) @ self.inverse)
 
 
-def printed_integration(order: float, n: int, span: float) -> Matrix:
-    """F^a of Eqs. 44 and 45, upper triangular, (n, n) [time unit^order]; ``integration_matrix(...).T``."""
-    return np.asarray(integration_matrix(order, n, span / n).T)
+def wavelet_response(
+    path: TransferPath, drive: Vector, basis: WaveletBasis, span: float, blocks: int
+) -> Vector:
+    """Response at the nodes, (N,) [response unit], to block values of the drive (N,) [drive unit].
+
+    Eq. 61 of `path` solved for ``Y^T`` over a record of length `span` [time unit], with `blocks` whole blocks
+    for its delay. Accuracy: `block_pulse_response` to rounding.
+    """
+    system = _system(path, lambda order: basis.integration(order, span))
+    forced = basis.shift(blocks) @ basis.integration(path.orders[0], span)
+    right = path.gain * (drive @ basis.inverse) @ forced
+    return np.asarray(np.linalg.solve(system.T, right) @ basis.psi)
 
 
-def printed_shift(blocks: int, n: int) -> Matrix:
-    """E of Eq. 53: ones `blocks` above the diagonal, (n, n) [-]; ``shift_matrix(...).T``."""
-    return np.asarray(shift_matrix(blocks, n).T)
+def block_pulse_response(path: TransferPath, drive: Vector, span: float, blocks: int) -> Vector:
+    """`wavelet_response` in block-pulse coordinates, where the system is triangular; any number of blocks."""
+    n = drive.size
+    system = _system(path, lambda order: integration_matrix(order, n, span / n).T)
+    late = np.concatenate((np.zeros(min(blocks, n)), drive[: max(0, n - blocks)]))
+    right = path.gain * (late @ integration_matrix(path.orders[0], n, span / n).T)
+    return np.asarray(solve_triangular(system, right, trans="T"))
 
 
-@final
-@dataclass(frozen=True)
-class PrintedEquation:
-    """``b u(t - j1 h) = sum_i eta_i D^order_i y + k y`` for a record of length `span` (Eqs. 59-61)."""
-
-    gain: float
-    """b [response unit per drive unit, times stiffness]."""
-    etas: Sequence[float]
-    """Viscosities [time unit^order]."""
-    orders: Sequence[float]
-    """Orders [-], the first one largest."""
-    stiffness: float
-    """k [-]."""
-    blocks: int
-    """j1, the delay in whole blocks [-]."""
-    span: float
-    """Tf [time unit]."""
-
-    def wavelet_response(self, drive: Vector, basis: WaveletBasis) -> Vector:
-        """Response at the nodes, (N,) [response unit], for block values of the drive (N,) [drive unit].
-
-        Eq. 61 solved for ``Y^T``. Accuracy: `block_pulse_response` to rounding.
-        """
-        system = self._system(lambda order: basis.integration(order, self.span))
-        forced = basis.delayed_integration(self.orders[0], self.blocks, self.span)
-        right = self.gain * basis.coefficients(drive) @ forced
-        return np.asarray(np.linalg.solve(system.T, right) @ basis.psi)
-
-    def block_pulse_response(self, drive: Vector, *, triangular: bool = True) -> Vector:
-        """The same in block-pulse coordinates; any number of blocks.
-
-        The system is triangular there; `triangular` False solves it without using that.
-        """
-        n = drive.size
-        system = self._system(lambda order: printed_integration(order, n, self.span))
-        forced = printed_integration(self.orders[0], n, self.span)
-        late = np.concatenate((np.zeros(min(self.blocks, n)), drive[: max(0, n - self.blocks)]))
-        right = self.gain * (late @ forced)
-        if triangular:
-            return np.asarray(solve_triangular(system, right, trans="T"))
-        return np.asarray(np.linalg.solve(system.T, right))
-
-    def _system(self, integration: Callable[[float], Matrix]) -> Matrix:
-        top = self.orders[0]
-        system = self.stiffness * integration(top)
-        for eta, order in zip(self.etas, self.orders, strict=True):
-            system = system + eta * integration(top - order)
-        return system
+def _system(path: TransferPath, integration: Callable[[float], Matrix]) -> Matrix:
+    top = path.orders[0]
+    system = path.stiffness * integration(top)
+    for eta, order in zip(path.etas, path.orders, strict=True):
+        system = system + eta * integration(top - order)
+    return system
 
 
-@final
-@dataclass(frozen=True)
-class FormCost:
+class FormCost(NamedTuple):
     """What the wavelet form costs and changes against the block-pulse form (claim N1)."""
 
     n: int
     """Blocks [-]."""
-    wavelet_seconds: float
-    """Fastest wavelet-form solve [s]; Psi and its inverse are ready and not counted."""
-    block_pulse_seconds: float
-    """Fastest block-pulse solve [s]."""
-    general_seconds: float
-    """Fastest block-pulse solve that does not use the triangle [s]."""
+    ratio: float
+    """Cost of the wavelet form in block-pulse solves [-]; Psi and its inverse are ready and not counted."""
     difference: float
     """Largest difference of the two responses over the largest response [-]."""
-    condition: float
-    """Condition number of Psi [-]."""
     largest_overlap: float
     """Largest inner product of two different basis functions [-]."""
 
-    @property
-    def ratio(self) -> float:
-        """Cost of the wavelet form in block-pulse solves [-]."""
-        return self.wavelet_seconds / self.block_pulse_seconds
 
-    @property
-    def general_ratio(self) -> float:
-        """Cost of the wavelet form in block-pulse solves that do not use the triangle [-]."""
-        return self.wavelet_seconds / self.general_seconds
+def form_cost(path: TransferPath, drive: float, span: float, n: int, *, repeats: int = 5) -> FormCost:
+    """Both forms of the response to a step of `drive` [drive unit] at time 0 on `n` blocks, timed.
 
-
-def form_costs(
-    equation: PrintedEquation, drive: float, sizes: Sequence[int] = (64, 128, 256, 512), *, repeats: int = 3
-) -> tuple[FormCost, ...]:
-    """Both forms of the response to a step of `drive` [drive unit] at time 0, timed for each size."""
-    out = []
-    for n in sizes:
-        basis, step = WaveletBasis(n), np.full(n, drive)
-        plain = partial(equation.block_pulse_response, step)
-        wavelet = partial(equation.wavelet_response, step, basis)
-        general = partial(plain, triangular=False)
-        reference = plain()
-        out.append(
-            FormCost(
-                n,
-                difference=float(np.abs(wavelet() - reference).max() / np.abs(reference).max()),
-                wavelet_seconds=_fastest(wavelet, repeats),
-                block_pulse_seconds=_fastest(plain, repeats),
-                general_seconds=_fastest(general, repeats),
-                condition=float(np.linalg.cond(basis.psi)),
-                largest_overlap=basis.largest_overlap,
-            )
-        )
-    return tuple(out)
-
-
-def _fastest(work: Callable[[], object], repeats: int) -> float:
-    best = np.inf
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        work()
-        best = min(best, time.perf_counter() - begin)
-    return best
+    The record lasts `span` [time unit]; the delay of the path is rounded to whole blocks.
+    """
+    basis, step = WaveletBasis(n), np.full(n, drive)
+    late = round(path.delay * n / span)
+    plain = partial(block_pulse_response, path, step, span, late)
+    wavelet = partial(wavelet_response, path, step, basis, span, late)
+    reference = plain()
+    seconds = [min(timeit.repeat(form, number=1, repeat=repeats)) for form in (wavelet, plain)]
+    difference = float(np.abs(wavelet() - reference).max() / np.abs(reference).max())
+    return FormCost(n, seconds[0] / seconds[1], difference, basis.largest_overlap)

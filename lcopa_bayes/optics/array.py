@@ -1,18 +1,19 @@
-"""Linear and planar arrays of phase elements and the law that steers them (Ta et al. 2026, Eqs. 5, 13)."""
+"""A linear array of phase elements and the law that steers it (Ta et al. 2026, Eq. 5)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isfinite, pi
-from typing import final
+from math import pi
+from typing import Annotated, final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lcopa_bayes.core.arrays import Array
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.literature import PAPER, StatedOptics
-from lcopa_bayes.optics.checks import finite, unless_positive
+from lcopa_bayes.core.rules import Ruled, whole
+from lcopa_bayes.model.literature import PAPER, StatedOptics
+from lcopa_bayes.optics.checks import LENGTH, SHARE, finite
 
 _ROUNDING = 4 * float(np.finfo(float).eps)
 """A direction cosine beyond 1 by no more than this [-] is end-fire within rounding."""
@@ -20,28 +21,17 @@ _ROUNDING = 4 * float(np.finfo(float).eps)
 
 @final
 @dataclass(frozen=True)
-class LinearArray:
+class LinearArray(Ruled):
     """Equally spaced elements in a row; InputError for an impossible array, all problems at once."""
 
-    elements: int
-    """N [-]; at least 2."""
-    pitch: float
+    elements: Annotated[int, whole(2)]
+    """N [-]; one alone steers nothing."""
+    pitch: Annotated[float, LENGTH]
     """d, centre to centre [m]."""
-    wavelength: float
+    wavelength: Annotated[float, LENGTH]
     """lambda [m]."""
-    fill_factor: float = 0.0
-    """Width of an element over the pitch [-], in [0, 1]; 0 is a point, which radiates isotropically."""
-
-    def __post_init__(self) -> None:
-        problems: list[str] = []
-        if isinstance(self.elements, bool) or not isinstance(self.elements, int) or self.elements < 2:
-            problems.append(f"`elements` must be an integer >= 2; got {self.elements!r}: one steers nothing.")
-        problems += unless_positive("pitch", self.pitch, "metres")
-        problems += unless_positive("wavelength", self.wavelength, "metres")
-        if not (isfinite(self.fill_factor) and 0 <= self.fill_factor <= 1):
-            problems.append(f"`fill_factor` must be in [0, 1]; got {self.fill_factor!r}: 0 means points.")
-        if problems:
-            raise InputError(problems)
+    fill_factor: Annotated[float, SHARE] = 0.0
+    """Width of an element over the pitch [-]; 0 is a point, which radiates isotropically."""
 
     @property
     def period(self) -> float:
@@ -69,37 +59,6 @@ class LinearArray:
         """
         theta = finite(angle, name="angle", lower=-pi / 2, upper=pi / 2, unit="rad")
         return np.asarray(2 * pi * np.sin(theta) / self.period)
-
-
-@final
-@dataclass(frozen=True)
-class PlanarArray:
-    """Two crossed linear arrays of one wavelength, ``x.elements * y.elements`` elements (Eqs. 6-13)."""
-
-    x: LinearArray
-    y: LinearArray
-
-    def __post_init__(self) -> None:
-        if self.x.wavelength != self.y.wavelength:
-            raise InputError(
-                f"both axes of a planar array share one wavelength; got {self.x.wavelength} m along x and "
-                f"{self.y.wavelength} m along y: give the same."
-            )
-
-    def phase_steps(self, polar: float, azimuth: float) -> tuple[float, float]:
-        """``(dphi_x, dphi_y)`` [rad] for a polar angle [rad] in [0, pi/2] and an azimuth [rad] (Eq. 13)."""
-        sine = np.sin(finite(polar, name="polar", lower=0.0, upper=pi / 2, unit="rad"))
-        turn = finite(azimuth, name="azimuth", unit="rad")
-        u, v = sine * np.cos(turn), sine * np.sin(turn)
-        return float(2 * pi * u / self.x.period), float(2 * pi * v / self.y.period)
-
-    def steering_angles(self, step_x: float, step_y: float) -> tuple[float, float]:
-        """Polar angle and azimuth [rad] for phase steps `step_x`, `step_y` [rad]; inverse of Eq. 13.
-
-        Raises InputError where ``u^2 + v^2 > 1``. The azimuth of a beam along the normal is 0.
-        """
-        u, v = float(self.x.direction_cosine(step_x)), float(self.y.direction_cosine(step_y))
-        return float(np.arcsin(_propagating(np.hypot(u, v)))), float(np.arctan2(v, u))
 
 
 def paper_array(optics: StatedOptics = PAPER.optics, *, fill_factor: float = 0.0) -> LinearArray:

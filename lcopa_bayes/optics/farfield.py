@@ -1,4 +1,4 @@
-"""Far fields of linear and planar arrays, by sum and in closed form (Ta et al. 2026, Eqs. 2-4, 7-12).
+"""Far fields of linear and square arrays in closed form (Ta et al. 2026, Eqs. 2-4, 7-12).
 
 Directions are direction cosines, ``u = sin th cos ph`` and ``v = sin th sin ph`` (``u = sin th`` on one
 axis), where a planar pattern is a product of two linear ones. The obliquity factor of Eq. 1 is omitted, as
@@ -9,44 +9,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import pi
-from typing import TypeAlias, final
+from typing import final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.literature import PAPER, StatedOptics
-from lcopa_bayes.optics.array import LinearArray, PlanarArray, paper_array
+from lcopa_bayes.model.literature import PAPER, StatedOptics
+from lcopa_bayes.optics.array import LinearArray, paper_array
 from lcopa_bayes.optics.checks import finite
-
-ComplexArray: TypeAlias = NDArray[np.complex128]
-
-
-def array_sum(
-    array: LinearArray, u: ArrayLike, phases: ArrayLike, amplitudes: ArrayLike | None = None
-) -> ComplexArray:
-    """``sum_n A_n exp(j phi_n) exp(-j k n d u) / sum_n A_n`` (Ta et al. 2026, Eq. 3, normalised).
-
-    Parameters: `array`; `u` [-] in [-1, 1], any shape; `phases` [rad] and `amplitudes` [-], (elements,) each.
-    Returns: complex, shape of `u`; element factor not included. Raises InputError for other shapes.
-    Accuracy: about ``elements * 1e-16 * (1 + k d)``; memory does not grow with the element count.
-    """
-    direction = finite(u, name="u", lower=-1.0, upper=1.0)
-    weights = _weights((array.elements,), phases, amplitudes)
-    z = np.exp(-2j * pi / array.period * direction)
-    total = np.zeros(direction.shape, dtype=complex)
-    for weight in weights[::-1]:
-        total = total * z + weight
-    return total
 
 
 def array_factor(array: LinearArray, u: ArrayLike, step: float) -> Array:
     """``sin(N psi/2) / (N sin(psi/2))`` with ``psi = dphi - k d u`` (Ta et al. 2026, Eq. 4).
 
     `array`; `u` [-] in [-1, 1], any shape; `step` dphi [rad]. Real, signed, exactly +-1 where psi is a
-    multiple of 2 pi. `array_sum` with ``phi_n = n dphi`` is this times ``exp(j (N-1) psi / 2)``. Absolute
-    accuracy about ``elements * 1e-16 * (1 + k d)``, also next to a lobe.
+    multiple of 2 pi. The sum of Eq. 3 with ``phi_n = n dphi`` is this times ``exp(j (N-1) psi / 2)``.
+    Absolute accuracy about ``elements * 1e-16 * (1 + k d)``, also next to a lobe.
     """
     direction = finite(u, name="u", lower=-1.0, upper=1.0)
     psi = float(finite(step, name="step", unit="rad")) - 2 * pi / array.period * direction
@@ -78,50 +58,6 @@ def intensity(array: LinearArray, u: ArrayLike, step: float) -> Array:
     return np.asarray(array_factor(array, u, step) ** 2 * element_factor(array, u) / main)
 
 
-def planar_intensity(array: PlanarArray, u: ArrayLike, v: ArrayLike, steps: tuple[float, float]) -> Matrix:
-    """Product of two linear patterns on the grid ``u x v`` (Ta et al. 2026, Eq. 12), one per axis of `array`.
-
-    `u` (nu,) and `v` (nv,) [-] in [-1, 1]; `steps` ``(dphi_x, dphi_y)`` [rad]. Returns (nu, nv) [-], 1 at the
-    main lobe and NaN where ``u^2 + v^2 > 1``, where nothing propagates. Errors as in `intensity`.
-    """
-    array.steering_angles(*steps)
-    across, along = frozen(u, name="u"), frozen(v, name="v")
-    pattern = np.outer(intensity(array.x, across, steps[0]), intensity(array.y, along, steps[1]))
-    pattern[np.add.outer(across**2, along**2) > 1] = np.nan
-    return pattern
-
-
-def planar_intensity_at(
-    array: PlanarArray, polar: ArrayLike, azimuth: ArrayLike, steps: tuple[float, float]
-) -> Array:
-    """`planar_intensity` of `array` at scattered directions, with phase `steps` [rad].
-
-    `polar` angles [rad] in [0, pi/2] and `azimuth` [rad] broadcast together. Errors as in `intensity`.
-    """
-    array.steering_angles(*steps)
-    sine = np.sin(finite(polar, name="polar", lower=0.0, upper=pi / 2, unit="rad"))
-    turn = finite(azimuth, name="azimuth", unit="rad")
-    along_x = intensity(array.x, sine * np.cos(turn), steps[0])
-    return np.asarray(along_x * intensity(array.y, sine * np.sin(turn), steps[1]))
-
-
-def planar_sum(
-    array: PlanarArray, u: ArrayLike, v: ArrayLike, phases: ArrayLike, amplitudes: ArrayLike | None = None
-) -> ComplexArray:
-    """``sum_mn A_mn exp(j phi_mn) exp(-j k (m dx u + n dy v)) / sum_mn A_mn`` (Ta et al. 2026, Eq. 10).
-
-    `array`; `u` (nu,) and `v` (nv,) [-]; `phases` [rad] and `amplitudes` [-] (x.elements, y.elements), free
-    of any separability. Returns complex (nu, nv), element factor not included; points outside the unit
-    circle too.
-    """
-    across = finite(u, name="u", lower=-1.0, upper=1.0)
-    along = finite(v, name="v", lower=-1.0, upper=1.0)
-    weights = _weights((array.x.elements, array.y.elements), phases, amplitudes)
-    along_x = np.exp(-2j * pi / array.x.period * np.outer(across, np.arange(array.x.elements)))
-    along_y = np.exp(-2j * pi / array.y.period * np.outer(np.arange(array.y.elements), along))
-    return np.asarray(along_x @ weights @ along_y)
-
-
 @final
 @dataclass(frozen=True)
 class LinearPatterns:
@@ -138,16 +74,14 @@ class LinearPatterns:
 @final
 @dataclass(frozen=True)
 class PlanarPattern:
-    """Pattern of a planar array: the data of one panel of Fig. 5."""
+    """Pattern of a square array: the data of one panel of Fig. 5."""
 
-    u: Vector
-    """``sin th cos ph``, (nu,) [-]."""
-    v: Vector
-    """``sin th sin ph``, (nv,) [-]."""
+    axis: Vector
+    """Direction cosines ``sin th cos ph`` and ``sin th sin ph``, (n,) [-]."""
     target: tuple[float, float]
     """Polar angle and azimuth [rad]."""
     intensity: Matrix
-    """(nu, nv) [-], 1 at the target, NaN outside the unit circle."""
+    """(n, n) [-], 1 at the target, NaN outside the unit circle."""
 
 
 def steered_patterns(optics: StatedOptics = PAPER.optics, *, points: int = 4001) -> LinearPatterns:
@@ -167,14 +101,25 @@ def planar_patterns(optics: StatedOptics = PAPER.optics, *, points: int = 801) -
 
     `optics` holds the printed numbers; `points` direction cosines [-] per axis from -1 to 1.
     """
-    array = PlanarArray(paper_array(optics), paper_array(optics))
     axis = np.linspace(-1.0, 1.0, points)
-    polar, azimuth = np.radians(optics.target_2d_deg)
-    targets = ((0.0, 0.0), (float(polar), float(azimuth)))
-    return tuple(
-        PlanarPattern(axis, axis, goal, planar_intensity(array, axis, axis, array.phase_steps(*goal)))
-        for goal in targets
-    )
+    polar, azimuth = map(float, np.radians(optics.target_2d_deg))
+    array = paper_array(optics)
+    return tuple(planar_pattern(array, axis, target) for target in ((0.0, 0.0), (polar, azimuth)))
+
+
+def planar_pattern(array: LinearArray, axis: Vector, target: tuple[float, float]) -> PlanarPattern:
+    """Two crossed arrays steered to a polar angle and azimuth [rad] (Ta et al. 2026, Eqs. 12, 13).
+
+    The product of two linear patterns on the grid of direction cosines `axis` (n,) [-], each steered by
+    ``2 pi d sin th cos ph / lambda`` or with ``sin ph``; NaN where nothing propagates. Errors as in
+    `intensity`.
+    """
+    polar, azimuth = target
+    cosines = np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth)
+    along_x, along_y = (intensity(array, axis, float(2 * pi * u / array.period)) for u in cosines)
+    pattern = np.outer(along_x, along_y)
+    pattern[np.add.outer(axis**2, axis**2) > 1] = np.nan
+    return PlanarPattern(axis, target, pattern)
 
 
 def _dirichlet(psi: Array, n: int) -> Array:
@@ -185,19 +130,3 @@ def _dirichlet(psi: Array, n: int) -> Array:
     at_lobe = half == 0
     safe = np.where(at_lobe, 1.0, half)
     return np.asarray(sign * np.where(at_lobe, 1.0, np.sin(n * safe) / (n * np.sin(safe))))
-
-
-def _weights(shape: tuple[int, ...], phases: ArrayLike, amplitudes: ArrayLike | None) -> ComplexArray:
-    """``A exp(j phi) / sum A``, shape `shape`; InputError for another shape or a vanishing sum."""
-    phi = finite(phases, name="phases", unit="rad")
-    size = np.ones(shape) if amplitudes is None else finite(amplitudes, name="amplitudes", lower=0.0)
-    problems = [
-        f"`{name}` must have one entry per element, shape {shape}; got {given.shape}."
-        for name, given in (("phases", phi), ("amplitudes", size))
-        if given.shape != shape
-    ]
-    if size.sum() <= 0:
-        problems.append("`amplitudes` must not all be zero: no light leaves the array.")
-    if problems:
-        raise InputError(problems)
-    return np.asarray(size * np.exp(1j * phi) / size.sum())

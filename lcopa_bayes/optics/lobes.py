@@ -12,8 +12,8 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.special import spherical_jn
 
 from lcopa_bayes.core.arrays import Vector, frozen
-from lcopa_bayes.data.literature import PAPER, StatedOptics
-from lcopa_bayes.optics.array import LinearArray, PlanarArray, paper_array
+from lcopa_bayes.model.literature import PAPER, StatedOptics
+from lcopa_bayes.optics.array import LinearArray, paper_array
 from lcopa_bayes.optics.checks import finite
 from lcopa_bayes.optics.farfield import element_factor, intensity
 
@@ -36,21 +36,6 @@ class Lobe:
     """Relative to the main lobe [-]: exactly 1 for isotropic elements; may exceed 1."""
 
 
-@final
-@dataclass(frozen=True)
-class PlanarLobe:
-    """A lobe of a planar array."""
-
-    orders: tuple[int, int]
-    """Orders along x and y [-]."""
-    polar: float
-    """[rad]."""
-    azimuth: float
-    """[rad]."""
-    intensity: float
-    """Relative to the main lobe [-]."""
-
-
 def lobes(array: LinearArray, step: float) -> tuple[Lobe, ...]:
     """Every propagating lobe, by ascending order, of `array` with phase `step` [rad].
 
@@ -69,19 +54,6 @@ def lobes(array: LinearArray, step: float) -> tuple[Lobe, ...]:
         # The array factor is 1 here by construction; evaluating it would only add its rounding.
         height = float(element_factor(array, u)) / float(element_factor(array, start)) if order else 1.0
         visible.append(Lobe(order, u, asin(u), height))
-    return tuple(visible)
-
-
-def planar_lobes(array: PlanarArray, steps: tuple[float, float]) -> tuple[PlanarLobe, ...]:
-    """Every propagating lobe of a planar array for two phase steps [rad]; the main lobe has orders (0, 0)."""
-    array.steering_angles(*steps)
-    visible = []
-    for a in lobes(array.x, steps[0]):
-        for b in lobes(array.y, steps[1]):
-            sine = float(np.hypot(a.direction_cosine, b.direction_cosine))
-            if sine <= 1:
-                turn = float(np.arctan2(b.direction_cosine, a.direction_cosine))
-                visible.append(PlanarLobe((a.order, b.order), asin(sine), turn, a.intensity * b.intensity))
     return tuple(visible)
 
 
@@ -127,40 +99,6 @@ def side_lobe_level(array: LinearArray, step: float) -> float:
         options={"xatol": 1e-7 * width},
     )
     return max(-float(top.fun), float(level[best]))
-
-
-@final
-@dataclass(frozen=True)
-class LobeRow:
-    """A lobe of the array of Section 2 at one steering angle (claim S2)."""
-
-    target: float
-    """Steering angle [rad]."""
-    order: int
-    """[-]."""
-    angle: float
-    """[rad]."""
-    isotropic: float
-    """Intensity relative to the main lobe, isotropic elements [-]."""
-    with_element: float
-    """Intensity relative to the main lobe, elements of finite width [-]."""
-
-
-def lobe_table(
-    targets: ArrayLike, optics: StatedOptics = PAPER.optics, *, fill_factor: float = 1.0
-) -> tuple[LobeRow, ...]:
-    """All lobes at steering angles `targets` [rad], with and without the element factor (claim S2).
-
-    `optics` holds the printed numbers; `fill_factor` [-] sets the slit; 1 is the largest possible element
-    and suppresses grating lobes most.
-    """
-    bare, slit = paper_array(optics), paper_array(optics, fill_factor=fill_factor)
-    rows = []
-    for goal in np.ravel(finite(targets, name="targets", unit="rad")):
-        step = float(bare.phase_step(goal))
-        pairs = zip(lobes(bare, step), lobes(slit, step), strict=True)
-        rows += [LobeRow(float(goal), a.order, a.angle, a.intensity, b.intensity) for a, b in pairs]
-    return tuple(rows)
 
 
 def strongest_grating_lobe(

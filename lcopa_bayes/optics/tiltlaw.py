@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.literature import PAPER, StatedOptics
+from lcopa_bayes.model.literature import PAPER, StatedOptics
 from lcopa_bayes.optics.cell import Cell, Field, paper_cell
 from lcopa_bayes.optics.checks import finite
 from lcopa_bayes.optics.director import CELLS, equilibrium
@@ -31,15 +31,6 @@ class DirectorCurve:
     """(m, n) [rad], out of the plates."""
     mean: Vector
     """Spatial mean, (m,) [rad]."""
-
-    def mean_at(self, voltage: ArrayLike) -> Array:
-        """Mean tilt [rad] at each `voltage` [V], linear between the solved voltages.
-
-        InputError outside their range. The square-root rise at threshold costs up to 0.04 rad within one
-        spacing of 10 mV of it; `director.equilibrium` has no such error.
-        """
-        inside = finite(voltage, name="voltage", lower=self.voltage[0], upper=self.voltage[-1], unit="V")
-        return np.asarray(np.interp(inside, self.voltage, self.mean))
 
 
 def director_curve(
@@ -139,6 +130,14 @@ class FitQuality:
     largest_error: float
     """[rad]."""
 
+    def as_json(self) -> dict[str, float]:
+        """What is reported beside the range; every number says its unit."""
+        return {
+            "r_squared": self.r_squared,
+            "largest_relative_error": self.largest_relative_error,
+            "largest_error_rad": self.largest_error,
+        }
+
 
 def fit_quality(curve: DirectorCurve, law: TiltLaw, lower: float, upper: float) -> FitQuality:
     """Compare `law` with `curve` at its solved voltages in ``[lower, upper]`` [V].
@@ -176,8 +175,6 @@ class TiltLawCheck:
     best: tuple[FitQuality, ...]
     printed_jump: float
     """Of the law as printed at the knee [rad]."""
-    continuous_jump: float
-    """Of the continuous reading at the knee [rad]."""
     solved_change: float
     """Change of the solved mean tilt over 2 mV about the knee [rad]; small when there is no jump."""
     largest_printed_tilt: float
@@ -219,7 +216,6 @@ def tilt_law_check(
         judged(continuous),
         judged(best_law(curve, optics)),
         printed.jump,
-        continuous.jump,
         float(np.diff(near.mean)[0]),
         float(printed(limit)),
     )

@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from lcopa_bayes.data.literature import Stated
-from lcopa_bayes.paper.posteriorclaims import needs_audit
-from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict, earlier
+from lcopa_bayes.model.literature import Stated
+from lcopa_bayes.paper.verdict import Evidence, Kind, Test, Verdict, undecided, waiting
+from lcopa_bayes.results.stored import stored_values
 
 COLLINEAR = 10.0
 """Collinearity index from which sensitivities count as coupled [-] (Brun et al. 2001)."""
@@ -18,20 +18,19 @@ _NEEDS = ("study", "grade", "parameters", "printed_form", "spectrum", "local", "
 _CLAIMED = ("gain", "time", "order", "delay")
 """Kinds of parameters that the claim is about; a time constant counts as a viscosity."""
 
-Test = Callable[[Stated, Evidence], Verdict]
 Reading = Callable[[Stated, Mapping[str, Any]], Verdict]
 
 
 def load_audit(folder: Path) -> Mapping[str, Any]:
     """`audit.json` of a run folder; InputError when there is none or it cannot be used."""
-    return earlier(folder, "audit", _NEEDS)
+    return stored_values(folder, "audit", _NEEDS)
 
 
 def from_audit(reading: Reading, question: str) -> Test:
     """A test that reads the audits in turn, and names the missing audit where there is none."""
 
     def test(stated: Stated, evidence: Evidence) -> Verdict:
-        verdict = needs_audit(question)(stated, evidence)
+        verdict = waiting("audit", question)
         for audit in evidence.audits:
             result = reading(stated, audit)
             how = f"Audit of the study {audit['study']} (draws: {audit['grade']}): {result.how}"
@@ -47,9 +46,7 @@ def unique_map(stated: Stated, audit: Mapping[str, Any]) -> Verdict:
     """I1: contradicted by any direction of the printed parameters that changes no sample."""
     form = audit["printed_form"]
     if form is None or not form["certain"]:
-        return Verdict(
-            Kind.UNDECIDED, None, "-", "it has no certain rank of a single path in its printed form."
-        )
+        return undecided("it has no certain rank of a single path in its printed form.")
     blind = form["parameters"] - form["rank"]
     said = "; ".join(symmetry["sentence"] for symmetry in form["symmetries"])
     how = (
@@ -75,7 +72,7 @@ def uncoupled(stated: Stated, audit: Mapping[str, Any]) -> Verdict:
     """I3: by the collinearity index of all sensitivities."""
     local = audit["local"]
     if local is None:
-        return Verdict(Kind.UNDECIDED, None, "-", "no plant parameter was free in it.")
+        return undecided("no plant parameter was free in it.")
     index, alike = local["collinearity"], local["most_alike"]
     pair = (
         f"; most alike are {' and '.join(alike[0]['pair'])}, cosine {alike[0]['cosine']:.3f}" if alike else ""
@@ -105,7 +102,7 @@ def dominant_order(stated: Stated, audit: Mapping[str, Any]) -> Verdict:
     names = ("order_1", "order_1_direct")
     row = next((row for row in audit["parameters"] if row["name"] in names), None)
     if row is None:
-        return Verdict(Kind.UNDECIDED, None, "-", "it has no free largest order.")
+        return undecided("it has no free largest order.")
     lower, upper = row["profile"]["lower"], row["profile"]["upper"]
     wanted = stated.records.dominant_order
     ends = ["open" if end is None else f"{end:.3g}" for end in (lower, upper)]
@@ -126,9 +123,7 @@ def separate_delays(stated: Stated, audit: Mapping[str, Any]) -> Verdict:
     delays = audit["delays"]
     unit = delays["paths"][0]["unit"] if delays["paths"] else "-"
     if not delays["separations"] or unit != "ms":
-        return Verdict(
-            Kind.UNDECIDED, None, "-", f"{delays['sentence']}; a record of several paths is needed."
-        )
+        return undecided(f"{delays['sentence']}; a record of several paths is needed.")
     smallest = [separation["smallest_difference"] for separation in delays["separations"]]
     worst = None if None in smallest else max(smallest)
     how = (

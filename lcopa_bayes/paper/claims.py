@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from lcopa_bayes.data.literature import PAPER, Stated
+from lcopa_bayes.model.literature import PAPER, Stated
 from lcopa_bayes.paper import (
     auditclaims,
     comparisonclaims,
-    crosstalkclaims,
-    dynamicclaims,
+    modelclaims,
     numericsclaims,
     opticsclaims,
 )
 from lcopa_bayes.paper.auditclaims import from_audit
-from lcopa_bayes.paper.comparisonclaims import from_comparison, jointly
-from lcopa_bayes.paper.posteriorclaims import uncompared
+from lcopa_bayes.paper.comparisonclaims import from_comparison, jointly, uncompared
 from lcopa_bayes.paper.verdict import Claim, Evidence, Judged
 
 CLAIMS: tuple[Claim, ...] = (
@@ -88,14 +86,14 @@ CLAIMS: tuple[Claim, ...] = (
         from_comparison(
             comparisonclaims.same_steady_state,
             "do both models tend to the same value?",
-            otherwise=dynamicclaims.steady_state,
+            otherwise=modelclaims.steady_state,
         ),
     ),
     Claim(
         "M3",
         "The identified model settles in 10 ms without overshoot.",
         "Table 1",
-        dynamicclaims.settling_time,
+        modelclaims.settling_time,
     ),
     Claim(
         "M4",
@@ -110,19 +108,19 @@ CLAIMS: tuple[Claim, ...] = (
         "X1",
         "Crosstalk gains 0.00115 and 0.00185 follow from Eq. 65.",
         "Section 4.3",
-        crosstalkclaims.crosstalk_gains,
+        modelclaims.crosstalk_gains,
     ),
     Claim(
         "X2",
         "The measured crosstalk of 8.3 % agrees with the identified gains.",
         "Section 5.2",
-        crosstalkclaims.measured_crosstalk,
+        modelclaims.measured_crosstalk,
     ),
     Claim(
         "X3",
         "The two-axis steady values 0.0184 and 0.0124 rad agree with the identified model.",
         "Section 5.2",
-        crosstalkclaims.two_axis_steady,
+        modelclaims.two_axis_steady,
     ),
     Claim(
         "N1",

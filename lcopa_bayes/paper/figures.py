@@ -7,17 +7,18 @@ says; any other record has the same curves and no printed numbers beside them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import final
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from lcopa_bayes.core.arrays import Vector
-from lcopa_bayes.data.drive import Drive
-from lcopa_bayes.data.literature import PAPER, Stated
+from lcopa_bayes.data.drive import AxisDrive, axis_drives, first_change
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.paper.equation import PathModel, response_to
+from lcopa_bayes.model.literature import PAPER, Stated
+from lcopa_bayes.model.path import TransferPath
+from lcopa_bayes.paper.equation import response_to
 from lcopa_bayes.paper.identify import Identification, Identified
 from lcopa_bayes.paper.paths import resting_level
 
@@ -33,45 +34,18 @@ def model_of(identified: Identification, kind: str) -> Identified:
     return dict(zip(KINDS, models, strict=True))[kind]
 
 
-@final
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """One model on one axis of one record."""
-
-    kind: str
-    response: Vector
-    """At the samples [response unit]."""
-    rmse: float
-    """Of the samples about it [response unit]."""
-    printed_rmse: str = ""
-    """What the text says of this model on such a record, in words; empty when nothing."""
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Panel:
-    """One response axis of one record."""
-
-    record: str
-    axis: str
-    unit: str
-    held_out: bool
-    figure: str
-    """Figure of the paper that shows such a record, such as "Fig. 13"; empty when none does."""
-    time: Vector
-    """Of the samples [time unit]."""
-    observed: Vector
-    """[response unit]."""
-    curves: tuple[Curve, ...]
-    printed_level: float | None
-    """Steady response that the text gives for this axis [response unit]; None when it gives none."""
-
-
-def panels(study: Study, identified: Sequence[Identification], stated: Stated = PAPER) -> tuple[Panel, ...]:
+def panels(
+    study: Study, identified: Sequence[Identification], stated: Stated = PAPER
+) -> list[tuple[dict[str, Any], pd.DataFrame]]:
     """Every response axis of every record, fitted records first, with the models of `KINDS`.
 
-    `found` are the paths of the study. A model of an axis is the sum over the drives that move; its resting
-    level is that of the record, as in the identification.
+    `identified` are the paths of the study. A model of an axis is the sum over the drives that move; its
+    resting level is that of the record, as in the identification.
+
+    Returns: for each, plain values (record, axis, unit, held_out; figure of the paper that shows such a
+    record, empty when none does; printed_level, the steady response the text gives [response unit] or None;
+    curves with model, RMSE [response unit] and what the text prints for it), and a table of the samples:
+    time [time unit], observed and each model [response unit].
     """
     out = []
     for held, records in ((False, study.fit), (True, study.held_out)):
@@ -79,22 +53,25 @@ def panels(study: Study, identified: Sequence[Identification], stated: Stated = 
             figure = paper_figure(record, stated)
             for i, axis in enumerate(study.response_axes):
                 taken = np.isfinite(record.response[:, i])
-                if taken.any() and _moved(record):
-                    time, seen = record.time[taken], record.response[taken, i]
-                    sums = {kind: _response(study, identified, record, i, kind) for kind in KINDS}
-                    curves = tuple(
-                        Curve(
-                            kind,
-                            response,
-                            float(np.sqrt(np.mean((seen - response) ** 2))),
-                            _printed_rmse(figure, kind, stated),
-                        )
-                        for kind, response in sums.items()
-                    )
-                    level = _printed_level(figure, axis.name, stated)
-                    panel = (record.name, axis.name, axis.unit, held, figure, time, seen, curves, level)
-                    out.append(Panel(*panel))
-    return tuple(out)
+                if not (taken.any() and any(drive.moves for drive in axis_drives(record))):
+                    continue
+                time, seen = record.time[taken], record.response[taken, i]
+                models = {kind: _response(study, identified, record, i, kind) for kind in KINDS}
+                curves = [
+                    {
+                        "model": kind,
+                        "rmse": float(np.sqrt(np.mean((seen - response) ** 2))),
+                        "printed_rmse": _printed_rmse(figure, kind, stated),
+                    }
+                    for kind, response in models.items()
+                ]
+                values = {
+                    **{"record": record.name, "axis": axis.name, "unit": axis.unit, "held_out": held},
+                    **{"figure": figure, "printed_level": _printed_level(figure, axis.name, stated)},
+                    "curves": curves,
+                }
+                out.append((values, pd.DataFrame({"time": time, "observed": seen} | models)))
+    return out
 
 
 def paper_figure(record: Record, stated: Stated = PAPER) -> str:
@@ -106,7 +83,7 @@ def paper_figure(record: Record, stated: Stated = PAPER) -> str:
         tuple(float(record.drive[row, axes[name]]) if name in axes else 0.0 for name in "xy")
         for row in (0, -1)
     )
-    steps = [Drive.of_rows(record.time, record.drive[:, j]).times.size for j in axes.values()]
+    steps = [AxisDrive.of_rows(record.time, record.drive[:, j]).times.size for j in axes.values()]
     if max(steps) > 1:
         return ""
     given, rest = stated.records, (0.0, 0.0)
@@ -122,23 +99,18 @@ def paper_figure(record: Record, stated: Stated = PAPER) -> str:
     return ""
 
 
-def _moved(record: Record) -> list[Drive]:
-    drives = [Drive.of_rows(record.time, column) for column in record.drive.T]
-    return [drive for drive in drives if drive.moves]
-
-
 def _response(
     study: Study, identified: Sequence[Identification], record: Record, response: int, kind: str
 ) -> Vector:
     taken = np.isfinite(record.response[:, response])
     times, seen = record.time[taken], record.response[taken, response]
-    begin = min(float(drive.times[0]) for drive in _moved(record))
+    begin = first_change(record)
     out = np.full(times.size, resting_level(times, seen, begin)[0])
     for each in identified:
-        drive = Drive.of_rows(record.time, record.drive[:, each.data.drive])
+        drive = AxisDrive.of_rows(record.time, record.drive[:, each.data.drive])
         if each.data.response == response and drive.moves:
-            model: PathModel = model_of(each, kind).model
-            out += response_to(drive, model, times, exposure=study.model.exposure)
+            model: TransferPath = model_of(each, kind).model
+            out += response_to(drive, model, times, exposure=study.exposure)
     return out
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, final
 
@@ -14,7 +13,8 @@ from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.paper.equation import Convention, PathModel, equation_rmse, least_squares, output_rmse
+from lcopa_bayes.model.path import Normalisation, TransferPath
+from lcopa_bayes.paper.equation import equation_rmse, least_squares, output_rmse
 from lcopa_bayes.paper.intervals import Interval, Scan
 from lcopa_bayes.paper.outputerror import output_error_fit
 from lcopa_bayes.paper.paths import PathData, path_data
@@ -27,7 +27,7 @@ class Identified:
     """A model of a path with its errors on the records it was identified from."""
 
     method: str
-    model: PathModel
+    model: TransferPath
     equation_rmse: float
     """Equation error over blocks, per unit of left side [response unit]; see `equation_rmse`."""
     output_rmse: float
@@ -77,7 +77,8 @@ def identify(
     """Identify every path of a study, row by row; the same for any number of `jobs`.
 
     A path is identified from the fit records in which its drive alone moves. Its number of terms, and
-    its orders if fixed, are the study's. InputError when records or intervals cannot be used.
+    its orders if fixed, are the study's. InputError when records or intervals cannot be used, or the study
+    uses effects.
     """
     paths = scannable(study, plan)
     plan = _within_study(plan or Scan(), study)
@@ -94,7 +95,13 @@ def _identified(shared: tuple[Study, Scan], data: PathData) -> Identification:
 
 
 def scannable(study: Study, plan: Scan | None = None) -> tuple[PathData, ...]:
-    """Every path of a study that the plan can scan; InputError when records or intervals cannot be used."""
+    """Every path of a study that the plan can scan; InputError when records or intervals cannot be used, or
+    the study uses effects."""
+    if study.effects.use:
+        raise InputError(
+            f"{study.name}: uses {', '.join(study.effects.use)}, and the paper's model has no effects: its "
+            "paths would take them up; leave `use` out of [effects], or `fit` the study"
+        )
     plan = _within_study(plan or Scan(), study)
     paths = path_data(study)
     problems: list[str] = []
@@ -106,19 +113,6 @@ def scannable(study: Study, plan: Scan | None = None) -> tuple[PathData, ...]:
     if problems:
         raise InputError(problems)
     return paths
-
-
-def words_of(values: Mapping[str, Any]) -> list[str]:
-    """Lines for a reader: a row per model of each path."""
-    words = [f"{'path':8}{'model':30}{'orders':24}{'delay':>8}{'steady':>12}{'RMSE':>11}  unit"]
-    for path in values["paths"]:
-        for model in path["models"]:
-            orders = ", ".join(f"{order:.3g}" for order in model["orders"])
-            words.append(
-                f"{path['path']:8}{model['method']:30}{orders:24}{model['delay']:8.4g}{model['steady']:12.5g}"
-                f"{model['output_rmse']:11.3g}  {path['response_unit']}"
-            )
-    return words
 
 
 def integer_orders(terms: int) -> tuple[float, ...]:
@@ -140,22 +134,22 @@ def _identify(study: Study, data: PathData, plan: Scan, bar: tqdm[Any] | None = 
         fixed, whole = study.model.orders != "free", integer_orders(data.terms)
         rigid = replace(plan, orders=tuple(Interval(order, order) for order in whole))
         scanned = []
-        for title, count, limits, convention in (
-            ("k given", data.terms, plan, Convention.STIFFNESS),
-            ("last eta = 1", data.terms, plan, Convention.LAST_ETA),
-            ("integer orders", len(whole), rigid, Convention.STIFFNESS),
+        for title, count, limits, normalisation in (
+            ("k given", data.terms, plan, Normalisation.STIFFNESS),
+            ("last eta = 1", data.terms, plan, Normalisation.LAST_ETA),
+            ("integer orders", len(whole), rigid, Normalisation.STIFFNESS),
         ):
             if bar is not None:
                 bar.set_description(f"{data.name}, {title}")
             blocks = [each.blocks for each in data.records]
-            best = scan(blocks, count, data.span, limits, convention=convention, bar=bar)
+            best = scan(blocks, count, data.span, limits, normalisation=normalisation, bar=bar)
             scanned.append(_of_scan(f"scan, {title}", data, best))
         winner = scanned[0].model
         if bar is not None:
             bar.set_description(f"{data.name}, output error")
         rng = np.random.default_rng([study.seed, data.response, data.drive])
         free = output_error_fit(
-            study, data, rng, terms=data.terms, orders=winner.form.orders if fixed else "free", start=winner
+            study, data, rng, terms=data.terms, orders=winner.orders if fixed else "free", start=winner
         )
         rival = scanned[2].model
         stiff = output_error_fit(study, data, rng, terms=len(whole), orders=whole, start=rival)
@@ -170,13 +164,13 @@ def _identify(study: Study, data: PathData, plan: Scan, bar: tqdm[Any] | None = 
         )
 
 
-def _with_stiffness(data: PathData, winner: PathModel, stiffness: float) -> PathModel:
+def _with_stiffness(data: PathData, winner: TransferPath, stiffness: float) -> TransferPath:
     """Eq. 63 solved anew at the winner's orders and delay with another k."""
     blocks = [each.blocks for each in data.records]
-    return least_squares(blocks, winner.form.orders, winner.delay, known=stiffness)
+    return least_squares(blocks, winner.orders, winner.delay, known=stiffness)
 
 
-def _described(method: str, data: PathData, model: PathModel) -> Identified:
+def _described(method: str, data: PathData, model: TransferPath) -> Identified:
     blocks = [each.blocks for each in data.records]
     return Identified(method, model, equation_rmse(blocks, model), output_rmse(data.records, model))
 
@@ -197,10 +191,21 @@ def results(study: Study, identified: tuple[Identification, ...], plan: Scan | N
         {
             "study": study.name,
             "time_unit": study.time_unit,
+            "verdict": " ".join(_sentence(each, study.time_unit) for each in identified),
             "paths": [_path(each, stiffness, study.time_unit) for each in identified],
         }
     )
     return fields
+
+
+def _sentence(identified: Identification, time_unit: str) -> str:
+    """Result of the scan for one path, and how much worse integer orders are."""
+    best, whole, unit = identified.scan, identified.integer, identified.data.response_unit
+    orders = ", ".join(f"{order:.3g}" for order in best.model.orders)
+    return (
+        f"Path {identified.data.name}: orders {orders}, delay {best.model.delay:.4g} {time_unit}, RMSE "
+        f"{best.output_rmse:.3g} {unit}; with integer orders {whole.output_rmse:.3g}."
+    )
 
 
 def _path(identified: Identification, stiffness: float, time_unit: str) -> dict[str, Any]:
@@ -224,13 +229,13 @@ def _model(identified: Identified, stiffness: float, time_unit: str) -> dict[str
     model = identified.model
     return {
         "method": identified.method,
-        "orders": model.form.orders,
+        "orders": model.orders,
         "delay": model.delay,
         "delay_unit": time_unit,
         "coefficients": {
-            convention.value: {"gain": form.gain, "etas": form.etas, "stiffness": form.stiffness}
-            for convention in Convention
-            for form in (model.scaled(convention, stiffness),)
+            normalisation.value: {"gain": path.gain, "etas": path.etas, "stiffness": path.stiffness}
+            for normalisation in Normalisation
+            for path in (model.normalised(normalisation, stiffness),)
         },
         "steady": model.steady,
         "physical": model.physical,

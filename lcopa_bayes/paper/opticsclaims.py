@@ -7,11 +7,11 @@ from math import pi
 
 import numpy as np
 
-from lcopa_bayes.data.literature import PAPER, Stated, StatedOptics
+from lcopa_bayes.model.literature import PAPER, Stated, StatedOptics
 from lcopa_bayes.optics.array import LinearArray, paper_array
 from lcopa_bayes.optics.cell import Field
-from lcopa_bayes.optics.chain import geometry_check, linearisation_row
 from lcopa_bayes.optics.lobes import strongest_grating_lobe
+from lcopa_bayes.optics.steering import geometry_check, largest_linearisation_error
 from lcopa_bayes.optics.tiltlaw import TiltLawCheck, tilt_law_check
 from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict
 
@@ -94,17 +94,16 @@ def linearised_steering(stated: Stated, evidence: Evidence) -> Verdict:
     optics, records = stated.optics, stated.records
     largest = max(records.step_drive, records.single_axis_drive, *records.two_axis_drive)
     pitch = geometry_check(stated).implied_pitch
-    used = linearisation_row(LinearArray(optics.elements, pitch, optics.wavelength), largest)
-    section_2 = paper_array(optics)
-    there, beyond = linearisation_row(section_2, largest), linearisation_row(section_2, pi)
+    used = largest_linearisation_error(LinearArray(optics.elements, pitch, optics.wavelength), largest)
+    there, beyond = (largest_linearisation_error(paper_array(optics), limit) for limit in (largest, pi))
     limit = records.steady_state_error
     how = (
-        f"At the pitch the measured angle implies, Eq. 26 is off by at most {used.largest:.1e} of the angle "
+        f"At the pitch the measured angle implies, Eq. 26 is off by at most {used:.1e} of the angle "
         f"for phases up to {largest:.3f} rad; harmless is below the claimed steady-state error {limit:g}. At "
-        f"d = {optics.pitch_in_wavelengths:g} lambda it would be {there.largest:.1e}, and "
-        f"{beyond.largest:.1e} up to pi."
+        f"d = {optics.pitch_in_wavelengths:g} lambda it would be {there:.1e}, and "
+        f"{beyond:.1e} up to pi."
     )
-    return Verdict(Kind.of(used.largest <= limit), used.largest, "-", how)
+    return Verdict(Kind.of(used <= limit), used, "-", how)
 
 
 def one_geometry(stated: Stated, evidence: Evidence) -> Verdict:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -14,8 +13,8 @@ from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.model.element import Element, to_paper
-from lcopa_bayes.paper.equation import PathModel, output_rmse
+from lcopa_bayes.model.path import TransferPath
+from lcopa_bayes.paper.equation import output_rmse
 from lcopa_bayes.paper.paths import PathData
 
 
@@ -26,9 +25,9 @@ def output_error_fit(
     *,
     terms: int,
     orders: tuple[float, ...] | Literal["free"] = "free",
-    start: PathModel | None = None,
+    start: TransferPath | None = None,
     starts: int = 12,
-) -> PathModel:
+) -> TransferPath:
     """Least sum of squares of response minus model over etas, b, orders and delay together.
 
     The data are those of the scan, resting levels subtracted. Starts are the best of many draws from
@@ -41,7 +40,7 @@ def output_error_fit(
         least = LeastSquares(posterior)
         values = least.with_noise(_values(posterior, start))
         solutions.append(least.solve(values)[0])
-    models = [_model(posterior, values) for values in solutions]
+    models = [posterior.table.paths(values)[0][0] for values in solutions]
     return min(models, key=lambda model: output_rmse(data.records, model))
 
 
@@ -54,28 +53,20 @@ def _posterior(
         study.time_unit,
         study.seed,
         tuple(each.record for each in data.records),
-        model=ModelSettings(terms=terms, orders=orders, offset="none", exposure=study.model.exposure),
+        model=ModelSettings(terms=terms, orders=orders, offset="none", exposure_ms=study.model.exposure_ms),
         noise=NoiseSettings("white"),
     )
     return problem_of(single).posterior
 
 
-def _values(posterior: Posterior, model: PathModel) -> Vector:
+def _values(posterior: Posterior, model: TransferPath) -> Vector:
     """Table values of a physical model; the noise scale is a guess."""
-    table, form = posterior.table, replace(model.form)
+    table = posterior.table
     out = np.zeros(len(table.rows))
     out[table.at("gain", 0)] = model.steady
-    for k, (eta, order) in enumerate(zip(form.etas, form.orders, strict=True)):
-        out[table.at("time", 0, k)] = (eta / form.stiffness) ** (1 / order)
+    for k, (time, order) in enumerate(zip(model.times, model.orders, strict=True)):
+        out[table.at("time", 0, k)] = time
         out[table.at("order", 0, k)] = order
     out[table.at("delay", 0)] = model.delay
     out[table.at("sigma", 0)] = 1.0
     return out
-
-
-def _model(posterior: Posterior, values: Vector) -> PathModel:
-    table = posterior.table
-    dynamics = table.dynamics(values[None])
-    times, orders = (tuple(float(v) for v in part[0][0]) for part in (dynamics.times, dynamics.orders))
-    gain = float(values[table.at("gain", 0)])
-    return PathModel(to_paper(gain, Element(times, orders), stiffness=1.0), float(dynamics.delays[0, 0]))

@@ -9,7 +9,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Vector
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.model.grid import Grid
@@ -34,7 +34,7 @@ class Blocks:
 
     grid: Grid
     """Blocks of one sampling period, samples at their midpoints, where the samples allow it."""
-    drive: Drive
+    drive: AxisDrive
     response: Vector
     """Block means, (n,) [response unit]."""
 
@@ -49,7 +49,7 @@ class Blocks:
         """
         taken = np.isfinite(record.response[:, 0])
         times, values = record.time[taken] - exposure / 2, record.response[taken, 0]
-        drive = Drive.of_rows(record.time, record.drive[:, 0])
+        drive = AxisDrive.of_rows(record.time, record.drive[:, 0])
         begin = float(drive.times[0])
         after = times > begin
         knots = np.concatenate(([begin], times[after]))
@@ -146,7 +146,7 @@ def path_data(study: Study) -> tuple[PathData, ...]:
                     f"{unknowns} unknowns; add samples or choose fewer terms under [model]"
                 )
             elif alone[j]:
-                records = tuple(_path_record(r, i, j, study.model.exposure) for r in usable)
+                records = tuple(_path_record(r, i, j, study.exposure) for r in usable)
                 if not any(np.any(each.blocks.response) for each in records):
                     problems.append(f"path {name}: the response never moves; leave its column out")
                 paths.append(PathData(i, j, name, response.unit, drive.unit, terms, records))
@@ -160,7 +160,7 @@ def _moving(record: Record) -> list[int]:
 
 
 def _begin(record: Record, drive: int) -> float:
-    return float(Drive.of_rows(record.time, record.drive[:, drive]).times[0])
+    return float(AxisDrive.of_rows(record.time, record.drive[:, drive]).times[0])
 
 
 def _samples_after(record: Record, response: int, drive: int) -> int:
@@ -190,7 +190,7 @@ def resting_level(times: Vector, values: Vector, begin: float) -> tuple[float, s
     """Mean of the samples up to the first drive change, or of the first samples that do not leave it.
 
     Parameters: times [time unit] and values [response unit] of the samples; begin [time unit], the change.
-    Returns: the level [response unit] and the samples it is the mean of, in words.
+    Returns: the level [response unit] and a description of the samples it is the mean of.
     """
     before = int(np.searchsorted(times, begin, side="right"))
     if before >= _RESTING:

@@ -10,13 +10,15 @@ import numpy as np
 
 from lcopa_bayes.bench.acquisition import Bench, truth
 from lcopa_bayes.bench.command import step
-from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.bench.device import Device
+from lcopa_bayes.bench.inversion import step_response
 from lcopa_bayes.core.arrays import Vector
-from lcopa_bayes.data.literature import PAPER, Stated, StatedPath
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.paper.equation import PathModel, output_rmse
+from lcopa_bayes.model.literature import PAPER, Stated
+from lcopa_bayes.model.path import TransferPath
+from lcopa_bayes.paper.equation import output_rmse
 from lcopa_bayes.paper.identify import integer_orders
 from lcopa_bayes.paper.intervals import Interval, Scan
 from lcopa_bayes.paper.outputerror import output_error_fit
@@ -43,10 +45,8 @@ class PrintedModel:
     @cached_property
     def device(self) -> Device:
         """The model on the virtual bench, resting at zero."""
-        plant = self.stated.plant
-        rows = ((plant.xx, plant.xy), (plant.yx, plant.yy))
         axes = (Axis("x", "rad"), Axis("y", "rad"))
-        return Device(tuple(tuple(_path(each) for each in row) for row in rows), axes, axes, (0.0, 0.0))
+        return Device(self.stated.plant.paths, axes, axes, (0.0, 0.0))
 
     def steady(self, drive_x: float, drive_y: float) -> tuple[float, float]:
         """Responses at rest under phases [rad] held for ever, ``sum_j b_ij / k_ij u_j`` [rad]."""
@@ -69,7 +69,7 @@ class PrintedModel:
     @cached_property
     def step_on(self) -> Vector:
         """Response of x at `times` to the step of Fig. 13 [rad]."""
-        return np.asarray(self.stated.records.step_drive * self.device.paths[0][0].step_response(self.times))
+        return np.asarray(self.stated.records.step_drive * step_response(self.device.paths[0][0], self.times))
 
     def settled(self, level: float, band: float, *, within: float) -> float:
         """Time from which the step of Fig. 13 stays within `band` [-] of `level` [rad], up to `within` [ms].
@@ -96,7 +96,7 @@ class PrintedModel:
 class Rival:
     """The integer-order model that comes closest to the step response of Eq. 65."""
 
-    model: PathModel
+    model: TransferPath
     steady: float
     """Response at rest under the drive of Fig. 13 [rad]."""
     rmse: float
@@ -120,7 +120,3 @@ def integer_rival(stated: Stated = PAPER) -> Rival:
         study, data, np.random.default_rng(0), terms=len(orders), orders=orders, start=start, starts=4
     )
     return Rival(model, model.steady * stated.records.step_drive, output_rmse(data.records, model))
-
-
-def _path(path: StatedPath) -> TransferPath:
-    return TransferPath(path.gain, path.delay, path.etas, path.orders, path.stiffness)

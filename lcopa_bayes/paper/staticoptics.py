@@ -2,210 +2,151 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from math import pi
 from typing import Any, final
 
 import numpy as np
+import pandas as pd
 
-from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.estimate import plain
-from lcopa_bayes.optics.chain import linearisation_error, linearised_angle, paper_chain
-from lcopa_bayes.optics.checks import finite
+from lcopa_bayes.optics.array import paper_array
+from lcopa_bayes.optics.cell import Field
 from lcopa_bayes.optics.director import Profile, equilibrium
 from lcopa_bayes.optics.farfield import LinearPatterns, PlanarPattern, planar_patterns, steered_patterns
-from lcopa_bayes.optics.lobes import LobeRow, lobe_table, main_lobe, side_lobe_level
+from lcopa_bayes.optics.lobes import lobes, main_lobe, side_lobe_level
+from lcopa_bayes.optics.steering import linearisation_error, linearised_angle
 from lcopa_bayes.optics.tiltlaw import RANGES, TiltLawCheck, continuous_law, printed_law, tilt_law_check
 from lcopa_bayes.paper.opticsplan import OpticsPlan
 
 _CHAIN_POINTS = 241
-_NOTHING = 1e-12
-"""Relative intensity that is zero but for rounding [-]."""
-
-
-@final
-@dataclass(frozen=True)
-class Steered:
-    """The array steered to one target."""
-
-    target: float
-    """[rad]."""
-    phase_step: float
-    """[rad]."""
-    main_lobe: float
-    """Angle of the maximum of the pattern [rad]."""
-    side_lobe: float
-    """Largest relative intensity away from every lobe [-]; NaN when there is none."""
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class ChainCurves:
-    """Voltage to tilt, phase and angle over the lower branch of Eq. 24, as far as the beam propagates."""
-
-    voltage: Vector
-    """(n,) [V]."""
-    tilt: Vector
-    """By Eq. 24 [rad]."""
-    phase: Vector
-    """By Eq. 23 [rad]."""
-    angle: Vector
-    """By Eq. 5, exact [rad]."""
-    linearised: Vector
-    """By Eq. 26 [rad]."""
-    relative_error: Vector
-    """Linearised over exact - 1 [-]."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class StaticOptics:
-    """All results that the verb reports and draws."""
+    """All that the verb reports and draws."""
 
     plan: OpticsPlan
+    values: Mapping[str, Any]
+    """Plain values that are reported; every number says its unit in its name or beside it."""
     check: TiltLawCheck
     profiles: tuple[Profile, ...]
     """One per voltage of the plan."""
     patterns: LinearPatterns
     planar: tuple[PlanarPattern, ...]
-    steered: tuple[Steered, ...]
-    lobes: tuple[LobeRow, ...]
-    chain: ChainCurves
-
-    @property
-    def laws(self) -> Matrix:
-        """Eq. 24 as printed and its continuous reading at the voltages of the plan, (2, n) [rad]."""
-        optics = self.plan.optics
-        return np.array([law(self.plan.voltages) for law in (printed_law(optics), continuous_law(optics))])
-
-    def as_json(self) -> dict[str, Any]:
-        """Plain values; every number says its unit in its name or beside it."""
-        optics, chain = self.plan.optics, self.chain
-        fits = zip(RANGES, self.check.printed, self.check.continuous, self.check.best, strict=True)
-        fields: dict[str, Any] = plain(
-            {
-                "array": {
-                    "elements": optics.elements,
-                    "pitch_m": optics.pitch_in_wavelengths * optics.wavelength,
-                    "wavelength_m": optics.wavelength,
-                    "fill_factor": self.plan.fill_factor,
-                },
-                "field": self.plan.field.value,
-                "pretilt_rad": self.plan.pretilt,
-                "threshold_voltage": {"value": self.check.threshold, "unit": "V"},
-                "mean_tilt": [
-                    {
-                        "voltage_V": profile.voltage,
-                        "tilt_rad": profile.mean,
-                        "largest_tilt_rad": profile.largest,
-                        "printed_law_rad": printed,
-                        "continuous_law_rad": continuous,
-                    }
-                    for profile, printed, continuous in zip(self.profiles, *self.laws, strict=True)
-                ],
-                "tilt_law": [
-                    {
-                        "range": name,
-                        "from_V": a.lower,
-                        "to_V": a.upper,
-                        **{
-                            law: {
-                                "r_squared": fit.r_squared,
-                                "largest_relative_error": fit.largest_relative_error,
-                                "largest_error_rad": fit.largest_error,
-                            }
-                            for law, fit in (("printed", a), ("continuous", b), ("best", c))
-                        },
-                    }
-                    for name, a, b, c in fits
-                ],
-                "steering": [
-                    {
-                        "target_deg": np.degrees(each.target),
-                        "phase_step_rad": each.phase_step,
-                        "main_lobe_deg": np.degrees(each.main_lobe),
-                        "side_lobe": each.side_lobe,
-                    }
-                    for each in self.steered
-                ],
-                "grating_lobes": [
-                    {
-                        "target_deg": np.degrees(row.target),
-                        "order": row.order,
-                        "angle_deg": np.degrees(row.angle),
-                        "isotropic": row.isotropic,
-                        "with_element": row.with_element,
-                    }
-                    for row in self.lobes
-                ],
-                "chain": [
-                    {
-                        "voltage_V": chain.voltage[k],
-                        "tilt_rad": chain.tilt[k],
-                        "phase_rad": chain.phase[k],
-                        "angle_rad": chain.angle[k],
-                        "angle_linearised_rad": chain.linearised[k],
-                    }
-                    for k in range(0, chain.voltage.size, (_CHAIN_POINTS - 1) // 12)
-                ],
-            }
-        )
-        return fields
-
-    def words(self) -> list[str]:
-        """A short table to read."""
-        lines = [
-            f"threshold voltage {self.check.threshold:.4f} V",
-            "",
-            "voltage [V]  mean tilt [rad]  Eq. 24",
-        ]
-        for profile, law in zip(self.profiles, self.laws[0], strict=True):
-            lines.append(f"{profile.voltage:11.4g}  {profile.mean:15.5f}  {law:.5f}")
-        lines += ["", "target [deg]  phase step [rad]  lobes: order, angle [deg], intensity over main lobe"]
-        for each in self.steered:
-            own = [row for row in self.lobes if row.target == each.target and row.order]
-            said = "; ".join(f"{r.order:+d}, {np.degrees(r.angle):.1f}, {_height(r):.2g}" for r in own)
-            lines.append(f"{np.degrees(each.target):12.4g}  {each.phase_step:16.4f}  {said or 'none'}")
-        return lines
+    chain: pd.DataFrame
+    """Voltage to tilt, phase step and angle over the lower branch of Eq. 24, with the error of Eq. 26 [-]."""
 
 
 def static_optics(plan: OpticsPlan) -> StaticOptics:
     """Solve and evaluate everything; errors as in the optics modules."""
-    optics, array = plan.optics, plan.array
-    targets = np.radians(optics.targets_1d_deg)
-    steered = []
-    for target in targets:
-        step = float(array.phase_step(target))
-        lobe, side = main_lobe(array, step), side_lobe_level(array, step)
-        steered.append(Steered(float(target), step, lobe, side))
-    return StaticOptics(
-        plan,
-        tilt_law_check(optics, field=plan.field, pretilt=plan.pretilt),
-        tuple(equilibrium(plan.cell, volt, field=plan.field) for volt in plan.voltages),
-        steered_patterns(optics),
-        planar_patterns(optics),
-        tuple(steered),
-        lobe_table(targets, optics, fill_factor=plan.fill_factor),
-        _chain(plan),
-    )
+    optics, field = plan.optics, Field(plan.field)
+    check = tilt_law_check(optics, field=field, pretilt=plan.pretilt)
+    profiles = tuple(equilibrium(plan.cell, volt, field=field) for volt in plan.voltages)
+    laws = (law(plan.voltages) for law in (printed_law(optics), continuous_law(optics)))
+    chain, rows = _chain(plan), lobe_rows(plan)
+    fits = {"printed": check.printed, "continuous": check.continuous, "best": check.best}
+    values: dict[str, Any] = {
+        "plan": asdict(plan),
+        "verdict": _verdict(check, rows),
+        "array": {
+            "elements": plan.elements,
+            "pitch_m": plan.array.pitch,
+            "wavelength_m": plan.wavelength,
+            "fill_factor": plan.fill_factor,
+        },
+        "field": plan.field,
+        "pretilt_rad": plan.pretilt,
+        "threshold_voltage": {"value": check.threshold, "unit": "V"},
+        "mean_tilt": [
+            {
+                "voltage_V": profile.voltage,
+                "tilt_rad": profile.mean,
+                "largest_tilt_rad": profile.largest,
+                "printed_law_rad": printed,
+                "continuous_law_rad": continuous,
+            }
+            for profile, printed, continuous in zip(profiles, *laws, strict=True)
+        ],
+        "tilt_law": [
+            {
+                "range": name,
+                "from_V": fits["printed"][k].lower,
+                "to_V": fits["printed"][k].upper,
+                **{law: fit[k].as_json() for law, fit in fits.items()},
+            }
+            for k, name in enumerate(RANGES)
+        ],
+        "steering": _steering(plan),
+        "grating_lobes": rows,
+        "chain": chain.iloc[:: (_CHAIN_POINTS - 1) // 12, :-1].to_dict("records"),
+    }
+    patterns, planar = steered_patterns(optics), planar_patterns(optics)
+    return StaticOptics(plan, plain(values), check, profiles, patterns, planar, chain)
 
 
-def _height(row: LobeRow) -> float:
-    return row.with_element if row.with_element > _NOTHING else 0.0
+def lobe_rows(plan: OpticsPlan) -> list[dict[str, float]]:
+    """All lobes at every target, their intensity over the main lobe of point elements and of the plan's."""
+    bare, slit = plan.array, paper_array(plan.optics, fill_factor=plan.fill_factor)
+    rows = []
+    for target in np.radians(plan.targets_deg):
+        step = float(bare.phase_step(target))
+        for point, wide in zip(lobes(bare, step), lobes(slit, step), strict=True):
+            rows.append(
+                {
+                    "target_deg": float(np.degrees(target)),
+                    "order": point.order,
+                    "angle_deg": float(np.degrees(point.angle)),
+                    "isotropic": point.intensity,
+                    "with_element": wide.intensity,
+                }
+            )
+    return rows
 
 
-def _chain(plan: OpticsPlan) -> ChainCurves:
+def _steering(plan: OpticsPlan) -> list[dict[str, float]]:
+    """The array steered to every target; without a side lobe its height is NaN."""
+    rows = []
+    for target in np.radians(plan.targets_deg):
+        step = float(plan.array.phase_step(target))
+        rows.append(
+            {
+                "target_deg": float(np.degrees(target)),
+                "phase_step_rad": step,
+                "main_lobe_deg": float(np.degrees(main_lobe(plan.array, step))),
+                "side_lobe": side_lobe_level(plan.array, step),
+            }
+        )
+    return rows
+
+
+def _chain(plan: OpticsPlan) -> pd.DataFrame:
     """Up to the knee of Eq. 24, or to where the phase steers to end-fire."""
-    array = plan.array
-    chain = paper_chain(plan.optics, array=array)
-    end = min(np.nextafter(chain.voltage_limit, 0), 2 * pi / array.period / chain.phase_per_volt)
-    voltage = finite(np.linspace(0.0, end, _CHAIN_POINTS), name="voltage")
-    phase = chain.phase(voltage)
-    return ChainCurves(
-        voltage,
-        chain.tilt(voltage),
-        phase,
-        chain.angle(voltage),
-        linearised_angle(array, phase),
-        linearisation_error(array, phase),
+    array, optics = plan.array, plan.optics
+    end = min(np.nextafter(optics.knee_voltage, 0), 2 * pi / array.period / optics.phase_per_volt)
+    voltage = np.linspace(0.0, end, _CHAIN_POINTS)
+    phase = optics.phase_per_volt * voltage
+    return pd.DataFrame(
+        {
+            "voltage_V": voltage,
+            "tilt_rad": optics.tilt_slope_low * voltage,
+            "phase_rad": phase,
+            "angle_rad": array.steering_angle(phase),
+            "angle_linearised_rad": linearised_angle(array, phase),
+            "relative_error": linearisation_error(array, phase),
+        }
     )
+
+
+def _verdict(check: TiltLawCheck, rows: list[dict[str, float]]) -> str:
+    """Threshold and strongest grating lobe in a sentence."""
+    best = max((row for row in rows if row["order"]), key=lambda row: row["with_element"], default=None)
+    said = (
+        "no grating lobe propagates"
+        if best is None
+        else f"the strongest grating lobe has {best['with_element']:.2g} of the main lobe, steered to "
+        f"{best['target_deg']:.3g} deg"
+    )
+    return f"The director tilts above {check.threshold:.4f} V; {said}."

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from pathlib import Path
-from typing import Any, final
+from typing import Any, TypeAlias, final
 
-from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import plain
-from lcopa_bayes.data.literature import Stated
+from lcopa_bayes.model.literature import Stated
 
 
 class Kind(Enum):
@@ -41,6 +38,16 @@ class Verdict:
     """The calculation in a sentence or two, its criterion included; for an undecided claim, the reason."""
 
 
+def undecided(how: str, unit: str = "-") -> Verdict:
+    """A verdict without a number, for this reason."""
+    return Verdict(Kind.UNDECIDED, None, unit, how)
+
+
+def waiting(stage: str, question: str) -> Verdict:
+    """The verdict while no result of a stage is among the evidence, with what it has to answer."""
+    return undecided(f"No {stage} is among the evidence; it has to answer: {question}")
+
+
 @final
 @dataclass(frozen=True, eq=False)
 class Evidence:
@@ -52,20 +59,21 @@ class Evidence:
     """Results of a comparison of integer and fractional models."""
 
 
+Test: TypeAlias = Callable[[Stated, Evidence], Verdict]
+"""Computes a verdict from the stated numbers and the evidence alone."""
+
+
 @final
 @dataclass(frozen=True, eq=False)
 class Claim:
-    """A sentence of the paper and the test of it.
-
-    A test computes its verdict from the stated numbers and the evidence alone: a copy of `Stated` with
-    another number can give another verdict.
-    """
+    """A sentence of the paper and the test of it: a copy of `Stated` with another number can give another
+    verdict."""
 
     id: str
     text: str
     source: str
     """Section or equation of Ta et al. 2026."""
-    test: Callable[[Stated, Evidence], Verdict]
+    test: Test
 
 
 @final
@@ -90,19 +98,3 @@ class Judged:
             }
         )
         return fields
-
-
-def earlier(folder: Path, verb: str, needs: Sequence[str]) -> Mapping[str, Any]:
-    """Results that `verb` wrote to a run folder; InputError when it cannot be read or lacks any of
-    `needs`."""
-    path = folder / f"{verb}.json"
-    try:
-        results: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: cannot be read ({error}); give the run folder that `{verb}` wrote"
-        ) from None
-    absent = [key for key in needs if key not in results] if isinstance(results, dict) else list(needs)
-    if absent:
-        raise InputError(f"{path}: lacks {', '.join(absent)}; run `{verb}` again with --resume")
-    return results

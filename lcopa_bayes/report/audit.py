@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,11 +9,10 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.report.formatting import NONE, figures, interval, percent
-from lcopa_bayes.report.page import Verdict, write_page
+from lcopa_bayes.report.formatting import NONE, ends, figures, percent
+from lcopa_bayes.report.page import write_graded
 from lcopa_bayes.report.savedrun import SavedRun, load_run
-from lcopa_bayes.report.section import Column, Drawing, Section, Table
+from lcopa_bayes.report.section import Drawing, Section, Table, paged
 from lcopa_bayes.report.theme import (
     BAND,
     CYCLE,
@@ -24,7 +22,6 @@ from lcopa_bayes.report.theme import (
     grid,
     label,
     log_ticks,
-    look,
     plain,
     svg_of,
 )
@@ -38,43 +35,17 @@ _PAIRS = 6
 _DOTS = 1500
 
 
-NAME = "audit.html"
-"""Name of the page inside the run folder."""
-_NEEDS = (
-    *(
-        "study",
-        "verdict",
-        "grade",
-        "grade_reason",
-        "limitations",
-        "parameters",
-        "symmetries",
-        "structure",
-        "printed_form",
-        "spectrum",
-    ),
-    *("local", "radial", "functions", "delays", "next_measurement"),
-)
-
-
 def write_audit(folder: Path) -> Path:
     """`audit.html` with verdicts, profiles, spectrum and pairs; returns its path.
 
     InputError when the folder holds no audit or it cannot be used.
     """
-    path = folder / "audit.json"
-    try:
-        results: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); run `audit` to write it") from None
-    absent = [key for key in _NEEDS if key not in results]
-    if absent:
-        raise InputError(f"{path}: lacks {', '.join(absent)}; run `audit` again with --resume")
-    run = load_run(folder)
-    with look():
-        sections = [*_tables(results), *_figures(results, run)]
-    verdict = Verdict(str(results["grade"]), str(results["verdict"]), str(results["grade_reason"]))
-    return write_page(folder, f"{results['study']}: identifiability", sections, verdict, NAME)
+    return write_graded(
+        folder,
+        "audit",
+        "identifiability",
+        lambda values: [*_tables(values), *_figures(values, load_run(folder))],
+    )
 
 
 def _tables(results: Mapping[str, Any]) -> list[Section]:
@@ -83,20 +54,7 @@ def _tables(results: Mapping[str, Any]) -> list[Section]:
 
 
 def _verdicts(results: Mapping[str, Any]) -> Section:
-    columns = (
-        *(Column("name", "code"), Column("unit"), Column("verdict"), Column("profile, 90 %", "interval")),
-        *(Column("contraction", "number"), Column("relative sd", "number")),
-    )
-    rows = []
-    for row in results["parameters"]:
-        lower, upper = row["profile"]["lower"], row["profile"]["upper"]
-        spread = None if lower is None or upper is None else (upper - lower) / 3.29
-        rows.append(
-            (
-                *(str(row["name"]), str(row["unit"]), str(row["verdict"]), interval(lower, upper, spread)),
-                *(figures(row["contraction"], 2), figures(row["relative_sd"], 2)),
-            )
-        )
+    rows = results["parameters"]
     caption = (
         "The profile interval is that of the likelihood alone, within the support of the priors. Contraction "
         "is 1 - posterior over prior variance on the sampled scale; relative sd is the Cramer-Rao bound "
@@ -106,26 +64,32 @@ def _verdicts(results: Mapping[str, Any]) -> Section:
         "sampling period or a factor of 2, an offset within half the range of the response. Weakly "
         "identified: bounded, but not as narrowly. Unresolved: a resonance faster than the samples resolve."
     )
-    why = Table(
-        (Column("name", "code"), Column("why", "prose"), Column("partners", "prose")),
-        tuple(
-            (str(row["name"]), str(row["reason"]), ", ".join(row["partners"]) or NONE)
-            for row in results["parameters"]
-        ),
-        "Partners are parameters that can compensate a change of this parameter, the most exact first.",
+    verdicts = Table.of(
+        rows,
+        ("name", "code", "name"),
+        ("unit", "text", "unit"),
+        ("verdict", "text", "verdict"),
+        ("profile, 90 %", "interval", lambda row: ends(row["profile"])),
+        ("contraction", "number", lambda row: figures(row["contraction"], 2)),
+        ("relative sd", "number", lambda row: figures(row["relative_sd"], 2)),
+        caption=caption,
     )
-    against = tuple(
-        (str(row["name"]), str(row["verdict"]), "; ".join(row["disagreements"]))
-        for row in results["parameters"]
-        if row["disagreements"]
+    why = Table.of(
+        rows,
+        ("name", "code", "name"),
+        ("why", "prose", "reason"),
+        ("partners", "prose", lambda row: ", ".join(row["partners"]) or NONE),
+        caption="Partners are parameters that can compensate a change of this parameter, the most exact "
+        "first.",
     )
-    contrary = Table(
-        (Column("name", "code"), Column("verdict"), Column("contrary evidence and limits", "prose")),
-        against,
-        "Where the four methods disagree; the verdict is that of the symmetries and the profile.",
+    contrary = Table.of(
+        [row for row in rows if row["disagreements"]],
+        ("name", "code", "name"),
+        ("verdict", "text", "verdict"),
+        ("contrary evidence and limits", "prose", lambda row: "; ".join(row["disagreements"])),
+        caption="Where the four methods disagree; the verdict is that of the symmetries and the profile.",
     )
-    tables = (Table(columns, tuple(rows), caption), why, *((contrary,) if against else ()))
-    return Section("Verdicts", (), (), tables)
+    return Section("Verdicts", tables=(verdicts, why, *((contrary,) if contrary.rows else ())))
 
 
 def _next(results: Mapping[str, Any]) -> Section:
@@ -151,24 +115,22 @@ def _next(results: Mapping[str, Any]) -> Section:
     text = (_sentence(advice["reason"]),)
     if not advice["parameters"]:
         return Section("What to measure next", text)
-    columns = (
-        *(Column("name", "code"), Column("best drive"), Column("relative sd", "number")),
-        *(Column("after a plain step", "number"), Column("why no drive", "prose")),
-    )
-    rows = tuple(
-        (
-            *(row["name"], row["drive"] or NONE, *(_expected(row, key) for key in ("", "_step"))),
-            row["reason"] or NONE,
-        )
-        for row in advice["parameters"]
-    )
     caption = (
         "Parameters that are not identified, and their relative sd after a further record of "
         f"{advice['time']:g} {advice['time_unit']}, each with its best drive: median Cramer-Rao bounds over "
         "draws of the posterior; above 1 a parameter is still not determined. The verb design tries other "
         "times and confirms the result by simulation."
     )
-    return Section("What to measure next", text, (), (Table(columns, rows, caption),))
+    table = Table.of(
+        advice["parameters"],
+        ("name", "code", "name"),
+        ("best drive", "text", lambda row: row["drive"] or NONE),
+        ("relative sd", "number", lambda row: _expected(row, "")),
+        ("after a plain step", "number", lambda row: _expected(row, "_step")),
+        ("why no drive", "prose", lambda row: row["reason"] or NONE),
+        caption=caption,
+    )
+    return Section("What to measure next", text, tables=(table,))
 
 
 def _sentence(clause: str) -> str:
@@ -212,26 +174,18 @@ def _symmetries(results: Mapping[str, Any]) -> Section:
 
 
 def _functions(results: Mapping[str, Any]) -> Section:
-    columns = (
-        *(Column("function", "code"), Column("unit"), Column("median", "number")),
-        *(Column("90 % interval", "interval"), Column("width / median", "number"), Column("verdict")),
-        Column("grade", "grade"),
+    table = Table.of(
+        results["functions"],
+        ("function", "code", "name"),
+        ("unit", "text", "unit"),
+        ("median", "number", "value"),
+        ("90 % interval", "interval", ends),
+        ("width / median", "number", lambda row: percent(row["relative_width"])),
+        ("verdict", "text", "verdict"),
+        ("grade", "grade", "grade"),
+        caption="Functions of the parameters, the most precise first; equal-tailed credible intervals.",
     )
-    rows = tuple(
-        (
-            *(row["name"], row["unit"], figures(row["value"])),
-            interval(row["lower"], row["upper"], _spread(row)),
-            *(percent(row["relative_width"]), row["verdict"], row["grade"]),
-        )
-        for row in results["functions"]
-    )
-    caption = "Functions of the parameters, the most precise first; equal-tailed credible intervals."
-    return Section("Best-determined functions", (), (), (Table(columns, rows, caption),))
-
-
-def _spread(row: Mapping[str, Any]) -> float | None:
-    ends = (row["lower"], row["upper"])
-    return None if None in ends else (ends[1] - ends[0]) / 3.29
+    return Section("Best-determined functions", tables=(table,))
 
 
 def _delays(results: Mapping[str, Any]) -> Section:
@@ -242,10 +196,17 @@ def _delays(results: Mapping[str, Any]) -> Section:
     if not rows:
         return Section("Delays of the paths", text)
     unit = delays["paths"][0]["unit"]
-    columns = (Column("pair", "code"), Column(f"smallest resolved difference [{unit}]", "number"))
-    cells = tuple((" / ".join(row["pair"]), figures(row["smallest_difference"], 2)) for row in rows)
-    caption = "Smallest difference whose 90 % interval excludes 0, linearised; a dash: none."
-    return Section("Delays of the paths", text, (), (Table(columns, cells, caption),))
+    table = Table.of(
+        rows,
+        ("pair", "code", lambda row: " / ".join(row["pair"])),
+        (
+            f"smallest resolved difference [{unit}]",
+            "number",
+            lambda row: figures(row["smallest_difference"], 2),
+        ),
+        caption="Smallest difference whose 90 % interval excludes 0, linearised; a dash: none.",
+    )
+    return Section("Delays of the paths", text, tables=(table,))
 
 
 def _figures(results: Mapping[str, Any], run: SavedRun) -> list[Section]:
@@ -259,11 +220,7 @@ def _profiles(results: Mapping[str, Any], run: SavedRun) -> Section:
         "Line: fall of twice the log likelihood along the profile, its 90 % level dashed, an open side where "
         "the line stays below to the end. Filled: marginal posterior on the scale of the axis."
     )
-    pages = [rows[k : k + _PER_FIGURE] for k in range(0, len(rows), _PER_FIGURE)]
-    drawings = tuple(
-        Drawing(f"profiles_{number:02d}", _profile_page(page, run), caption)
-        for number, page in enumerate(pages, start=1)
-    )
+    drawings = paged("profiles", rows, _PER_FIGURE, lambda part: _profile_page(part, run), caption)
     return Section("Profiles and marginals", drawings=drawings)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -10,54 +9,47 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.report.formatting import figures, percent, probability
-from lcopa_bayes.report.page import Verdict, write_page
-from lcopa_bayes.report.section import Column, Drawing, Section, Table
-from lcopa_bayes.report.theme import BAND, HELD_OUT, INK, NOISE, blank, grid, look, plain, svg_of
+from lcopa_bayes.report.formatting import NONE, figures, percent, probability
+from lcopa_bayes.report.page import write_graded
+from lcopa_bayes.report.section import Cell, Column, Drawing, Kind, Section, Table
+from lcopa_bayes.report.theme import BAND, HELD_OUT, INK, NOISE, blank, grid, plain, svg_of
 
 _PER_FIGURE = 18
 """Most quantities on one figure of ranks."""
 _MOST_ROWS = 40
 """Most replicas listed individually."""
 
-_NEEDS = (
-    *("study", "verdict", "grade", "grade_reason", "seed", "asked", "replicas", "coverage", "simultaneous"),
-    *("p_value", "p_value_of", "ranks", "rank_bins", "rank_corridor", "reliable", "grades", "not_reliable"),
-    *("failures", "truths", "model_gap", "seconds", "sampler", "engine", "discretisation"),
-)
-
 
 def write_calibration(folder: Path) -> Path:
     """`report.html` with coverage, ranks and grades; returns its path. InputError when keys are missing."""
-    results: Mapping[str, Any] = json.loads((folder / "results.json").read_text(encoding="utf-8"))
-    absent = [key for key in _NEEDS if key not in results]
-    if absent:
-        raise InputError(
-            f"{folder / 'results.json'}: lacks {', '.join(absent)}; run `calibrate` again with --resume"
-        )
-    with look():
-        sections = _sections(results)
-    verdict = Verdict(results["grade"], results["verdict"], results["grade_reason"])
-    return write_page(folder, f"{results['study']}: calibration", sections, verdict)
-
-
-def _sections(results: Mapping[str, Any]) -> list[Section]:
-    """Sections of a calibration's `results.json`."""
-    return [_coverage(results), _ranks(results), _differences(results), _replicas(results)]
+    parts = (_coverage, _ranks, _differences, _replicas)
+    return write_graded(
+        folder,
+        "calibrate",
+        "calibration",
+        lambda values: [part(values) for part in parts],
+        file="results.json",
+        name="report.html",
+    )
 
 
 def _coverage(results: Mapping[str, Any]) -> Section:
     rows, reliable = results["coverage"], results["reliable"]
     others = {(row["parameter"], row["level"]): row for row in (reliable or {"coverage": ()})["coverage"]}
-    table = Table(
+    table = Table.of(
+        [row | {"reliable": others.get((row["parameter"], row["level"]))} for row in rows],
+        ("quantity", "code", "parameter"),
+        ("stated", "number", lambda row: percent(row["level"])),
+        ("observed", "number", lambda row: _percent(row["observed"])),
+        ("band", "number", lambda row: f"{_percent(row['lower'])} to {_percent(row['upper'])}"),
+        ("p-value", "number", lambda row: figures(row["p_value"], 2)),
+        ("within", "text", lambda row: "yes" if row["within"] else "NO"),
         (
-            *(Column("quantity", "code"), Column("stated", "number"), Column("observed", "number")),
-            *(Column("band", "number"), Column("p-value", "number"), Column("within")),
-            Column("observed in reliable replicas", "number"),
+            "observed in reliable replicas",
+            "number",
+            lambda row: _percent(row["reliable"]["observed"]) if row["reliable"] else NONE,
         ),
-        tuple(_row(row, others.get((row["parameter"], row["level"]))) for row in rows),
-        f"Share of replicas whose equal-tailed interval holds the truth, over {results['replicas']} "
+        caption=f"Share of replicas whose equal-tailed interval holds the truth, over {results['replicas']} "
         f"replicas. The band is {rows[0]['band']}'s at a confidence of {100 * rows[0]['confidence']:.2f} %: "
         f"if every interval covers as stated, all {len(rows)} rows are within theirs together with a "
         f"probability of {percent(results['simultaneous'])} or more. P-values are exact binomial, each row "
@@ -72,18 +64,6 @@ def _coverage(results: Mapping[str, Any]) -> Section:
         ("A step response counts at several times after the step, each path by itself.",),
         (Drawing("calibration_coverage", _dots(results), caption),),
         (table,),
-    )
-
-
-def _row(row: Mapping[str, Any], reliable: Mapping[str, Any] | None) -> tuple[str, ...]:
-    return (
-        str(row["parameter"]),
-        percent(row["level"]),
-        _percent(row["observed"]),
-        f"{_percent(row['lower'])} to {_percent(row['upper'])}",
-        figures(row["p_value"], 2),
-        "yes" if row["within"] else "NO",
-        "–" if reliable is None else _percent(reliable["observed"]),  # noqa: RUF001
     )
 
 
@@ -218,33 +198,22 @@ def _replicas(results: Mapping[str, Any]) -> Section:
         *((name.replace("_", " "), str(value)) for name, value in results["sampler"].items()),
     )
     lists = [Table((Column("replicas"), Column("value", "number")), rows)]
-    if results["not_reliable"]:
-        lists.append(
-            Table(
-                (
-                    Column("replica", "number"),
-                    Column("seed", "code"),
-                    Column("grade", "grade"),
-                    Column("reason", "prose"),
-                ),
-                tuple(
-                    (str(row["replica"]), str(row["seed"]), row["grade"], row["reason"])
-                    for row in results["not_reliable"][:_MOST_ROWS]
-                ),
-                _further(len(results["not_reliable"])),
+    listed: tuple[tuple[str, str, tuple[tuple[str, Kind, Cell], ...]], ...] = (
+        ("not_reliable", "replica", (("grade", "grade", "grade"), ("reason", "prose", "reason"))),
+        ("failures", "failed replica", (("error", "prose", "error"),)),
+    )
+    for key, title, more in listed:
+        if results[key]:
+            rest = len(results[key]) - _MOST_ROWS
+            lists.append(
+                Table.of(
+                    results[key][:_MOST_ROWS],
+                    (title, "number", "replica"),
+                    ("seed", "code", "seed"),
+                    *more,
+                    caption=f"And {rest} more in results.json." if rest > 0 else "",
+                )
             )
-        )
-    if results["failures"]:
-        lists.append(
-            Table(
-                (Column("failed replica", "number"), Column("seed", "code"), Column("error", "prose")),
-                tuple(
-                    (str(row["replica"]), str(row["seed"]), row["error"])
-                    for row in results["failures"][:_MOST_ROWS]
-                ),
-                _further(len(results["failures"])),
-            )
-        )
     text = (
         "Only failed replicas are excluded from the numbers above. The distance of the forward "
         "model from the bench, root sum of squares over all samples, bounds by how many posterior standard "
@@ -273,7 +242,3 @@ def _origin(source: Mapping[str, Any]) -> str:
 
 def _number(value: float | None) -> str:
     return "none" if value is None else figures(value, 2)
-
-
-def _further(count: int) -> str:
-    return f"And {count - _MOST_ROWS} more in results.json." if count > _MOST_ROWS else ""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,20 +12,15 @@ from matplotlib.ticker import MaxNLocator
 
 from lcopa_bayes.comparison.compare import folder_name
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.report.decimation import extremes
+from lcopa_bayes.report.decimation import draw_band, draw_line
 from lcopa_bayes.report.formatting import NONE, figures, interval, percent, to_spread
-from lcopa_bayes.report.page import Verdict, write_page
-from lcopa_bayes.report.section import Column, Drawing, Section, Table
-from lcopa_bayes.report.theme import CYCLE, HELD_OUT, NOISE, SEEN, blank, label, look, plain, svg_of
+from lcopa_bayes.report.page import Verdict, write_graded
+from lcopa_bayes.report.section import Drawing, Section, Table
+from lcopa_bayes.report.theme import CYCLE, HELD_OUT, NOISE, SEEN, blank, label, plain, svg_of
 from lcopa_bayes.results.bands import POINTWISE
 
 _NEAR = 60.0
 """Log evidence below the best that is still shown [nat]."""
-
-
-NAME = "compare.html"
-"""Name of the page inside the run folder."""
-_NEEDS = ("study", "models", "preferred", "why", "agreement", "fractional", "order_is_integer", "flags")
 
 
 def write_comparison(folder: Path) -> Path:
@@ -34,24 +28,16 @@ def write_comparison(folder: Path) -> Path:
 
     InputError when the folder holds no comparison or it cannot be used.
     """
-    path = folder / "compare.json"
-    try:
-        results: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); run `compare` to write it") from None
-    absent = [key for key in _NEEDS if key not in results]
-    if absent:
-        raise InputError(f"{path}: lacks {', '.join(absent)}; run `compare` again with --resume")
-    if any("containment" not in row for row in results["models"]):
-        raise InputError(f"{path}: written by an earlier version; run `compare` again")
-    with look():
-        scores, *rest = _tables(results)
-        sections = [scores, *_figures(results, _curves(folder, results)), *rest]
-    graded = {row["name"]: row for row in results["models"]}
-    own = graded.get(results["preferred"])
+    return write_graded(
+        folder, "compare", "comparison", lambda values: _sections(values, folder), box=_verdict
+    )
+
+
+def _verdict(results: Mapping[str, Any]) -> Verdict:
+    """Grade of the preferred candidate."""
+    own = next((row for row in results["models"] if row["name"] == results["preferred"]), None)
     grade, reason = (own["grade"], own["grade_reason"]) if own else ("unusable", results["why"])
-    verdict = Verdict(str(grade), f"{results['why']} {results['fractional']['sentence']}", str(reason))
-    return write_page(folder, f"{results['study']}: comparison", sections, verdict, NAME)
+    return Verdict(str(grade), f"{results['why']} {results['fractional']['sentence']}", str(reason))
 
 
 def _curves(folder: Path, results: Mapping[str, Any]) -> dict[str, pd.DataFrame]:
@@ -68,41 +54,23 @@ def _curves(folder: Path, results: Mapping[str, Any]) -> dict[str, pd.DataFrame]
     return out
 
 
-def _tables(results: Mapping[str, Any]) -> list[Section]:
-    """The sections of a comparison that hold text and tables."""
-    return [_scores(results), _priors(results), _predicted(results), _orders(results), _warnings(results)]
+def _sections(results: Mapping[str, Any], folder: Path) -> list[Section]:
+    """Every part of the page."""
+    parts = (_priors, _predicted, _orders, _warnings)
+    return [_scores(results), _figures(results, _curves(folder, results)), *(part(results) for part in parts)]
 
 
 def _scores(results: Mapping[str, Any]) -> Section:
-    columns = (
-        *(Column("model", "code"), Column("what it is", "prose"), Column("parameters", "number")),
-        *(Column("log evidence [nat]", "number"), Column("log Bayes factor", "number")),
-        *(Column("probability", "number"), Column("grade", "grade")),
-    )
-    rows = tuple(
-        (
-            *(str(row["name"]), str(row["about"]), str(row["parameters"])),
-            _with_error(row["log_evidence"], row["log_evidence_sd"]),
-            _with_error(row["log_bayes_factor"], row["log_bayes_factor_sd"]),
-            _with_error(row["probability"], row["probability_sd"], 3),
-            str(row["grade"]),
-        )
-        for row in results["models"]
-    )
-    other_columns = (
-        *(Column("model", "code"), Column("elpd [nat]", "number"), Column("less than best", "number")),
-        *(Column("stacking weight", "number"), Column("max log likelihood", "number")),
-        *(Column("AIC", "number"), Column("BIC", "number")),
-    )
-    others = tuple(
-        (
-            str(row["name"]),
-            _with_error(row["elpd"], row["elpd_sd"], 1),
-            _with_error(row["elpd_difference"], row["elpd_difference_sd"], 1),
-            _plain(row["stacking"], 2),
-            *(_plain(row[key], 1) for key in ("max_log_likelihood", "aic", "bic")),
-        )
-        for row in results["models"]
+    models = results["models"]
+    scores = Table.of(
+        models,
+        ("model", "code", "name"),
+        ("what it is", "prose", "about"),
+        ("parameters", "number", "parameters"),
+        ("log evidence [nat]", "number", lambda row: _with_error(row, "log_evidence")),
+        ("log Bayes factor", "number", lambda row: _with_error(row, "log_bayes_factor")),
+        ("probability", "number", lambda row: _with_error(row, "probability", places=3)),
+        ("grade", "grade", "grade"),
     )
     caption = (
         "± is a standard error: of the evidence by bridge sampling, of predictive densities by the spread "
@@ -124,34 +92,36 @@ def _scores(results: Mapping[str, Any]) -> Section:
         if (names := [contained["model"] for contained in row["containment"]["contains"]])
         and row["containment"]["met"]
     ]
-    return Section("Scores", tuple(text), (), (Table(columns, rows), Table(other_columns, others, caption)))
+    others = Table.of(
+        models,
+        ("model", "code", "name"),
+        ("elpd [nat]", "number", lambda row: _with_error(row, "elpd", places=1)),
+        ("less than best", "number", lambda row: _with_error(row, "elpd_difference", places=1)),
+        ("stacking weight", "number", lambda row: _with_error(row, "stacking", "")),
+        ("max log likelihood", "number", lambda row: _with_error(row, "max_log_likelihood", "", places=1)),
+        ("AIC", "number", lambda row: _with_error(row, "aic", "", places=1)),
+        ("BIC", "number", lambda row: _with_error(row, "bic", "", places=1)),
+        caption=caption,
+    )
+    return Section("Scores", tuple(text), tables=(scores, others))
 
 
 def _priors(results: Mapping[str, Any]) -> Section:
-    columns = (
-        *(Column("model", "code"), Column("width of the priors", "number")),
-        *(Column("log evidence [nat]", "number"), Column("change", "number"), Column("method")),
-        *(Column("ESS", "number"), Column("Pareto k", "number"), Column("priors changed", "prose")),
+    table = Table.of(
+        [
+            width | {"model": row["name"], "change": _less(width["log_evidence"], row["log_evidence"])}
+            for row in results["models"]
+            for width in row["prior_widths"]
+        ],
+        ("model", "code", "model"),
+        ("width of the priors", "number", lambda row: f"{row['factor']:g}"),
+        ("log evidence [nat]", "number", lambda row: _with_error(row, "log_evidence", "sd")),
+        ("change", "number", lambda row: NONE if row["change"] is None else f"{row['change']:+.2f}"),
+        ("method", "text", "method"),
+        ("ESS", "number", lambda row: f"{row['ess']:.0f}"),
+        ("Pareto k", "number", lambda row: figures(row["pareto_k"], 2)),
+        ("priors changed", "prose", lambda row: ", ".join(row["parameters"]) or "none"),
     )
-    rows = []
-    for row in results["models"]:
-        for prior_width in row["prior_widths"]:
-            change = (
-                None
-                if prior_width["log_evidence"] is None
-                else prior_width["log_evidence"] - row["log_evidence"]
-            )
-            rows.append(
-                (
-                    *(str(row["name"]), f"{prior_width['factor']:g}"),
-                    _with_error(prior_width["log_evidence"], prior_width["sd"]),
-                    NONE if change is None else f"{change:+.2f}",
-                    str(prior_width["road"]),
-                    f"{prior_width['ess']:.0f}",
-                    figures(prior_width["pareto_k"], 2),
-                    ", ".join(prior_width["parameters"]) or "none",
-                )
-            )
     text = (
         "The evidence depends on the width of the priors. Here gains, times and delays have priors half and "
         "twice as wide; orders keep theirs, which are the ends of their domain. Importance weights use the "
@@ -159,44 +129,43 @@ def _priors(results: Mapping[str, Any]) -> Section:
         "marks narrower priors that exclude values the data support; no preference is stated where this "
         "occurs."
     )
-    tables = (Table(columns, tuple(rows)),) if rows else ()
-    return Section("Influence of the prior", (text,), (), tables)
+    return Section("Influence of the prior", (text,), tables=(table,) if table.rows else ())
+
+
+def _less(value: float | None, other: float) -> float | None:
+    return None if value is None else value - other
 
 
 def _predicted(results: Mapping[str, Any]) -> Section:
-    columns = (
-        *(Column("model", "code"), Column("predicted", "code"), Column("how")),
-        *(Column("samples", "number"), Column("log density [nat]", "number"), Column("if fitted", "number")),
-        *(Column("method"), Column("Pareto k", "number"), Column("ESS", "number"), Column("grade", "grade")),
-        Column("level from", "prose"),
+    predictions = Table.of(
+        [part | {"model": row["name"]} for row in results["models"] for part in row["predictions"]],
+        ("model", "code", "model"),
+        ("predicted", "code", "part"),
+        ("how", "text", "kind"),
+        ("samples", "number", "samples"),
+        ("log density [nat]", "number", lambda row: _with_error(row, "elpd", "monte_carlo_sd", places=1)),
+        ("if fitted", "number", lambda row: _with_error(row, "in_sample", "", places=1)),
+        ("method", "text", "method"),
+        ("Pareto k", "number", lambda row: figures(row["pareto_k"], 2)),
+        ("ESS", "number", lambda row: f"{row['ess']:.0f}"),
+        ("grade", "grade", "grade"),
+        ("level from", "prose", lambda row: "; ".join(row["level_from"])),
     )
-    rows = tuple(
-        (
-            *(str(row["name"]), str(prediction["part"]), str(prediction["kind"]), str(prediction["samples"])),
-            _with_error(prediction["elpd"], prediction["monte_carlo_sd"], 1),
-            *(
-                _plain(prediction["in_sample"], 1),
-                str(prediction["road"]),
-                figures(prediction["pareto_k"], 2),
-            ),
-            *(f"{prediction['ess']:.0f}", str(prediction["grade"]), "; ".join(prediction["level_from"])),
-        )
-        for row in results["models"]
-        for prediction in row["predictions"]
-    )
-    held = tuple(
-        (
-            *(str(row["name"]), str(entry["record"]), str(entry["axis"]), use, figures(entry["rmse"])),
-            *(str(entry["unit"]), percent(entry["coverage_90"]), percent(entry["coverage_50"])),
-        )
-        for row in results["models"]
-        for key, use in (("fit_scores", "fit"), ("held_out", "held out"))
-        for entry in row[key]
-    )
-    errors = (
-        *(Column("model", "code"), Column("record", "code"), Column("axis", "code"), Column("use")),
-        *(Column("RMSE", "number"), Column("unit"), Column("in pointwise 90 % band", "number")),
-        Column("in pointwise 50 % band", "number"),
+    errors = Table.of(
+        [
+            entry | {"model": row["name"], "use": use}
+            for row in results["models"]
+            for key, use in (("fit_scores", "fit"), ("held_out", "held out"))
+            for entry in row[key]
+        ],
+        ("model", "code", "model"),
+        ("record", "code", "record"),
+        ("axis", "code", "axis"),
+        ("use", "text", "use"),
+        ("RMSE", "number", "rmse"),
+        ("unit", "text", "unit"),
+        ("in pointwise 90 % band", "number", lambda row: percent(row["coverage_90"])),
+        ("in pointwise 50 % band", "number", lambda row: percent(row["coverage_50"])),
     )
     text = (
         "Whole records are predicted from the others, and the future of a record from its past where it is "
@@ -208,39 +177,29 @@ def _predicted(results: Mapping[str, Any]) -> Section:
         "draws of a fit that includes them, which is larger; where it is not, the grade is lowered. Bands "
         "are pointwise: of every 100 samples 90 are expected inside, not whole curves."
     )
-    return Section("Prediction", (text,), (), (Table(columns, rows), Table(errors, held)))
+    return Section("Prediction", (text,), tables=(predictions, errors))
 
 
 def _orders(results: Mapping[str, Any]) -> Section:
-    columns = (
-        *(Column("model", "code"), Column("order", "code"), Column("median", "number")),
-        *(Column("90 % interval", "interval"), Column("nearest", "number")),
-        *(
-            Column("log Bayes factor", "number"),
-            Column("density from", "prose"),
-            Column("answer"),
-            Column("grade", "grade"),
-        ),
+    table = Table.of(
+        [entry["estimate"] | entry for entry in results["order_is_integer"]],
+        ("model", "code", "model"),
+        ("order", "code", "parameter"),
+        ("median", "number", lambda row: to_spread(row["value"], row["sd"])),
+        ("90 % interval", "interval", lambda row: interval(row["lower"], row["upper"], row["sd"])),
+        ("nearest", "number", lambda row: str(row["nearest"])),
+        ("log Bayes factor", "number", lambda row: _with_error(row, "log_bayes_factor", "log_sd")),
+        ("density from", "prose", "method"),
+        ("answer", "text", "answer"),
+        ("grade", "grade", "grade"),
     )
-    rows = []
-    for entry in results["order_is_integer"]:
-        estimate, spread = entry["estimate"], entry["estimate"]["sd"]
-        said = _with_error(entry["log_bayes_factor"], entry["log_sd"])
-        rows.append(
-            (
-                *(str(entry["model"]), str(entry["parameter"]), to_spread(estimate["value"], spread)),
-                interval(estimate["lower"], estimate["upper"], spread),
-                *(str(entry["nearest"]), said, str(entry["road"]), str(entry["answer"]), str(entry["grade"])),
-            )
-        )
     text = (
         "The Savage-Dickey ratio: posterior over prior density at the nearest integer, as a logarithm "
         "[nat] with its Monte Carlo error. Two errors above log 3 the integer is favoured, two below log "
         "1/3 it is not. Where too few draws are at the integer its density is that of a normal tail. "
         "Intervals are equal-tailed credible.",
     )
-    tables = (Table(columns, tuple(rows)),) if rows else ()
-    return Section("Is this order an integer?", text, (), tables)
+    return Section("Is this order an integer?", text, tables=(table,) if table.rows else ())
 
 
 def _warnings(results: Mapping[str, Any]) -> Section:
@@ -250,25 +209,22 @@ def _warnings(results: Mapping[str, Any]) -> Section:
     )
 
 
-def _with_error(value: float | None, error: float | None, places: int = 2) -> str:
-    """`value ± error`."""
+def _with_error(row: Mapping[str, Any], key: str, error: str | None = None, *, places: int = 2) -> str:
+    """`value ± error` of a key and that of its error, by default the one with `_sd`."""
+    value, sd = row[key], row.get(f"{key}_sd" if error is None else error)
     if value is None:
         return NONE
-    return f"{value:.{places}f}" if error is None else f"{value:.{places}f} ± {error:.{places}f}"
+    return f"{value:.{places}f}" if sd is None else f"{value:.{places}f} ± {sd:.{places}f}"
 
 
-def _plain(value: float | None, places: int) -> str:
-    return NONE if value is None else f"{value:.{places}f}"
-
-
-def _figures(results: Mapping[str, Any], curves: Mapping[str, pd.DataFrame]) -> list[Section]:
+def _figures(results: Mapping[str, Any], curves: Mapping[str, pd.DataFrame]) -> Section:
     """Figures of a comparison; `curves` by candidate."""
     drawings = [*_evidence(results), *_records(results, curves)]
     text = (
         "Each model in its own colour throughout; black dots are fitted samples, red dots samples "
         "that no model was fitted to.",
     )
-    return [Section("Candidates side by side", text, tuple(drawings))]
+    return Section("Candidates side by side", text, tuple(drawings))
 
 
 def _evidence(results: Mapping[str, Any]) -> list[Drawing]:
@@ -356,8 +312,7 @@ def _drawn(
     some = parts[rows[0]["name"]]
     colour, unit = HELD_OUT if held else SEEN, str(some["unit"].iloc[0])
     seen, time = some["observed"].to_numpy(), some["time"].to_numpy()
-    at = extremes(seen)
-    top.plot(time[at], seen[at], ".", ms=2.5, mew=0, color=colour, label="observed", zorder=1)
+    draw_line(top, time, seen, ".", ms=2.5, mew=0, color=colour, label="observed", zorder=1)
     for row, own in zip(rows, CYCLE * len(rows), strict=False):
         _rival(
             top, below, parts[row["name"]], plain(row["name"]), own, row["name"] == results["preferred"], held
@@ -379,12 +334,9 @@ def _rival(
     residual = part["observed"].to_numpy() - middle
     if held or preferred:
         low, high = part["low"].to_numpy(), part["high"].to_numpy()
-        at = extremes(low, high)
-        top.fill_between(time[at], low[at], high[at], color=colour, alpha=0.12, lw=0)
-    at = extremes(middle)
-    top.plot(time[at], middle[at], color=colour, lw=1.6 if preferred else 1.0, label=name, zorder=2)
-    at = extremes(residual)
-    below.plot(time[at], residual[at], color=colour, lw=0.9 if preferred else 0.6)
+        draw_band(top, time, low, high, color=colour, alpha=0.12)
+    draw_line(top, time, middle, color=colour, lw=1.6 if preferred else 1.0, label=name, zorder=2)
+    draw_line(below, time, residual, color=colour, lw=0.9 if preferred else 0.6)
 
 
 def _caption(rows: Sequence[Mapping[str, Any]], record: str, axis: str, *, held: bool) -> str:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import floor, isfinite, log10
+from typing import Any
 
 OPEN = "open"
 """An end of an interval that no draw bounds."""
@@ -44,6 +46,12 @@ def interval(lower: float | None, upper: float | None, spread: float | None, *, 
     """`lower to upper`; an undefined side is open, and `nothing` is said when both are."""
     ends = [OPEN if end is None else to_spread(end, spread) for end in (lower, upper)]
     return nothing if lower is None and upper is None else f"{ends[0]} to {ends[1]}"
+
+
+def ends(row: Mapping[str, Any]) -> str:
+    """The 90 % interval of an estimate, to the digits that its width allows."""
+    lower, upper = row["lower"], row["upper"]
+    return interval(lower, upper, None if lower is None or upper is None else abs(upper - lower) / 3.29)
 
 
 def percent(share: float | None) -> str:

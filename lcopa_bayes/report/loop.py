@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,35 +9,14 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.report.formatting import NONE, figures, interval, percent
-from lcopa_bayes.report.page import Verdict, write_page
-from lcopa_bayes.report.section import Column, Drawing, Section, Table
-from lcopa_bayes.report.theme import BAND, HELD_OUT, NOISE, SEEN, blank, label, look, plain, svg_of
+from lcopa_bayes.report.page import Verdict, write_graded
+from lcopa_bayes.report.section import Drawing, Section, Table
+from lcopa_bayes.report.theme import BAND, HELD_OUT, NOISE, SEEN, blank, label, plain, svg_of
+from lcopa_bayes.results.stored import stored_values
 
 _MOST_CURVES = 12
 _LONGEST = 20
-
-
-NAME = "loop.html"
-"""Name of the page inside the run folder."""
-_NEEDS = {
-    "loop.json": (
-        *(
-            "study",
-            "verdict",
-            "confidence",
-            "sentence",
-            "grade",
-            "grade_reason",
-            "noise",
-            "effects",
-            "before",
-        ),
-        *("after", "evidence", "rounds", "moved", "survival", "next_measurement", "residual", "cautions"),
-    ),
-    "loop_curves.json": ("views", "curves"),
-}
 
 
 def write_loop(folder: Path) -> Path:
@@ -47,26 +25,18 @@ def write_loop(folder: Path) -> Path:
 
     InputError when the folder holds no loop or it cannot be used.
     """
-    results, shown = (_loaded(folder / name, keys) for name, keys in _NEEDS.items())
-    with look():
-        sections = [*_tables(results), *_figures(results, shown)]
-    verdict = Verdict(
-        str(results["grade"]),
-        f"{results['verdict']} ({results['confidence']}): {results['sentence']}",
-        str(results["grade_reason"]),
+    shown = stored_values(folder, "loop", ("views", "curves"), file="loop_curves.json")
+    return write_graded(
+        folder,
+        "loop",
+        "what the model lacks",
+        lambda values: [*_tables(values), *_figures(values, shown)],
+        box=lambda values: Verdict(
+            str(values["grade"]),
+            f"{values['verdict']} ({values['confidence']}): {values['sentence']}",
+            str(values["grade_reason"]),
+        ),
     )
-    return write_page(folder, f"{results['study']}: what the model lacks", sections, verdict, NAME)
-
-
-def _loaded(path: Path, keys: tuple[str, ...]) -> Mapping[str, Any]:
-    try:
-        results: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); run `loop` to write it") from None
-    absent = [key for key in keys if key not in results]
-    if absent:
-        raise InputError(f"{path}: lacks {', '.join(absent)}; run `loop` again")
-    return results
 
 
 def _tables(results: Mapping[str, Any]) -> list[Section]:
@@ -97,22 +67,6 @@ def _effects(results: Mapping[str, Any]) -> Section:
         text.append(f"{effect['name']}: {effect['formula']} ({effect['source']}).{also}")
     if results["next_measurement"]:
         text.append(f"Next measurement: {results['next_measurement']}")
-    columns = (
-        *(Column("parameter", "code"), Column("value", "number"), Column("90 % interval", "interval")),
-        *(Column("unit"), Column("prior sd", "number"), Column("grade", "grade")),
-    )
-    rows = tuple(
-        (
-            str(estimate["name"]),
-            figures(estimate["value"]),
-            interval(estimate["lower"], estimate["upper"], estimate["sd"]),
-            str(estimate["unit"]),
-            figures(estimate["prior_sd"], 2),
-            str(estimate["grade"]),
-        )
-        for effect in results["effects"]
-        for estimate in effect["parameters"]
-    )
     constants = "; ".join(
         f"{effect['name']}: " + ", ".join(f"{key} {value}" for key, value in effect["constants"].items())
         for effect in results["effects"]
@@ -121,29 +75,21 @@ def _effects(results: Mapping[str, Any]) -> Section:
     caption = "Coefficients of the effects; all vanish at zero." + (
         f" Constants: {constants}." if constants else ""
     )
-    return Section("What was missing", tuple(text), (), (Table(columns, rows, caption),) if rows else ())
+    table = Table.of(
+        [estimate for effect in results["effects"] for estimate in effect["parameters"]],
+        ("parameter", "code", "name"),
+        ("value", "number", "value"),
+        ("90 % interval", "interval", lambda row: interval(row["lower"], row["upper"], row["sd"])),
+        ("unit", "text", "unit"),
+        ("prior sd", "number", lambda row: figures(row["prior_sd"], 2)),
+        ("grade", "grade", "grade"),
+        caption=caption,
+    )
+    return Section("What was missing", tuple(text), tables=(table,) if table.rows else ())
 
 
 def _errors(results: Mapping[str, Any]) -> Section:
     before, after = results["before"], results["after"]
-    columns = (
-        *(Column("record"), Column("axis"), Column("held out"), Column("RMSE before", "number")),
-        *(
-            Column("RMSE after", "number"),
-            Column("after / noise", "number"),
-            Column("90 % band before", "number"),
-        ),
-        *(Column("90 % band after", "number"), Column("unit"), Column("level from", "prose")),
-    )
-    rows = tuple(
-        (
-            *(str(a["record"]), str(a["axis"]), "yes" if a["held_out"] else ""),
-            *(figures(a["rmse"]), figures(b["rmse"]), figures(b["rmse_over_noise"])),
-            *(percent(a["coverage_90"]), percent(b["coverage_90"]), str(a["unit"])),
-            str(b["level_from"]),
-        )
-        for a, b in zip(before["scores"], after["scores"], strict=True)
-    )
     text = (
         f"Held-out records were predicted by {results['unseen_by']}. Pointwise 90 % bands hold "
         f"{percent(before['held_out_coverage_90'])} of their samples before and "
@@ -155,7 +101,24 @@ def _errors(results: Mapping[str, Any]) -> Section:
         "Root mean square of observed minus predicted, and the share of samples inside the pointwise band "
         "with noise. Where the level is estimated from the record itself, a constant error is not visible."
     )
-    return Section("Errors before and after", (text,), (), (Table(columns, rows, caption),))
+    table = Table.of(
+        [
+            after | {"rmse_before": before["rmse"], "coverage_before": before["coverage_90"]}
+            for before, after in zip(before["scores"], after["scores"], strict=True)
+        ],
+        ("record", "text", "record"),
+        ("axis", "text", "axis"),
+        ("held out", "text", lambda row: "yes" if row["held_out"] else ""),
+        ("RMSE before", "number", "rmse_before"),
+        ("RMSE after", "number", "rmse"),
+        ("after / noise", "number", "rmse_over_noise"),
+        ("90 % band before", "number", lambda row: percent(row["coverage_before"])),
+        ("90 % band after", "number", lambda row: percent(row["coverage_90"])),
+        ("unit", "text", "unit"),
+        ("level from", "prose", "level_from"),
+        caption=caption,
+    )
+    return Section("Errors before and after", (text,), tables=(table,))
 
 
 def _noise(results: Mapping[str, Any]) -> Section:
@@ -168,23 +131,6 @@ def _evidence(results: Mapping[str, Any]) -> Section:
         return Section(
             "Evidence of every effect", ("No residual was analysed: the base fit cannot be used.",)
         )
-    columns = (
-        *(Column("effect", "code"), Column("place"), Column("log Bayes factor [nat]", "number")),
-        *(Column("probability", "number"), Column("survival", "number"), Column("shown by", "prose")),
-        Column("else mistaken for", "prose"),
-    )
-    rows = tuple(
-        (
-            *(
-                str(effect_class["name"]),
-                str(effect_class["place"]),
-                figures(effect_class["log_bayes_factor"]),
-            ),
-            *(figures(effect_class["probability"], 2), figures(effect_class["survival"], 2)),
-            *(str(effect_class["reveals"]), str(effect_class["mistaken_for"]) or NONE),
-        )
-        for effect_class in evidence["classes"]
-    )
     text = (
         f"Chance alone reaches {figures(evidence['threshold'])} nat once in a hundred times "
         f"({evidence['draws']} draws, "
@@ -196,31 +142,41 @@ def _evidence(results: Mapping[str, Any]) -> Section:
         "Survival is the share of an effect's signature that the base model cannot reproduce; it does "
         "not depend on the residual: below 0.1 these records do not show the effect."
     )
-    return Section("Evidence of every effect", (text,), (), (Table(columns, rows, caption),))
+    table = Table.of(
+        evidence["classes"],
+        ("effect", "code", "name"),
+        ("place", "text", "place"),
+        ("log Bayes factor [nat]", "number", "log_bayes_factor"),
+        ("probability", "number", lambda row: figures(row["probability"], 2)),
+        ("survival", "number", lambda row: figures(row["survival"], 2)),
+        ("shown by", "prose", "reveals"),
+        ("else mistaken for", "prose", lambda row: str(row["mistaken_for"]) or NONE),
+        caption=caption,
+    )
+    return Section("Evidence of every effect", (text,), tables=(table,))
 
 
 def _rounds(results: Mapping[str, Any]) -> Section:
-    columns = (
-        *(Column("round", "number"), Column("refitted", "code"), Column("log Bayes factor [nat]", "number")),
-        *(Column("held-out gain [nat]", "number"), Column("beyond 3 sd"), Column("kept")),
+    table = Table.of(
+        [
+            refit | {"round": number, "kept": refit["added"] == one["chosen"]}
+            for number, one in enumerate(results["rounds"], start=1)
+            for refit in one["refits"]
+        ],
+        ("round", "number", "round"),
+        ("refitted", "code", lambda row: ", ".join(row["added"])),
+        ("log Bayes factor [nat]", "number", "log_bayes_factor"),
+        ("held-out gain [nat]", "number", "left_out_gain"),
+        ("beyond 3 sd", "text", lambda row: "yes" if row["significant"] else "no"),
+        ("kept", "text", lambda row: "yes" if row["kept"] else ""),
+        caption="Candidates refitted with everything free.",
     )
-    rows = tuple(
-        (
-            *(str(number), ", ".join(refit["added"]), figures(refit["log_bayes_factor"])),
-            *(figures(refit["left_out_gain"]), "yes" if refit["significant"] else "no"),
-            "yes" if refit["added"] == round_["chosen"] else "",
-        )
-        for number, round_ in enumerate(results["rounds"], start=1)
-        for refit in round_["refits"]
-    )
-    if not rows:
+    if not table.rows:
         return Section("Refits", ("No candidate had to be refitted.",))
     failures = tuple(
         f"Could not be refitted: {failure}." for round_ in results["rounds"] for failure in round_["failures"]
     )
-    return Section(
-        "Refits", failures, (), (Table(columns, rows, "Candidates refitted with everything free."),)
-    )
+    return Section("Refits", failures, tables=(table,))
 
 
 def _moved(results: Mapping[str, Any]) -> Section:
@@ -228,19 +184,16 @@ def _moved(results: Mapping[str, Any]) -> Section:
         return Section(
             "Bias of the parameters without the effect", ("No parameter shifted by more than 2 sd.",)
         )
-    columns = (
-        *(Column("parameter", "code"), Column("before", "number"), Column("after", "number")),
-        *(Column("shift [sd]", "number"), Column("unit")),
-    )
-    rows = tuple(
-        (
-            *(str(entry["name"]), figures(entry["before"], 4), figures(entry["after"], 4)),
-            *(figures(entry["shift_in_sd"], 2), str(entry["unit"])),
-        )
-        for entry in results["moved"]
+    table = Table.of(
+        results["moved"],
+        ("parameter", "code", "name"),
+        ("before", "number", lambda row: figures(row["before"], 4)),
+        ("after", "number", lambda row: figures(row["after"], 4)),
+        ("shift [sd]", "number", lambda row: figures(row["shift_in_sd"], 2)),
+        ("unit", "text", "unit"),
     )
     text = "Without the effect these parameters were biased by more than 2 sd of the fit with it."
-    return Section("Bias of the parameters without the effect", (text,), (), (Table(columns, rows),))
+    return Section("Bias of the parameters without the effect", (text,), tables=(table,))
 
 
 def _figures(results: Mapping[str, Any], shown: Mapping[str, Any]) -> list[Section]:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.files import writable_folder, write_text
-from lcopa_bayes.report.savedrun import SavedRun, load_run
+from lcopa_bayes.report.savedrun import load_run
 from lcopa_bayes.report.section import Drawing, Section
 from lcopa_bayes.report.sections import (
     crosscheck,
@@ -29,6 +30,7 @@ from lcopa_bayes.report.sections import (
     traces,
 )
 from lcopa_bayes.report.theme import inlined, look
+from lcopa_bayes.results.stored import stored_values
 
 _SECTIONS = (
     records.section,
@@ -67,11 +69,10 @@ class Verdict:
         return _ADVICE.get(self.grade, "")
 
     @classmethod
-    def of(cls, run: SavedRun) -> Verdict:
-        """Verdict of a run; the reason is not repeated."""
-        results = run.results
-        sentence, reason = str(results["verdict"]), str(results["grade_reason"])
-        return cls(str(results["grade"]), sentence, "" if reason in sentence else reason)
+    def of(cls, values: Mapping[str, Any]) -> Verdict:
+        """Verdict of a result; the reason is not repeated."""
+        sentence, reason = str(values["verdict"]), str(values["grade_reason"])
+        return cls(str(values["grade"]), sentence, "" if reason in sentence else reason)
 
 
 def write_report(folder: Path) -> Path:
@@ -83,7 +84,33 @@ def write_report(folder: Path) -> Path:
     run = load_run(folder)
     with look():
         sections = [compose(run) for compose in _SECTIONS]
-    return write_page(folder, str(run.results["study"]), sections, Verdict.of(run))
+    return write_page(folder, str(run.results["study"]), sections, Verdict.of(run.results))
+
+
+def write_graded(
+    folder: Path,
+    verb: str,
+    title: str,
+    compose: Callable[[Mapping[str, Any]], Sequence[Section]],
+    *,
+    box: Callable[[Mapping[str, Any]], Verdict] = Verdict.of,
+    file: str | None = None,
+    name: str | None = None,
+) -> Path:
+    """Write the page of a verb's result: the sections that `compose` draws of its values, below its grade;
+    returns the path of the page.
+
+    `file` and `name`, of values and page, are by default named after the verb. InputError when the values
+    cannot be read or a key is absent.
+    """
+    values = stored_values(folder, verb, ("study",), file=file)
+    try:
+        with look():
+            sections = compose(values)
+        verdict = box(values)
+    except KeyError as error:
+        raise InputError(f"{folder / (file or f'{verb}.json')}: lacks {error}; run `{verb}` again") from error
+    return write_page(folder, f"{values['study']}: {title}", sections, verdict, name or f"{verb}.html")
 
 
 def write_page(

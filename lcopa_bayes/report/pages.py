@@ -11,6 +11,7 @@ from lcopa_bayes.report.compare import write_comparison
 from lcopa_bayes.report.design import write_design
 from lcopa_bayes.report.loop import write_loop
 from lcopa_bayes.report.page import write_report
+from lcopa_bayes.report.paperpages import write_claims, write_identification, write_optics
 from lcopa_bayes.report.predict import write_prediction
 
 _PAGES: Mapping[str, Callable[[Path], Path]] = {
@@ -21,6 +22,9 @@ _PAGES: Mapping[str, Callable[[Path], Path]] = {
     "loop": write_loop,
     "calibrate": write_calibration,
     "predict": write_prediction,
+    "optics": write_optics,
+    "identify": write_identification,
+    "claims": write_claims,
 }
 
 

@@ -1,67 +1,83 @@
-"""Pages about the paper: static optics, identification, claims."""
+"""Pages about the paper, drawn from their run folders: static optics, identification, claims."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-from lcopa_bayes.data.study import Study
-from lcopa_bayes.paper.figures import panels
-from lcopa_bayes.paper.identify import Identification
-from lcopa_bayes.paper.staticoptics import StaticOptics
-from lcopa_bayes.paper.steptable import Row
-from lcopa_bayes.paper.verdict import Judged, Kind
+import pandas as pd
+
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.paper.opticsplan import OpticsPlan
+from lcopa_bayes.paper.staticoptics import static_optics
 from lcopa_bayes.report.formatting import figures
 from lcopa_bayes.report.page import write_page
 from lcopa_bayes.report.section import Column, Section, Table
 from lcopa_bayes.report.sections import claimfigures, director, farfields, identification
 from lcopa_bayes.report.theme import look
+from lcopa_bayes.results.stored import stored_values
 
 
-def write_optics(folder: Path, calculated: StaticOptics) -> Path:
-    """`report.html` with far fields, director, tilt law and chain; returns its path."""
+def write_optics(folder: Path) -> Path:
+    """`optics.html` with far fields, director, tilt law and chain; returns its path.
+
+    All is solved again for the plan in `optics.json`; InputError when that file cannot be used.
+    """
+    plan = stored_values(folder, "optics", ("plan",))["plan"]
+    try:
+        calculated = static_optics(OpticsPlan(**plan))
+    except TypeError as error:
+        raise InputError(f"{folder / 'optics.json'}: holds no plan ({error}); run `optics` again") from None
     with look():
         sections = [*farfields.sections(calculated), *director.sections(calculated)]
-    return write_page(folder, "Static optics of the array", sections)
+    return write_page(folder, "Static optics of the array", sections, name="optics.html")
 
 
-def write_identification(
-    folder: Path, study: Study, identified: Sequence[Identification], rows: Sequence[Row]
-) -> Path:
-    """`identify.html` with models, Table 1 and records; returns its path."""
+def write_identification(folder: Path) -> Path:
+    """`identify.html` with models, Table 1 and records; returns its path.
+
+    InputError when `identify.json` or a table of samples cannot be used.
+    """
+    values = stored_values(folder, "identify", ("study", "time_unit", "paths", "step_metrics", "records"))
+    try:
+        samples = [pd.read_csv(folder / entry["samples"]) for entry in values["records"]]
+    except (OSError, ValueError) as error:
+        raise InputError(f"{folder}: samples cannot be read ({error}); run `identify` again") from None
     with look():
-        sections = identification.sections(study.time_unit, identified, rows, panels(study, identified))
-    return write_page(folder, f"{study.name}: identification", sections, name="identify.html")
+        sections = identification.sections(values, samples)
+    return write_page(folder, f"{values['study']}: identification", sections, name="identify.html")
 
 
-def write_claims(folder: Path, judged: Sequence[Judged]) -> Path:
-    """`report.html` with every claim, its verdict and the figures behind them; returns its path."""
+def write_claims(folder: Path) -> Path:
+    """`claims.html` with every claim, its verdict and the figures behind them; returns its path.
+
+    InputError when `claims.json` cannot be used.
+    """
+    values = stored_values(folder, "claims", ("verdict", "claims"))
     with look():
-        sections = [_verdicts(judged), *claimfigures.sections()]
-    return write_page(folder, "Claims of the paper", sections)
+        sections = [_verdicts(values), *claimfigures.sections()]
+    return write_page(folder, "Claims of the paper", sections, name="claims.html")
 
 
-def _verdicts(judged: Sequence[Judged]) -> Section:
+def _verdicts(values: Mapping[str, Any]) -> Section:
     """The table of claims."""
-    counts = Counter(each.verdict.kind for each in judged)
-    said = ", ".join(f"{counts[kind]} {kind.value}" for kind in Kind)
     columns = (
         *(Column("id"), Column("claim", "prose"), Column("verdict")),
         *(Column("number", "number"), Column("unit"), Column("how", "prose")),
     )
     rows = tuple(
         (
-            *(each.claim.id, f"{each.claim.text} ({each.claim.source})", each.verdict.kind.value),
-            *(figures(each.verdict.number), each.verdict.unit, each.verdict.how),
+            *(row["id"], f"{row['text']} ({row['source']})", row["verdict"]),
+            *(figures(row["number"]), row["unit"], row["how"]),
         )
-        for each in judged
+        for row in values["claims"]
     )
     return Section(
         "Verdicts",
         (
-            f"{len(judged)} claims of Ta et al. 2026: {said}. A verdict follows from the printed numbers by "
-            "the calculation beside it; undecided means that data needed to decide it are missing.",
+            f"{values['verdict']} A verdict follows from the printed numbers by the calculation beside it; "
+            "undecided means that data needed to decide it are missing.",
         ),
         tables=(Table(columns, rows),),
     )

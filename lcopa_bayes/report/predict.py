@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.report.decimation import extremes
-from lcopa_bayes.report.formatting import figures, interval, percent
-from lcopa_bayes.report.page import Verdict, write_page
-from lcopa_bayes.report.section import Column, Drawing, Section, Table
-from lcopa_bayes.report.theme import BAND, CYCLE, HELD_OUT, NOISE, blank, label, look, plain, svg_of
+from lcopa_bayes.report.decimation import draw_line
+from lcopa_bayes.report.formatting import ends, figures
+from lcopa_bayes.report.page import write_graded
+from lcopa_bayes.report.section import Drawing, Section, Table, score_columns
+from lcopa_bayes.report.sections.records import draw_bands, draw_drives
+from lcopa_bayes.report.theme import BAND, HELD_OUT, NOISE, blank, label, svg_of
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
-from lcopa_bayes.results.newdrive import BANDS, DRIVES, NAME
+from lcopa_bayes.results.newdrive import BANDS, DRIVES
+from lcopa_bayes.results.stored import stored_values
 
-PAGE = "predict.html"
-"""Name of the page inside its folder."""
-_NEEDS = (
-    *("study", "drive", "verdict", "grade", "grade_reason", "time_unit", "axes", "outside"),
-    *("scores", "draws", "measured"),
-)
 _OUTSIDE = "#faf0e8"
 """Shade of what lies outside the fitted range."""
 
@@ -35,57 +29,48 @@ def write_prediction(folder: Path) -> Path:
 
     InputError when a file of the prediction is missing or cannot be used.
     """
-    path = folder / NAME
+    path = folder / "tables"
     try:
-        values: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         bands, drives = (
-            pd.read_csv(folder / "tables" / name, dtype={"axis": str, "unit": str}, keep_default_na=True)
-            for name in (BANDS, DRIVES)
+            pd.read_csv(path / name, dtype={"axis": str, "unit": str}) for name in (BANDS, DRIVES)
         )
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read ({error}); run `predict` to write it") from None
-    absent = [key for key in _NEEDS if key not in values]
-    if absent:
-        raise InputError(f"{path}: lacks {', '.join(absent)}; run `predict` again")
-    with look():
-        sections = [_curves(values, bands, drives), _range(values), *_scores(values)]
-    verdict = Verdict(str(values["grade"]), str(values["verdict"]), str(values["grade_reason"]))
-    return write_page(folder, f"{values['study']}: response to {values['drive']}", sections, verdict, PAGE)
+    values = stored_values(folder, "predict", ("drive",))
+    return write_graded(
+        folder,
+        "predict",
+        f"response to {values['drive']}",
+        lambda values: [_curves(values, bands, drives), _range(values), *_scores(values)],
+    )
 
 
 def _curves(values: Mapping[str, Any], bands: pd.DataFrame, drives: pd.DataFrame) -> Section:
-    drawings, rows = [], []
-    for number, entry in enumerate(values["axes"], start=1):
-        own = bands[bands["axis"] == str(entry["axis"])]
-        drawings.append(
-            Drawing(
-                f"predict_{number:02d}_{entry['axis']}",
-                _drawn(values, own, drives),
-                f"Response {entry['axis']}, offset: {entry['offset_from']}. {values['draws']} draws.",
-            )
+    drawings = tuple(
+        Drawing(
+            f"predict_{number:02d}_{entry['axis']}",
+            _drawn(values, bands[bands["axis"] == str(entry["axis"])], drives),
+            f"Response {entry['axis']}, offset: {entry['offset_from']}. {values['draws']} draws.",
         )
-        spread = (entry["upper"] - entry["lower"]) / 3.29
-        rows.append(
-            (
-                *(str(entry["axis"]), figures(entry["end"]), figures(entry["value_at_end"])),
-                *(interval(entry["lower"], entry["upper"], spread), str(entry["unit"])),
-                figures(entry[f"half_width_{POINTWISE}"], 2),
-                figures(entry[f"half_width_{SIMULTANEOUS}"], 2),
-                figures(entry["half_width_noisy"], 2),
-            )
-        )
-    columns = (
-        *(Column("axis"), Column(f"end [{values['time_unit']}]", "number"), Column("median there", "number")),
-        *(Column("90 % interval", "interval"), Column("unit"), Column(f"widest {POINTWISE}", "number")),
-        Column(f"widest {SIMULTANEOUS}", "number"),
-        Column("widest with noise", "number"),
+        for number, entry in enumerate(values["axes"], start=1)
     )
-    caption = "Half widths of the 90 % bands where they are widest; only the last column includes noise."
+    table = Table.of(
+        values["axes"],
+        ("axis", "text", "axis"),
+        (f"end [{values['time_unit']}]", "number", "end"),
+        ("median there", "number", "value_at_end"),
+        ("90 % interval", "interval", ends),
+        ("unit", "text", "unit"),
+        (f"widest {POINTWISE}", "number", lambda row: figures(row[f"half_width_{POINTWISE}"], 2)),
+        (f"widest {SIMULTANEOUS}", "number", lambda row: figures(row[f"half_width_{SIMULTANEOUS}"], 2)),
+        ("widest with noise", "number", lambda row: figures(row["half_width_noisy"], 2)),
+        caption="Half widths of the 90 % bands where they are widest; only the last column includes noise.",
+    )
     text = (
         f"A {POINTWISE} band holds the response at each time by itself; a {SIMULTANEOUS} band holds the "
         "whole curve of its axis, at all times at once. Blue: the plant alone. Grey: samples, with noise.",
     )
-    return Section("Predicted response", text, tuple(drawings), (Table(columns, tuple(rows), caption),))
+    return Section("Predicted response", text, drawings, (table,))
 
 
 def _drawn(values: Mapping[str, Any], rows: pd.DataFrame, drives: pd.DataFrame) -> str:
@@ -103,17 +88,7 @@ def _drawn(values: Mapping[str, Any], rows: pd.DataFrame, drives: pd.DataFrame) 
             shade = "outside the fitted range" if panel is top else None
             panel.axvspan(float(beyond[0]), last, color=_OUTSIDE, lw=0, zorder=-1, label=shade)
     for panel, unit in zip(below, units, strict=True):
-        own = drives[drives["unit"] == unit]
-        names = list(dict.fromkeys(own["axis"]))
-        for name, colour in zip(names, CYCLE * len(names), strict=False):
-            one = own[own["axis"] == name]
-            at, value = one["time"].to_numpy(), one["drive"].to_numpy()
-            at, value = np.append(at, max(last, at[-1])), np.append(value, value[-1])
-            panel.plot(at, value, drawstyle="steps-post", color=colour, label=plain(name))
-        panel.set_ylabel(label(names[0] if len(names) == 1 else "drive", unit))
-        panel.margins(y=0.12)
-        if len(names) > 1:
-            panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+        draw_drives(panel, drives[drives["unit"] == unit], unit, until=last)
     top.set_ylabel(label(str(rows["axis"].iloc[0]), str(rows["unit"].iloc[0])))
     margin = 0.02 * (last - first)
     top.set_xlim(first - margin, last + margin)
@@ -125,27 +100,23 @@ def _drawn(values: Mapping[str, Any], rows: pd.DataFrame, drives: pd.DataFrame) 
 
 def _bands(panel: Axes, rows: pd.DataFrame, *, measured: bool) -> None:
     time = rows["time"].to_numpy()
-    for what, kind, low, high, colour, alpha, name in (
-        ("noisy", POINTWISE, "05", "95", NOISE, 0.30, f"90 % with noise, {POINTWISE}"),
-        ("plant", POINTWISE, "05", "95", BAND, 0.30, f"90 % plant, {POINTWISE}"),
-        ("plant", POINTWISE, "25", "75", BAND, 0.55, f"50 % plant, {POINTWISE}"),
-    ):
-        lower, upper = (rows[f"{what}_{kind}_{end}"].to_numpy() for end in (low, high))
-        at = extremes(lower, upper)
-        panel.fill_between(time[at], lower[at], upper[at], color=colour, alpha=alpha, lw=0, label=name)
+    draw_bands(
+        panel,
+        rows,
+        (
+            ("noisy", "05", "95", NOISE, 0.30, f"90 % with noise, {POINTWISE}"),
+            ("plant", "05", "95", BAND, 0.30, f"90 % plant, {POINTWISE}"),
+            ("plant", "25", "75", BAND, 0.55, f"50 % plant, {POINTWISE}"),
+        ),
+    )
     for what, colour, name in (("noisy", NOISE, "with noise"), ("plant", BAND, "plant")):
         for end in ("05", "95"):
             edge = rows[f"{what}_{SIMULTANEOUS}_{end}"].to_numpy()
-            at = extremes(edge)
             text = f"90 % {name}, {SIMULTANEOUS}" if end == "05" else None
-            panel.plot(time[at], edge[at], color=colour, lw=0.7, ls=(0, (4, 3)), label=text)
-    middle = rows[f"plant_{POINTWISE}_50"].to_numpy()
-    at = extremes(middle)
-    panel.plot(time[at], middle[at], color=BAND, label="median")
+            draw_line(panel, time, edge, color=colour, lw=0.7, ls=(0, (4, 3)), label=text)
     if measured:
         seen = rows["observed"].to_numpy()
-        at = extremes(seen)
-        panel.plot(time[at], seen[at], ".", ms=2.5, mew=0, color=HELD_OUT, label="observed", zorder=3)
+        draw_line(panel, time, seen, ".", ms=2.5, mew=0, color=HELD_OUT, label="observed", zorder=3)
 
 
 def _range(values: Mapping[str, Any]) -> Section:
@@ -157,19 +128,11 @@ def _range(values: Mapping[str, Any]) -> Section:
 def _scores(values: Mapping[str, Any]) -> list[Section]:
     if not values["scores"]:
         return []
-    columns = (
-        *(Column("axis"), Column("RMSE", "number"), Column("unit"), Column("in 50 % band", "number")),
-        *(Column("in 90 % band", "number"), Column("samples", "number"), Column("offset from", "prose")),
+    table = Table.of(
+        values["scores"],
+        ("axis", "text", "axis"),
+        *score_columns(),
+        caption=f"RMSE is against the median of the plant; coverage is by the {POINTWISE} bands with noise. "
+        "The record was not fitted.",
     )
-    rows = tuple(
-        (
-            *(str(row["axis"]), figures(row["rmse"]), str(row["unit"]), percent(row["coverage_50"])),
-            *(percent(row["coverage_90"]), str(row["samples"]), str(row["offset_from"])),
-        )
-        for row in values["scores"]
-    )
-    caption = (
-        f"RMSE is against the median of the plant; coverage is by the {POINTWISE} bands with noise. "
-        "The record was not fitted."
-    )
-    return [Section("Scores", (), (), (Table(columns, rows, caption),))]
+    return [Section("Scores", tables=(table,))]

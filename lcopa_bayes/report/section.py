@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, final
+from typing import Any, Literal, TypeAlias, TypeVar, final
+
+from lcopa_bayes.report.formatting import figures, percent
 
 Kind = Literal["text", "number", "grade", "code", "interval", "prose"]
 """Cells of `text` and `number` stay on one line; those of `interval` and `prose` may wrap."""
+Row: TypeAlias = Mapping[str, Any]
+"""What a row of a table is about."""
+Cell: TypeAlias = str | Callable[[Row], str]
+T = TypeVar("T")
 
 
 @final
@@ -27,10 +34,42 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
     caption: str = ""
 
+    @classmethod
+    def of(cls, rows: Iterable[Row], *columns: tuple[str, Kind, Cell], caption: str = "") -> Table:
+        """One row per entry of `rows`, one column per title, kind and cell.
+
+        A cell is a key of the entry, whose value stands to three digits in columns of numbers and as it is in
+        others, or a function of the entry.
+        """
+        return cls(
+            tuple(Column(title, kind) for title, kind, _ in columns),
+            tuple(tuple(_cell(row, kind, cell) for _, kind, cell in columns) for row in rows),
+            caption,
+        )
+
     def __post_init__(self) -> None:
         wrong = [row for row in self.rows if len(row) != len(self.columns)]
         if wrong:
             raise ValueError(f"each row needs {len(self.columns)} cells; got {wrong[0]}")
+
+
+def score_columns() -> tuple[tuple[str, Kind, Cell], ...]:
+    """Columns of error and coverage of a record's axis."""
+    return (
+        ("RMSE", "number", "rmse"),
+        ("unit", "text", "unit"),
+        ("in 50 % band", "number", lambda row: percent(row["coverage_50"])),
+        ("in 90 % band", "number", lambda row: percent(row["coverage_90"])),
+        ("samples", "number", "samples"),
+        ("offset from", "prose", "offset_from"),
+    )
+
+
+def _cell(row: Row, kind: Kind, cell: Cell) -> str:
+    if callable(cell):
+        return cell(row)
+    value = row[cell]
+    return figures(value) if value is None or (kind == "number" and isinstance(value, float)) else str(value)
 
 
 @final
@@ -43,6 +82,14 @@ class Drawing:
     caption: str
     mark: str = ""
     """A word set before the caption that must not be overlooked, such as "held out"."""
+
+
+def paged(
+    stem: str, names: Sequence[T], most: int, draw: Callable[[Sequence[T]], str], caption: str
+) -> tuple[Drawing, ...]:
+    """Figures `<stem>_01` and so on, each of up to `most` of the `names`, as `draw` gives them."""
+    parts = [names[k : k + most] for k in range(0, len(names), most)]
+    return tuple(Drawing(f"{stem}_{k:02d}", draw(part), caption) for k, part in enumerate(parts, start=1))
 
 
 @final

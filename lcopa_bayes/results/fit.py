@@ -11,7 +11,7 @@ import numpy as np
 from xarray import DataTree
 
 from lcopa_bayes.core.arrays import Matrix, digest_of
-from lcopa_bayes.core.checks import refuse_if
+from lcopa_bayes.core.errors import refuse_if
 from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.core.files import save_json, save_table, writable_folder, write_text, write_whole
 from lcopa_bayes.data.requirements import unmet

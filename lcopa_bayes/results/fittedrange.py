@@ -13,7 +13,7 @@ from typing import Any, Literal, final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
-from lcopa_bayes.data.drive import Drive as Changes
+from lcopa_bayes.data.drive import axis_drives, first_change
 from lcopa_bayes.data.record import Axis, Driven
 
 _SLIGHT = 0.01
@@ -47,16 +47,6 @@ class Outside:
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
         return asdict(self)
-
-
-def moves(driven: Driven) -> tuple[Changes, ...]:
-    """Changes of every drive of a record or drive, as deviations from rest."""
-    return tuple(Changes.of_rows(driven.time, column) for column in driven.drive.T)
-
-
-def beginning(driven: Driven) -> float:
-    """Time of the first change of any drive; the first row's where none changes [time unit]."""
-    return min((float(one.times[0]) for one in moves(driven) if one.moves), default=float(driven.time[0]))
 
 
 @final
@@ -150,7 +140,7 @@ class FittedRange:
         ]
 
     def _times(self, driven: Driven, times: Vector) -> list[Outside]:
-        begin = beginning(driven)
+        begin = first_change(driven)
         last = begin + self.span
         if times[-1] <= last + self.period:
             return []
@@ -167,7 +157,7 @@ class FittedRange:
 
     def edges(self, driven: Driven, times: Vector) -> Vector:
         """Ends of the bands of frequency that are looked at, (bands + 1,) [cycles / time unit]."""
-        length = max(float(times[-1]) - beginning(driven), self.period)
+        length = max(float(times[-1]) - first_change(driven), self.period)
         gaps = np.diff(np.unique(driven.time))
         finest = min(self.period, float(gaps.min()) if gaps.size else self.period)
         finest = max(finest, length / _MOST)
@@ -188,7 +178,7 @@ class FittedRange:
         total = energy.sum(axis=(1, 2), keepdims=True)
         share = np.max(energy / np.where(total > 0, total, 1.0), axis=0)
         # of a drive that repeats what the records show, a stretch as long as the longest of them counts
-        length = max(float(times[-1]) - beginning(driven), self.period)
+        length = max(float(times[-1]) - first_change(driven), self.period)
         excursion = np.max([np.abs(one.drive - one.drive[0]).max(axis=0) for one in self.records], axis=0)
         size = np.abs(driven.drive - driven.drive[0]).max(axis=0)
         larger = np.maximum(size / np.where(excursion > 0, excursion, 1.0), 1.0)  # marked as amplitude
@@ -219,12 +209,12 @@ def energies(driven: Driven, until: float, edges: Vector) -> Matrix:
     Fourier transform over each band, both signs of frequency, (drives, bands) [drive unit^2 time unit].
     Accuracy: the drive enters by exact means over blocks of a sixteenth of the shortest cycle.
     """
-    begin = beginning(driven)
+    begin = first_change(driven)
     length = max(until - begin, 1.0 / edges[-1])
     blocks = min(int(np.ceil(16 * length * edges[-1])), 4 * _MOST)
     corners = begin + length * np.arange(blocks + 1) / blocks
     width, out = length / blocks, []
-    for one in moves(driven):
+    for one in axis_drives(driven):
         if not one.moves:
             out.append(np.zeros(edges.size - 1))
             continue

@@ -1,13 +1,11 @@
 r"""Frequency response of every path, with bands: ``gain exp(-s delay) / (1 + sum_i (T_i s)^order_i)``.
 
-At ``s = i 2 pi f`` (Ta et al. 2026, Eq. 31, stiffness divided out). The denominator's terms have arguments
-within ``pi order / 2 <= pi``, so that it stays in one half plane: its principal argument is the continuous
-one."""
+At ``s = i 2 pi f`` (Ta et al. 2026, Eq. 31, stiffness divided out)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 import numpy as np
 import pandas as pd
@@ -17,7 +15,9 @@ from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import Estimate, plain
 from lcopa_bayes.inference.parameters import ParameterTable
-from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS, pointwise, simultaneous
+from lcopa_bayes.model.transfer import denominator
+from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS, Bands, named
+from lcopa_bayes.results.result import notebook_table
 from lcopa_bayes.sampling.draws import Draws
 
 _DRAWS = 2000
@@ -32,21 +32,6 @@ fit records resolve [-]."""
 _SEARCH_POINTS = 300
 _SIGN = 0.05
 """Share of draws with a gain of the other sign from which the phase has two values [-]."""
-
-
-class Bands(NamedTuple):
-    """Bands of one curve over its points."""
-
-    pointwise: Matrix
-    """5, 25, 50, 75, 95 % quantiles, (5, n)."""
-    simultaneous: Matrix
-    """Lower end at 90 and 50 %, upper end at 50 and 90 %, (4, n)."""
-
-    @classmethod
-    def of(cls, curves: Matrix) -> Bands:
-        """Bands of curves (draws, n)."""
-        quantiles = pointwise(curves)
-        return cls(quantiles, simultaneous(curves, quantiles))
 
 
 @final
@@ -138,17 +123,7 @@ class FrequencyResponse:
         return out
 
     def _repr_html_(self) -> str:
-        return str(self.summary().to_html())
-
-
-def named(name: str, bands: Bands) -> dict[str, Vector]:
-    """Columns of a table: the ends of the bands by kind and percentage."""
-    columns = {
-        f"{name}_{POINTWISE}_{q}": row
-        for q, row in zip(("05", "25", "50", "75", "95"), bands.pointwise, strict=True)
-    }
-    rows = zip(("05", "25", "75", "95"), bands.simultaneous, strict=True)
-    return columns | {f"{name}_{SIMULTANEOUS}_{q}": row for q, row in rows}
+        return notebook_table(self.summary())
 
 
 def transfer_function(table: ParameterTable, values: Matrix, frequency: Vector) -> tuple[Array, Array]:
@@ -161,16 +136,13 @@ def transfer_function(table: ParameterTable, values: Matrix, frequency: Vector) 
     angular = 2 * np.pi * frequency
     size = (len(layout.responses), len(layout.drives), values.shape[0], frequency.size)
     magnitude, phase = np.empty(size), np.empty(size)
-    below = [
-        1.0
-        + sum((1j * angular * time[:, None]) ** order[:, None] for time, order in zip(t.T, o.T, strict=True))
-        for t, o in zip(dynamics.times, dynamics.orders, strict=True)
-    ]
+    elements = zip(dynamics.times, dynamics.orders, strict=True)
+    below = [denominator(times, orders, angular) for times, orders in elements]
     for i, j in np.ndindex(size[:2]):
-        denominator = below[layout.element_of[i][j]]
+        element = below[layout.element_of[i][j]]
         gain, delay = gains[:, i, j, None], dynamics.delays[:, layout.delay_of[i][j], None]
-        magnitude[i, j] = np.abs(gain) / np.abs(denominator)
-        phase[i, j] = -angular * delay - np.angle(denominator) - np.pi * (gain < 0)
+        magnitude[i, j] = np.abs(gain) / np.abs(element)
+        phase[i, j] = -angular * delay - np.angle(element) - np.pi * (gain < 0)
     return magnitude, phase
 
 

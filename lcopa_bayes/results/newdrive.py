@@ -14,13 +14,13 @@ from lcopa_bayes.core.arrays import Array, Vector
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import save_json, save_table, writable_folder
-from lcopa_bayes.data.drives import Drive, drive_of
+from lcopa_bayes.data.drive import Drive, drive_of, first_change
 from lcopa_bayes.data.record import Record, load_columns, record_of
 from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
-from lcopa_bayes.results.fittedrange import FittedRange, Outside, beginning
-from lcopa_bayes.results.frequency import Bands, named, transfer_function
+from lcopa_bayes.results.fittedrange import FittedRange, Outside
+from lcopa_bayes.results.frequency import transfer_function
 from lcopa_bayes.results.prediction import (
     Band,
     band_of,
@@ -29,7 +29,7 @@ from lcopa_bayes.results.prediction import (
     named_rng,
     plant_draws,
 )
-from lcopa_bayes.results.provenance import provenance
+from lcopa_bayes.results.provenance import digest, provenance
 from lcopa_bayes.results.result import Result
 from lcopa_bayes.results.runfolder import add_origin, opened
 from lcopa_bayes.sampling.draws import Draws
@@ -98,19 +98,8 @@ class Prediction(Result):
         """One row per axis and time: ends of the bands by kind, plant alone and with noise [`unit`], and
         whether the time lies within the fitted range of amplitude and duration."""
         since = min((one.since for one in self.outside if one.since is not None), default=np.inf)
-        frames = []
-        for band in self.bands:
-            columns: dict[str, Any] = {
-                "axis": band.axis,
-                "unit": band.unit,
-                "time": band.time,
-                "observed": band.observed,
-            }
-            columns |= named("plant", Bands(band.plant, band.plant_simultaneous))
-            columns |= named("noisy", Bands(band.noisy, band.noisy_simultaneous))
-            columns["inside"] = band.time < since
-            frames.append(pd.DataFrame(columns))
-        return pd.concat(frames, ignore_index=True)
+        frames = [band.table().assign(inside=band.time < since) for band in self.bands]
+        return pd.concat(frames, ignore_index=True).drop(columns=["record", "held_out"])
 
     def drives(self) -> pd.DataFrame:
         """One row per drive axis and row of the drive: its value from there on [`unit`]."""
@@ -241,14 +230,24 @@ def _squared(draws: Draws, frequency: Vector) -> Array:
 
 
 def _recorded(problem: Problem, draws: Draws, record: Record) -> tuple[Record, list[Band]]:
-    """Bands of a held-out record: what a fit gives that had it from the start."""
-    study = replace(problem.study, held_out=(record,))
+    """Bands of a held-out record: what a fit gives that had it from the start, whatever its name."""
+    name, fitted = record.name, problem.study.fit
+    while name in {one.name for one in fitted}:
+        name += "-new"
+    study = replace(problem.study, held_out=(replace(record, name=name),))
+    same = [one.name for one in fitted if digest(one) == digest(study.held_out[0])]
+    if same:
+        raise InputError(
+            f"record {record.name!r} is {same[0]!r} of the fit, where errors are not those of a prediction; "
+            "give another record, or leave out its responses for bands under its drive"
+        )
     if problems := unmet(study):
         raise InputError(problems)
     (held,) = study.held_out
     samples, model = problem.simulated(study.held_out)
     noise = problem.posterior.noise
-    return held, bands(draws, model, samples, noise, held_out=True, seed=problem.study.seed)
+    shown = bands(draws, model, samples, noise, held_out=True, seed=problem.study.seed)
+    return replace(held, name=record.name), [replace(band, record=record.name) for band in shown]
 
 
 def _unmeasured(problem: Problem, draws: Draws, drive: Drive, level: Level) -> tuple[Drive, list[Band]]:
@@ -284,7 +283,7 @@ def _times(drive: Drive, span: float, period: float) -> Vector:
     """Times to predict at: the rows where they are sampled as the records are, else a lattice of `period`."""
     if drive.until == drive.time[-1] and np.diff(drive.time).max(initial=0.0) <= 1.5 * period:
         return drive.time
-    begin = beginning(drive)
+    begin = first_change(drive)
     last = drive.time[-1] + span if drive.until is None else drive.until
     # the first change falls on the lattice, which lies between the first row and the end
     first = begin - np.floor((begin - drive.time[0]) / period + 1e-9) * period

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from xarray import DataTree
 
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.drives import Drive
+from lcopa_bayes.data.drive import Drive
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem

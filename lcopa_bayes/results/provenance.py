@@ -80,16 +80,21 @@ def commanded(command: Sequence[str]) -> Iterator[None]:
         _COMMAND.reset(token)
 
 
-def provenance(study: Study, verb: str) -> dict[str, Any]:
+def provenance(study: Study | None, verb: str) -> dict[str, Any]:
     """What another person needs to get the same numbers: command line, or the function that was called, seed,
-    settings, hashes of records and input files, versions."""
+    settings, hashes of records and input files, versions. Without a study, of the paper's printed numbers."""
+    own: dict[str, Any] = {"study": "Ta et al. 2026", "records_sha256": {}}
+    if study is not None:
+        own = {
+            "study": study.name,
+            "seed": study.seed,
+            "settings": settings_of(study),
+            "records_sha256": {record.name: digest(record) for record in study.fit},
+            "inputs_sha256": dict(study.inputs),
+        }
     return {
         "command": list(_COMMAND.get() or (f"lcopa_bayes.{verb}",)),
-        "study": study.name,
-        "seed": study.seed,
-        "settings": settings_of(study),
-        "records_sha256": {record.name: digest(record) for record in study.fit},
-        "inputs_sha256": dict(study.inputs),
+        **own,
         "python": platform.python_version(),
         "versions": {name: version(name) for name in _PACKAGES},
     }

@@ -10,6 +10,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.inference.parameter import Parameter
+from lcopa_bayes.model.transfer import denominator
 from lcopa_bayes.sampling.convergence import Limitation
 from lcopa_bayes.sampling.draws import Draws
 
@@ -84,9 +85,7 @@ def peaks(times: Matrix, orders: Matrix) -> tuple[Vector, Vector]:
     """Largest ``|1 / (sum (i w T)^order + 1)|`` at angular frequencies above one, (batch,) [-], and where, in
     the reciprocal of the unit of `times`, (batch, terms)."""
     frequency = np.exp(np.arange(0.0, np.log(_SPAN), _STEP))
-    below = np.ones((times.shape[0], frequency.size), dtype=complex)
-    for time, order in zip(times.T, orders.T, strict=True):
-        below += (1j * frequency * time[:, None]) ** order[:, None]
+    below = denominator(times, orders, frequency)
     at = np.argmin(np.abs(below), axis=1)
     return 1 / np.abs(below[np.arange(at.size), at]), frequency[at]
 

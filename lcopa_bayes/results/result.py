@@ -64,9 +64,27 @@ class Result(ABC):
         return bool(stored == plain(self.to_json()))
 
     def __str__(self) -> str:
-        return f"{self.summary().to_string(index=False)}\n\n{self.verdict}"
+        return f"{self.summary().to_string(index=False, float_format=shown)}\n\n{self.verdict}"
 
     def _repr_html_(self) -> str:
         from html import escape
 
-        return f"<p>{escape(self.verdict)}</p>{self.summary().to_html(index=False)}"
+        table = self.summary()
+        return f"<p>{escape(self.verdict)}</p>" + (notebook_table(table) if len(table) else "")
+
+
+def notebook_table(table: pd.DataFrame) -> str:
+    """A table as HTML for a notebook: numbers short and on the right, words on the left."""
+    words = table.select_dtypes(exclude="number").columns
+    left: list[Any] = [{"selector": "", "props": "text-align: left"}]
+    style = table.style.hide(axis="index").format(shown, escape="html")
+    return str(style.set_table_styles(dict.fromkeys(words, left)).to_html())
+
+
+def shown(value: object) -> str:
+    """A cell: four significant digits or two decimals, nothing for what is open or undefined."""
+    if value is None or value != value:
+        return ""
+    if isinstance(value, float):
+        return f"{value:.4g}" if abs(value) < 10 else f"{value:.2f}"
+    return str(value)

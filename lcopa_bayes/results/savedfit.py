@@ -21,7 +21,7 @@ import xarray as xr
 from lcopa_bayes.core.arrays import Array
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.files import writable_folder, write_whole
-from lcopa_bayes.data.studycopy import study_from_json, study_to_json
+from lcopa_bayes.data.studywriter import study_from_json, study_to_json
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.results.datatree import POSTERIOR, load_tree

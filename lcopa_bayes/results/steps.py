@@ -10,7 +10,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.core.estimate import Estimate
-from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.simulation import Simulation
 from lcopa_bayes.model.forward import Experiment, ForwardModel
@@ -104,8 +104,8 @@ def _effect_steps(table: ParameterTable, values: Matrix, time: Vector) -> Array:
     assert told is not None
     heights, experiments = told.ranges.drive, []
     for j, height in enumerate(heights):
-        step = Drive(np.zeros(1), np.array([float(height)]))
-        drives = tuple(step if j == k else Drive(np.empty(0), np.empty(0)) for k in range(heights.size))
+        step = AxisDrive(np.zeros(1), np.array([float(height)]))
+        drives = tuple(step if j == k else AxisDrive(np.empty(0), np.empty(0)) for k in range(heights.size))
         experiments.append(Experiment("step", Mesh.of_samples(time, 0.0), drives, np.zeros(heights.size)))
     count = len(experiments)
     over = replace(told, epochs=np.zeros(count), times=(time,) * count, fitted=(None,) * count)
@@ -117,7 +117,7 @@ def _effect_steps(table: ParameterTable, values: Matrix, time: Vector) -> Array:
 
 def _unit_steps(table: ParameterTable, values: Matrix, time: Vector) -> Array:
     """Responses to a unit step at time 0 over their steady values, (units, draws, n) [-]."""
-    step = Drive(np.zeros(1), np.ones(1))
+    step = AxisDrive(np.zeros(1), np.ones(1))
     rest = np.zeros(len(table.layout.drives))
     drives = tuple(step for _ in table.layout.drives)
     model = ForwardModel(table.layout, (Experiment("step", Mesh.of_samples(time, 0.0), drives, rest),))

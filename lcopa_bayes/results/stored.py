@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -93,4 +93,24 @@ class StoredResult(Result):
 def origin_of(fit: Predictive, verb: str) -> dict[str, Any]:
     """Provenance of a result that rests on a fit."""
     values: dict[str, Any] = plain(provenance(fit.study, verb) | {"draws_sha256": fit.draws.sha256})
+    return values
+
+
+def stored_values(
+    folder: Path, verb: str, needs: Sequence[str], *, file: str | None = None
+) -> Mapping[str, Any]:
+    """Values that `verb` wrote to a run folder; InputError when they cannot be read or lack any of `needs`.
+
+    They are in `file`, by default the one named after the verb.
+    """
+    path = folder / (file or f"{verb}.json")
+    try:
+        values: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: cannot be read ({error}); give the run folder that `{verb}` wrote"
+        ) from None
+    absent = [key for key in needs if key not in values] if isinstance(values, dict) else list(needs)
+    if absent:
+        raise InputError(f"{path}: lacks {', '.join(absent)}; run `{verb}` again")
     return values

@@ -17,6 +17,7 @@ from scipy.optimize import brentq
 from scipy.special import logsumexp
 
 from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.convergence import rank_correlation
 from lcopa_bayes.sampling.mixturemoves import learned
@@ -63,12 +64,19 @@ def temper(
 
     At each temperature every walker makes moves until the population has lost its correlation with its start,
     at most `sweeps` of them and a third while the temperature is low. `factor` times as many walkers come
-    from the prior as are kept. Deterministic given `rng` and `random`.
+    from the prior as are kept; those with a likelihood of 0 are drawn again. Deterministic given `rng` and
+    `random`. InputError when no draw of the prior has a likelihood above 0.
     """
     crowd = factor * walkers
     position = posterior.coordinates(posterior.table.draw(crowd, rng))
     prior = posterior.log_prior(position)
     likelihood = posterior.log_density(position) - prior
+    while (dead := np.isneginf(likelihood)).any():  # where effects leave no bounded response
+        if dead.all():
+            raise InputError("no draw of the prior has a likelihood above 0; narrow the priors")
+        position[dead] = posterior.coordinates(posterior.table.draw(int(dead.sum()), rng))
+        prior[dead] = posterior.log_prior(position[dead])
+        likelihood[dead] = posterior.log_density(position[dead]) - prior[dead]
     heat, rises, moves, trail = 0.0, 0, 0, []
     while heat < 1.0:
         rise = _rise(likelihood, 1.0 - heat)

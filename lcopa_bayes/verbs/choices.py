@@ -40,8 +40,15 @@ def fit(parser: argparse.ArgumentParser) -> None:
 def compare(parser: argparse.ArgumentParser) -> None:
     """Of `compare`."""
     sampled(parser)
-    parser.add_argument("--candidates", type=Path, metavar="FILE", help="[compare] and [[candidates]] (TOML)")
-    parser.add_argument("--pick", nargs="+", metavar="NAME", help="candidates by name")
+    parser.add_argument(
+        "--candidates",
+        type=Path,
+        default=(),
+        dest="described",
+        metavar="FILE",
+        help="[compare] and [[candidates]] (TOML)",
+    )
+    parser.add_argument("--pick", nargs="+", dest="candidates", metavar="NAME", help="candidates by name")
 
 
 def loop(parser: argparse.ArgumentParser) -> None:
@@ -101,7 +108,12 @@ def simulate(parser: argparse.ArgumentParser) -> None:
 def design(parser: argparse.ArgumentParser) -> None:
     """Of `design`."""
     sampled(parser)
-    parser.add_argument("--time", type=float, help="bench time [time unit of the study] (default: 40 spans)")
+    parser.add_argument(
+        "--time",
+        type=float,
+        dest="bench_time",
+        help="bench time [time unit of the study] (default: 40 spans)",
+    )
     parser.add_argument("--repeats", type=int, default=1, help="records to take (default: 1)")
     parser.add_argument(
         "--amplitude", type=float, help="largest deviation from rest [drive unit] (default: the records')"
@@ -175,24 +187,42 @@ def identify(parser: argparse.ArgumentParser) -> None:
 def optics(parser: argparse.ArgumentParser) -> None:
     """Of `optics`."""
     from lcopa_bayes.optics.cell import Field
+    from lcopa_bayes.paper.opticsplan import OpticsPlan
 
+    plan = OpticsPlan()
     parser.add_argument("--out", type=Path, default=RUNS / "optics", help="folder for the page")
-    parser.add_argument("--elements", type=int, help="elements along an axis (default: the paper's 32)")
+    parser.add_argument(
+        "--elements",
+        type=int,
+        default=plan.elements,
+        help="elements along an axis (default: the paper's 32)",
+    )
     parser.add_argument("--pitch", type=float, help="distance of elements [m] (default: 1.2 wavelengths)")
-    parser.add_argument("--wavelength", type=float, help="wavelength [m] (default: the paper's 1064e-9)")
     parser.add_argument(
-        "--fill-factor", type=float, default=1.0, help="element width over pitch, for the lobe table"
+        "--wavelength",
+        type=float,
+        default=plan.wavelength,
+        help="wavelength [m] (default: the paper's 1064e-9)",
     )
     parser.add_argument(
-        "--targets", nargs="+", type=float, metavar="DEG", help="steering angles [deg] (default: Fig. 3)"
+        "--fill-factor",
+        type=float,
+        default=plan.fill_factor,
+        help="element width over pitch, for the lobe table",
     )
     parser.add_argument(
-        "--voltages", nargs="+", type=float, metavar="V", default=[1.0, 2.0, 3.0, 4.0, 5.0], help="[V]"
+        "--targets",
+        nargs="+",
+        type=float,
+        metavar="DEG",
+        default=plan.targets_deg,
+        help="steering angles [deg] (default: Fig. 3)",
     )
-    parser.add_argument("--pretilt", type=float, default=0.0, help="tilt at the plates [rad]")
+    parser.add_argument("--voltages", nargs="+", type=float, metavar="V", default=plan.voltages, help="[V]")
+    parser.add_argument("--pretilt", type=float, default=plan.pretilt, help="tilt at the plates [rad]")
     parser.add_argument(
         "--field",
         choices=[field.value for field in Field],
-        default=Field.UNIFORM.value,
+        default=plan.field,
         help="how the voltage spreads over the cell",
     )

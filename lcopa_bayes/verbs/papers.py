@@ -2,79 +2,94 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any, final
+from typing import final
 
 import pandas as pd
 
-from lcopa_bayes.core.files import save_json, writable_folder
+from lcopa_bayes.core.files import writable_folder
 from lcopa_bayes.paper.auditclaims import load_audit
 from lcopa_bayes.paper.claims import judge
 from lcopa_bayes.paper.comparisonclaims import load_comparison
+from lcopa_bayes.paper.figures import panels
 from lcopa_bayes.paper.identify import identify as identified
-from lcopa_bayes.paper.identify import results, scannable, words_of
+from lcopa_bayes.paper.identify import results, scannable
 from lcopa_bayes.paper.intervals import Scan
 from lcopa_bayes.paper.opticsplan import OpticsPlan
 from lcopa_bayes.paper.staticoptics import static_optics
 from lcopa_bayes.paper.steptable import load_posterior, step_table
-from lcopa_bayes.paper.verdict import Evidence
-from lcopa_bayes.report.paperpages import write_claims, write_identification, write_optics
+from lcopa_bayes.paper.verdict import Evidence, Kind
+from lcopa_bayes.results.provenance import provenance
+from lcopa_bayes.results.stored import StoredResult
 from lcopa_bayes.verbs.sources import FitLike, study_of
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class PaperResult:
-    """What was calculated after the paper, as values, table and page."""
+class OpticsResult(StoredResult):
+    """Far field, director and the chain from volts to angle."""
 
-    values: Mapping[str, Any]
-    """What `to_json` gives."""
-    file: str
-    """File that `save` writes."""
-    rows: Sequence[Mapping[str, Any]]
-    """Rows of the summary."""
-    lines: Sequence[str]
-    """The result in words."""
-    page: Callable[[Path], Path]
-    """Writes the page into a folder."""
+    verb, file = "optics", "optics.json"
 
     def summary(self) -> pd.DataFrame:
-        """The main table: steering angles [deg] of `optics`, step metrics of `identify`, verdicts of
-        `claims`."""
-        return pd.DataFrame(self.rows)
-
-    def to_json(self) -> dict[str, Any]:
-        """Every number as plain values."""
-        return dict(self.values)
-
-    def save(self, folder: Path | str) -> Path:
-        """Write the values into a folder, which is returned; InputError when it cannot be written to."""
-        path = writable_folder(Path(folder))
-        save_json(self.values, path / self.file)
-        return path
-
-    def report(self, folder: Path | str) -> Path:
-        """`save`, then the page; returns its path."""
-        return self.page(self.save(folder))
+        """One row per lobe: target [deg], order, angle [deg], and intensity over the main lobe, of point
+        elements and of elements as wide as the fill factor says."""
+        return pd.DataFrame(self.values["grating_lobes"])
 
     def __str__(self) -> str:
-        return "\n".join(self.lines)
-
-    def _repr_html_(self) -> str:
-        return str(self.summary().to_html(index=False))
+        return f"{pd.DataFrame(self.values['mean_tilt']).to_string(index=False)}\n\n{super().__str__()}"
 
 
-def optics(plan: OpticsPlan | None = None) -> PaperResult:
+@final
+@dataclass(frozen=True, eq=False)
+class IdentifyResult(StoredResult):
+    """The paper's identification of every path, with the integer rival and its Table 1."""
+
+    verb, file, beside = "identify", "identify.json", ("tables/identify_*.csv",)
+
+    def summary(self) -> pd.DataFrame:
+        """One row per model of each path: orders, delay [time unit], steady gain, RMSE, and unit of the
+        response."""
+        return pd.DataFrame(
+            [
+                {
+                    "path": path["path"],
+                    "model": model["method"],
+                    "orders": ", ".join(f"{order:.3g}" for order in model["orders"]),
+                    "delay": model["delay"],
+                    "steady": model["steady"],
+                    "rmse": model["output_rmse"],
+                    "unit": path["response_unit"],
+                }
+                for path in self.values["paths"]
+                for model in path["models"]
+            ]
+        )
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class ClaimsResult(StoredResult):
+    """The paper's claims with their verdicts."""
+
+    verb, file = "claims", "claims.json"
+
+    def summary(self) -> pd.DataFrame:
+        """One row per claim: id, verdict, the number that decides [`unit`], and the calculation."""
+        return pd.DataFrame(self.values["claims"])
+
+    def __str__(self) -> str:
+        table = self.summary()[["id", "verdict", "number", "unit"]]
+        return f"{table.to_string(index=False, justify='left', na_rep='-')}\n\n{self.verdict}"
+
+
+def optics(plan: OpticsPlan | None = None) -> OpticsResult:
     """Far field, director and the chain from volts to angle; `plan` by default the paper's."""
-    calculated = static_optics(plan or OpticsPlan.of())
-    values = calculated.as_json()
-    rows = next((value for value in values.values() if isinstance(value, list)), [])
-    return PaperResult(
-        values, "results.json", rows, calculated.words(), partial(write_optics, calculated=calculated)
-    )
+    return OpticsResult(static_optics(plan or OpticsPlan()).values, provenance(None, "optics"))
 
 
 def identify(
@@ -85,11 +100,11 @@ def identify(
     folder: Path | str | None = None,
     jobs: int = 1,
     quiet: bool = True,
-) -> PaperResult:
+) -> IdentifyResult:
     """The paper's least-squares scan of every path, with the integer rival and its Table 1.
 
     Parameters: `study`, or a fit of it; `scan`, intervals and spacing; `posterior`, the run folder of a fit
-    whose intervals stand beside; `folder`, to be written to afterwards; `jobs`, processes to use; `quiet`, no
+    whose intervals are shown too; `folder`, a run folder to write into; `jobs`, processes to use; `quiet`, no
     progress bar. InputError when records, intervals or folders cannot be used.
     """
     wanted, plan = study_of(study), scan or Scan()
@@ -97,15 +112,21 @@ def identify(
     scannable(wanted, plan)
     if folder is not None:
         writable_folder(Path(folder))
-    found = identified(wanted, plan=plan, quiet=quiet, jobs=jobs)
-    rows = step_table(wanted, found, posterior=beside)
-    table = [row.as_json() for row in rows]
-    values = results(wanted, found, plan) | {"step_metrics": table}
-    page = partial(write_identification, study=wanted, identified=found, rows=rows)
-    return PaperResult(values, "identify.json", table, words_of(values), page)
+    models = identified(wanted, plan=plan, quiet=quiet, jobs=jobs)
+    shown, texts = [], {}
+    for number, (entry, samples) in enumerate(panels(wanted, models), start=1):
+        stem = re.sub(r"[^A-Za-z0-9_-]+", "_", f"identify_{number:02d}_{entry['record']}_{entry['axis']}")
+        shown.append(entry | {"samples": f"tables/{stem}.csv"})
+        texts[f"tables/{stem}.csv"] = str(samples.to_csv(index=False, float_format="%.9g"))
+    table = step_table(wanted, models, posterior=beside)
+    values = results(wanted, models, plan) | {"step_metrics": table, "records": shown}
+    result = IdentifyResult(values, provenance(wanted, "identify"), texts)
+    if folder is not None:
+        result.save(folder)
+    return result
 
 
-def claims(*, audits: Sequence[Path | str] = (), comparison: Path | str | None = None) -> PaperResult:
+def claims(*, audits: Sequence[Path | str] = (), comparison: Path | str | None = None) -> ClaimsResult:
     """Every claim of the paper with its computed verdict.
 
     Parameters: `audits`, run folders of audits, which decide claims I1 to I6; `comparison`, the run folder of
@@ -116,10 +137,8 @@ def claims(*, audits: Sequence[Path | str] = (), comparison: Path | str | None =
         tuple(load_audit(Path(folder)) for folder in audits),
         None if comparison is None else load_comparison(Path(comparison)),
     )
-    judged = judge(evidence=evidence)
-    rows = [each.as_json() for each in judged]
-    lines = [f"{'claim':6}{'verdict':14}{'number':>12}  unit"]
-    for each in judged:
-        number = "-" if each.verdict.number is None else f"{each.verdict.number:.4g}"
-        lines.append(f"{each.claim.id:6}{each.verdict.kind.value:14}{number:>12}  {each.verdict.unit}")
-    return PaperResult({"claims": rows}, "results.json", rows, lines, partial(write_claims, judged=judged))
+    rows = [each.as_json() for each in judge(evidence=evidence)]
+    counts = Counter(row["verdict"] for row in rows)
+    said = ", ".join(f"{counts[kind.value]} {kind.value}" for kind in Kind)
+    values = {"verdict": f"{len(rows)} claims of Ta et al. 2026: {said}.", "claims": rows}
+    return ClaimsResult(values, provenance(None, "claims"))

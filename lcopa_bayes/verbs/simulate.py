@@ -10,10 +10,10 @@ from typing import Any, final
 import numpy as np
 import pandas as pd
 
-from lcopa_bayes.bench.campaign import write_campaign
-from lcopa_bayes.bench.campaignfile import load_plan
+from lcopa_bayes.bench.campaignfile import load_plan, write_campaign
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
+from lcopa_bayes.results.result import notebook_table
 
 
 @final
@@ -91,14 +91,14 @@ class Simulation:
         )
 
     def _repr_html_(self) -> str:
-        return str(self.summary().to_html(index=False))
+        return notebook_table(self.summary())
 
 
 def simulate(campaign: Path | str, *, seed: int | None = None) -> Simulation:
     """Measure the campaign file `campaign` on the virtual bench, by numerics that share nothing with the
     forward model.
 
-    `seed` stands in place of the campaign's. InputError with everything wrong in the file.
+    `seed` replaces the campaign's. InputError with everything wrong in the file.
     """
     plan = load_plan(Path(campaign))
     chosen = plan.seed if seed is None else seed

@@ -6,8 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeAlias
 
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.requirements import unmet_apart_from_rest
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.data.studyfile import load_study
+from lcopa_bayes.data.studyfile import BrokenStudyError, load_study
+from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.savedfit import NAME, load_fit
 
@@ -17,12 +20,25 @@ FitLike: TypeAlias = StudyLike | Predictive
 """A fit, or what `StudyLike` is; a path may be the run folder of a finished fit."""
 
 
-def study_of(source: FitLike) -> Study:
-    """The study, read where it is named by paths; InputError when it cannot be used."""
-    found = finished(source)
-    if found is not None:
-        return found.study
-    return source if isinstance(source, Study) else load_study(source)  # type: ignore[arg-type]
+def study_of(source: FitLike, *, held_out: Sequence[Path] = ()) -> Study:
+    """The study, read where it is named by paths, with `held_out` records added there.
+
+    InputError with all that is wrong in its file, and in what of it can still be fitted together.
+    """
+    result = finished(source)
+    if result is not None:
+        return result.study
+    if isinstance(source, Study):
+        return source
+    try:
+        return load_study(source, held_out=held_out)  # type: ignore[arg-type]
+    except BrokenStudyError as broken:
+        problems = [*broken.problems, *unmet_apart_from_rest(broken.study)]
+        try:
+            problem_of(broken.study)
+        except InputError as error:
+            problems += error.problems
+        raise InputError(problems) from None
 
 
 def finished(source: FitLike) -> Predictive | None:

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import final
+
+import pandas as pd
 
 from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.results.newdrive import BANDS, DRIVES, NAME
 from lcopa_bayes.results.result import Result
 from lcopa_bayes.results.runfolder import origins
 from lcopa_bayes.results.savedfit import load_fit
@@ -15,11 +20,27 @@ from lcopa_bayes.verbs.calibrate import CalibrationResult
 from lcopa_bayes.verbs.compare import Comparison
 from lcopa_bayes.verbs.design import DesignResult
 from lcopa_bayes.verbs.loop import LoopResult
-from lcopa_bayes.verbs.predict import SavedPrediction
+from lcopa_bayes.verbs.papers import ClaimsResult, IdentifyResult, OpticsResult
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class SavedPrediction(StoredResult):
+    """Bands of every response axis under one drive."""
+
+    verb, file, beside = "predict", NAME, (f"tables/{BANDS}", f"tables/{DRIVES}")
+
+    def summary(self) -> pd.DataFrame:
+        """One row per response axis, as `Prediction.summary`."""
+        return pd.DataFrame(self.values["axes"])
+
 
 _KINDS: Mapping[str, type[StoredResult]] = {
     kind.verb: kind
-    for kind in (AuditResult, DesignResult, Comparison, LoopResult, CalibrationResult, SavedPrediction)
+    for kind in (
+        *(AuditResult, DesignResult, Comparison, LoopResult, CalibrationResult, SavedPrediction),
+        *(OpticsResult, IdentifyResult, ClaimsResult),
+    )
 }
 
 

@@ -27,15 +27,16 @@ import numpy as np
 
 from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import step
-from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.bench.device import Device
 from lcopa_bayes.calibration.calibrate import Calibration, calibrate
-from lcopa_bayes.calibration.coverage import LEVELS, Coverage
+from lcopa_bayes.calibration.ranks import LEVELS, Coverage
 from lcopa_bayes.calibration.summary import results
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import save_json, writable_folder, write_text
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.data.settings import ModelSettings, NoiseSettings, SamplerSettings
 from lcopa_bayes.data.study import Study
+from lcopa_bayes.model.path import TransferPath
 from lcopa_bayes.report.theme import BAND, HELD_OUT, NOISE, blank, look, svg_of
 
 CAMERA, DURATION, COMMAND = 0.2, 48.0, 2.0
@@ -95,8 +96,7 @@ class Cell:
         return {ON: "on a sample", OFF: "between samples"}.get(self.delay, "anywhere")
 
     def study(self, seed: int) -> Study:
-        etas = tuple(time**order for time, order in zip(self.times, self.orders, strict=True))
-        path = TransferPath(1.0, float(np.mean(self.delay)), etas, self.orders, 1.0)
+        path = TransferPath.of_times(1.0, float(np.mean(self.delay)), self.times, self.orders)
         device = Device(((path,),), (Axis("u", "V"),), (Axis("y", "rad"),), (0.0,))
         bench = Bench(camera=CAMERA, noise_sd=self.level)
         rng = np.random.default_rng(seed)

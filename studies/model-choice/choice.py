@@ -15,30 +15,28 @@ Finished replicas are kept in the folder: a killed run goes on where it stopped.
 
 import argparse
 import json
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.stats import beta
-from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.bench.acquisition import Bench, truth
 from lcopa_bayes.bench.command import staircase
-from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.bench.device import Device
 from lcopa_bayes.calibration.simulation import measured
 from lcopa_bayes.comparison.candidates import candidates_of
 from lcopa_bayes.comparison.gains import by_evidence, simplest
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.files import writable_folder, write_text
+from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.data.record import Axis
-from lcopa_bayes.data.settings import ModelSettings, NoiseSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.identifiability.curvature import curvature
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.likelihood import Landscape
+from lcopa_bayes.model.path import TransferPath
 from lcopa_bayes.results.prediction import responses
 from lcopa_bayes.sampling.draws import gather
 from lcopa_bayes.sampling.evidence import evidence
@@ -71,19 +69,15 @@ def template() -> Study:
         "delay": {"dist": "uniform", "loc": 0.0, "scale": 3.0},
         "sigma": {"dist": "loguniform", "a": NOISE / 10, "b": 10 * NOISE},
     }
-    made = {
-        name: PriorSettings(name, dist=str(told.pop("dist")), parameters=told)  # type: ignore[arg-type]
-        for name, told in priors.items()
-    }
     return Study(
         "model-choice",
         None,
         "ms",
         SEED,
         (record,),
-        model=ModelSettings(terms=3, offset="none", blocks=480, exposure=1 / 3),
-        priors=made,
-        noise=NoiseSettings("white"),
+        model={"terms": 3, "offset": "none", "blocks": 480, "exposure_ms": 1 / 3},
+        priors=priors,
+        noise={"kind": "white"},
     )
 
 
@@ -209,9 +203,8 @@ def _share(count: int, of: int) -> dict[str, Any]:
     }
 
 
-def _perform(number: int, quick: bool) -> dict[str, Any]:
-    with threadpool_limits(1):
-        return replica(number, quick=quick)
+def _perform(quick: bool, number: int) -> dict[str, Any]:
+    return replica(number, quick=quick)
 
 
 def main() -> None:
@@ -231,9 +224,8 @@ def main() -> None:
         if told is not None and told["quick"] == options.quick:
             done[number] = told
     missing = [number for number in range(options.replicas) if number not in done]
-    with ProcessPoolExecutor(max(1, options.jobs), mp_context=get_context("spawn")) as pool:
-        for future in as_completed([pool.submit(_perform, number, options.quick) for number in missing]):
-            told = future.result()
+    with workers(options.quick, jobs=options.jobs) as crew:
+        for told in crew.finished(_perform, missing):
             done[told["replica"]] = told
             write_text(folder / f"{told['replica']:05d}.json", json.dumps(told, allow_nan=False) + "\n")
             right = sum(one["preferred"] == one["kind"] for one in done.values())
@@ -248,4 +240,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    from choice import main as run  # workers do not run this script: what they do must be in a module
+
+    run()

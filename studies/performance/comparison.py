@@ -66,15 +66,17 @@ def compared(names: list[str], found: dict[str, list[Piece]], parts: dict[str, i
     """The report: reference, a row per method, ratios of the first method to each.
 
     `found` has the parts of each method, `parts` how many of them make a run. The first two methods are the
-    roads to the reference: each of them is judged by the other, all others by both.
+    methods of the reference: each of them is judged by the other, all others by both.
     """
-    one_road, other_road, *_ = found
+    first_method, second_method, *_ = found
     estimates = {method: np.array([one.means for one in pieces]) for method, pieces in found.items()}
-    first, second = Known.of(estimates[one_road]), Known.of(estimates[other_road])
+    first, second = Known.of(estimates[first_method]), Known.of(estimates[second_method])
     both = first.averaged(second)
-    squares = [np.mean([one.squares for one in found[road]], axis=0) for road in (one_road, other_road)]
+    squares = [
+        np.mean([one.squares for one in found[method]], axis=0) for method in (first_method, second_method)
+    ]
     variance = np.mean(squares, axis=0) - both.means**2
-    against = {one_road: second, other_road: first}
+    against = {first_method: second, second_method: first}
     rows = []
     for method, pieces in found.items():
         ess = shown_by_errors(estimates[method], variance, against.get(method, both), parts[method])
@@ -109,7 +111,7 @@ def compared(names: list[str], found: dict[str, list[Piece]], parts: dict[str, i
     return {
         "wanted_ratio": WANTED,
         "reference": {
-            name: {"value": m, "standard_error": s, "posterior_sd": d, "roads_apart_in_errors": z}
+            name: {"value": m, "standard_error": s, "posterior_sd": d, "methods_apart_in_errors": z}
             for name, m, s, d, z in zip(
                 names,
                 *(one.tolist() for one in (both.means, both.variances**0.5, variance**0.5, apart)),
@@ -146,9 +148,9 @@ def table(report: dict[str, Any]) -> str:
     ]
     wanted = f"Ratio wanted of both kinds: {report['wanted_ratio']:g}. Ratios against {'; '.join(verdicts)}."
     reference = report["reference"]
-    name = max(reference, key=lambda key: reference[key]["roads_apart_in_errors"])
+    name = max(reference, key=lambda key: reference[key]["methods_apart_in_errors"])
     apart = (
-        f"The two roads to the reference are furthest apart in {name}, "
-        f"{reference[name]['roads_apart_in_errors']:.1f} standard errors."
+        f"The two methods of the reference are furthest apart in {name}, "
+        f"{reference[name]['methods_apart_in_errors']:.1f} standard errors."
     )
     return "\n".join([*lines, "", wanted, "", apart])

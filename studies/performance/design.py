@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.data.literature import PAPER
 from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.experiments.candidates import candidates
 from lcopa_bayes.experiments.information import Bench
 from lcopa_bayes.experiments.limits import limits_of
 from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.model.literature import PAPER
 
 STUDY = Path(__file__).parents[1] / "paper-step-x"
 TIMES = (25.0, 250.0, 1000.0, 10_000.0)

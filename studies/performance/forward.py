@@ -16,14 +16,14 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.data.drive import Drive
-from lcopa_bayes.data.literature import PAPER
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.model.blockpulses import integration_matrix
 from lcopa_bayes.model.forward import Dynamics, Experiment, ForwardModel
 from lcopa_bayes.model.grid import Mesh
 from lcopa_bayes.model.layout import Layout
+from lcopa_bayes.model.literature import PAPER
 
 SPAN = 25.0
 BATCH = 64
@@ -41,7 +41,7 @@ def model(n: int) -> ForwardModel:
     layout = Layout.of([Axis("x", "rad")], [Axis("x", "rad")], ModelSettings(terms=3))
     mesh = Mesh.of_samples(SPAN / n * np.arange(1, n + 1), 0.0, blocks=n)
     assert mesh.grid.n - n <= 3, "the mesh has spare blocks only"
-    drive = Drive(np.zeros(1), np.ones(1))
+    drive = AxisDrive(np.zeros(1), np.ones(1))
     return ForwardModel(layout, (Experiment("step", mesh, (drive,), np.zeros(1)),))
 
 
@@ -52,7 +52,7 @@ def dense(n: int) -> np.ndarray:
         eta * integration_matrix(top - order, n, step)
         for eta, order in zip(path.etas, path.orders, strict=True)
     )
-    means, _ = Drive(np.zeros(1), np.ones(1)).block_means(step * np.arange(n + 1), np.array([path.delay]))
+    means, _ = AxisDrive(np.zeros(1), np.ones(1)).block_means(step * np.arange(n + 1), np.array([path.delay]))
     return solve_triangular(system, integration_matrix(top, n, step) @ means[0], lower=True)
 
 

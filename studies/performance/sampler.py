@@ -11,9 +11,7 @@ import argparse
 import json
 import time
 from collections.abc import Callable, Iterable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +20,9 @@ import emcee
 import numpy as np
 from arviz_stats.base import array_stats
 from comparison import Piece, compared, table
-from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.posterior import Posterior
@@ -172,9 +170,8 @@ def started() -> Callable[[], tuple[float, float]]:
 def performed(task: tuple[str, int, Effort, float]) -> tuple[str, list[Piece]]:
     method, seed, effort, budget = task
     posterior = problem_of(load_study(STUDY)).posterior
-    with threadpool_limits(1):
-        posterior.log_density(posterior.coordinates(posterior.table.draw(4, np.random.default_rng(0))))
-        return method, METHODS[method](posterior, seed, effort, budget)
+    posterior.log_density(posterior.coordinates(posterior.table.draw(4, np.random.default_rng(0))))
+    return method, METHODS[method](posterior, seed, effort, budget)
 
 
 def gathered(jobs: int, effort: Effort) -> dict[str, list[Piece]]:
@@ -190,12 +187,12 @@ def gathered(jobs: int, effort: Effort) -> dict[str, list[Piece]]:
     def seeded(method: str, count: int, budget: float) -> list[tuple[str, int, Effort, float]]:
         return [(method, 1 + k, effort, budget) for k in range(count)]
 
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+    with workers(None, jobs=jobs) as crew:
         first = seeded(OURS, effort.ours, np.nan) + seeded(TUNED, effort.nested_runs, np.nan)
-        collect(pool.map(performed, first))
+        collect(crew.map(performed, first))
         budget = sum(one.cpu for one in out[OURS]) / effort.ours
         collect(
-            pool.map(performed, seeded(PLAIN, effort.dynesty, budget) + seeded(EMCEE, effort.emcee, budget))
+            crew.map(performed, seeded(PLAIN, effort.dynesty, budget) + seeded(EMCEE, effort.emcee, budget))
         )
     return out
 
@@ -239,4 +236,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    from sampler import main as run  # workers do not run this script: what they do must be in a module
+
+    run()

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.bench.marching import MarchError
+from lcopa_bayes.bench.hiddeneffects import MarchError
 from lcopa_bayes.bench.undeclared import NOISE, Campaign, campaign, drawn
 from lcopa_bayes.core.files import write_text
 from lcopa_bayes.data.settings import ModelSettings
@@ -47,7 +47,7 @@ def study_of(made: Campaign, seed: int) -> Study:
     return Study("hidden", None, "ms", seed, made.fit, made.held_out, ModelSettings(terms=TERMS))
 
 
-def play(task: Task, folder: Path) -> dict[str, Any]:
+def play(folder: Path, task: Task) -> dict[str, Any]:
     """Make, loop and judge; the row is kept in `folder`, and read back when it is there."""
     path = folder / f"{task.name}.json"
     if path.exists():
@@ -116,7 +116,7 @@ def judged(found: Loop, made: Campaign) -> dict[str, Any]:
         "leading": [[one.name, one.log_bayes_factor] for one in trace.traced[:6]] if trace else [],
         "of_truth": {name: _evidence(found, name) for name in truth},
         "refits": refits,
-        "orders": [one.process.order for one in found.base.noise],
+        "correlations": [one.law.share * one.law.rho for one in found.base.noise],
         "quiet_samples": [one.samples if one.known else 0 for one in found.base.noise],
         "base_failed": found.base.failed,
         "before": errors(found.before, made),

@@ -11,9 +11,7 @@ import argparse
 import json
 import sys
 import tomllib
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from itertools import combinations, product
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +22,7 @@ from tqdm import tqdm
 
 from lcopa_bayes.bench.undeclared import NAMED, OUTSIDE
 from lcopa_bayes.core.files import writable_folder, write_text
+from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.effectsearch import candidates, rounds, trace, verdict
 from lcopa_bayes.report.formatting import figures
 from lcopa_bayes.report.page import Verdict, write_page
@@ -93,13 +92,8 @@ def main() -> None:
         sys.exit(f"seeds below {FIRST_TEST_SEED} were used in development; give --trial to use one")
     listed = tasks(options)[:: options.every][: options.limit]
     folder = writable_folder(options.out / "rows")
-    if options.jobs == 1:
-        rows = [play(task, folder) for task in tqdm(listed, disable=options.quiet)]
-    else:
-        with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
-            waiting = [pool.submit(play, task, folder) for task in listed]
-            done = tqdm(as_completed(waiting), total=len(waiting), disable=options.quiet)
-            rows = [each.result() for each in done]
+    with workers(folder, jobs=options.jobs) as crew:
+        rows = list(tqdm(crew.finished(play, listed), total=len(listed), disable=options.quiet))
     rows.sort(key=lambda row: (row["kind"], row["effects"], row["seed"]))
     lines = sheet(rows, told["targets"], told["package"]["seen"])
     values = {

@@ -11,8 +11,7 @@ from small import study
 
 from lcopa_bayes.bench.acquisition import Bench, truth
 from lcopa_bayes.bench.hiddeneffects import HiddenDevice
-from lcopa_bayes.bench.schedules import rich_schedules
-from lcopa_bayes.bench.undeclared import NAMED, NOISE, drawn, shot_of, steerer
+from lcopa_bayes.bench.undeclared import NAMED, NOISE, drawn, rich_schedules, shot_of, steerer
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.effects import Effected, effected
 from lcopa_bayes.model.effects.catalogue import bundled

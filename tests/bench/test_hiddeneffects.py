@@ -12,12 +12,23 @@ from scipy.integrate import solve_ivp
 from lcopa_bayes.bench.campaignfile import load_plan
 from lcopa_bayes.bench.command import on_off
 from lcopa_bayes.bench.driveeffects import by_axis, joined
-from lcopa_bayes.bench.inversion import Compliance
-from lcopa_bayes.bench.marching import MarchError, marched, step_means
-from lcopa_bayes.bench.schedules import LARGEST, plain_schedules, rich_schedules
-from lcopa_bayes.bench.undeclared import NAMED, NOISE, OUTSIDE, UndeclaredPlan, campaign, drawn, steerer
+from lcopa_bayes.bench.hiddeneffects import MarchError, marched, step_means
+from lcopa_bayes.bench.inversion import unit_step
+from lcopa_bayes.bench.undeclared import (
+    LARGEST,
+    NAMED,
+    NOISE,
+    OUTSIDE,
+    UndeclaredPlan,
+    campaign,
+    drawn,
+    plain_schedules,
+    rich_schedules,
+    steerer,
+)
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.studyfile import load_study
+from lcopa_bayes.model.path import TransferPath
 
 STUDY = Path(__file__).parents[2] / "studies" / "undeclared"
 DEVICE = steerer(np.random.default_rng(1))
@@ -29,11 +40,11 @@ def made(names: list[str], *, seed: int = 5, **options):
 
 
 def test_march_without_a_change_is_the_step_response():
-    element = Compliance((1.5, 0.8), (1.7, 0.6), 1.0)
+    element = TransferPath(1.0, 0.0, (1.5, 0.8), (1.7, 0.6), 1.0)
     edges = 0.05 * np.arange(401)
     force = step_means(edges, np.array([0.0]), np.array([2.0]))[None]
     told = marched((element,), force, lambda f, y, rate, k: f, np.zeros(1), 0.05)
-    assert_allclose(told[0], 2.0 * element.step_response(edges[1:]), atol=1e-10)
+    assert_allclose(told[0], 2.0 * unit_step(element, edges[1:]), atol=1e-10)
 
 
 @pytest.mark.parametrize("orders", [(1.0,), (2.0, 1.0)])
@@ -49,7 +60,7 @@ def test_march_of_a_cubic_force_is_second_order(orders):
     errors = []
     for n in (60, 120, 240):
         told = marched(
-            (Compliance(etas, orders, 1.0),),
+            (TransferPath(1.0, 0.0, etas, orders, 1.0),),
             np.ones((1, n)),
             lambda f, y, rate, k: f - 2.0 * y**3,
             np.zeros(1),
@@ -63,7 +74,7 @@ def test_march_of_a_cubic_force_is_second_order(orders):
 def test_march_tells_of_a_runaway():
     with pytest.raises(MarchError):
         marched(
-            (Compliance((1.0,), (1.0,), 1.0),),
+            (TransferPath(1.0, 0.0, (1.0,), (1.0,), 1.0),),
             np.ones((1, 400)),
             lambda f, y, rate, k: f + 5 * y,
             np.zeros(1),

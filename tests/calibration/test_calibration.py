@@ -22,9 +22,9 @@ from scipy import stats
 from small import ONE, TRUTH, TWO, check_page, problem, record, row_values, same_quantiles, study
 
 from lcopa_bayes.bench.command import on_off
+from lcopa_bayes.bench.inversion import step_response
 from lcopa_bayes.calibration.calibrate import Calibration, calibrate
-from lcopa_bayes.calibration.coverage import Coverage
-from lcopa_bayes.calibration.ranks import bin_limits, corridor, p_uniform, rank_of
+from lcopa_bayes.calibration.ranks import Coverage, bin_limits, corridor, p_uniform, rank_of
 from lcopa_bayes.calibration.replica import ENGINES, RANKED, Failure, Outcome, Replication, holds
 from lcopa_bayes.calibration.simulation import command_of, device_of, exact_responses, measured, model_gap
 from lcopa_bayes.calibration.store import Store
@@ -228,7 +228,7 @@ def test_two_axes_rests_exposure_and_missing_cells_are_kept():
     holes[3:9, 0] = np.nan
     holes[20, :] = np.nan
     holed = Record("holed", told.time, told.drive, holes, told.drive_axes, told.response_axes, "ms")
-    made = problem(told, holed, noise="ar1", terms={"direct": 2, "cross": 1}, exposure=0.1)
+    made = problem(told, holed, noise="ar1", terms={"direct": 2, "cross": 1}, exposure_ms=0.1)
     table = made.posterior.table
     truth = table.draw(1, np.random.default_rng(4))[0]
     exact = exact_responses(made, truth)
@@ -302,7 +302,7 @@ def test_a_replica_ranks_everything(alone):
         assert all(inner <= outer for inner, outer in outcome.inside)
         truth = row_values(table, dict(zip(names, outcome.truths, strict=False)) | FIXED)
         path = device_of(table, truth, 0, time_unit="ms").paths[0][0]
-        assert_allclose(outcome.truths[4:8], path.step_response(alone.replication.step_times), rtol=2e-3)
+        assert_allclose(outcome.truths[4:8], step_response(path, alone.replication.step_times), rtol=2e-3)
     assert len({outcome.truths for outcome in alone.outcomes}) == 3
 
 

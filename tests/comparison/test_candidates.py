@@ -8,7 +8,7 @@ from small import TWO, record, study
 from lcopa_bayes.comparison.candidates import Candidate, candidates_of, derived, known_settings
 from lcopa_bayes.comparison.compare import compare
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.candidatesettings import CandidateSettings
+from lcopa_bayes.data.settings import CandidateSettings, PriorSettings
 from lcopa_bayes.data.studyfile import load_candidates
 from lcopa_bayes.inference.assembly import problem_of
 
@@ -129,7 +129,7 @@ def test_a_file_adds_and_picks(tmp_path):
         ("[compare]\npick = 3", "`pick` must be a list"),
         ("[candidate]\nname = 3", "did you mean 'candidates'"),
         ("", "names no candidate"),
-        ("not toml", "cannot be read as TOML"),
+        ("not toml", "is not valid TOML"),
     ],
 )
 def test_what_is_wrong_in_a_file_is_told(tmp_path, text, said):
@@ -147,7 +147,7 @@ def test_unknown_names_and_single_candidates_are_refused():
     with pytest.raises(InputError, match="1 candidate left"):
         candidates_of(study(record()), pick=["fractional-1", "study"])  # the same model twice
     with pytest.raises(InputError, match="no parameter 'gian'"):
-        derived(study(record()), CandidateSettings("a", improper=("gian",)))
+        derived(study(record()), CandidateSettings("a", priors={"gian": PriorSettings("gian", dist="flat")}))
 
 
 def test_candidates_of_different_data_are_refused():

@@ -73,7 +73,7 @@ def test_every_score_has_its_error_and_grade(told):
         for one in row["predictions"]:
             assert one["plausible"]
             assert (one["in_sample"] is None) == (one["kind"] == "held-out record")
-            assert one["road"] in ("exact", "importance weights", "refit")
+            assert one["method"] in ("exact", "importance weights", "refit")
             assert one["monte_carlo_sd"] >= 0
 
 
@@ -167,7 +167,7 @@ def test_another_comparison_gives_another_verdict(claim, change):
 
 
 def test_m2_reads_the_distance_of_the_steady_states():
-    from lcopa_bayes.data.literature import PAPER
+    from lcopa_bayes.model.literature import PAPER
     from lcopa_bayes.paper.comparisonclaims import same_steady_state
 
     def kind(told: dict) -> str:

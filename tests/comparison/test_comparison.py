@@ -70,7 +70,7 @@ def test_savage_dickey_is_the_ratio_of_densities(rng, mean, sd):
     window = found.window
     exact = (norm.cdf(1 + window, mean, sd) - norm.cdf(1 - window, mean, sd)) / window
     assert found.nearest == 1
-    assert found.road == "draws at the integer"
+    assert found.method == "draws at the integer"
     assert abs(found.log_bayes_factor - log(exact)) < 4 * found.log_sd
     assert found.log_bayes_factor == pytest.approx(log(norm.pdf(1, mean, sd) / 0.5), abs=0.15)
 
@@ -78,7 +78,7 @@ def test_savage_dickey_is_the_ratio_of_densities(rng, mean, sd):
 def test_far_from_the_integer_the_tail_is_normal_and_says_so(rng):
     draws, prior = rng.normal(0.8, 0.02, 4_000), rng.uniform(0, 2, 200_000)
     found = savage_dickey(draws, prior, estimate(draws, 400))
-    assert found.road == "normal tail"
+    assert found.method == "normal tail"
     assert found.answer == "not an integer"
     assert abs(found.log_bayes_factor - norm.logpdf(1, 0.8, 0.02) - log(2)) < 4 * found.log_sd
 
@@ -97,7 +97,7 @@ def test_a_sharply_known_order_is_not_an_integer_because_it_is_near_one(rng, sd,
 def test_draws_that_do_not_vary_say_nothing(rng):
     draws = np.ones(4_000)
     found = savage_dickey(draws, rng.uniform(0, 2, 200_000), estimate(draws, 4_000))
-    assert (found.road, found.answer) == ("undefined", "undecided")
+    assert (found.method, found.answer) == ("undefined", "undecided")
 
 
 def test_an_order_at_an_end_of_its_domain_is_compared_with_the_prior_there(rng):

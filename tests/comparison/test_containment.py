@@ -11,11 +11,10 @@ from small import TWO, path, problem, record, row_values, study
 from lcopa_bayes.bench.command import prbs
 from lcopa_bayes.bench.device import Device
 from lcopa_bayes.comparison import candidatefit
-from lcopa_bayes.comparison.candidatefit import Contender
+from lcopa_bayes.comparison.candidatefit import Contender, highest
 from lcopa_bayes.comparison.candidates import candidates_of, derived, known_settings
 from lcopa_bayes.comparison.compare import compare
 from lcopa_bayes.comparison.containment import Check, reached
-from lcopa_bayes.comparison.criteria import highest
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.inference.assembly import problem_of
@@ -240,7 +239,7 @@ def test_a_missed_mode_is_found_and_the_richer_model_sampled_again(misled, monke
     assert held["sampled_again"]
     assert held["met"]
     assert richer["max_log_likelihood"] >= one["max_log_likelihood"] - 0.5
-    delay = next(row for row in richer["parameters_told"] if row["name"] == "delay")
+    delay = next(row for row in richer["estimates"] if row["name"] == "delay")
     assert delay["value"] == pytest.approx(2.37, abs=0.1)
     (flag,) = [flag for flag in told["flags"] if flag["kind"] == "missed mode"]
     assert flag["model"] == "fractional-2"

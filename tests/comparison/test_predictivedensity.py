@@ -19,7 +19,7 @@ from lcopa_bayes.comparison.lineardensity import linear_densities
 from lcopa_bayes.comparison.predictivedensity import left_out_weights, predictions
 from lcopa_bayes.comparison.priorwidth import widths
 from lcopa_bayes.comparison.sequentialdensity import known_before, log_densities
-from lcopa_bayes.data.candidatesettings import CandidateSettings
+from lcopa_bayes.data.settings import CandidateSettings
 from lcopa_bayes.inference.noise import AR1, Student, White
 from lcopa_bayes.inference.observations import Observed, Samples
 from lcopa_bayes.results.fit import fit
@@ -209,7 +209,7 @@ def test_left_out_records_by_weights_and_by_refit_are_the_exact_integral(pair, m
     monkeypatch.setattr(predictivedensity, "usable_k", lambda draws: np.inf if way != "refit" else -np.inf)
     monkeypatch.setattr(predictivedensity, "FEWEST_EFFECTIVE", 10.0)
     for found in predictions(pair):
-        assert found.road == way
+        assert found.method == way
         exact = exact_elpd(pair, found.part)
         total = float(found.log_density.sum())
         assert abs(total - exact) < 4 * found.error + 0.05
@@ -241,7 +241,7 @@ def test_a_wider_prior_by_weights_has_their_pareto_k(pair):
     """Half the width of the gain's prior; weights of draws from within are near 1, so k is small, whereas
     the evidence gains about log 2."""
     for one in widths(pair):
-        if one.road == "importance weights":
+        if one.method == "importance weights":
             assert one.log_evidence - pair.evidence.value == pytest.approx(-np.log(one.factor), abs=0.1)
 
 
@@ -296,7 +296,7 @@ def test_two_short_records_left_out_in_turn_are_those_of_separate_fits():
         (alone,) = predictions(
             fit(study(known, held_out=[left], priors=own, sampler=PLAN)), held_out_only=True
         )
-        assert found.road == "refit"
+        assert found.method == "refit"
         apart = float(found.log_density.sum() - alone.log_density.sum())
         assert abs(apart) < 4 * np.hypot(found.error, alone.error)
         assert found.log_density.sum() < found.in_sample

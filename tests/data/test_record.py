@@ -105,7 +105,7 @@ def test_a_bad_cell_is_named_by_line_and_column(tmp_path, line, column, rows, wo
         ("time_ms,drive_x_rad,response_x", ["'response_x'", "response_<axis>_<unit>"]),
         ("time_ms,drive_rad,response_x_rad", ["'drive_rad'", "drive_<axis>_<unit>"]),
         ("time_m,drive_x_rad,response_x_rad", ["'time_m'", "did you mean 'ms'?"]),
-        ("time,drive_x_rad,response_x_rad", ["'time'", "known: ms, s, us"]),
+        ("time,drive_x_rad,response_x_rad", ["'time'", "known: h, min, ms, ns, s, us"]),
         ("drive_y_rad,drive_x_rad,response_x_rad", ["has no time column"]),
         ("time_ms,response_y_rad,response_x_rad", ["has no drive column"]),
         ("time_ms,drive_x_rad,drive_y_rad", ["has no response column"]),
@@ -197,7 +197,7 @@ def test_parquet_problems_name_the_row(tmp_path):
         ({"drive": [[0.0, 0.0]] * 3}, "need"),
         ({"drive_axes": ()}, "distinct names"),
         ({"drive_axes": (Axis("x", "V"), Axis("x", "rad")), "drive": [[0.0, 0.0]] * 3}, "distinct names"),
-        ({"time_unit": "min"}, "time unit 'min'"),
+        ({"time_unit": "day"}, "time unit 'day'"),
         ({"time": [0.0], "drive": [[0.0]], "response": [[0.0]]}, "two or more rows"),
     ],
 )

@@ -38,10 +38,10 @@ def scaled(factor: float, level: float = 0.0) -> Record:
 BAD = {
     "exposure over the record": (
         PLAIN,
-        {"exposure": 50.0},
+        {"exposure_ms": 50.0},
         "the exposure of 50 ms is longer than the 0.2 ms",
     ),
-    "exposure over the sampling": (PLAIN, {"exposure": 0.3}, "in which a sample cannot be taken"),
+    "exposure over the sampling": (PLAIN, {"exposure_ms": 0.3}, "in which a sample cannot be taken"),
     "constant response": (
         replace(PLAIN, response=np.where(np.isnan(PLAIN.response), np.nan, 0.5)),
         {},
@@ -67,7 +67,7 @@ def test_what_no_fit_can_use_is_refused_in_words(name):
 
 def test_what_is_unusual_but_sound_is_fitted():
     assert unmet(study(PLAIN)) == []
-    assert unmet(study(PLAIN, exposure=0.2)) == []
+    assert unmet(study(PLAIN, exposure_ms=0.2)) == []
     for sound in (scaled(1e-12), scaled(1e12), scaled(1.0, 1e3), with_twin(1e-3)):
         assert unmet(study(sound)) == []
 
@@ -115,7 +115,7 @@ def test_unusual_records_give_the_truth_of_the_bench(name):
     noisy = exact + 0.002 * np.ptp(exact) * np.random.default_rng(1).standard_normal(exact.shape)
     response[np.searchsorted(rows, times)] = noisy
     rows = rows + (1.7e12 if name == "clock of years" else 0.0)  # to 0.001 of a sample in double precision
-    made = study(Record("r", rows, drive[:, None], response, (U,), (Y,), "ms"), exposure=exposure)
+    made = study(Record("r", rows, drive[:, None], response, (U,), (Y,), "ms"), exposure_ms=exposure)
     assert unmet(made) == []
     posterior = resolved(problem_of(made)).posterior
     best = find_optima(posterior, np.random.default_rng(0), starts=6)[0]

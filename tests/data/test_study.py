@@ -57,7 +57,7 @@ def test_three_lines_are_a_study(tmp_path):
     assert study.drive_axes == study.response_axes == (Axis("x", "rad"),)
     assert (study.model, study.noise, study.sampler) == (ModelSettings(), NoiseSettings(), SamplerSettings())
     assert dict(study.priors) == {}
-    assert list(study.stages) == ["fit", "rival"]
+    assert study.stages == ("fit", "rival")
     expected = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in os.listdir(folder)}
     assert dict(study.inputs) == expected
     assert load_study(folder / "study.toml").inputs == study.inputs
@@ -81,7 +81,7 @@ def test_times_are_in_the_unit_of_the_records_unless_the_study_states_one(tmp_pa
     for study, last, exposure in ((alone, 1.5, 0.0), (beside, 1.5, 0.25), (stated, 1500.0, 250.0)):
         assert study.fit[0].time_unit == study.time_unit
         assert study.fit[0].time[-1] == last
-        assert study.model.exposure == exposure
+        assert study.exposure == exposure
 
 
 def test_priors_of_a_study_are_in_the_unit_of_its_records(tmp_path):
@@ -147,7 +147,7 @@ steps = 5000
 target_ess = 100
 thin = 2
 [stages]
-fit = {}
+fit = true
 """
 
 
@@ -155,14 +155,15 @@ def test_every_setting_arrives(tmp_path):
     study = load_study(folder_of(tmp_path, FULL, a=STEP, b=QUIET))
     np.testing.assert_allclose(study.fit[0].time, [0, 500, 1500], rtol=1e-15)
     assert [r.name for r in study.held_out] == ["b"]
-    assert study.model == ModelSettings(3, (2.0, 1.0, 1.0), "none", "path", "shared", 128, 250.0)
+    assert study.model == ModelSettings(3, (2.0, 1.0, 1.0), "none", "path", "shared", 128, 0.25)
+    assert study.exposure == 250.0
     assert study.noise == NoiseSettings("student")
     assert study.sampler == SamplerSettings(3, 32, 5000, 100, 2)
     assert study.priors["delay"].fixed == 3.027
     gain, order = study.priors["gain"].frozen(), study.priors["order"].frozen()
     assert gain.logpdf(0.1) == stats.loguniform(1e-3, 10).logpdf(0.1)
     assert order.pdf(1.3) == stats.beta(2, 2, scale=2).pdf(1.3)
-    assert {name: dict(settings) for name, settings in study.stages.items()} == {"fit": {}}
+    assert study.stages == ("fit",)
 
 
 @pytest.mark.parametrize(
@@ -177,6 +178,7 @@ def test_every_setting_arrives(tmp_path):
         ("[study]\nseed = -1", ["[study]", "`seed`", "at least 0", "-1"]),
         ("[study]\nseed = 1.5", ["[study]", "`seed`", "whole number", "1.5"]),
         ("[study]\nseed = true", ["[study]", "`seed`", "True"]),
+        ("priors = 3", ["[priors]", "must be a table", "3"]),
         ("study = 3", ["[study]", "must be a table", "3"]),
         ('[records]\nheldout = ["step.csv"]', ["[records]", "'heldout'", "'held_out'"]),
         ('[records]\nfit = "step.csv"', ["[records]", "`fit`", "list of file names"]),
@@ -216,6 +218,10 @@ def test_every_setting_arrives(tmp_path):
         ('[priors]\ngain = {dist = "uniform", scale = inf}', ["[priors]", "'gain'", "'scale'", "finite"]),
         ('[priors]\ngain = {dist = "norm", loc = "0"}', ["[priors]", "'gain'", "'loc'", "finite number"]),
         ('[priors]\ngain = {dist = "poisson", mu = 1}', ["[priors]", "'gain'", "'poisson'"]),
+        (
+            '[priors]\ngain = {dist = "flat"}',
+            ["[priors]", "'gain'", "flat is no distribution", "only a candidate"],
+        ),
         ("[priors]\ngain = {loc = 1}", ["[priors]", "'gain'", "dist ="]),
         ("[priors]\ngain = nan", ["[priors]", "'gain'", "finite"]),
         ('[priors]\ngain = "norm"', ["[priors]", "'gain'", "'norm'"]),
@@ -228,8 +234,8 @@ def test_every_setting_arrives(tmp_path):
         ("[sampler]\nwalker = 8", ["[sampler]", "'walker'", "'walkers'"]),
         ("[stages.fits]\na = 1", ["[stages]", "'fits'", "'fit'"]),
         ('stages = ["fit", "fitt"]', ["[stages]", "'fitt'", "'fit'"]),
-        ("[stages]\nfit = {most = 2}", ["[stages]", "fit", "'most'"]),
-        ("[stages]\nfit = 3", ["[stages]", "`fit`", "3"]),
+        ("[stages]\nfit = {most = 2}", ["[stages]", "`fit`", "true or false", "'most'"]),
+        ("[stages]\nfit = 3", ["[stages]", "`fit`", "true or false", "3"]),
         ("[stages]\nfit = false", ["[stages]", "names no stage"]),
         ('stages = "fit"', ["[stages]", "must be a table or a list", "'fit'"]),
     ],
@@ -368,7 +374,7 @@ def test_a_study_is_locked_and_can_be_sent_to_another_process(tmp_path):
             study.inputs,
         )
         assert one.model.terms == {"xx": 2, "xy": 1}
-        for mapping in (one.priors, one.stages, one.stages["fit"], one.inputs, one.model.terms):
+        for mapping in (one.priors, one.inputs, one.model.terms):
             with pytest.raises(TypeError):
                 mapping["other"] = 1  # type: ignore[index]
         np.testing.assert_array_equal(one.fit[0].response, study.fit[0].response)
@@ -387,7 +393,7 @@ def test_a_study_made_by_hand_is_checked_too(tmp_path):
 
 def test_settings_tell_all_their_problems():
     with pytest.raises(InputError) as caught:
-        ModelSettings(terms=0, share="x", blocks=0, exposure=-1.0)  # type: ignore[arg-type]
+        ModelSettings(terms=0, share="x", blocks=0, exposure_ms=-1.0)  # type: ignore[arg-type]
     assert len(caught.value.problems) == 4
     with pytest.raises(InputError, match="held_out"):
         RecordsSettings(held_out="a.csv")  # type: ignore[arg-type]

@@ -30,7 +30,7 @@ def test_every_setting_and_number_comes_back(tmp_path: Path):
         priors={"delay": ("uniform", {"loc": 0.1, "scale": 1 / 3}), "time_1_direct": 1 / 7},
         sampler={"ensembles": 3, "target_ess": 250},
         terms={"direct": 2, "cross": 1},
-        exposure=0.01,
+        exposure_ms=0.01,
         blocks=300,
     )
     made = replace(

@@ -18,7 +18,7 @@ from lcopa_bayes.effectsearch.explained import coordinates_of, explained_study
 from lcopa_bayes.effectsearch.loop import Loop, loop
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.model.effects.commands import OverdrivePulse
-from lcopa_bayes.model.effects.ripples import Vibration
+from lcopa_bayes.model.effects.records import Vibration
 from lcopa_bayes.results.fit import Fit, fit
 
 

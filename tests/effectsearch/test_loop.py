@@ -9,7 +9,7 @@ import pytest
 
 from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import on_off, staircase, step
-from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.bench.device import Device
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
@@ -21,13 +21,15 @@ from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.gaussnewton import Regression
 from lcopa_bayes.effectsearch.heldouteffects import unseen_share
 from lcopa_bayes.effectsearch.loop import loop
-from lcopa_bayes.effectsearch.noisesamples import axis_noise, repeat_pieces
+from lcopa_bayes.effectsearch.noise import axis_noise, repeat_pieces
 from lcopa_bayes.effectsearch.summary import drawn, results, words
 from lcopa_bayes.effectsearch.verdict import Found, decide
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.effect import UnstableError
+from lcopa_bayes.model.path import TransferPath
 
 NOISE = 5e-3
 NAMES = ("odd_curvature", "even_curvature", "gain_drift", "unmodelled_smooth")
@@ -81,7 +83,7 @@ def test_a_clean_campaign_stays_clean(clean):
 def test_the_noise_is_measured_before_the_drive_moves(clean):
     (noise,) = clean.base.noise
     assert noise.source == "quiet"
-    assert noise.process.sd == pytest.approx(NOISE, rel=4 / np.sqrt(2 * noise.samples))
+    assert noise.law.sd == pytest.approx(NOISE, rel=4 / np.sqrt(2 * noise.samples))
 
 
 def test_the_hidden_effect_is_named_and_its_size_recovered(bent):
@@ -197,8 +199,8 @@ def test_repeats_measure_the_noise():
         Study("twin", None, "ms", 6, (made[0], twin), (), ModelSettings(offset="shared"))
     ).posterior
     pieces = repeat_pieces(posterior.samples, 0)
-    assert sum(piece.size for piece in pieces) == np.isfinite(made[0].response).sum()
-    noise = axis_noise(posterior.samples, 0, 0.0, "x")
+    assert sum(piece.values.size for piece in pieces) == np.isfinite(made[0].response).sum()
+    noise = axis_noise(posterior.samples, 0, 0.0, "x", Scales.of(made))
     assert noise is not None
     assert noise.known
 
@@ -279,5 +281,5 @@ def test_whitening_of_records_is_that_of_their_parts(clean):
     state = clean.before.state
     both = Whitening(state.whitening.samples, state.whitening.noise)
     part = both.parts[1]
-    alone = both.noise[0].whiten(both.observed[part.rows])
+    alone = both.noise[0].whiten(both.observed[part.rows], both.samples[part.record].axes[part.axis].gaps)
     np.testing.assert_allclose(both(both.observed)[part.rows], alone)

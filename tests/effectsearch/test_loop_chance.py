@@ -7,29 +7,27 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.linalg import toeplitz
 from scipy.stats import binom, chi2, kstest, norm
 from scipy.stats import t as student
 
 from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import on_off, staircase, step
-from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.bench.device import Device
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.effectsearch.autoregression import Autoregression, unbroken
 from lcopa_bayes.effectsearch.heldouteffects import Errors
 from lcopa_bayes.effectsearch.loop import loop
-from lcopa_bayes.effectsearch.noisepieces import NoisePieces
-from lcopa_bayes.effectsearch.noiseposterior import NoisePosterior
-from lcopa_bayes.effectsearch.noisesamples import FEWEST
+from lcopa_bayes.effectsearch.noise import FEWEST, Law
 from lcopa_bayes.effectsearch.refits import SIGNIFICANT, Refit
 from lcopa_bayes.effectsearch.trace import threshold_of
 from lcopa_bayes.effectsearch.whitening import Whitening
-from lcopa_bayes.inference.observations import Samples
+from lcopa_bayes.inference.mixednoise import WhiteAR1
+from lcopa_bayes.inference.observations import Observed, Samples
+from lcopa_bayes.inference.restnoise import PlausibleNoise
 from lcopa_bayes.model.effects.catalogue import catalogue
+from lcopa_bayes.model.path import TransferPath
 
-PARTIAL = st.lists(st.floats(-0.95, 0.95), max_size=5).map(np.array)
 AXIS = (Axis("x", "rad"),)
 NOISE, PERIOD = 5e-3, 0.2
 """Standard deviation of the noise over a step of 1 [-] and sampling period [ms] of the campaigns."""
@@ -41,41 +39,66 @@ LIBRARY = [
 
 
 def first_order(rho, sd=1.0):
-    return Autoregression(np.array([rho]), sd * np.sqrt(1 - rho**2))
+    return Law(0.0, sd, rho)
 
 
-@given(PARTIAL, st.integers(1, 12))
+def noise_of(law, count, n, rng):
+    """(count, n)."""
+    return WhiteAR1().draw(np.tile(law.parameters, (count, 1)), np.ones(n), rng)
+
+
+def covariance(law, n):
+    lags = np.abs(np.arange(n)[:, None] - np.arange(n))
+    return law.sigma**2 * np.eye(n) + law.sigma_ar**2 * law.rho**lags
+
+
+def shapes(*rows):
+    """Laws of unit variance, all as likely beforehand."""
+    return np.array(rows), np.zeros(len(rows))
+
+
+def known_by(values, *rows):
+    """What samples of noise leave of some laws."""
+    return PlausibleNoise.of([Observed(np.arange(values.size), values, np.ones(values.size))], *shapes(*rows))
+
+
+SHARE, RHO = st.floats(0.0, 1.0), st.floats(0.05, 0.99)
+
+
+@given(SHARE, RHO, st.lists(st.sampled_from([1.0, 1.0, 4.5]), min_size=1, max_size=12).map(np.array))
 @settings(max_examples=40, deadline=None)
-def test_adjoint_is_that_of_whitening(partial, n):
-    process, rng = Autoregression(partial, 0.3), np.random.default_rng(1)
-    a, b = rng.normal(size=(2, n))
-    assert process.whiten(a) @ b == pytest.approx(a @ process.adjoint(b), rel=1e-9)
+def test_adjoint_is_that_of_whitening(share, rho, gaps):
+    law, rng = Law(np.sqrt(1 - share), np.sqrt(share), rho), np.random.default_rng(1)
+    a, b = rng.normal(size=(2, gaps.size))
+    back = WhiteAR1().adjoint(b[None], law.parameters, gaps)[0]
+    assert law.whiten(a, gaps) @ b == pytest.approx(a @ back, rel=1e-9, abs=1e-12)
 
 
-@given(PARTIAL, st.integers(2, 40))
+@given(SHARE, RHO, st.integers(2, 40))
 @settings(max_examples=40, deadline=None)
-def test_samples_per_independent_one_are_those_of_a_sum_of_squares(partial, n):
+def test_samples_per_independent_one_are_those_of_a_sum_of_squares(share, rho, n):
     """The variance of a quadratic form of normal samples is twice the trace of its squared covariance."""
-    process = Autoregression(partial, 2.0)
-    covariance = toeplitz(process.autocovariance(n - 1))
-    exact = np.trace(covariance @ covariance) / (n * process.sd**4)
-    assert process.correlated(n - 1) == pytest.approx(exact, rel=1e-9)
+    law = Law(2 * np.sqrt(1 - share), 2 * np.sqrt(share), rho)
+    exact = np.trace(covariance(law, n) @ covariance(law, n)) / (n * law.sd**4)
+    assert law.correlated(n - 1) == pytest.approx(exact, rel=1e-9)
 
 
-def test_the_posterior_of_the_noise_is_that_of_a_grid():
-    """24 samples admit orders 0 and 1: importance sampling against sums over a grid of the correlation."""
-    pieces = NoisePieces.of(list(first_order(0.7).draw(2, 12, np.random.default_rng(2))))
-    grid = np.tanh(np.linspace(-8, 8, 3001))
-    weights = np.exp(-np.array([pieces.cost(np.array([kappa]))[0] for kappa in grid]) + pieces.modes[0].cost)
-    weights *= np.gradient(np.arcsin(grid)) / np.pi
-    drawn = NoisePosterior(pieces).draw(4000, np.random.default_rng(0))
-    kappa = np.array([one.partial[0] for one in drawn if one.order == 1])
-    exact = weights.sum() / (1 + weights.sum())
-    assert kappa.size / 4000 == pytest.approx(exact, abs=0.03)
-    for level in (0.1, 0.5, 0.9, 0.98):
-        at = grid[np.searchsorted(np.cumsum(weights) / weights.sum(), level)]
-        # 400 proposals; their weights leave more than half of them
-        assert np.mean(kappa <= at) == pytest.approx(level, abs=4 * np.sqrt(level * (1 - level) / 200))
+def test_the_posterior_of_the_noise_is_that_of_dense_densities():
+    """Level and scale integrated out in closed form, or by sums over a grid of both."""
+    values = noise_of(first_order(0.7), 1, 12, np.random.default_rng(2))[0]
+    rows = [(1.0, 0.0, 0.5), (0.0, 1.0, 0.7), (np.sqrt(0.5), np.sqrt(0.5), 0.9)]
+    level, log_sd = (grid.ravel() for grid in np.meshgrid(np.linspace(-8, 8, 400), np.linspace(-3, 3, 300)))
+    mass = []
+    for row in rows:
+        inverse = np.linalg.inv(covariance(Law(*row), 12))
+        apart = values - level[:, None]
+        power = np.einsum("bi,ij,bj->b", apart, inverse, apart) * np.exp(-2 * log_sd)
+        mass.append(np.exp(-0.5 * power - 12 * log_sd).sum() * np.sqrt(np.linalg.det(inverse)))
+    known = known_by(values, *rows)
+    np.testing.assert_allclose(known.weights, np.array(mass) / sum(mass), rtol=1e-3)
+    drawn = known.draw(4000, np.random.default_rng(0))
+    share = np.mean(drawn[:, 1] == 0.0)
+    assert share == pytest.approx(known.weights[0], abs=4 * np.sqrt(share * (1 - share) / 4000))
 
 
 def samples_of(pieces):
@@ -88,11 +111,11 @@ def samples_of(pieces):
 
 
 def test_chance_beside_a_scale_that_is_estimated_is_student():
-    """Ten samples admit order 0 alone: then a whitened sample is exactly Student with nine degrees."""
+    """White noise by ten samples: then a whitened sample is exactly Student with nine degrees."""
     rng = np.random.default_rng(3)
-    known = NoisePosterior(NoisePieces.of([rng.normal(size=10)]))
-    white = Whitening(samples_of([rng.normal(size=8)]), (known.pieces.estimate,), (), (known,))
-    # four draws from each process share its scale: as many independent draws as processes
+    known = known_by(rng.normal(size=10), (1.0, 0.0, 0.5))
+    white = Whitening(samples_of([rng.normal(size=8)]), (Law.of(known),), (), (known,))
+    # four draws from each law share its scale: as many independent draws as laws
     drawn = np.concatenate([white.chance(1000, rng)[0, ::4] for _ in range(8)])
     assert kstest(drawn, student(9).cdf).pvalue > 1e-3
     assert binom.sf(np.count_nonzero(np.abs(drawn) > 3) - 1, 2000, 2 * norm.sf(3)) < 1e-6
@@ -101,26 +124,28 @@ def test_chance_beside_a_scale_that_is_estimated_is_student():
 def test_covariance_under_plausible_noise_is_that_of_its_draws():
     """Three ways to the same matrices: lag sums of the adjoint, many draws, and dense algebra."""
     rng = np.random.default_rng(4)
-    pieces = [first_order(0.8).draw(1, n, rng)[0] for n in (40, 25)]
-    known = NoisePosterior(NoisePieces.of([first_order(0.8).draw(1, 8000, rng)[0]]))
+    truth = Law(0.5, 0.9, 0.8)
+    pieces = [noise_of(truth, 1, n, rng)[0] for n in (40, 25)]
+    rows = [(np.sqrt(1 - s), np.sqrt(s), r) for s in (0.7, 0.8, 1.0) for r in (0.75, 0.8, 0.85)]
+    known = known_by(noise_of(truth, 1, 8000, rng)[0], *rows)
     white = Whitening(samples_of(pieces), (first_order(0.5),), (3.0,), (known,))
     columns = np.cumsum(rng.normal(size=(65, 2)), axis=0)
     found = white.covariances(columns, 200).mean(axis=0)
     drawn = np.cov(columns.T @ white.chance(8000, rng))
-    error = 5 * np.sqrt(2 / 8000) + 0.03  # of 8000 draws, and of the mean of 200 processes
+    error = 5 * np.sqrt(2 / 8000) + 0.03  # of 8000 draws, and of the mean of 200 laws
     np.testing.assert_allclose(drawn, found, atol=error * np.diag(found).max())
-    process = known.draw(1, np.random.default_rng(7))[0]
-    dense = np.zeros((65, 65))
-    dense[:40, :40], dense[40:, 40:] = (toeplitz(process.autocovariance(n - 1)) for n in (40, 25))
+    law = Law(*known.draw(1, np.random.default_rng(7))[0].tolist())
+    exact = np.zeros((65, 65))
+    exact[:40, :40], exact[40:, 40:] = (covariance(law, n) for n in (40, 25))
     back = white.adjoint(columns.T)
-    np.testing.assert_allclose(white.covariances(columns, 1)[0], back @ dense @ back.T, rtol=1e-8)
+    np.testing.assert_allclose(white.covariances(columns, 1)[0], back @ exact @ back.T, rtol=1e-8)
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.9, 0.98])
 def test_errors_of_correlated_noise_are_missed_as_seldom_as_told(rho):
     """Of independent ones so many squares would lie beyond 5 standard deviations as good as never."""
-    process = first_order(rho) if rho else Autoregression(np.empty(0), 1.0)
-    drawn, count = process.draw(4000, 600, np.random.default_rng(5)), 600.0
+    law = first_order(rho) if rho else Law(1.0)
+    drawn, count = noise_of(law, 4000, 600, np.random.default_rng(5)), 600.0
 
     def p_values(noise):
         return np.array(
@@ -130,29 +155,28 @@ def test_errors_of_correlated_noise_are_missed_as_seldom_as_told(rho):
             ]
         )
 
-    told = p_values([[process]])
+    told = p_values([[law]])
     for level in (0.05, 0.005):
         beyond = np.count_nonzero(told < level)
         assert binom.sf(beyond - 1, 4000, 1.3 * level) > 1e-3  # a chi-squared of the right variance is near
         assert binom.cdf(beyond, 4000, level / 2) > 1e-3
     assert not (told < norm.sf(5.0)).any()
-    alone = p_values([[Autoregression(np.empty(0), 1.0)]])
+    alone = p_values([[Law(1.0)]])
     assert (np.mean(alone < norm.sf(5.0)) > 0.01) == (rho > 0)
 
 
 def test_significance_beside_coloured_noise_is_what_it_says():
     """Samples weighted alike: a tangent as slow as the noise scatters more than their number says."""
     rng, n = np.random.default_rng(6), 300
-    known = NoisePosterior(NoisePieces.of([first_order(0.9).draw(1, 4000, rng)[0]]))
-    dependence = known.pieces.estimate.correlated(n)
-    white = Whitening(
-        samples_of([rng.normal(size=n)]), (Autoregression(np.empty(0), 1.0),), (dependence,), (known,)
-    )
+    rows = [(0.0, 1.0, r) for r in np.linspace(0.8, 0.98, 37)]
+    known = known_by(noise_of(first_order(0.9), 1, 4000, rng)[0], *rows)
+    dependence = Law.of(known).correlated(n)
+    white = Whitening(samples_of([rng.normal(size=n)]), (Law(1.0),), (dependence,), (known,))
     t = np.linspace(0, 1, n)
     tangents = white(np.stack([np.ones(n), 1 - np.exp(-t / 0.2), t, t**2])).T
     information = tangents.T @ tangents + 1e-6 * np.eye(4)
     old, new = [], []
-    for noise in white(first_order(0.9).draw(150, n, rng)):
+    for noise in white(noise_of(first_order(0.9), 150, n, rng)):
         x = np.linalg.solve(information, tangents.T @ noise)
         optimum = SimpleNamespace(
             x=x, stuck=np.zeros(4, bool), jacobian=tangents, information=information, covariance=None
@@ -175,12 +199,6 @@ def test_a_threshold_tells_its_own_error():
         held.append(low <= -np.log(-np.log(0.99)) <= high)
         assert low <= threshold <= high
     assert binom.cdf(sum(held), 300, 0.95) > 1e-3
-
-
-def test_samples_without_a_period_are_one_stretch():
-    uneven = np.concatenate([[1.0], np.geomspace(0.2, 30.0, 40)])
-    assert unbroken(uneven) == [slice(0, 41)]
-    assert unbroken(np.array([1.0, 2, 2, 2])) == [slice(k, k + 1) for k in range(4)]
 
 
 def commands(quiet):
@@ -207,12 +225,12 @@ def noiseless(quiet):
 def campaign(records, seed, rho, curvature=0.0):
     """The records with noise of correlation `rho`; the last is held out."""
     rng = np.random.default_rng([seed, 5])
-    process = first_order(rho, NOISE) if rho else Autoregression(np.empty(0), NOISE)
+    law = first_order(rho, NOISE) if rho else Law(NOISE)
     out = []
     for one in records:
         response = one.response + curvature * one.response**3
         sampled = np.isfinite(response[:, 0])
-        response[sampled, 0] += process.draw(1, int(sampled.sum()), rng)[0]
+        response[sampled, 0] += noise_of(law, 1, int(sampled.sum()), rng)[0]
         out.append(replace(one, response=response))
     return Study("clean", None, "ms", seed, tuple(out[:4]), (out[4],), ModelSettings(offset="shared"))
 

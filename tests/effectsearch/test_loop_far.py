@@ -9,26 +9,29 @@ import pytest
 
 from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import step
-from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.bench.device import Device
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_study
-from lcopa_bayes.effectsearch.autoregression import Autoregression
 from lcopa_bayes.effectsearch.basefit import base_fit
 from lcopa_bayes.effectsearch.basemodel import BaseModel
 from lcopa_bayes.effectsearch.crossvalidation import PARTS, groups
 from lcopa_bayes.effectsearch.loop import loop
-from lcopa_bayes.effectsearch.noisesamples import joint_noise
+from lcopa_bayes.effectsearch.noise import Law, joint_noise
 from lcopa_bayes.effectsearch.signature import Scale
 from lcopa_bayes.effectsearch.starts import regressed
 from lcopa_bayes.effectsearch.terms import fitted_base
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.inference.defaultpriors import Scales
+from lcopa_bayes.inference.mixednoise import WhiteAR1
+from lcopa_bayes.inference.observations import Observed
 from lcopa_bayes.model.effects import superposition
 from lcopa_bayes.model.effects.catalogue import catalogue
+from lcopa_bayes.model.path import TransferPath
 
 RECORDS = Path(os.environ.get("LCOPA_BAYES_DATA", Path(__file__).parents[2] / ".." / "shared")) / "records"
 AXIS = (Axis("x", "rad"),)
@@ -73,7 +76,7 @@ def resonant(seed=2, n=1500):
 @pytest.mark.parametrize("delay", [0.0, 0.1, 0.66])
 def test_many_even_changes_are_one_convolution(delay, monkeypatch):
     rng, times = np.random.default_rng(0), np.arange(400) * 0.1 + 0.3
-    drive = Drive(times[1:], rng.normal(size=399))
+    drive = AxisDrive(times[1:], rng.normal(size=399))
     jumps, shape = superposition.jumps_of(drive), relaxing
     fast = superposition.summed(times, drive, delay, jumps, shape)
     monkeypatch.setattr(superposition, "_MANY", 10**9)
@@ -87,7 +90,7 @@ def test_changes_between_samples_are_shared_to_second_order():
     for period in (0.2, 0.1, 0.05):
         times = np.arange(int(20 / period)) * period
         at = times[1:] + 0.4 * period
-        drive = Drive(at, np.sin(at))
+        drive = AxisDrive(at, np.sin(at))
         exact = sum(
             jump * -np.expm1(-np.maximum(times - t, 0) / 2.0)
             for t, jump in zip(at, superposition.jumps_of(drive), strict=True)
@@ -151,18 +154,20 @@ def test_a_drop_of_power_is_the_inverse_of_its_worth():
 def test_a_dependent_residual_counts_as_fewer_samples():
     """Of an AR(1) with correlation r the power has ``n (1 - r^2) / (1 + r^2)`` independent samples."""
     r = 0.9
-    process = Autoregression(np.array([r]), np.sqrt(1 - r**2))
-    noise = joint_noise([process.draw(1, 20_000, np.random.default_rng(3))[0]], "x", 0)
-    assert noise.process.order == 0
-    assert noise.process.sd == pytest.approx(1.0, rel=0.05)
+    n, rng = 20_000, np.random.default_rng(3)
+    ones, scales = np.ones(n), Scales.of(stepped(10.0).fit)
+    drawn = WhiteAR1().draw(Law(0.0, 1.0, r).parameters[None], ones, rng)[0]
+    noise = joint_noise([Observed(np.arange(n), drawn, ones)], "x", 0, scales)
+    assert noise.law.share == 0
+    assert noise.law.sd == pytest.approx(1.0, rel=0.05)
     assert noise.dependence == pytest.approx((1 + r**2) / (1 - r**2), rel=0.15)
-    white = joint_noise([np.random.default_rng(4).standard_normal(20_000)], "x", 0)
+    white = joint_noise([Observed(np.arange(n), rng.standard_normal(n), ones)], "x", 0, scales)
     assert white.dependence == pytest.approx(1.0, abs=0.1)
 
 
 def test_a_single_record_leaves_out_samples_from_all_over_it():
     posterior = problem_of(stepped(10.0)).posterior
-    chosen = groups(Whitening(posterior.samples, (Autoregression(np.empty(0), 1.0),)))
+    chosen = groups(Whitening(posterior.samples, (Law(1.0),)))
     rows = np.sort(np.concatenate([group.rows for group in chosen]))
     assert len(chosen) == PARTS
     np.testing.assert_array_equal(rows, np.arange(posterior.size))

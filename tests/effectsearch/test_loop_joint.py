@@ -16,8 +16,7 @@ from lcopa_bayes.effectsearch.basemodel import BaseModel
 from lcopa_bayes.effectsearch.heldouteffects import missed
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.rounds import SINGLE
-from lcopa_bayes.effectsearch.scoreevidence import Projection
-from lcopa_bayes.effectsearch.signature import Scale, Signature
+from lcopa_bayes.effectsearch.signature import Projection, Scale, Signature
 from lcopa_bayes.effectsearch.startlevel import started
 from lcopa_bayes.effectsearch.trace import Traced, _chance
 from lcopa_bayes.effectsearch.whitening import Whitening
@@ -99,7 +98,7 @@ def test_a_bend_is_named_from_a_residual_that_holds_it():
     assert found.after.unseen[0].rmse < 0.6 * found.before.unseen[0].rmse
     refit = found.rounds[0].chosen
     assert refit.whitening.noise[0].sd == pytest.approx(0.02, rel=0.1)
-    assert refit.whitening.noise[0].sd < 0.8 * found.base.noise[0].process.sd
+    assert refit.whitening.noise[0].sd < 0.8 * found.base.noise[0].law.sd
 
 
 def test_a_residual_without_independent_samples_names_nothing():
@@ -182,7 +181,7 @@ def test_a_record_without_a_sampling_period_is_looped_to_a_verdict():
     assert found.base.failed == ""
     assert found.verdict.kind == "clean"
     assert found.base.noise[0].source == "quiet"
-    assert found.base.noise[0].process.sd == pytest.approx(0.02, rel=4 / np.sqrt(2 * 60))
+    assert found.base.noise[0].law.sd == pytest.approx(0.02, rel=4 / np.sqrt(2 * 60))
     wrong = replace(record, response=rng.permutation(y)[:, None])
     bad = loop(replace(study, fit=(wrong,)), library=library, sample=False, quick=True, as_stated=True)
     assert "less than half" in bad.base.failed

@@ -1,60 +1,69 @@
-"""Noise of the loop: autoregression, whitening, quiet samples, and evidence in closed form."""
+"""Noise of the loop: its law by samples at rest, and evidence in closed form."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.linalg import toeplitz
 from scipy.stats import multivariate_normal
 
-from lcopa_bayes.effectsearch.autoregression import Autoregression, unbroken
-from lcopa_bayes.effectsearch.noisepieces import estimated
-from lcopa_bayes.effectsearch.scatter import scatter_evidence
-from lcopa_bayes.effectsearch.scoreevidence import Projection, log_bayes_factors, survival
-from lcopa_bayes.effectsearch.signature import Scale, Signature
+from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.effectsearch.noise import Law, laws, plausible, scatter_evidence
+from lcopa_bayes.effectsearch.signature import Projection, Scale, Signature, log_bayes_factors, survival
+from lcopa_bayes.inference.defaultpriors import Scales
+from lcopa_bayes.inference.mixednoise import WhiteAR1
+from lcopa_bayes.inference.observations import Observed
 from lcopa_bayes.model.effects.catalogue import catalogue
 
-PARTIAL = st.lists(st.floats(-0.95, 0.95), max_size=5).map(np.array)
+GAPS = st.lists(st.sampled_from([1.0, 1.0, 1.0, 2.5, 7.0]), min_size=1, max_size=9).map(np.array)
 
 
-@given(PARTIAL, st.floats(1e-3, 1e3))
+def dense(law, gaps):
+    """Covariance of samples under a law."""
+    at = np.cumsum(gaps)
+    correlated = law.sigma_ar**2 * law.rho ** np.abs(at[:, None] - at)
+    return law.sigma**2 * np.eye(gaps.size) + correlated
+
+
+@given(st.floats(0.0, 1.0), st.floats(0.05, 0.99), GAPS)
 @settings(max_examples=40, deadline=None)
-def test_whitening_is_the_inverse_of_the_covariance(partial, sd):
-    process, n = Autoregression(partial, sd), 9
-    covariance = toeplitz(process.autocovariance(n - 1))
-    white = process.whiten(np.eye(n)).T
-    np.testing.assert_allclose(white @ covariance @ white.T, np.eye(n), atol=1e-8)
-    assert process.log_scale(n) == pytest.approx(np.linalg.slogdet(covariance)[1] / 2, abs=1e-7)
+def test_whitening_is_the_inverse_of_the_covariance(share, rho, gaps):
+    law = Law(0.3 * np.sqrt(1 - share), 0.3 * np.sqrt(share), rho)
+    white = law.whiten(np.eye(gaps.size), gaps).T
+    np.testing.assert_allclose(white @ dense(law, gaps) @ white.T, np.eye(gaps.size), atol=1e-8)
 
 
-def test_first_order_autocovariance_is_exact():
-    process = Autoregression(np.array([0.6]), 0.5)
-    np.testing.assert_allclose(process.autocovariance(3), 0.25 / (1 - 0.36) * 0.6 ** np.arange(4), rtol=1e-12)
+def scales(n):
+    """Of a record whose drive moves at once."""
+    time = np.arange(float(n))
+    drive = (time > 0).astype(float)[:, None]
+    return Scales.of([Record("r", time, drive, drive, (Axis("u", "V"),), (Axis("y", "V"),), "ms")])
 
 
-def test_order_and_scale_are_recovered():
-    truth = Autoregression(np.array([0.6, -0.4, 0.3]), 2e-4)
-    rng = np.random.default_rng(1)
-    pieces = [1.0 + rng.normal() + truth.draw(1, 80, rng)[0] for _ in range(16)]
-    found = estimated(pieces)
-    assert found.order >= 3
-    np.testing.assert_allclose(found.partial[:3], truth.partial, atol=4 / np.sqrt(16 * 80))
-    assert found.sd == pytest.approx(truth.sd, rel=0.1)
+def pieces_of(law, count, n, seed):
+    rng = np.random.default_rng(seed)
+    drawn = WhiteAR1().draw(np.tile(law.parameters, (count, 1)), np.ones(n), rng)
+    return [Observed(np.arange(n), one + rng.normal(), np.ones(n)) for one in drawn]
 
 
-def test_white_noise_needs_no_coefficient_most_of_the_time():
-    rng = np.random.default_rng(2)
-    orders = [estimated([rng.normal(size=60) for _ in range(6)]).order for _ in range(12)]
-    assert np.mean(np.array(orders) == 0) > 0.5
+@pytest.mark.parametrize("truth", [Law(2e-4), Law(0.0, 2e-4, 0.8), Law(1.5e-4, 2e-4, 0.9)])
+def test_the_noise_is_recovered(truth):
+    """By 1280 samples in pieces about their own levels: its scale, and what decides about slow effects, its
+    power at low frequencies."""
+    posterior = plausible(pieces_of(truth, 16, 80, 1), scales(400))
+    found = laws(posterior.draw(400, np.random.default_rng(0)))
+
+    def slow(law):
+        return law.sd * np.sqrt(1 - law.share + law.share * (1 + law.rho) / (1 - law.rho))
+
+    assert Law.of(posterior).sd == pytest.approx(truth.sd, rel=0.1)
+    logs = np.log([slow(law) for law in found])
+    assert abs(np.median(logs) - np.log(slow(truth))) < 3.5 * logs.std()
+    assert logs.std() < 0.3
 
 
-def test_a_constant_has_no_noise_scale():
-    with pytest.raises(ValueError, match="cannot give the scale"):
-        estimated([np.array([1.0])])
-
-
-def test_missing_samples_break_a_stretch():
-    assert unbroken(np.array([1.0, 1, 1, 3, 1])) == [slice(0, 3), slice(3, 5)]
+def test_a_single_sample_has_no_noise_scale():
+    with pytest.raises(ValueError, match="two samples"):
+        plausible([Observed(np.arange(1), np.ones(1), np.ones(1))], scales(400))
 
 
 def test_evidence_is_that_of_the_normal_densities():
@@ -66,7 +75,7 @@ def test_evidence_is_that_of_the_normal_densities():
 
 
 def test_projection_is_evidence_with_the_tangents_integrated_out():
-    """Both roads: marginal densities with J in the covariance, or projected signatures and residual."""
+    """Two methods: marginal densities with J in the covariance, or projected signatures and residual."""
     rng = np.random.default_rng(4)
     tangents = 1e4 * rng.normal(size=(15, 3))
     signature, data = rng.normal(size=(15, 2)), rng.normal(size=15)

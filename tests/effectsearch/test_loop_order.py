@@ -12,9 +12,9 @@ from small import U, Y, path, problem, record
 
 from lcopa_bayes.bench.command import staircase
 from lcopa_bayes.bench.device import Device
-from lcopa_bayes.effectsearch.autoregression import Autoregression
 from lcopa_bayes.effectsearch.basemodel import BaseModel
 from lcopa_bayes.effectsearch.gaussnewton import Regression
+from lcopa_bayes.effectsearch.noise import Law
 from lcopa_bayes.effectsearch.summary import moved
 from lcopa_bayes.effectsearch.whitening import Whitening
 
@@ -36,7 +36,7 @@ def fitted(**priors: object) -> tuple[BaseModel, Regression]:
     posterior = problem(TAKEN, terms=2, offset="none", priors=priors).posterior
     model = BaseModel(posterior)
     assert model.names == ("gain", "time_1", "order_1", "time_2", "order_2", "delay")
-    noise = (Autoregression(np.empty(0), NOISE),)
+    noise = (Law(NOISE),)
     return model, Regression(model, Whitening(posterior.samples, noise))
 
 
@@ -109,7 +109,7 @@ def test_terms_stay_resolved_wherever_a_descent_begins(start):
     posterior = problem(TAKEN, terms=2, offset="none").posterior
     model = BaseModel(posterior)
     assert len(posterior.table.limited) == 2
-    noise = (Autoregression(np.empty(0), NOISE),)
+    noise = (Law(NOISE),)
     regression = Regression(model, Whitening(posterior.samples, noise))
     first, time_1, second, time_2 = start
     optimum = regression.descend(np.array([2.0, time_1, first, time_2, second, 0.5]), most=60)

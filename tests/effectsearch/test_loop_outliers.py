@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from test_loop import LIBRARY, NOISE, study
 
+from lcopa_bayes.data.settings import NoiseSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basefit import base_fit
 from lcopa_bayes.effectsearch.basemodel import BaseModel
+from lcopa_bayes.effectsearch.explained import explained_study
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.outliers import outlying
 from lcopa_bayes.effectsearch.summary import results
@@ -69,6 +71,13 @@ def test_an_effect_is_found_beside_outliers():
     told = results(found)
     assert told["outliers"]["count"] > 0
     assert "outliers" in told["sentence"]
+    assert found.study.effects.use == ("odd_curvature", "outliers")
+    for record, given in zip(found.study.fit, made.fit, strict=True):
+        np.testing.assert_array_equal(record.response, given.response)
+    table = problem_of(found.study).posterior.table
+    assert {"odd_curvature.c", "outliers.nu"} <= set(table.names)
+    stated = replace(found.problem.study, noise=NoiseSettings("student"))
+    assert explained_study(stated, found.after.state.model, found.outliers).effects.use == ("odd_curvature",)
 
 
 def test_outliers_alone_are_a_disturbance():

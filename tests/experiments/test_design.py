@@ -19,17 +19,15 @@ from lcopa_bayes.bench.command import quiet, step
 from lcopa_bayes.cli import main
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.record import load_record, save_record
-from lcopa_bayes.experiments.candidates import PLAIN, Candidate, candidates
+from lcopa_bayes.experiments.candidates import PLAIN, Candidate, candidates, template
 from lcopa_bayes.experiments.confirmation import confirm, confirmed
 from lcopa_bayes.experiments.design import checked, design
 from lcopa_bayes.experiments.information import Bench
 from lcopa_bayes.experiments.limits import Limits, bench_times, limits_of
-from lcopa_bayes.experiments.nextmeasurement import next_measurement
 from lcopa_bayes.experiments.precision import cramer_rao, promises, reached, within
 from lcopa_bayes.experiments.refit import device_of, refit
-from lcopa_bayes.experiments.summary import as_json
-from lcopa_bayes.experiments.template import template
-from lcopa_bayes.identifiability.sensitivities import sensitivities
+from lcopa_bayes.experiments.summary import as_json, next_measurement
+from lcopa_bayes.identifiability.curvature import sensitivities
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.likelihood import Landscape
 from lcopa_bayes.results.predictive import Predictive

@@ -252,7 +252,7 @@ def test_a_study_file_declares_effects(tmp_path: Path):
     with pytest.raises(InputError) as caught:
         load_study(tmp_path)
     assert "unknown key 'uses'; did you mean 'use'?" in str(caught.value)
-    assert "`use` must be a list of texts" in str(caught.value)
+    assert "`use` must be a list of names" in str(caught.value)
 
 
 def test_without_effects_nothing_is_simulated():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from lcopa_bayes.data.settings import NOISE_KINDS
+from lcopa_bayes.data.settings import NoiseKind
 from lcopa_bayes.inference.kinds import KINDS
 from lcopa_bayes.inference.noise import AR1, NOISES, Student, White, WhiteAR1
 
@@ -212,7 +214,7 @@ def test_every_noise_is_known_by_its_kind():
     assert {kind: noise.kind for kind, noise in NOISES.items()} == {
         k: k for k in ("white", "ar1", "white+ar1", "student")
     }
-    assert set(NOISES) == set(NOISE_KINDS)
+    assert set(NOISES) == set(get_args(NoiseKind))
     for noise in NOISES.values():
         assert KINDS[noise.names[0]].noise == "scale"
         assert (

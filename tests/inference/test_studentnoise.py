@@ -12,7 +12,7 @@ from scipy.integrate import cumulative_trapezoid
 from small import TRUTH, TWO, problem, record, row_values
 
 from lcopa_bayes.bench.command import quiet, step
-from lcopa_bayes.identifiability.sensitivities import sensitivities
+from lcopa_bayes.identifiability.curvature import sensitivities
 from lcopa_bayes.inference.likelihood import Landscape
 from lcopa_bayes.inference.noise import Student
 from lcopa_bayes.inference.observations import Samples

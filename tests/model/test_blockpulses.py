@@ -17,7 +17,6 @@ from lcopa_bayes.model.blockpulses import (
     integration_weights,
     integration_weights_slope,
     lower_toeplitz,
-    shift_matrix,
 )
 
 ORDERS = (0.0, 1e-3, 0.5, 0.9, 0.999, 1.0, 1.3, 1.7, 2.0, 2.6, 3.0)
@@ -122,24 +121,12 @@ def test_orders_commute_and_one_integrates_twice():
     )
 
 
-@settings(max_examples=50, deadline=None)
-@given(blocks=st.integers(0, 12), n=st.integers(1, 10))
-def test_shift_delays_by_whole_blocks(blocks, n):
-    means = np.arange(1.0, n + 1)
-    assert_array_equal(shift_matrix(blocks, n) @ means, np.r_[np.zeros(blocks), means][:n])
-
-
 @pytest.mark.parametrize(
     ("order", "n", "step"), [(-0.1, 4, 1.0), (1.0, 0, 1.0), (1.0, 4, 0.0), (np.nan, 4, 1.0)]
 )
 def test_impossible_matrices_are_refused(order, n, step):
     with pytest.raises(ValueError, match="need order >= 0"):
         integration_matrix(order, n, step)
-
-
-def test_a_shift_into_the_future_is_refused():
-    with pytest.raises(ValueError, match="future"):
-        shift_matrix(-1, 4)
 
 
 def test_lower_toeplitz_repeats_its_column():

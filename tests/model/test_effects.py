@@ -13,9 +13,9 @@ from scipy.integrate import solve_ivp
 from small import ONE, problem, record
 
 from lcopa_bayes.bench.command import on_off, prbs, staircase, two_axis
-from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.bench.device import Device
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.drive import Drive, sorted_jumps
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.inference.effects import Effected, carried, effected, epochs_of
 from lcopa_bayes.model.effects import balance, sensor
@@ -29,9 +29,10 @@ from lcopa_bayes.model.effects.dynamics import (
 )
 from lcopa_bayes.model.effects.effect import UnstableError
 from lcopa_bayes.model.effects.parallel import Backflow
+from lcopa_bayes.model.effects.records import Vibration
 from lcopa_bayes.model.effects.response import OddCurvature
-from lcopa_bayes.model.effects.ripples import Vibration
 from lcopa_bayes.model.effects.sensor import SensorLag
+from lcopa_bayes.model.path import TransferPath
 from lcopa_bayes.results.prediction import responses
 
 NAMES = [
@@ -320,7 +321,7 @@ def test_refresh_at_full_strength_is_on_the_grid():
 
 def test_hysteresis_needs_a_reversal():
     """On a drive that goes one way the play only shifts levels; after a reversal it lags."""
-    up = Drive(np.arange(4.0), np.array([0.2, 0.4, 0.6, 0.4]))
+    up = AxisDrive(np.arange(4.0), np.array([0.2, 0.4, 0.6, 0.4]))
     drive, _ = Hysteresis(0.1).commands(up, 0.0, 0, BASE.simulator.scene(0, BASE.plant(VALUES)), np.ones(1))
     assert_allclose(drive.values, [0.1, 0.3, 0.5])  # and the last step of 0.2 down is all play
 
@@ -328,7 +329,7 @@ def test_hysteresis_needs_a_reversal():
 @given(st.lists(st.tuples(st.integers(0, 5), st.floats(-2, 2)), max_size=8))
 def test_sorted_jumps_keep_the_sum(told):
     times, jumps = np.array([float(t) for t, _ in told]), np.array([j for _, j in told])
-    drive = sorted_jumps(times, jumps)
+    drive = AxisDrive.of_jumps(times, jumps)
     assert (np.diff(drive.times) > 0).all()
     if jumps.any():
         assert drive.values[-1] == pytest.approx(jumps.sum(), abs=1e-12)

@@ -10,14 +10,13 @@ import pytest
 from numpy.testing import assert_allclose
 from small import problem
 
-from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.inference.effects import Effected, carried, effected
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.model.effects.catalogue import bundled
-from lcopa_bayes.model.effects.crossfade import CrossFade
-from lcopa_bayes.model.effects.parallel import relaxing
-from lcopa_bayes.model.effects.superposition import jumps_of, summed
+from lcopa_bayes.model.effects.parallel import jumps_of, relaxing, summed
+from lcopa_bayes.model.effects.response import CrossFade
 from lcopa_bayes.model.forward import forward_model
 
 ALL = bundled()
@@ -117,7 +116,7 @@ def test_a_transition_on_one_axis_leaves_a_dark_axis_alone():
 def test_many_changes_under_few_samples(samples: int):
     """Against the sum change by change: a grid coarser than the changes does not share them out."""
     rng = np.random.default_rng(3)
-    drive = Drive(0.05 + 0.11 * np.arange(80), rng.normal(size=80))
+    drive = AxisDrive(0.05 + 0.11 * np.arange(80), rng.normal(size=80))
     times = np.linspace(0.0, 10.0, samples) if samples > 1 else np.array([9.0])
     total = summed(times, drive, 0.3, jumps_of(drive), relaxing(0.4))
     late = np.maximum(times[:, None] - drive.times - 0.3, 0.0)

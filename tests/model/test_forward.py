@@ -12,46 +12,43 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from lcopa_bayes.bench.command import Command, prbs, staircase, step
-from lcopa_bayes.bench.device import Device, TransferPath
-from lcopa_bayes.data.drive import Drive
-from lcopa_bayes.data.literature import PAPER
+from lcopa_bayes.bench.device import Device
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings
-from lcopa_bayes.model.element import PaperForm, from_paper
 from lcopa_bayes.model.forward import Dynamics, Experiment, ForwardModel, forward_model
 from lcopa_bayes.model.grid import Mesh
 from lcopa_bayes.model.layout import Layout
+from lcopa_bayes.model.literature import PAPER
+from lcopa_bayes.model.path import TransferPath
 
 X, Y = Axis("x", "rad"), Axis("y", "rad")
-UNIT_STEP = Drive(np.zeros(1), np.ones(1))
+UNIT_STEP = AxisDrive(np.zeros(1), np.ones(1))
 KELVIN = ((3.0, 1.0), (1.6, 0.7))
 
 
 def single(
-    drive: Drive, times: np.ndarray, terms: int, *, begin: float | None = None, **options
+    drive: AxisDrive, times: np.ndarray, terms: int, *, begin: float | None = None, **options
 ) -> ForwardModel:
     layout = Layout.of((X,), (X,), ModelSettings(terms=terms))
     mesh = Mesh.of_samples(times, float(drive.times[0]) if begin is None else begin, **options)
     return ForwardModel(layout, (Experiment("one", mesh, (drive,), np.zeros(1)),))
 
 
-def respond(element, delay: float, drive: Drive, times: np.ndarray, **options) -> np.ndarray:
+def respond(element, delay: float, drive: AxisDrive, times: np.ndarray, **options) -> np.ndarray:
     model = single(drive, times, len(element[0]), **options)
     dynamics = Dynamics((np.array([element[0]]),), (np.array([element[1]]),), np.array([[delay]]))
     return model.unit_responses(dynamics)[0][0, 0]
 
 
 def on_bench(element, delay: float, command: Command, times: np.ndarray, exposure: float = 0.0) -> np.ndarray:
-    etas: dict[float, float] = {}
-    for time, order in zip(*element, strict=True):
-        etas[order] = etas.get(order, 0.0) + time**order
-    path = TransferPath(1.0, delay, tuple(etas.values()), tuple(etas), 1.0)
+    path = TransferPath.of_times(1.0, delay, *element).merged()
     device = Device(((path,),), (X,), (X,), (0.0,))
     return device.response(command, times, exposure=exposure)[:, 0] - command.rest[0]
 
 
-def drive_of(command: Command) -> Drive:
-    return Drive(command.times, command.values[:, 0] - command.rest[0])
+def drive_of(command: Command) -> AxisDrive:
+    return AxisDrive(command.times, command.values[:, 0] - command.rest[0])
 
 
 def order_of(errors: Sequence[float]) -> float:
@@ -64,7 +61,6 @@ def order_of(errors: Sequence[float]) -> float:
 
 def test_reference_of_the_paper_at_1024_blocks():
     path = PAPER.plant.xx
-    gain, element = from_paper(PaperForm(path.gain, path.etas, path.orders, path.stiffness))
     exact = {
         3.5: 0.0008158871940552879,
         5.0: 0.006599891310313528,
@@ -73,7 +69,7 @@ def test_reference_of_the_paper_at_1024_blocks():
         25.0: 0.01739526378981913,
     }
     times = 0.5 * np.arange(1, 51)
-    both = (element.times, element.orders)
+    gain, both = path.steady, (path.times, path.orders)
     read = gain * respond(both, path.delay, UNIT_STEP, times, blocks=1024)
     off = [(read[round(2 * t) - 1] - value) / gain for t, value in exact.items()]
     assert np.abs(off).max() < 1e-5  # 6.3e-6 at 3.5, right after the onset
@@ -200,16 +196,16 @@ def test_a_single_sample_and_very_many_agree_with_the_bench():
 
 
 @pytest.fixture
-def moving(rng: np.random.Generator) -> Drive:
-    return Drive(np.cumsum(rng.uniform(0.1, 2.0, 8)) - 0.5, rng.normal(size=8))
+def moving(rng: np.random.Generator) -> AxisDrive:
+    return AxisDrive(np.cumsum(rng.uniform(0.1, 2.0, 8)) - 0.5, rng.normal(size=8))
 
 
 TIMES = 0.1 * np.arange(1, 121)
 
 
 def test_response_is_linear_in_the_drive(moving, rng):
-    other = Drive(moving.times, rng.normal(size=8))
-    total = Drive(moving.times, 2.0 * moving.values - 3.0 * other.values)
+    other = AxisDrive(moving.times, rng.normal(size=8))
+    total = AxisDrive(moving.times, 2.0 * moving.values - 3.0 * other.values)
     a, b, both = (respond(KELVIN, 0.7, drive, TIMES) for drive in (moving, other, total))
     assert_allclose(both, 2.0 * a - 3.0 * b, rtol=0, atol=1e-8)
 
@@ -217,7 +213,7 @@ def test_response_is_linear_in_the_drive(moving, rng):
 @settings(max_examples=30, deadline=None)
 @given(start=st.floats(-0.5, 6.0), delay=st.floats(0.0, 6.0))
 def test_nothing_moves_before_drive_and_delay(start, delay):
-    drive = Drive(np.array([start]), np.ones(1))
+    drive = AxisDrive(np.array([start]), np.ones(1))
     for times in (TIMES, TIMES + 0.02 * np.sin(100 * TIMES)):
         read = respond(((2.0,), (0.6,)), delay, drive, times)
         reach = 2 * 12.0 / 200  # blocks that share a sample with the onset
@@ -228,7 +224,7 @@ def test_nothing_moves_before_drive_and_delay(start, delay):
 
 
 def test_a_later_change_does_not_alter_the_past(moving):
-    longer = Drive(np.append(moving.times, 11.0), np.append(moving.values, 40.0))
+    longer = AxisDrive(np.append(moving.times, 11.0), np.append(moving.values, 40.0))
     before = TIMES < 11.0
     a, b = (respond(KELVIN, 0.0, drive, TIMES)[before] for drive in (moving, longer))
     assert_allclose(a, b, rtol=0, atol=1e-6)
@@ -237,14 +233,14 @@ def test_a_later_change_does_not_alter_the_past(moving):
 def test_whole_blocks_shift_the_response(moving):
     model = single(moving, TIMES, 2, begin=-0.5)
     width, n_skip = model.experiments[0].mesh.grid.step, 12
-    later = Drive(moving.times + n_skip * width, moving.values)
+    later = AxisDrive(moving.times + n_skip * width, moving.values)
     here = respond(KELVIN, 0.3, moving, TIMES, begin=-0.5)
     there = respond(KELVIN, 0.3, later, TIMES, begin=-0.5)
     delayed = respond(KELVIN, 0.3 + n_skip * width, moving, TIMES, begin=-0.5)
     split = round(0.1 / width)
     assert_allclose(there[n_skip // split :], here[: -(n_skip // split)], rtol=0, atol=1e-8)
     assert_allclose(delayed, there, rtol=0, atol=1e-8)
-    everything = Drive(moving.times + 100.0, moving.values)
+    everything = AxisDrive(moving.times + 100.0, moving.values)
     assert_allclose(respond(KELVIN, 0.3, everything, TIMES + 100.0, begin=99.5), here, rtol=0, atol=1e-8)
 
 
@@ -383,8 +379,8 @@ def test_proportional_drives_are_simulated_once_and_all_the_same():
     """Steps of several heights and signs, and one record that differs: as if each stood alone."""
     heights = (1.5, -0.75, 0.3)
     times = 0.1 * np.arange(1, 120)
-    steps = [Drive(np.array([0.0, 4.0]), height * np.array([1.0, 0.5])) for height in heights]
-    other = Drive(np.array([0.0, 4.0]), np.array([1.0, 0.6]))
+    steps = [AxisDrive(np.array([0.0, 4.0]), height * np.array([1.0, 0.5])) for height in heights]
+    other = AxisDrive(np.array([0.0, 4.0]), np.array([1.0, 0.6]))
     mesh = Mesh.of_samples(times, 0.0)
     layout = Layout.of([Axis("x", "rad")], [Axis("x", "rad")], ModelSettings(terms=2))
     experiments = tuple(Experiment("", mesh, (drive,), np.zeros(1)) for drive in (*steps, other))
@@ -397,4 +393,4 @@ def test_proportional_drives_are_simulated_once_and_all_the_same():
         assert_allclose(found, alone, rtol=0, atol=1e-10)
     assert steps[1].over(steps[0]) == -0.5
     assert other.over(steps[0]) is None
-    assert Drive(np.array([0.0, 5.0]), steps[0].values).over(steps[0]) is None
+    assert AxisDrive(np.array([0.0, 5.0]), steps[0].values).over(steps[0]) is None

@@ -8,13 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from lcopa_bayes.bench.device import TransferPath
-from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.bench.inversion import unit_ramp, unit_step
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.model.forward import Dynamics, Experiment, ForwardModel
 from lcopa_bayes.model.grid import Mesh
 from lcopa_bayes.model.layout import Layout
+from lcopa_bayes.model.path import TransferPath
 from lcopa_bayes.model.powerseries import Circle
 from lcopa_bayes.model.stepresponse import StepResponse, step_response, taps
 from lcopa_bayes.model.superposition import phases
@@ -34,8 +35,8 @@ Element = tuple[tuple[float, ...], tuple[float, ...]]
 def exact(element: Element, time: np.ndarray, integral: bool = False) -> np.ndarray:
     """Zero up to the onset."""
     etas = tuple(time**order for time, order in zip(*element, strict=True))
-    compliance = TransferPath(1.0, 0.0, etas, element[1], 1.0).compliance
-    return np.asarray((compliance.ramp_response if integral else compliance.step_response)(time))
+    path = TransferPath(1.0, 0.0, etas, element[1], 1.0)
+    return (unit_ramp if integral else unit_step)(path, time)
 
 
 def solved(element: Element, *, step: float = STEP, slopes: bool = False) -> StepResponse:
@@ -128,7 +129,7 @@ def test_slopes_are_differences_also_right_after_the_onset(element):
 # Superposition
 
 
-def respond(drive: Drive, times: np.ndarray, delay: float, *, exposure: float = 0.0) -> np.ndarray:
+def respond(drive: AxisDrive, times: np.ndarray, delay: float, *, exposure: float = 0.0) -> np.ndarray:
     axis = Axis("x", "rad")
     layout = Layout.of((axis,), (axis,), ModelSettings(terms=1))
     mesh = Mesh.of_samples(times, float(drive.times[0]), exposure=exposure)
@@ -137,7 +138,7 @@ def respond(drive: Drive, times: np.ndarray, delay: float, *, exposure: float = 
     return model.unit_responses(element)[0][0, 0]
 
 
-def superposed(drive: Drive, times: np.ndarray, delay: float, exposure: float = 0.0) -> np.ndarray:
+def superposed(drive: AxisDrive, times: np.ndarray, delay: float, exposure: float = 0.0) -> np.ndarray:
     total = np.zeros(times.size)
     for change, jump in zip(drive.times, np.diff(drive.values, prepend=0.0), strict=True):
         late = times - change - delay
@@ -164,7 +165,7 @@ def test_superposition_is_that_of_the_bench(irregular, exposure, changes, rng):
         "many phases": np.cumsum(rng.uniform(0.1, 1.0, 20)),
         "dense": np.cumsum(rng.uniform(0.05, 0.3, 90)),
     }[changes]
-    drive = Drive(at, rng.normal(size=at.size))
+    drive = AxisDrive(at, rng.normal(size=at.size))
     off = respond(drive, times, 1.0, exposure=exposure) - superposed(drive, times, 1.0, exposure)
     exactly = changes in ("lattice", "few", "many phases") or (changes == "binary" and not irregular)
     assert np.abs(off).max() < (4e-4 if exactly else 0.02) * np.abs(drive.values).max()
@@ -172,7 +173,7 @@ def test_superposition_is_that_of_the_bench(irregular, exposure, changes, rng):
 
 def test_phases_hold_every_change(rng):
     for size in (1, 5, 20, 200):
-        drive = Drive(np.cumsum(rng.uniform(0.1, 1.0, size)), rng.normal(size=size))
+        drive = AxisDrive(np.cumsum(rng.uniform(0.1, 1.0, size)), rng.normal(size=size))
         parts = phases(drive, 0.05)
         jumps = np.concatenate([part.jumps for part in parts])
         when = np.concatenate([part.time + 0.05 * part.blocks for part in parts])

@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from optics_quadrature import quadrature
 from scipy.special import ellipk
 
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.literature import PAPER
+from lcopa_bayes.model.literature import PAPER
 from lcopa_bayes.optics.cell import Cell, Field, paper_cell
-from lcopa_bayes.optics.director import NotConverged, equilibrium, grid_threshold
-from lcopa_bayes.optics.firstintegral import quadrature
-from lcopa_bayes.optics.freeenergy import expand, newton_step
+from lcopa_bayes.optics.director import NotConverged, equilibrium, expand, grid_threshold, newton_step
 from lcopa_bayes.optics.tiltlaw import (
     RANGES,
     TiltLaw,
@@ -231,9 +230,6 @@ def test_curve_rises_and_refuses_beyond_its_range():
     curve = director_curve(CELL, np.linspace(0, 5, 26))
     assert curve.tilt.shape == (26, 801)
     assert (np.diff(curve.mean[curve.voltage > CELL.threshold]) > 0).all()
-    assert curve.mean_at(curve.voltage[7]) == curve.mean[7]
-    with pytest.raises(InputError, match="voltage"):
-        curve.mean_at(5.1)
     with pytest.raises(InputError, match="ascend"):
         director_curve(CELL, [1.0, 1.0])
 

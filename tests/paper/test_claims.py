@@ -9,9 +9,11 @@ from math import asin, pi
 import numpy as np
 import pytest
 
-from lcopa_bayes.data.literature import PAPER, Stated, StatedPath
+from lcopa_bayes.bench.inversion import step_response
+from lcopa_bayes.model.literature import PAPER, Stated
+from lcopa_bayes.model.path import TransferPath
 from lcopa_bayes.paper.claims import CLAIMS, judge
-from lcopa_bayes.paper.crosstalkclaims import crosstalk_rules
+from lcopa_bayes.paper.modelclaims import crosstalk_rules
 from lcopa_bayes.paper.numericsclaims import delay_costs, wavelet_cost
 from lcopa_bayes.paper.opticsclaims import tilt_checks
 from lcopa_bayes.paper.printedmodel import RECORD_LENGTH, PrintedModel, integer_rival
@@ -33,15 +35,15 @@ def optics(**fields: object) -> Stated:
     return replace(PAPER, optics=replace(PAPER.optics, **fields))
 
 
-def plant(**paths: StatedPath) -> Stated:
+def plant(**paths: TransferPath) -> Stated:
     return replace(PAPER, plant=replace(PAPER.plant, **paths))
 
 
-WHOLE = StatedPath(0.1, (16.0, 12.0), (2.0, 1.0), 5.0, delay=3.0)
+WHOLE = TransferPath(0.1, 3.0, (16.0, 12.0), (2.0, 1.0), 5.0)
 """A path of integer orders: no slow tail, and its own rival."""
 
 
-def at_rest(path: StatedPath) -> Stated:
+def at_rest(path: TransferPath) -> Stated:
     steady = path.gain / path.stiffness * PAPER.records.step_drive
     own = plant(xx=path)
     return replace(own, records=replace(own.records, measured=replace(own.records.measured, steady=steady)))
@@ -158,7 +160,7 @@ def test_settling_numbers():
     model, steady = PrintedModel(), PrintedModel().steady(pi / 2, 0.0)[0]
     for band in (0.02, 0.05):
         time = model.settled(steady, band, within=1000.0)
-        value = model.device.paths[0][0].step_response(np.array([time]))[0] * pi / 2
+        value = step_response(model.device.paths[0][0], np.array([time]))[0] * pi / 2
         assert value == pytest.approx(steady * (1 - band), rel=1e-5)
     assert model.settled(steady, 0.02, within=RECORD_LENGTH) == np.inf
     assert verdict("M3").number == pytest.approx(model.settled(steady, 0.05, within=1000.0))
@@ -177,7 +179,7 @@ def test_crosstalk_numbers():
 
 def test_the_integer_rival_is_at_rest_when_the_record_ends():
     rival = integer_rival(PAPER)
-    assert rival.model.form.orders == (2.0, 1.0)
+    assert rival.model.orders == (2.0, 1.0)
     assert rival.rmse < 2e-4  # nothing like the 1.1e-3 rad of the text
     assert rival.steady == pytest.approx(0.02708, abs=5e-5)
     assert verdict("M1").number == rival.rmse

@@ -1,4 +1,4 @@
-"""The paper's identification: recovery, its two conventions, the bias of the equation error, bad input."""
+"""The paper's identification: recovery, its two normalisations, the bias of the equation error, bad input."""
 
 from __future__ import annotations
 
@@ -25,27 +25,24 @@ from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.model.blockpulses import integration_matrix
-from lcopa_bayes.model.element import PaperForm
+from lcopa_bayes.model.path import Normalisation, TransferPath
 from lcopa_bayes.paper.equation import (
-    Convention,
-    PathModel,
     columns,
     equation_rmse,
     least_squares,
     output_rmse,
     responses,
 )
-from lcopa_bayes.paper.evaluation import evaluate
 from lcopa_bayes.paper.identify import identify, integer_orders, results
 from lcopa_bayes.paper.intervals import Candidates, Interval, Scan, decreasing
 from lcopa_bayes.paper.outputerror import output_error_fit
 from lcopa_bayes.paper.paths import MOST_BLOCKS, PathData, path_data
-from lcopa_bayes.paper.scan import scan
+from lcopa_bayes.paper.scan import evaluate, scan
 
 PAPER_STEP = Path(__file__).parents[2] / "studies" / "paper-step"
 U, Y = Axis("u", "V"), Axis("y", "rad")
 ORDERS, ETAS, GAIN, DELAY = (1.6, 0.7), (3.0, 2.0), 0.2, 1.0
-TRUE = PathModel(PaperForm(GAIN, ETAS, ORDERS, 1.0), DELAY)
+TRUE = TransferPath(GAIN, DELAY, ETAS, ORDERS, 1.0)
 DEVICE = Device(
     ((path(GAIN, DELAY, [e ** (1 / a) for e, a in zip(ETAS, ORDERS, strict=True)], ORDERS),),),
     (U,),
@@ -130,7 +127,7 @@ def test_a_long_record_is_taken_in_block_means():
     data = data_of(record_, terms=1)
     assert data.records[0].blocks.grid.n == MOST_BLOCKS
     found = least_squares(blocks_of(data), (1.0,), 0.0)
-    assert_allclose(found.form.etas, [1.0], rtol=1e-3)
+    assert_allclose(found.etas, [1.0], rtol=1e-3)
     assert found.steady == pytest.approx(1.0, rel=1e-3)
 
 
@@ -141,7 +138,7 @@ def test_the_equation_holds_on_exact_data_to_second_order():
     errors = []
     for camera in (0.2, 0.1, 0.05):
         found = least_squares(blocks_of(data_of(clean(camera))), ORDERS, DELAY)
-        errors.append(np.abs(np.array([*found.form.etas, found.form.gain]) / [*ETAS, GAIN] - 1))
+        errors.append(np.abs(np.array([*found.etas, found.gain]) / [*ETAS, GAIN] - 1))
     assert errors[-1].max() < 2e-4
     halved = errors[0] / errors[1], errors[1] / errors[2]
     assert_allclose(np.log2(halved), 2.0, atol=0.25)
@@ -149,26 +146,26 @@ def test_the_equation_holds_on_exact_data_to_second_order():
 
 def test_a_sample_with_an_exposure_stands_for_its_middle():
     exposed = truth(DEVICE, Bench(camera=0.1, exposure=0.1), step(1.0, at=1.0), duration=12.0, name="exposed")
-    told, untold = (data_of(exposed, exposure=exposure) for exposure in (0.1, 0.0))
+    told, untold = (data_of(exposed, exposure_ms=exposure) for exposure in (0.1, 0.0))
     found, late = (least_squares(blocks_of(data), ORDERS, DELAY) for data in (told, untold))
-    assert_allclose(found.form.etas, ETAS, rtol=0.01)
-    assert np.abs(np.array(late.form.etas) / ETAS - 1).max() > 0.03
+    assert_allclose(found.etas, ETAS, rtol=0.01)
+    assert np.abs(np.array(late.etas) / ETAS - 1).max() > 0.03
     assert output_rmse(told.records, TRUE) < 0.2 * output_rmse(untold.records, TRUE)
 
 
-def test_both_conventions_agree_on_exact_data_and_convert():
+def test_both_normalisations_agree_on_exact_data_and_convert():
     blocks = blocks_of(data_of(clean(0.025)))
     stiff = least_squares(blocks, ORDERS, DELAY)
-    last = least_squares(blocks, ORDERS, DELAY, convention=Convention.LAST_ETA)
-    assert last.form.etas[-1] == 1.0
-    for convention in Convention:
-        one, other = (model.scaled(convention, 5.57) for model in (stiff, last))
+    last = least_squares(blocks, ORDERS, DELAY, normalisation=Normalisation.LAST_ETA)
+    assert last.etas[-1] == 1.0
+    for normalisation in Normalisation:
+        one, other = (model.normalised(normalisation, 5.57) for model in (stiff, last))
         assert_allclose([*one.etas, one.gain], [*other.etas, other.gain], rtol=2e-4)
-    assert stiff.scaled(Convention.STIFFNESS, 5.57).stiffness == pytest.approx(5.57)
-    assert last.scaled(Convention.LAST_ETA, 5.57).etas[-1] == pytest.approx(1.0)
+    assert stiff.normalised(Normalisation.STIFFNESS, 5.57).stiffness == pytest.approx(5.57)
+    assert last.normalised(Normalisation.LAST_ETA, 5.57).etas[-1] == pytest.approx(1.0)
     assert_allclose(
         responses(CLEAN.records, stiff)[0],
-        responses(CLEAN.records, replace(stiff, form=stiff.scaled(Convention.LAST_ETA, 1.0)))[0],
+        responses(CLEAN.records, stiff.normalised(Normalisation.LAST_ETA))[0],
         atol=1e-12,
     )
 
@@ -179,9 +176,7 @@ def test_no_output_error_prefers_a_stiffness(k):
     noisy = data_of(record(device=DEVICE, command=step(1.0, at=1.0), camera=0.1, noise_sd=0.004))
     blocks = blocks_of(noisy)
     one, other = (least_squares(blocks, (1.7, 0.8), 0.9, known=value) for value in (1.0, k))
-    assert_allclose(
-        [*other.form.etas, other.form.gain], k * np.array([*one.form.etas, one.form.gain]), rtol=1e-9
-    )
+    assert_allclose([*other.etas, other.gain], k * np.array([*one.etas, one.gain]), rtol=1e-9)
     assert output_rmse(noisy.records, other) == pytest.approx(output_rmse(noisy.records, one), rel=1e-9)
     assert equation_rmse(blocks, other) == pytest.approx(equation_rmse(blocks, one), rel=1e-9)
 
@@ -191,7 +186,7 @@ def test_the_equation_error_of_a_hand_made_case():
     record_ = table([-0.1, 0.0, *times], [0.0, 1.0, *np.ones(100)], [0.0, 0.0, *np.ones(100)])
     blocks = data_of(record_, terms=1).records[0].blocks
     # 2 y + 3 I y - 5 I u by hand; in the block that holds the step y = 0 and u = 1/2
-    model, step_ = PathModel(PaperForm(5.0, (2.0,), (1.0,), 3.0), 0.0), 0.1
+    model, step_ = TransferPath(5.0, 0.0, (2.0,), (1.0,), 3.0), 0.1
     k = np.arange(1, 101)
     expected = np.array([-5 * step_ / 4, *(2 + 3 * step_ * (k - 0.5) - 5 * step_ * k)])
     expected /= 2 + 3 * 101 * step_
@@ -199,7 +194,7 @@ def test_the_equation_error_of_a_hand_made_case():
 
 
 def test_responses_are_those_of_the_dense_system_for_any_sign():
-    model = PathModel(PaperForm(0.3, (3.0, -0.4), ORDERS, 1.2), 0.83)
+    model = TransferPath(0.3, 0.83, (3.0, -0.4), ORDERS, 1.2)
     blocks = CLEAN.records[0].blocks
     n, h = blocks.grid.n, blocks.grid.step
     system = sum(
@@ -219,9 +214,9 @@ def test_responses_are_those_of_the_dense_system_for_any_sign():
 # -- scan ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("convention", Convention)
+@pytest.mark.parametrize("normalisation", Normalisation)
 @pytest.mark.parametrize("terms", [1, 2, 3])
-def test_many_at_once_are_as_one_by_one(convention, terms):
+def test_many_at_once_are_as_one_by_one(normalisation, terms):
     records = [
         record(k, device=DEVICE, command=command, camera=camera, noise_sd=0.003, name=f"r{k}")
         for k, (command, camera) in enumerate(
@@ -232,17 +227,17 @@ def test_many_at_once_are_as_one_by_one(convention, terms):
     blocks = blocks_of(data)
     values = [np.array([1.9, 1.6]), np.array([1.2, 0.7]), np.array([0.4, 0.2])][:terms]
     candidates = Candidates(decreasing(values), np.array([0.0, 0.73, 1.0]))
-    made = evaluate(blocks, candidates, convention)
+    made = evaluate(blocks, candidates, normalisation)
     assert made.squares.size == candidates.size == 3 * 2**terms
     for position in range(candidates.size):
         orders, delay = made.of(position)
-        single = least_squares(blocks, orders, delay, convention=convention)
+        single = least_squares(blocks, orders, delay, normalisation=normalisation)
         found = made.coefficients[position]
         norms = [
             np.linalg.norm(np.concatenate(part))
             for part in zip(*_columns(blocks, orders, delay), strict=True)
         ]
-        wanted = np.array([*single.form.etas, single.form.stiffness, single.form.gain])
+        wanted = np.array([*single.etas, single.stiffness, single.gain])
         assert_allclose(found * norms, wanted * norms, atol=1e-6 * np.abs(wanted * norms).max())
         assert bool(made.physical[position]) == single.physical
         if single.physical:
@@ -253,27 +248,27 @@ def _columns(blocks, orders, delay):
     return [columns(each, orders, delay).T for each in blocks]
 
 
-def _dense_squares(blocks, model: PathModel) -> float:
+def _dense_squares(blocks, model: TransferPath) -> float:
     total = 0.0
     for each in blocks:
-        stacked = columns(each, model.form.orders, model.delay)
-        top, n, h = model.form.orders[0], each.grid.n, each.grid.step
-        system = model.form.stiffness * integration_matrix(top, n, h)
-        for eta, order in zip(model.form.etas, model.form.orders, strict=True):
+        stacked = columns(each, model.orders, model.delay)
+        top, n, h = model.orders[0], each.grid.n, each.grid.step
+        system = model.stiffness * integration_matrix(top, n, h)
+        for eta, order in zip(model.etas, model.orders, strict=True):
             system += eta * integration_matrix(top - order, n, h)
-        modelled = solve_triangular(system, -model.form.gain * stacked[:, -1], lower=True)
+        modelled = solve_triangular(system, -model.gain * stacked[:, -1], lower=True)
         total += float(((modelled - each.response) ** 2).sum())
     return total
 
 
-@pytest.mark.parametrize("convention", Convention)
-def test_a_scan_that_contains_the_truth_finds_it(convention):
+@pytest.mark.parametrize("normalisation", Normalisation)
+def test_a_scan_that_contains_the_truth_finds_it(normalisation):
     plan = replace(NARROW, rounds=0)
-    found = scan(blocks_of(CLEAN), 2, CLEAN.span, plan, convention=convention)
-    assert found.model.form.orders == ORDERS
+    found = scan(blocks_of(CLEAN), 2, CLEAN.span, plan, normalisation=normalisation)
+    assert found.model.orders == ORDERS
     assert found.model.delay == pytest.approx(DELAY)
     assert found.candidates == 25 * 5
-    assert_allclose(found.model.scaled(Convention.STIFFNESS, 1.0).etas, ETAS, rtol=2e-3)
+    assert_allclose(found.model.normalised(Normalisation.STIFFNESS, 1.0).etas, ETAS, rtol=2e-3)
     assert found.model.steady == pytest.approx(GAIN, rel=1e-3)
 
 
@@ -292,8 +287,8 @@ def test_refinement_does_not_lose_ground_and_delays_may_go_below_a_block():
 def test_the_scan_stays_within_its_intervals():
     plan = Scan(orders=(Interval(1.7, 1.9), Interval(0.8, 0.9)), delay=Interval(1.1, 1.3), rounds=4)
     found = scan(blocks_of(CLEAN), 2, CLEAN.span, plan)
-    assert 1.7 <= found.model.form.orders[0] <= 1.9
-    assert 0.8 <= found.model.form.orders[1] <= 0.9
+    assert 1.7 <= found.model.orders[0] <= 1.9
+    assert 0.8 <= found.model.orders[1] <= 0.9
     assert 1.1 - 1e-9 <= found.model.delay <= 1.3 + 1e-9
 
 
@@ -306,7 +301,7 @@ def test_a_winner_that_cannot_be_physical_is_told():
     assert found.physical == 0
     assert not found.model.physical
     assert found.rmse == found.unconstrained_rmse
-    assert_allclose(found.model.form.etas[0], -1 / 0.4, rtol=0.02)
+    assert_allclose(found.model.etas[0], -1 / 0.4, rtol=0.02)
 
 
 def test_a_hundred_thousand_candidates_in_a_minute():
@@ -330,11 +325,11 @@ def test_the_equation_error_is_biased_and_the_output_error_is_not():
         once = study(noisy, terms=2)
         data = path_data(once)[0]
         rough, last = (
-            least_squares(blocks_of(data), ORDERS, DELAY, convention=convention) for convention in Convention
+            least_squares(blocks_of(data), ORDERS, DELAY, normalisation=each) for each in Normalisation
         )
         rng = np.random.default_rng(seed)
         fine = output_error_fit(once, data, rng, terms=2, orders=ORDERS, start=TRUE, starts=1)
-        forms = [model.scaled(Convention.STIFFNESS, 1.0) for model in (rough, last, fine)]
+        forms = [model.normalised(Normalisation.STIFFNESS, 1.0) for model in (rough, last, fine)]
         wide.append([[*form.etas, form.gain] for form in forms])
         assert output_rmse(data.records, fine) <= output_rmse(data.records, rough)
     relative = np.array(wide) / [*ETAS, GAIN] - 1
@@ -351,8 +346,8 @@ def test_output_error_fit_of_exact_data_with_a_delay_between_blocks():
     data = path_data(once)[0]
     found = output_error_fit(once, data, np.random.default_rng(1), terms=2, starts=3)
     assert found.delay == pytest.approx(DELAY, abs=0.003)
-    assert_allclose(found.form.orders, ORDERS, atol=0.01)
-    assert_allclose(found.form.etas, ETAS, rtol=0.02)
+    assert_allclose(found.orders, ORDERS, atol=0.01)
+    assert_allclose(found.etas, ETAS, rtol=0.02)
     assert found.steady == pytest.approx(GAIN, rel=5e-3)
 
 
@@ -376,9 +371,9 @@ def identified():
 def test_every_path_of_the_bundled_study(identified):
     _, found = identified
     assert [each.data.name for each in found] == ["x_x", "x_y", "y_x", "y_y"]
-    assert [len(each.scan.model.form.orders) for each in found] == [3, 2, 2, 3]
+    assert [len(each.scan.model.orders) for each in found] == [3, 2, 2, 3]
     for each in found:
-        assert each.integer.model.form.orders == (2.0, 1.0)
+        assert each.integer.model.orders == (2.0, 1.0)
         assert each.output_error.output_rmse <= each.scan.output_rmse * (1 + 1e-6)
         assert each.integer_output_error.output_rmse <= each.integer.output_rmse * (1 + 1e-6)
         rmse = [value for _, value in each.stiffness]
@@ -395,7 +390,7 @@ def test_results_are_plain_and_convert(identified):
     told = json.loads(json.dumps(results(once, found, FEW), allow_nan=False))
     assert [path_["path"] for path_ in told["paths"]] == ["x_x", "x_y", "y_x", "y_y"]
     model = told["paths"][0]["models"][0]
-    given, last = (model["coefficients"][convention.value] for convention in Convention)
+    given, last = (model["coefficients"][normalisation.value] for normalisation in Normalisation)
     assert given["stiffness"] == 5.57
     assert last["etas"][-1] == 1.0
     assert given["gain"] / last["gain"] == pytest.approx(given["stiffness"] / last["stiffness"])
@@ -407,9 +402,9 @@ def test_results_are_plain_and_convert(identified):
 
 def test_fixed_orders_are_kept_and_equal_ones_merged():
     found = identify(study(clean(), terms=3, orders=(1.6, 0.7, 0.7)), plan=None)[0]
-    assert found.scan.model.form.orders == ORDERS
-    assert found.output_error.model.form.orders == ORDERS
-    assert_allclose(found.output_error.model.form.etas, ETAS, rtol=0.02)
+    assert found.scan.model.orders == ORDERS
+    assert found.output_error.model.orders == ORDERS
+    assert_allclose(found.output_error.model.etas, ETAS, rtol=0.02)
 
 
 def test_nothing_is_printed_unless_asked(capsys):
@@ -517,3 +512,9 @@ def test_the_study_is_left_as_it_was(identified):
     once, _ = identified
     assert isinstance(once, Study)
     assert np.isnan(once.fit[0].response[0]).all()
+
+
+def test_a_study_with_effects_is_refused():
+    made = study(clean())
+    with pytest.raises(InputError, match="uses odd_curvature, and the paper's model has no effects"):
+        identify(replace(made, effects=replace(made.effects, use=("odd_curvature",))))

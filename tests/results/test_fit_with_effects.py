@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 from small import draws_of, record, study, with_effect
 
 from lcopa_bayes.bench.command import staircase
-from lcopa_bayes.data.drives import Drive
+from lcopa_bayes.data.drive import Drive
 from lcopa_bayes.data.settings import EffectsSettings, SamplerSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from small import TRUTH, TWO, draws_of, problem, record, row_values
 
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.drives import Drive
+from lcopa_bayes.data.drive import Drive
 from lcopa_bayes.results.frequency import frequency_response, transfer_function
 from lcopa_bayes.results.prediction import responses
 

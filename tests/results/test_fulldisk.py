@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from small import record
 
-from lcopa_bayes.bench.campaign import write_campaign
+from lcopa_bayes.bench.campaignfile import write_campaign
 from lcopa_bayes.cli import main
 from lcopa_bayes.core import files
 from lcopa_bayes.core.errors import InputError
@@ -185,7 +185,7 @@ def test_the_first_save_of_a_run_promises_nothing(tmp_path, monkeypatch, capsys)
 def test_a_campaign_that_does_not_fit_names_its_file_and_leaves_nothing(tmp_path, monkeypatch, at):
     monkeypatch.setattr(files.os, at, full)
     with pytest.raises(InputError) as caught:
-        write_campaign(tmp_path, [record(camera=0.8)])
+        write_campaign(tmp_path, [record(camera=0.8)], name="one", seed=1)
     assert str(tmp_path / "step.csv") + ": cannot be written (No space" in caught.value.problems[0]
     assert list(tmp_path.iterdir()) == []
 
@@ -193,7 +193,7 @@ def test_a_campaign_that_does_not_fit_names_its_file_and_leaves_nothing(tmp_path
 def test_a_campaign_in_a_folder_that_cannot_be_made_is_told(tmp_path, monkeypatch):
     monkeypatch.setattr(files.Path, "mkdir", full)
     with pytest.raises(InputError, match="cannot be written to"):
-        write_campaign(tmp_path / "new", [record(camera=0.8)])
+        write_campaign(tmp_path / "new", [record(camera=0.8)], name="one", seed=1)
 
 
 def test_figures_that_cannot_be_kept_are_told(tmp_path):

@@ -14,7 +14,7 @@ from small import ONE, TRUTH, TWO, draws_of, problem, record, row_values, study
 from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import Command, on_off, step
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.drives import Drive
+from lcopa_bayes.data.drive import Drive
 from lcopa_bayes.data.record import save_record
 from lcopa_bayes.results.fit import Fit, fit
 from lcopa_bayes.results.fittedrange import energies
@@ -254,43 +254,16 @@ def test_a_record_that_a_fit_would_refuse_is_not_scored(alone):
     wrong = replace(HELD, drive_axes=(replace(HELD.drive_axes[0], unit="mV"),))
     with pytest.raises(InputError, match="in mV"):
         alone.score(wrong)
-    with pytest.raises(InputError, match="2 records are named"):
-        alone.score(replace(HELD, name="step"))
-    with pytest.raises(InputError, match="s"):
+    with pytest.raises(InputError, match="is in s, the study is in ms; convert its times"):
         alone.score(replace(HELD, time_unit="s"))
 
 
-def test_a_record_from_another_rest_is_scored_and_marked(alone):
-    high = record(8, command=step(0.4, at=2.0, rest=0.5), name="high")
-    result = alone.predict(high)
-    assert [one.kind for one in result.outside] == ["rest"]
-    assert "is at 0.5 V before its first change" in result.verdict
-
-
-def test_a_file_without_responses_cannot_be_scored(alone, tmp_path):
-    path = tmp_path / "plan.csv"
-    path.write_text("time_ms,drive_u_V\n0,0\n1,1\n9,1\n")
-    with pytest.raises(InputError, match="holds no response"):
-        alone.score(path)
-    assert alone.predict(path).bands[0].time[-1] == pytest.approx(9.0)
-
-
-def test_step_metrics_of_a_path_over_another_span(alone):
-    whole = alone.step_metrics().set_index("name")
-    known = {one.name: one for one in alone.metrics}
-    assert set(whole.index) == set(known)
-    assert whole.loc["rise_10_90[y]", "value"] == known["rise_10_90[y]"].value
-    longer = alone.step_metrics("y", span=200.0).set_index("name")
-    exact = np.median(alone.draws.column("gain"))
-    assert longer.loc["value_at_end[y]", "value"] == pytest.approx(exact, rel=0.05)
-    near, far = (abs(result.loc["value_at_end[y]", "value"] - exact) for result in (longer, whole))
-    assert near < far
-    with pytest.raises(InputError, match="no path 'z'"):
-        alone.step_metrics("z")
-    with pytest.raises(InputError, match="span"):
-        alone.step_metrics(span=-1.0)
-
-
-def test_frequency_response_of_a_fit_is_that_of_its_draws(alone):
-    (path,) = alone.frequency_response([1e-6]).paths
-    assert_allclose(path.gain.pointwise[2], np.median(np.abs(alone.draws.column("gain"))), rtol=1e-3)
+def test_a_new_record_may_have_the_name_of_a_fitted_one_but_not_its_samples(alone):
+    """The score does not depend on the name, but for the noise that is drawn."""
+    (fitted,) = alone.study.fit
+    named = alone.predict(replace(HELD, name=fitted.name))
+    assert named.driven.name == named.bands[0].record == fitted.name
+    assert named.bands[0].rmse == pytest.approx(alone.predict(HELD).bands[0].rmse, rel=0.01)
+    for name in ("step", "again"):
+        with pytest.raises(InputError, match=f"'{name}' is 'step' of the fit, .* give another record"):
+            alone.predict(replace(fitted, name=name))

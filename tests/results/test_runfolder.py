@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+from importlib.metadata import version
 
 import arviz_base
 import arviz_stats
+import h5py
 import numpy as np
 import pandas as pd
 import pytest
@@ -62,7 +64,7 @@ def test_tables_read_back(fitted, folder):
         assert len(read) == len(table) > 0, name
     bands = pd.read_csv(folder / "tables" / "bands.csv")
     assert set(bands["record"]) == {"a", "b", "held"}
-    assert (bands["noisy_05"] <= bands["noisy_95"]).all()
+    assert (bands["noisy_pointwise_05"] <= bands["noisy_pointwise_95"]).all()
     priors = pd.read_csv(folder / "tables" / "priors.csv").set_index("name")
     assert priors.loc["delay", "prior"] == "fixed at 0.73"
     assert priors.loc["gain", "integrated_out"] == (fitted.problem.posterior.noise.kind == "white")
@@ -104,6 +106,11 @@ def test_posterior_has_the_arviz_groups(fitted, folder):
         assert read.attrs["grade"] == fitted.draws.grade.level
         assert read.attrs["seed"] == fitted.study.seed
         assert json.loads(read.attrs["settings"])["sampler"]["walkers"] == 16
+        assert read.attrs["version"] == version("lcopa-bayes")
+        assert (read.attrs["study"], read.attrs["time_unit"]) == ("small", "ms")
+        assert read["constant_data"]["a_drive"].dims == ("a_drive_time", "drive")
+        assert read["predictions"]["held_y"].dims == ("chain", "draw", "held_y_time")
+        assert read["observed_data"]["a_y_time"].attrs["units"] == "ms"
         assert read["log_likelihood"]["a_y"].dims == ("chain", "draw", "a_y_time")
         assert read["observed_data"]["a_y"].attrs["units"] == "rad"
         assert list(read["constant_data"].coords["record"].to_numpy()) == ["a", "b"]
@@ -127,6 +134,15 @@ def test_posterior_has_the_arviz_groups(fitted, folder):
         predictive = np.median(read["posterior_predictive"]["a_y"], axis=(0, 1))
         width = fitted.bands[0].noisy[4] - fitted.bands[0].noisy[0]
         assert np.all(np.abs(predictive - fitted.bands[0].noisy[2]) < 0.2 * width)
+
+
+def test_every_variable_is_compressed_without_loss(fitted, folder):
+    with h5py.File(folder / "posterior.nc") as file:
+        stored = {f"{group}/{name}": one for group, part in file.items() for name, one in part.items()}
+        for group, node in fitted.to_datatree().children.items():
+            for name in node.data_vars:
+                assert stored[f"{group}/{name}"].compression == "gzip"
+        assert_array_equal(stored["posterior/gain"], fitted.draws.values[..., 0])
 
 
 def test_log_prior_and_log_likelihood_are_consistent_with_the_density(fitted, folder):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -13,10 +14,9 @@ from small import TWO, record, study
 
 from lcopa_bayes.bench.command import on_off
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.candidatesettings import CandidateSettings, CompareSettings
-from lcopa_bayes.data.drives import Drive
-from lcopa_bayes.data.settings import PriorSettings
-from lcopa_bayes.data.studycopy import study_from_json, study_to_json
+from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.settings import CandidateSettings, CompareSettings, PriorSettings
+from lcopa_bayes.data.studywriter import study_from_json, study_to_json
 from lcopa_bayes.results.fit import Fit, fit
 from lcopa_bayes.results.provenance import fingerprint, settings_of
 from lcopa_bayes.results.savedfit import fit_to_json, load_fit
@@ -60,6 +60,12 @@ def test_a_saved_fit_predicts_scores_and_grades_as_it_did(fitted, folder):
     )
 
 
+def test_the_exposure_of_a_study_in_seconds_survives_its_copy_exactly():
+    slow = study(replace(record(1), time_unit="s"), exposure_ms=0.1 / 3)
+    again = study_from_json(json.loads(json.dumps(study_to_json(slow))))
+    assert again.exposure == slow.exposure == 0.1 / 3 / 1000
+
+
 def test_a_study_survives_its_copy_exactly():
     first = record(1, device=TWO, camera=0.37, name="x y")
     known = study(
@@ -67,14 +73,16 @@ def test_a_study_survives_its_copy_exactly():
         held_out=(record(2, device=TWO, camera=0.41, name="other"),),
         priors={"delay": 0.1, "sigma_x": ("loguniform", {"a": 0.001, "b": 1.0})},
         terms={"direct": 2, "cross": 1},
-        exposure=0.05,
+        exposure_ms=0.05,
         sampler=TINY,
     )
     prior = PriorSettings("delay", dist="norm", parameters={"loc": 0.1, "scale": 0.2})
-    candidate = CandidateSettings("rival", orders=(2.0, 1.0), priors={"delay": prior}, improper=("gain",))
+    candidate = CandidateSettings(
+        "rival", orders=(2.0, 1.0), priors={"delay": prior, "gain": PriorSettings("gain", dist="flat")}
+    )
     known = type(known)(
         **{key: getattr(known, key) for key in known.__dataclass_fields__}
-        | {"candidates": (candidate,), "compare": CompareSettings(("rival",)), "stages": {"fit": {}}}
+        | {"candidates": (candidate,), "compare": CompareSettings(("rival",)), "stages": ("fit",)}
     )
     again = study_from_json(json.loads(json.dumps(study_to_json(known), allow_nan=False)))
     assert settings_of(again) == settings_of(known)

@@ -113,3 +113,60 @@ def test_the_advice_helps():
     """The same study with the default budget is reliable."""
     told = results(fit(study(record(camera=0.6), sampler={"ensembles": 2, "walkers": 32, "target_ess": 200})))
     assert told["grade"] == "reliable", told["grade_reason"]
+
+
+BROKEN = """
+[noize]
+kind = "white"
+[sampler]
+ensembles = 1
+walker = 8
+[model]
+exposure_ms = 50
+[effects]
+use = ["cubic_stifness", "bilinear_crosstalk", "clipping", "clipping"]
+[priors]
+gain = { dist = "nrm" }
+delya = 0.1
+"ion_creep.k" = 0.1
+"""
+WRONG = (
+    "unknown table [noize]; did you mean 'noise'?",
+    "[sampler]: unknown key 'walker'; did you mean 'walkers'?",
+    "[sampler]: `ensembles` must be a whole number of at least 2; got 1",
+    "prior of 'gain': unknown distribution 'nrm'",
+    "the exposure of 50 ms is longer than the 0.6 ms",
+    "no effect is named 'cubic_stifness'; did you mean 'cubic_stiffness'?",
+    "'bilinear_crosstalk' has no place in a plant of 1 drive and 1 response",
+    "'clipping' is listed 2 times",
+    "[priors] ion_creep.k: the effect 'ion_creep' is not used",
+    "[priors] delya: this model has no such parameter; did you mean 'delay'?",
+)
+
+
+@pytest.mark.parametrize(
+    "verb", ["run", "fit", "audit", "design", "compare", "loop", "calibrate", "identify"]
+)
+def test_every_problem_of_a_study_is_named_at_once(verb, tmp_path, capsys):
+    """Those of its file, of its records, of its effects and of its priors, whichever tables are wrong."""
+    folder, out = tmp_path / "in", tmp_path / "out"
+    folder.mkdir()
+    save_record(record(camera=0.6), folder / "step.csv")
+    (folder / "study.toml").write_text(BROKEN)
+    assert main([verb, str(folder), "--out", str(out), "--jobs", "1", "--quiet"]) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    lines = printed.err.splitlines()
+    for words, line in zip(WRONG, lines, strict=True):
+        assert words in line
+    assert not out.exists()
+
+
+def test_a_plant_that_cannot_be_read_is_not_judged_further(tmp_path, capsys):
+    save_record(record(camera=0.6), tmp_path / "step.csv")
+    (tmp_path / "study.toml").write_text('[model]\nterms = 9\n[priors]\ntime_4 = 1.0\n[noise]\nkind = "ar"\n')
+    assert main(["fit", str(tmp_path), "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2  # whether there is a fourth term depends on what `terms` should have been
+    assert "`terms` must be a whole number from 1 to 6; got 9" in lines[0]
+    assert "`kind` must be one of white, ar1, white+ar1, student; got 'ar'; did you mean 'ar1'?" in lines[1]

@@ -20,7 +20,7 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studywriter import write_study
 from lcopa_bayes.experiments.information import Bench
 from lcopa_bayes.experiments.refit import EffectedDevice, device_of, refit
-from lcopa_bayes.identifiability.sensitivities import sensitivities
+from lcopa_bayes.identifiability.curvature import sensitivities
 from lcopa_bayes.identifiability.symmetries import DIFFERENCED, structure
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.likelihood import Landscape

@@ -82,7 +82,7 @@ def test_a_record_is_scored_as_it_was_when_held_out_from_the_start(fitted, folde
         ("time_ms,drive_u_V\n0,0.5\n1,1\n", ["is at 0.5 V before its first change"]),
         ("time_ms,drive_u_V\n0,0\n2,1\n1,0\n", ["line 4, column 'time_ms': 1.0 does not come after"]),
         ("time_ms,drive_u_V\n0,0\n2,\n", ["line 3, column 'drive_u_V': the cell is empty"]),
-        ("time_min,drive_u_V\n0,0\n2,1\n", ["the time unit 'min' is not known"]),
+        ("time_week,drive_u_V\n0,0\n2,1\n", ["the time unit 'week' is not known"]),
         ("time_ms\n0\n2\n", ["has no drive column"]),
     ],
 )
@@ -95,6 +95,15 @@ def test_a_drive_that_does_not_suit_is_refused_and_nothing_written(folder, capsy
     lines = known.err.splitlines()
     assert len(lines) == len(words)
     assert all(word in line for word, line in zip(words, lines, strict=True))
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_a_fitted_record_is_refused_and_nothing_written(fitted, folder, capsys, tmp_path):
+    save_record(fitted.study.fit[0], tmp_path / "step.csv")
+    before = sorted(folder.rglob("*"))
+    assert main(["predict", str(folder), str(tmp_path / "step.csv")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "record 'step' is 'step' of the fit" in line
     assert sorted(folder.rglob("*")) == before
 
 

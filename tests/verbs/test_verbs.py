@@ -13,9 +13,15 @@ from small import check_page
 
 from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import step
-from lcopa_bayes.bench.device import Device, TransferPath
+from lcopa_bayes.bench.device import Device
+from lcopa_bayes.bench.inversion import step_response
 from lcopa_bayes.cli import main
+from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.record import Axis, save_record
+from lcopa_bayes.model.path import TransferPath
+from lcopa_bayes.results.runfolder import origins
+from lcopa_bayes.verbs.papers import claims
+from lcopa_bayes.verbs.stored import load_result
 
 PATH = TransferPath(0.2, 1.0, (3.0, 2.0), (1.6, 0.7), 1.0)
 DEVICE = Device(((PATH,),), (Axis("in", "V"),), (Axis("out", "mm"),), (0.1,))
@@ -55,7 +61,7 @@ def optics(tmp_path_factory) -> Path:
 
 
 def test_optics_writes_its_figures(optics):
-    page = check_page(optics / "report.html")
+    page = check_page(optics / "optics.html")
     names = {path.stem for path in (optics / "figures").iterdir()}
     assert names == {"farfield_1d", "farfield_2d", "director", "tilt_voltage", "steering_chain"}
     assert page.count("<svg") == 5
@@ -85,8 +91,8 @@ def test_optics_tells_its_numbers(tmp_path, capsys):
     grating = [row for row in told["grating_lobes"] if row["order"]]
     assert all(row["isotropic"] == pytest.approx(1.0) for row in grating)
     assert max(row["with_element"] for row in grating) == pytest.approx(0.4846, abs=1e-4)
-    assert json.loads((tmp_path / "results.json").read_text())["chain"] == told["chain"]
-    assert told["report"] == str(tmp_path / "report.html")
+    assert json.loads((tmp_path / "optics.json").read_text())["chain"] == told["chain"]
+    assert told["report"] == str(tmp_path / "optics.html")
 
 
 def test_optics_of_another_array(tmp_path, capsys):
@@ -108,8 +114,9 @@ def test_optics_of_another_array(tmp_path, capsys):
 def test_optics_speaks_without_json(tmp_path, capsys):
     code, printed, _ = run(capsys, "optics", "--out", tmp_path, "--targets", 0, 10)
     assert code == 0
-    assert "threshold voltage 0.9555 V" in printed
-    assert printed.rstrip().endswith(str(tmp_path / "report.html"))
+    assert "tilts above 0.9555 V" in printed
+    assert "printed_law_rad" in printed
+    assert printed.rstrip().endswith(str(tmp_path / "optics.html"))
 
 
 @pytest.mark.parametrize(
@@ -162,7 +169,7 @@ def test_identify_tells_every_model_in_both_normalisations(identified):
     assert best["delay"] == pytest.approx(1.0, abs=0.2)
     assert best["output_rmse"] == pytest.approx(1e-3, rel=0.3)
     (end,) = (row for row in told["step_metrics"] if row["metric"] == "at end")
-    truth = float(PATH.step_response(12.0))  # what is tended to is not known from a record this short
+    truth = float(step_response(PATH, 12.0))  # what is tended to is not known from a record this short
     assert end["values"]["fractional, output error"] == pytest.approx(truth, rel=0.01)
     assert {row["metric"] for row in told["step_metrics"]} >= {"rise", "steady", "RMSE"}
 
@@ -176,7 +183,8 @@ def test_identify_draws_every_record(identified):
 
 
 def test_identify_leaves_the_report_of_a_fit_alone(identified):
-    assert sorted(path.name for path in identified.iterdir()) == ["figures", "identify.html", "identify.json"]
+    names = ["figures", "identify.html", "identify.json", "provenance.json", "tables"]
+    assert sorted(path.name for path in identified.iterdir()) == names
 
 
 def test_identify_prints_a_table_and_json(study, tmp_path, capsys):
@@ -223,10 +231,10 @@ def test_claims_write_their_page_and_tell_their_rows(tmp_path, capsys, monkeypat
     for row in told["claims"]:
         assert row["verdict"] in {"supported", "contradicted", "undecided"}
     folder = tmp_path / "runs" / "claims"
-    page = check_page(folder / "report.html")
+    page = check_page(folder / "claims.html")
     assert page.count("<svg") == len(list((folder / "figures").iterdir())) == 5
     assert all(f">{row['id']}<" in page for row in told["claims"])
-    assert json.loads((folder / "results.json").read_text())["claims"] == told["claims"]
+    assert json.loads((folder / "claims.json").read_text())["claims"] == told["claims"]
     code, printed, _ = run(capsys, "claims", "--out", tmp_path / "elsewhere")
     assert code == 0
     assert re.search(r"^S4 +contradicted +7\.66", printed, re.MULTILINE)
@@ -245,3 +253,54 @@ def test_identify_refuses_a_file_for_a_folder_before_it_scans(study, tmp_path, c
     assert code == 2
     assert "--out" in told
     assert "candidate" not in told  # no progress was shown
+
+
+# -- read back -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("verb", ["optics", "identify", "claims"])
+def test_a_result_about_the_paper_is_read_back_from_its_folder(verb, optics, identified, tmp_path):
+    """Values, table, text and page are those of the result that was saved."""
+    if verb == "claims":
+        made = claims()
+        folder = made.save(tmp_path / "claims")
+        made.report(folder)
+    else:
+        folder = {"optics": optics, "identify": identified}[verb]
+    read = load_result(folder)
+    assert read.verb == verb
+    stored = json.loads((folder / f"{verb}.json").read_text())
+    assert read.to_json() == stored
+    rows = {
+        "optics": lambda: stored["grating_lobes"],
+        "identify": lambda: [model for path in stored["paths"] for model in path["models"]],
+        "claims": lambda: stored["claims"],
+    }
+    assert len(read.summary()) == len(rows[verb]())
+    assert read.verdict in str(read)
+    again = read.report(tmp_path / "again")
+    assert again.read_text() == (folder / again.name).read_text()
+    assert load_result(tmp_path / "again").to_json() == stored
+    assert str(load_result(tmp_path / "again")) == str(read)
+    assert main(["report", str(tmp_path / "again"), "--quiet"]) == 0
+
+
+def test_a_result_cut_short_is_refused(identified, tmp_path):
+    folder = load_result(identified).save(tmp_path / "cut")
+    (sample,) = (folder / "tables").iterdir()
+    sample.unlink()
+    with pytest.raises(InputError, match="samples cannot be read"):
+        load_result(folder).report(folder)
+    (folder / "identify.json").write_text('{"study": ')
+    with pytest.raises(InputError, match="cannot be read"):
+        load_result(folder)
+
+
+def test_results_of_the_paper_stand_beside_each_other_but_not_beside_those_of_a_study(
+    optics, identified, tmp_path
+):
+    both = load_result(optics).save(tmp_path)
+    claims().save(both)
+    assert set(origins(both)) == {"optics", "claims"}
+    with pytest.raises(InputError, match="for the study"):
+        load_result(identified).save(both)

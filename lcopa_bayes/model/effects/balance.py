@@ -36,7 +36,7 @@ _LEAST = 2
 """Windows this short are iterated to the end."""
 _LONG_SWEEPS = 400
 _SHARES = (0.5, 0.2, 0.05)
-"""Steps of an iteration that would overshoot, over the way to its target [-]."""
+"""Steps of an iteration that would overshoot, over the distance to its target [-]."""
 RUNAWAY = 1e6
 """A response this many times its scale has run away [-]."""
 
@@ -54,15 +54,15 @@ def balanced(kernel: Matrix, force: Force, scale: Vector) -> Matrix:
 
     Parameters: kernel (axes, n), the impulse response in block means; scale (axes,), typical size of y.
     The whole is iterated with acceleration. When that does not converge it is halved, the first half
-    solved and its convolution carried into the second; stretches of up to 128 blocks are solved by
+    solved and its convolution added to the second; stretches of up to 128 blocks are solved by
     Newton's method, or halved further, down to two blocks, where the direct feed-through is small.
     Raises RunawayError. Accuracy: 1e-12 of the scale per iteration.
     """
     y, v = np.zeros(kernel.shape), np.zeros(kernel.shape)
     reach = min(kernel.shape[1], _DENSE)
     operators = [np.asfortranarray(toeplitz(row[:reach], np.zeros(reach))) for row in kernel]
-    made = _Balance(kernel, operators, force, scale[:, None], y, v)
-    made.solve(0, kernel.shape[1], kernel.shape[1], None)
+    problem = _Balance(kernel, operators, force, scale[:, None], y, v)
+    problem.solve(0, kernel.shape[1], kernel.shape[1], None)
     return y
 
 
@@ -91,16 +91,16 @@ class _Balance:
             before = np.concatenate((np.zeros((y.shape[0], 2)), y[:, max(a - 2, 0) : a]), axis=1)[:, -2:]
             problem = self.kernel[:, :n], self.force, y[:, a:b].copy(), before, self.scale, blocks
             if _LEAST < n <= _DENSE:
-                found = None if guess is None else _newton(self.operators, *problem[1:], guess[:, a:b])
-                found = _newton(self.operators, *problem[1:], problem[2]) if found is None else found
+                solution = None if guess is None else _newton(self.operators, *problem[1:], guess[:, a:b])
+                solution = _newton(self.operators, *problem[1:], problem[2]) if solution is None else solution
             else:
-                found, reached = _iterate(*problem)
+                solution, reached = _iterate(*problem)
                 if a == 0 and b == y.shape[1]:
                     guess = reached
-            if found is None and n <= _LEAST:
-                found = _relaxed(*problem)
-            if found is not None:
-                y[:, a:b], self.v[:, a:b] = found
+            if solution is None and n <= _LEAST:
+                solution = _relaxed(*problem)
+            if solution is not None:
+                y[:, a:b], self.v[:, a:b] = solution
                 return limit if limit > _DENSE else min(_DENSE, max(limit, 2 * n))
             if n <= _LEAST:
                 raise RunawayError(a)
@@ -123,7 +123,7 @@ def _newton(
     """Fixed point as in `_iterate`, by Newton's method from `start`.
 
     Slopes of the force, in y and in its two earlier values, are differences over 1e-6 of the scale; that
-    of one axis in another is left to the iteration.
+    of one axis in another is for the iteration.
     """
     axes, n = history.shape
     nudge = _NUDGE * scale[..., None] * np.eye(4)[1:].T  # (axes, 4 variants, 3 arguments)
@@ -140,14 +140,14 @@ def _newton(
             forces = force(every, *varied).reshape(axes, 4, n)
             v = forces[:, 0]
             slopes = (forces[:, 1:] - forces[:, :1]) / (_NUDGE * scale[..., None])
-            left = history - y
+            residual = history - y
             for i, operator in enumerate(operators):
-                left[i] += operator[:n, :n] @ v[i]
-        size = float(np.abs(left / scale).max())
+                residual[i] += operator[:n, :n] @ v[i]
+        size = float(np.abs(residual / scale).max())
         if not (size < RUNAWAY and np.isfinite(slopes.sum())):  # NaN too
             return None
         if size < TOLERANCE:
-            return y + left, v
+            return y + residual, v
         step = np.empty_like(y)
         for i, operator in enumerate(operators):
             matrix = operator[:n, :n] * -slopes[i, 0]
@@ -157,7 +157,7 @@ def _newton(
             matrix[diagonal, diagonal] += 1.0
             if not np.all(np.abs(matrix[diagonal, diagonal]) > _SINGULAR):
                 return None
-            step[i] = dtrtrs(matrix, left[i], lower=1)[0]
+            step[i] = dtrtrs(matrix, residual[i], lower=1)[0]
         y = y + step
     return None
 

@@ -197,4 +197,4 @@ def _of_rows(effect: ForceEffect, rows: Index) -> ForceEffect:
     constants = {
         name: value[rows] for name, value in effect.constants.items() if isinstance(value, np.ndarray)
     }
-    return replace(effect, **constants) if constants else effect  # type: ignore[type-var]
+    return replace(effect, **constants) if constants else effect

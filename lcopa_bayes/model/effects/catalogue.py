@@ -15,32 +15,29 @@ from pathlib import Path
 
 from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.model.effects import (
-    acquisition,
     commands,
-    crossfade,
     dynamics,
     generic,
     parallel,
     records,
     response,
-    ripples,
     sensor,
 )
 from lcopa_bayes.model.effects.effect import Card, Effect
 
 GROUP = "lcopa_bayes.effects"
 """Entry point group of effects in installed packages."""
-_MODULES = (acquisition, commands, dynamics, parallel, crossfade, response, sensor, records, ripples, generic)
+_MODULES = (commands, dynamics, parallel, response, sensor, records, generic)
 
 
 def bundled() -> dict[str, type[Effect]]:
     """Effects of this package by name."""
-    found = {}
+    known = {}
     for module in _MODULES:
         for _, kind in inspect.getmembers(module, inspect.isclass):
             if issubclass(kind, Effect) and kind.__module__ == module.__name__:
-                found[kind.card.name] = kind
-    return dict(sorted(found.items()))
+                known[kind.card.name] = kind
+    return dict(sorted(known.items()))
 
 
 def catalogue(add: Sequence[str] = (), folder: Path | None = None) -> dict[str, type[Effect]]:
@@ -48,10 +45,10 @@ def catalogue(add: Sequence[str] = (), folder: Path | None = None) -> dict[str, 
 
     Raises InputError with everything that cannot be used: files, classes, or two effects of one name.
     """
-    found, problems = bundled(), []
-    told = [(f"entry point {point.name}", point.load) for point in entry_points(group=GROUP)]
-    told += [(f"[effects] add = {text!r}", partial(_from_file, text, folder)) for text in add]
-    for where, load in told:
+    known, problems = bundled(), []
+    sources = [(f"entry point {point.name}", point.load) for point in entry_points(group=GROUP)]
+    sources += [(f"[effects] add = {text!r}", partial(_from_file, text, folder)) for text in add]
+    for where, load in sources:
         try:
             kind = load()
         except InputError as error:
@@ -63,13 +60,13 @@ def catalogue(add: Sequence[str] = (), folder: Path | None = None) -> dict[str, 
         fit = inspect.isclass(kind) and issubclass(kind, Effect) and not inspect.isabstract(kind)
         if not (fit and isinstance(getattr(kind, "card", None), Card)):
             problems.append(f"{where}: must be a concrete Effect class with a `card`; got {kind!r}")
-        elif kind.card.name in found:
+        elif kind.card.name in known:
             problems.append(f"{where}: an effect named {kind.card.name!r} exists; choose another name")
         else:
-            found[kind.card.name] = kind
+            known[kind.card.name] = kind
     if problems:
         raise InputError(problems)
-    return found
+    return known
 
 
 def _from_file(text: str, folder: Path | None) -> object:

@@ -9,10 +9,9 @@ from typing import ClassVar, Self, final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
-from lcopa_bayes.data.drive import Drive, sorted_jumps
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.effects.effect import (
     Card,
-    Coefficient,
     Constant,
     DriveEffect,
     Ranges,
@@ -31,6 +30,7 @@ class OverdrivePulse(DriveEffect):
 
     linear = True
     units = MappingProxyType({"frame": "time"})
+    estimated = single("k", 0.2)
     card: ClassVar[Card] = Card(
         name="overdrive_pulse",
         place="drive",
@@ -46,17 +46,13 @@ class OverdrivePulse(DriveEffect):
         longest = max(6 * ranges.speed, 8 * ranges.period)
         return tuple(cls(float(frame)) for frame in np.geomspace(2 * ranges.period, longest, 16))
 
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """k [-]."""
-        return single("k", 0.2)
-
     def commands(
-        self, drive: Drive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[Drive, float]:
+        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
+    ) -> tuple[AxisDrive, float]:
         """One more pair of changes per change."""
         jumps = np.diff(drive.values, prepend=0.0)
         times = np.concatenate((drive.times, drive.times + self.frame))
-        return sorted_jumps(times, np.concatenate(((1 + psi[0]) * jumps, -psi[0] * jumps))), rest
+        return AxisDrive.of_jumps(times, np.concatenate(((1 + psi[0]) * jumps, -psi[0] * jumps))), rest
 
 
 @final
@@ -71,6 +67,7 @@ class RefreshHold(DriveEffect):
 
     units = MappingProxyType({"refresh": "time"})
     fractions = frozenset({"phase"})
+    estimated = single("w", 0.6, one_signed=True)
     card: ClassVar[Card] = Card(
         name="refresh_hold",
         place="drive",
@@ -93,25 +90,21 @@ class RefreshHold(DriveEffect):
         refresh, phase = super().internal(ranges)
         return refresh, replace(phase, high=1.0)
 
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """w [-]."""
-        return single("w", 0.6, one_signed=True)
-
     def commands(
-        self, drive: Drive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[Drive, float]:
+        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
+    ) -> tuple[AxisDrive, float]:
         """Of several changes that fall to one refresh the sum acts."""
         ticks = np.ceil(drive.times / self.refresh - self.phase - 1e-9) + self.phase
         times = drive.times + psi[0] * (self.refresh * ticks - drive.times)
-        return sorted_jumps(times, np.diff(drive.values, prepend=0.0)), rest
+        return AxisDrive.of_jumps(times, np.diff(drive.values, prepend=0.0)), rest
 
 
-def _mapped(drive: Drive, rest: float, levels: Vector) -> tuple[Drive, float]:
+def _mapped(drive: AxisDrive, rest: float, levels: Vector) -> tuple[AxisDrive, float]:
     """The drive with other levels: that at rest, then one per change."""
-    return sorted_jumps(drive.times, np.diff(levels)), float(levels[0])
+    return AxisDrive.of_jumps(drive.times, np.diff(levels)), float(levels[0])
 
 
-def _levels(drive: Drive, rest: float) -> Vector:
+def _levels(drive: AxisDrive, rest: float) -> Vector:
     """Drive at rest and after every change, (1 + changes,)."""
     return rest + np.concatenate(([0.0], drive.values))
 
@@ -125,6 +118,7 @@ class GreyQuantisation(DriveEffect):
     """Steps within the largest drive [-]."""
 
     linear = True
+    estimated = single("w", 0.6, one_signed=True)
     card: ClassVar[Card] = Card(
         name="grey_quantisation",
         place="drive",
@@ -144,13 +138,9 @@ class GreyQuantisation(DriveEffect):
         usual = (15, 16, 31, 32, 63, 64, 127, 128, 255)
         return tuple(cls(float(levels)) for levels in (*usual, *np.geomspace(6.0, 62.0, 156)))
 
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """w [-]."""
-        return single("w", 0.6, one_signed=True)
-
     def commands(
-        self, drive: Drive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[Drive, float]:
+        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
+    ) -> tuple[AxisDrive, float]:
         """Level by level."""
         step, levels = scene.ranges.drive[axis] / self.levels, _levels(drive, rest)
         return _mapped(drive, rest, levels + psi[0] * (step * np.round(levels / step) - levels))
@@ -165,13 +155,14 @@ class Hysteresis(DriveEffect):
     """Half-width of the play over the largest drive [-]."""
 
     linear = True
+    estimated = single("h", 0.1)
     card: ClassVar[Card] = Card(
         name="hysteresis",
         place="drive",
         formula="u -> u + h (p - u), p_k = max(u - r, min(u + r, p_(k-1))), r = width umax",
         source="play operator of Prandtl and Ishlinskii; ions, surface memory",
         reveals="sign reversal, staircases up and down",
-        mistaken_for="gain; invisible when every record goes one way",
+        mistaken_for="gain; invisible when every record goes in one direction",
     )
 
     @classmethod
@@ -179,13 +170,9 @@ class Hysteresis(DriveEffect):
         """Widths from 2 to 50 % of the range."""
         return tuple(cls(width) for width in (0.02, 0.05, 0.1, 0.2, 0.35, 0.5))
 
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """h [-]."""
-        return single("h", 0.1)
-
     def commands(
-        self, drive: Drive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[Drive, float]:
+        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
+    ) -> tuple[AxisDrive, float]:
         """The play starts where the drive rests."""
         radius, levels = self.width * scene.ranges.drive[axis], _levels(drive, rest)
         played = levels.copy()
@@ -195,11 +182,11 @@ class Hysteresis(DriveEffect):
 
 
 @final
-@dataclass(frozen=True)
 class VoltageKnee(DriveEffect):
     """Curve from drive to force after the calibration table."""
 
     linear = True
+    estimated = single("k", 0.05)
     card: ClassVar[Card] = Card(
         name="voltage_knee",
         place="drive",
@@ -209,23 +196,19 @@ class VoltageKnee(DriveEffect):
         mistaken_for="gain; odd_curvature",
     )
 
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """k [-]."""
-        return single("k", 0.05)
-
     def commands(
-        self, drive: Drive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[Drive, float]:
+        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
+    ) -> tuple[AxisDrive, float]:
         """Level by level."""
         levels = _levels(drive, rest)
         return _mapped(drive, rest, levels * (1 + psi[0] * (1 - np.abs(levels) / scene.ranges.drive[axis])))
 
 
 @final
-@dataclass(frozen=True)
 class FieldDependentDelay(DriveEffect):
     """Delay that falls (e > 0) with the drive that is switched on."""
 
+    estimated = single("e", 0.15)
     card: ClassVar[Card] = Card(
         name="field_dependent_delay",
         place="drive",
@@ -235,16 +218,34 @@ class FieldDependentDelay(DriveEffect):
         mistaken_for="delay, exactly so with one amplitude",
     )
 
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """e [-]."""
-        return single("e", 0.15)
-
     def commands(
-        self, drive: Drive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[Drive, float]:
+        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
+    ) -> tuple[AxisDrive, float]:
         """Every change is shifted by its own part of the delay of the drive's own path."""
         own = np.flatnonzero(scene.ranges.direct == axis)
         delay = float(scene.delays[own[0] if own.size else 0, axis])
         levels = np.abs(_levels(drive, rest)[1:]) / scene.ranges.drive[axis]
         times = drive.times + psi[0] * delay * (0.5 - levels)
-        return sorted_jumps(times, np.diff(drive.values, prepend=0.0)), rest
+        return AxisDrive.of_jumps(times, np.diff(drive.values, prepend=0.0)), rest
+
+
+@final
+class SampledDrive(DriveEffect):
+    """A drive that was sampled while it moved, not commanded and held: it changes half a period earlier."""
+
+    estimated = single("w", 0.6, one_signed=True)
+    card: ClassVar[Card] = Card(
+        name="sampled_drive",
+        place="drive",
+        formula="t -> t - w period / 2 for each change; w = 1 is a drive sampled at the middle of its holds",
+        source="midpoint rule for a band-limited drive; Ljung 1999, System Identification, ch. 13",
+        reveals="a drive that changes with every sample, a delay near 0",
+        mistaken_for="a shorter delay, exactly so where the delay can shrink",
+    )
+
+    def commands(
+        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
+    ) -> tuple[AxisDrive, float]:
+        """All changes by the same time."""
+        times = drive.times - 0.5 * psi[0] * scene.ranges.period
+        return AxisDrive.of_jumps(times, np.diff(drive.values, prepend=0.0)), rest

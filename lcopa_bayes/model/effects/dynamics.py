@@ -10,7 +10,6 @@ import numpy as np
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.model.effects.effect import (
     Card,
-    Coefficient,
     ElementEffect,
     ForceEffect,
     Ranges,
@@ -23,11 +22,11 @@ _SHARP = 3e-4
 
 
 @final
-@dataclass(frozen=True)
 class CubicStiffness(ForceEffect):
     """Restoring force that hardens (c > 0) or softens with the deflection."""
 
     batched = True
+    estimated = single("c", 0.1)
     card: ClassVar[Card] = Card(
         name="cubic_stiffness",
         place="plant",
@@ -37,21 +36,17 @@ class CubicStiffness(ForceEffect):
         mistaken_for="gain, time constants",
     )
 
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """c [-]."""
-        return single("c", 0.1)
-
     def force(self, f: Matrix, y: Matrix, rate: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """Pointwise."""
         return np.asarray(f - psi[0] * y * (y / scene.ranges.column) ** 2)
 
 
 @final
-@dataclass(frozen=True)
 class RiseFallAsymmetry(ForceEffect):
     """Viscosity that differs between motion away from rest and back."""
 
     batched = True
+    estimated = single("e", 0.3)
     card: ClassVar[Card] = Card(
         name="rise_fall_asymmetry",
         place="plant",
@@ -61,10 +56,6 @@ class RiseFallAsymmetry(ForceEffect):
         mistaken_for="time constants and orders when every step is an on-step; exactly so without a fall",
     )
 
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """e [-]."""
-        return single("e", 0.3)
-
     def force(self, f: Matrix, y: Matrix, rate: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """The viscous part of the force so far is ``f - y``."""
         width = _SHARP * scene.ranges.column**2 / scene.ranges.speed
@@ -73,11 +64,11 @@ class RiseFallAsymmetry(ForceEffect):
 
 
 @final
-@dataclass(frozen=True)
 class LevelDependentSpeed(ForceEffect):
     """Viscosity that falls (e > 0) with the deflection."""
 
     batched = True
+    estimated = single("e", 0.2)
     card: ClassVar[Card] = Card(
         name="level_dependent_speed",
         place="plant",
@@ -86,10 +77,6 @@ class LevelDependentSpeed(ForceEffect):
         reveals="amplitude series",
         mistaken_for="time constants and orders",
     )
-
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """e [-]."""
-        return single("e", 0.2)
 
     def force(self, f: Matrix, y: Matrix, rate: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """The viscous part of the force so far is ``f - y``."""
@@ -105,6 +92,7 @@ class Overflow(ForceEffect):
     """Where the further loss begins, over the largest deflection [-]."""
 
     batched = True
+    estimated = (*single("s", 0.3, one_signed=True), *single("k", 1.0, one_signed=True))
     card: ClassVar[Card] = Card(
         name="overflow",
         place="plant",
@@ -119,10 +107,6 @@ class Overflow(ForceEffect):
         """From half the range to near its end."""
         return tuple(cls(level) for level in (0.5, 0.7, 0.8, 0.9, 0.95))
 
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """s and k [-]."""
-        return (*single("s", 0.3, one_signed=True), *single("k", 1.0, one_signed=True))
-
     def force(self, f: Matrix, y: Matrix, rate: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """Pointwise."""
         part = np.abs(y) / scene.ranges.column
@@ -132,10 +116,10 @@ class Overflow(ForceEffect):
 
 
 @final
-@dataclass(frozen=True)
 class ViscosityDrift(ElementEffect):
     """Time constants that change through the campaign, as viscosity does with temperature."""
 
+    estimated = single("d", 0.1)
     card: ClassVar[Card] = Card(
         name="viscosity_drift",
         place="plant",
@@ -144,10 +128,6 @@ class ViscosityDrift(ElementEffect):
         reveals="repeats over time",
         mistaken_for="trigger_jitter",
     )
-
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """d [-]."""
-        return single("d", 0.1)
 
     def stretch(self, scene: Scene, psi: Vector) -> float:
         """Linear in the epoch."""

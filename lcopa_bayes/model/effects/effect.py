@@ -19,7 +19,7 @@ from types import MappingProxyType
 from typing import Any, ClassVar, Literal, Self, final
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
-from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.grid import Grid
 from lcopa_bayes.model.layout import Layout
 
@@ -135,7 +135,7 @@ class Scene:
     times: Vector
     """Sample times [time unit]."""
     grid: Grid
-    drives: tuple[Drive, ...]
+    drives: tuple[AxisDrive, ...]
     """Commands as recorded, deviations from rest."""
     rest: Vector
     """Drive before the first command [drive unit]."""
@@ -144,16 +144,19 @@ class Scene:
     delays: Matrix
     """(responses, drives) [time unit]."""
 
-    def direct(self, axis: int) -> tuple[Drive, float, float, float]:
+    def direct(self, axis: int) -> tuple[AxisDrive, float, float, float]:
         """Own drive of a response axis, its rest, gain and delay."""
         j = int(self.ranges.direct[axis])
         return self.drives[j], float(self.rest[j]), float(self.gains[axis, j]), float(self.delays[axis, j])
 
 
+@dataclass(frozen=True)
 class Effect(ABC):
     """An addition to the linear plant; concrete effects subclass one of the classes below."""
 
     card: ClassVar[Card]
+    estimated: ClassVar[tuple[Coefficient, ...]] = ()
+    """Coefficients whose scales are the same on any records."""
     per_command: ClassVar[bool] = False
     """Whether it is computed command by command, which takes long on records of thousands."""
     linear: ClassVar[bool] = False
@@ -178,7 +181,7 @@ class Effect(ABC):
         """Internal constants, in the order of the fields; they reach from end to end of `grid`, and what has
         a default value is fixed there."""
         listed, out = cls.grid(ranges), []
-        for field in fields(cls):  # type: ignore[arg-type]
+        for field in fields(cls):
             values = [getattr(one, field.name) for one in listed]
             if isinstance(values[0], bool):
                 out.append(Constant(field.name, "-", 0.0, 0.0, "choice"))
@@ -192,12 +195,12 @@ class Effect(ABC):
     @classmethod
     def with_constants(cls, ranges: Ranges, values: Sequence[float]) -> Self:
         """The instance with internal constants as numbers, in the order of `internal`."""
-        told = cls.internal(ranges)
-        return cls(*(bool(v) if one.kind == "choice" else v for one, v in zip(told, values, strict=True)))
+        pairs = zip(cls.internal(ranges), values, strict=True)
+        return cls(*(bool(v) if one.kind == "choice" else v for one, v in pairs))
 
-    @abstractmethod
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """Coefficients, of one record when the card says `per_record`."""
+        """Coefficients, of one record when the card says `per_record`; by default those of `estimated`."""
+        return self.estimated
 
     @classmethod
     def applies(cls, layout: Layout) -> bool:
@@ -212,7 +215,7 @@ class Effect(ABC):
     @property
     def constants(self) -> dict[str, Any]:
         """Internal constants by name."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
 class DriveEffect(Effect):
@@ -220,8 +223,8 @@ class DriveEffect(Effect):
 
     @abstractmethod
     def commands(
-        self, drive: Drive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[Drive, float]:
+        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
+    ) -> tuple[AxisDrive, float]:
         """Commands as they act: deviations from the resting drive, and that rest [drive unit]."""
 
 
@@ -291,13 +294,11 @@ def single(name: str, scale: float, unit: str = "-", *, one_signed: bool = False
     return (Coefficient(name, unit, scale, one_signed),)
 
 
-def per_axis(
-    ranges: Ranges, names: Sequence[str], part: float, *, one_signed: bool = False
-) -> tuple[Coefficient, ...]:
+def per_axis(ranges: Ranges, names: Sequence[str], part: float) -> tuple[Coefficient, ...]:
     """Coefficients [response unit] for every axis in turn; their scale is a `part` of its deflection."""
     return tuple(
         Coefficient(
-            f"{name}_{axis}" if ranges.axes > 1 else name, "response", part * float(size), one_signed, number
+            f"{name}_{axis}" if ranges.axes > 1 else name, "response", part * float(size), axis=number
         )
         for number, (axis, size) in enumerate(zip(ranges.names, ranges.response, strict=True))
         for name in names

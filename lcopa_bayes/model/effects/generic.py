@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar, final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.model.effects.effect import Card, Coefficient, ParallelEffect, Ranges, Scene, per_axis
-from lcopa_bayes.model.effects.parallel import falling, relaxing
-from lcopa_bayes.model.effects.superposition import jumps_of, summed
+from lcopa_bayes.model.effects.parallel import falling, jumps_of, relaxing, summed
 
 _LAGS = 6
 _WAVES = 8
@@ -20,7 +18,6 @@ _PARTS = (0.3, 1.0, 3.0)
 
 
 @final
-@dataclass(frozen=True)
 class UnmodelledLinear(ParallelEffect):
     """Any further linear response of an axis to its own drive."""
 
@@ -55,7 +52,6 @@ class UnmodelledLinear(ParallelEffect):
 
 
 @final
-@dataclass(frozen=True)
 class UnmodelledSmooth(ParallelEffect):
     """Any slow addition to a record, whatever the drive does."""
 
@@ -65,7 +61,7 @@ class UnmodelledSmooth(ParallelEffect):
         place="generic",
         formula="y += sum_k c_k cos(pi k (t - start) / length), k = 1..8, per record and axis",
         source="cosine series",
-        reveals="any record; repeats tell it from what the drive causes",
+        reveals="any record; repeats separate it from what the drive causes",
         mistaken_for="everything slow",
         per_record=True,
         disturbance=True,
@@ -84,7 +80,6 @@ class UnmodelledSmooth(ParallelEffect):
 
 
 @final
-@dataclass(frozen=True)
 class UnmodelledNonlinear(ParallelEffect):
     """A further response to powers of the drive, and to its falls."""
 

@@ -1,14 +1,14 @@
-"""Derivatives of the responses with effects, in the coefficients and in what the plant is made of."""
+"""Derivatives of the responses with effects, in the coefficients and in the numbers of the plant."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from typing import final
+from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
+from lcopa_bayes.core.arrays import Index, Matrix, Vector
 from lcopa_bayes.model.effects.effect import DriveEffect
 from lcopa_bayes.model.effects.passage import Moved, Plant
 from lcopa_bayes.model.effects.simulator import Simulator
@@ -42,10 +42,10 @@ def coefficient_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[
     out = [np.zeros((*y.shape, simulator.size)) for y in here]
     first = 0
     for effect in simulator.effects:
-        told = effect.coefficients(simulator.ranges)
-        for k, coefficient in enumerate(told):
+        coefficients = effect.coefficients(simulator.ranges)
+        for k, coefficient in enumerate(coefficients):
             repeats = records if effect.card.per_record else 1
-            columns = first + k + len(told) * np.arange(repeats)
+            columns = first + k + len(coefficients) * np.arange(repeats)
             step = COEFFICIENT_STEP * coefficient.scale
 
             def at(change: float, columns: Index = columns) -> list[Matrix]:
@@ -60,129 +60,92 @@ def coefficient_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[
                 slopes = difference(at, step, upward=upward, here=here)
             for r, slope in enumerate(slopes):
                 out[r][..., columns[r if effect.card.per_record else 0]] = slope
-        first += len(told) * (records if effect.card.per_record else 1)
+        first += len(coefficients) * (records if effect.card.per_record else 1)
     return out
 
 
-@final
-@dataclass(frozen=True, eq=False)
-class PlantSlopes:
-    """Derivatives of one record's responses; leading dimensions are (samples, axes)."""
-
-    gains: Array
-    """(samples, axes, responses, drives) [drive unit]."""
-    times: tuple[Array, ...]
-    """Per element (samples, axes, terms) [response unit per time unit]."""
-    orders: tuple[Array, ...]
-    """Per element (samples, axes, terms) [response unit]."""
-    delays: Array
-    """(samples, axes, slots) [response unit per time unit]."""
-
-
+Number: TypeAlias = tuple[str, int, int]
+"""A number of the plant: "gain" by response and drive, "time" or "order" by element and term, "delay" by slot
+and 0."""
 _RELATIVE = 1e-5
 """Step of a plant's number in units of its scale [-]; with a solver good to 1e-12 both errors are 1e-7."""
 
 
-def plant_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[PlantSlopes]:
-    """Derivatives of the responses in gains, times, orders and delays, per record.
+def plant_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[dict[Number, Matrix]]:
+    """Derivatives of the responses in every number of the plant, per record (samples, axes) [response unit
+    per unit of the number].
 
     Exact without effects. What acts on elements, forces or before the sensor is differenced to one side
     (1e-5 of each number); of everything else only the part that does not pass through the plant.
     """
+    exact = _linear_slopes(simulator, plant, psi)
     if not simulator.effects:
-        return _linear_slopes(simulator, plant, psi)
+        return exact
     upstream = simulator.bends(psi)
     delayed = any(isinstance(effect, DriveEffect) for effect in simulator.effects)  # commands may use it
     base = simulator.moved(plant, psi)
     here = simulator.finished(base, psi)
-    exact = _linear_slopes(simulator, plant, psi)
-    out = [_like(slope) for slope in exact]
-    for kind, place, step in _entries(simulator, plant):
-        other = _shifted(plant, kind, place, step)
-        if upstream or (kind == "delays" and delayed):
+    out: list[dict[Number, Matrix]] = [{} for _ in exact]
+    for number, step in _numbers(simulator, plant):
+        other = _shifted(plant, number, step)
+        if upstream or (number[0] == "delay" and delayed):
             moved = simulator.moved(other, psi)
         else:
             scenes = simulator.scenes(other, psi)
             moved = [
-                Moved(scene, y.deflection + step * _entry(slope, kind, place))
+                Moved(scene, y.deflection + step * slope[number])
                 for scene, y, slope in zip(scenes, base, exact, strict=True)
             ]
         for r, there in enumerate(simulator.finished(moved, psi)):
-            _entry(out[r], kind, place)[...] = (there - here[r]) / step
+            out[r][number] = (there - here[r]) / step
     return out
 
 
-def _entries(simulator: Simulator, plant: Plant) -> Iterator[tuple[str, tuple[int, ...], float]]:
-    """Kind, place and difference step of every number of the plant."""
+def _numbers(simulator: Simulator, plant: Plant) -> Iterator[tuple[Number, float]]:
+    """Every number of the plant and its difference step."""
     ranges, dynamics = simulator.ranges, plant.dynamics
     for i, j in np.ndindex(plant.gains.shape):
-        yield "gains", (i, j), _RELATIVE * float(ranges.response[i] / ranges.drive[j])
+        yield ("gain", i, j), _RELATIVE * float(ranges.response[i] / ranges.drive[j])
     for e, times in enumerate(dynamics.times):
         for k in range(times.shape[1]):
-            yield "times", (e, k), _RELATIVE * float(times[0, k])
-            yield "orders", (e, k), _RELATIVE
+            yield ("time", e, k), _RELATIVE * float(times[0, k])
+            yield ("order", e, k), _RELATIVE
     for d in range(dynamics.delays.shape[1]):
-        yield "delays", (d,), _RELATIVE * ranges.speed
+        yield ("delay", d, 0), _RELATIVE * ranges.speed
 
 
-def _entry(slope: PlantSlopes, kind: str, place: tuple[int, ...]) -> Array:
-    """The (samples, axes) array of a number."""
-    if kind == "gains":
-        return slope.gains[:, :, place[0], place[1]]
-    if kind == "delays":
-        return slope.delays[:, :, place[0]]
-    part: tuple[Array, ...] = getattr(slope, kind)
-    return part[place[0]][:, :, place[1]]
-
-
-def _shifted(plant: Plant, kind: str, place: tuple[int, ...], change: float) -> Plant:
+def _shifted(plant: Plant, number: Number, change: float) -> Plant:
     """The plant with one number changed."""
-    if kind == "gains":
+    kind, first, second = number
+    if kind == "gain":
         gains = plant.gains.copy()
-        gains[place] += change
+        gains[first, second] += change
         return replace(plant, gains=gains)
     d = plant.dynamics
-    parts = {"times": list(d.times), "orders": list(d.orders), "delays": [d.delays]}
-    element, column = (0, place[0]) if kind == "delays" else place
+    parts = {"time": list(d.times), "order": list(d.orders), "delay": [d.delays]}
+    element, column = (0, first) if kind == "delay" else (first, second)
     changed = parts[kind][element].copy()
     changed[0, column] += change
     parts[kind][element] = changed
-    return replace(
-        plant, dynamics=Dynamics(tuple(parts["times"]), tuple(parts["orders"]), parts["delays"][0])
-    )
+    return replace(plant, dynamics=Dynamics(tuple(parts["time"]), tuple(parts["order"]), parts["delay"][0]))
 
 
-def _like(slope: PlantSlopes) -> PlantSlopes:
-    return PlantSlopes(
-        np.zeros_like(slope.gains),
-        tuple(np.zeros_like(part) for part in slope.times),
-        tuple(np.zeros_like(part) for part in slope.orders),
-        np.zeros_like(slope.delays),
-    )
-
-
-def _linear_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[PlantSlopes]:
+def _linear_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[dict[Number, Matrix]]:
     """Exact derivatives of the linear plant under the commands that act."""
     model = simulator.driven(simulator.scenes(plant, psi))
     layout, out = model.layout, []
+    numbers = [number for number, _ in _numbers(simulator, plant)]
     for experiment, (units, slopes) in zip(model.experiments, model.unit_slopes(plant.dynamics), strict=True):
-        axes, drives = plant.gains.shape
-        head = (units.shape[2], axes)
-        counts = [slot.terms for slot in layout.elements]
-        made = PlantSlopes(
-            np.zeros((*head, axes, drives)),
-            tuple(np.zeros((*head, terms)) for terms in counts),
-            tuple(np.zeros((*head, terms)) for terms in counts),
-            np.zeros((*head, len(layout.delays))),
-        )
+        own = {number: np.zeros((units.shape[2], plant.gains.shape[0])) for number in numbers}
         for i, row in enumerate(layout.unit_of):
             for j, unit in enumerate(row):
-                element, delay = layout.element_of[i][j], layout.delay_of[i][j]
-                gain, terms = plant.gains[i, j], counts[element]
-                by_log_time, by_order, by_delay = np.split(slopes[unit][:, 0].T, [terms, 2 * terms], axis=1)
-                made.gains[:, i, i, j] = experiment.rest[j] + units[unit, 0]
-                made.times[element][:, i] += gain * by_log_time / plant.dynamics.times[element][0]
-                made.orders[element][:, i] += gain * by_order
-                made.delays[:, i, delay] += gain * by_delay[:, 0]
-        out.append(made)
+                element, gain = layout.element_of[i][j], plant.gains[i, j]
+                own["gain", i, j][:, i] = experiment.rest[j] + units[unit, 0]
+                *shape, by_delay = slopes[unit][:, 0]
+                terms = len(shape) // 2
+                for k, (by_log_time, by_order) in enumerate(zip(shape[:terms], shape[terms:], strict=True)):
+                    own["time", element, k][:, i] += gain * by_log_time / plant.dynamics.times[element][0, k]
+                    own["order", element, k][:, i] += gain * by_order
+                own["delay", layout.delay_of[i][j], 0][:, i] += gain * by_delay
+        out.append(own)
     return out

@@ -8,12 +8,64 @@ from types import MappingProxyType
 from typing import ClassVar, Self, final
 
 import numpy as np
+from scipy.signal import fftconvolve
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
-from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.effects.effect import Card, Coefficient, ParallelEffect, Ranges, Scene, single
-from lcopa_bayes.model.effects.superposition import jumps_of, summed
 from lcopa_bayes.model.layout import Layout
+
+_MANY = 64
+"""Changes above which a convolution is worth while [-]."""
+_ROUNDING = 1e-4
+"""How far printed times may lie from an even grid [periods]."""
+
+
+def summed(
+    times: Vector, drive: AxisDrive, delay: float, jumps: Vector, shape: Callable[[Array], Array]
+) -> Vector:
+    """``sum_k jumps_k shape(t - t_k - delay)``, (samples,); shape is 0 before 0.
+
+    Many changes under evenly spaced samples are one convolution: a change between two samples is then shared
+    by them, which is of second order in the sampling period and exact for changes at samples. Samples fewer
+    than the changes are too coarse for that, and are summed one change at a time.
+    """
+    if _MANY < drive.times.size <= times.size and _even(times):
+        return _convolved(times, drive.times, delay, jumps, shape)
+    out = np.zeros(times.size)
+    for at, jump in zip(drive.times + delay, jumps, strict=True):
+        if jump != 0.0:
+            first = int(np.searchsorted(times, at))
+            out[first:] += jump * shape(times[first:] - at)
+    return out
+
+
+def _even(times: Vector) -> bool:
+    """Whether samples are evenly spaced."""
+    even = np.linspace(times[0], times[-1], times.size)
+    return bool(np.abs(times - even).max() < _ROUNDING * (times[-1] - times[0]) / (times.size - 1))
+
+
+def _convolved(
+    times: Vector, changes: Vector, delay: float, jumps: Vector, shape: Callable[[Array], Array]
+) -> Vector:
+    period = (times[-1] - times[0]) / (times.size - 1)
+    place = (changes - times[0]) / period
+    place = np.where(np.abs(place - np.round(place)) < _ROUNDING, np.round(place), place)
+    below = np.floor(place).astype(np.intp)
+    begin = min(int(below[0]), 0)
+    dense = np.zeros(max(int(below[-1]) + 2, times.size) - begin)
+    np.add.at(dense, below - begin, jumps * (1 - (place - below)))
+    np.add.at(dense, below + 1 - begin, jumps * (place - below))
+    lags = np.arange(dense.size) * period - delay
+    kernel = np.zeros(lags.size)
+    kernel[lags >= 0] = shape(lags[lags >= 0])
+    return np.asarray(fftconvolve(kernel, dense)[-begin : times.size - begin])
+
+
+def jumps_of(drive: AxisDrive) -> Vector:
+    """Change of the drive at each instant [drive unit]."""
+    return np.diff(drive.values, prepend=0.0)
 
 
 def relaxing(time: float) -> Callable[[Array], Array]:
@@ -21,10 +73,23 @@ def relaxing(time: float) -> Callable[[Array], Array]:
     return lambda t: np.asarray(-np.expm1(-t / time))
 
 
-def falling(drive: Drive, rest: float) -> Array:
+def falling(drive: AxisDrive, rest: float) -> Array:
     """Whether each change leads to a smaller magnitude."""
     levels = np.abs(rest + np.concatenate(([0.0], drive.values)))
     return np.asarray(levels[1:] < levels[:-1])
+
+
+def own_responses(scene: Scene, size: float, shape: Callable[[Array], Array]) -> Matrix:
+    """``size K (rest + sum_k jump_k shape(t - t_k - delay))`` of every axis, (samples, axes).
+
+    K is the gain of the path from the axis' own drive, which arrives after its delay.
+    """
+    columns = []
+    for axis in range(scene.ranges.axes):
+        drive, rest, gain, delay = scene.direct(axis)
+        moved = summed(scene.times, drive, delay, jumps_of(drive), shape)
+        columns.append(size * gain * (rest + moved))
+    return np.stack(columns, axis=1)
 
 
 @final
@@ -36,6 +101,7 @@ class IonCreep(ParallelEffect):
     """Ti [time unit]."""
 
     units = MappingProxyType({"time": "time"})
+    estimated = single("k", 0.03)
     card: ClassVar[Card] = Card(
         name="ion_creep",
         place="plant",
@@ -50,18 +116,9 @@ class IonCreep(ParallelEffect):
         """From a quarter of the longest record to ten times it."""
         return tuple(cls(float(time)) for time in np.geomspace(0.25 * ranges.span, 10 * ranges.span, 4))
 
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """k [-]."""
-        return single("k", 0.03)
-
     def added(self, scene: Scene, psi: Vector) -> Matrix:
         """One exponential per change."""
-        columns = []
-        for axis in range(scene.ranges.axes):
-            drive, rest, gain, delay = scene.direct(axis)
-            moved = summed(scene.times, drive, delay, jumps_of(drive), relaxing(self.time))
-            columns.append(psi[0] * gain * (rest + moved))
-        return np.stack(columns, axis=1)
+        return own_responses(scene, psi[0], relaxing(self.time))
 
 
 @final
@@ -75,6 +132,7 @@ class Backflow(ParallelEffect):
     """Whether it follows rising instead of falling changes."""
 
     units = MappingProxyType({"time": "time"})
+    estimated = single("k", 0.1)
     card: ClassVar[Card] = Card(
         name="backflow",
         place="plant",
@@ -89,10 +147,6 @@ class Backflow(ParallelEffect):
         """From a tenth of the response time to the whole, on either change."""
         times = np.geomspace(0.1 * ranges.speed, ranges.speed, 6)
         return tuple(cls(float(time), rising) for rising in (False, True) for time in times)
-
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """k [-]."""
-        return single("k", 0.1)
 
     def added(self, scene: Scene, psi: Vector) -> Matrix:
         """``(x^2 / 2) e^(-x)``, x = t / Tb, per change."""
@@ -122,6 +176,7 @@ class ExtraMode(ParallelEffect):
 
     units = MappingProxyType({"frequency": "1/time"})
     fractions = frozenset({"damping"})
+    estimated = single("k", 0.05)
     card: ClassVar[Card] = Card(
         name="extra_mode",
         place="plant",
@@ -140,18 +195,9 @@ class ExtraMode(ParallelEffect):
             cls(float(f), damping) for damping in (0.03, 0.15) for f in np.geomspace(low, high, count)
         )
 
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """k [-]."""
-        return single("k", 0.05)
-
     def added(self, scene: Scene, psi: Vector) -> Matrix:
         """One damped oscillation per change."""
-        columns = []
-        for axis in range(scene.ranges.axes):
-            drive, rest, gain, delay = scene.direct(axis)
-            moved = summed(scene.times, drive, delay, jumps_of(drive), self.step)
-            columns.append(psi[0] * gain * (rest + moved))
-        return np.stack(columns, axis=1)
+        return own_responses(scene, psi[0], self.step)
 
     def step(self, t: Array) -> Array:
         """Response to a unit step."""

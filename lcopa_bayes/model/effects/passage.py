@@ -90,8 +90,8 @@ def passed(
     """
     spectra: dict[tuple[int, int, float, float], Spectrum] = {}
     return [
-        _Passage(model.layout, experiment, scene, plant, told, spectra).moved(without)
-        for experiment, scene, told, without in zip(
+        _Passage(model.layout, experiment, scene, plant, own, spectra).moved(without)
+        for experiment, scene, own, without in zip(
             model.experiments, scenes, acting, linear(model, scenes, plant), strict=True
         )
     ]

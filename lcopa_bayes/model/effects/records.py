@@ -1,14 +1,15 @@
-"""Effects that differ from record to record, and the distribution of the noise."""
+"""Effects that differ from record to record, ripples, and the distribution of the noise."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, final
+from types import MappingProxyType
+from typing import ClassVar, Self, final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.effects.effect import (
     Card,
     Coefficient,
@@ -24,12 +25,12 @@ from lcopa_bayes.model.effects.effect import (
 
 
 @final
-@dataclass(frozen=True)
 class GainDrift(ReadoutEffect):
     """Deflection that changes in size through the campaign."""
 
     linear = True
     affine = True
+    estimated = single("d", 0.03)
     card: ClassVar[Card] = Card(
         name="gain_drift",
         place="noise",
@@ -39,17 +40,12 @@ class GainDrift(ReadoutEffect):
         mistaken_for="pointing_offset",
     )
 
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """d [-]."""
-        return single("d", 0.03)
-
     def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """Pointwise."""
         return np.asarray((1 + psi[0] * scene.epoch) * y)
 
 
 @final
-@dataclass(frozen=True)
 class ClockSkew(DriveEffect):
     """Driver and camera clocks that run at different speeds."""
 
@@ -67,15 +63,14 @@ class ClockSkew(DriveEffect):
         return single("e", 2 * ranges.period / ranges.span)
 
     def commands(
-        self, drive: Drive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[Drive, float]:
+        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
+    ) -> tuple[AxisDrive, float]:
         """All changes are stretched."""
         start = scene.times[0]
-        return Drive(drive.times + psi[0] * (drive.times - start), drive.values), rest
+        return AxisDrive(drive.times + psi[0] * (drive.times - start), drive.values), rest
 
 
 @final
-@dataclass(frozen=True)
 class TriggerJitter(DriveEffect):
     """A record whose drive starts late or early as a whole."""
 
@@ -95,14 +90,13 @@ class TriggerJitter(DriveEffect):
         return single("dt", 2 * ranges.period, "time")
 
     def commands(
-        self, drive: Drive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[Drive, float]:
+        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
+    ) -> tuple[AxisDrive, float]:
         """All changes are shifted alike."""
-        return Drive(drive.times + psi[0], drive.values), rest
+        return AxisDrive(drive.times + psi[0], drive.values), rest
 
 
 @final
-@dataclass(frozen=True)
 class PointingOffset(ParallelEffect):
     """A record whose response is shifted as a whole."""
 
@@ -128,7 +122,6 @@ class PointingOffset(ParallelEffect):
 
 
 @final
-@dataclass(frozen=True)
 class PointingDrift(ParallelEffect):
     """A record whose response drifts."""
 
@@ -156,11 +149,11 @@ class PointingDrift(ParallelEffect):
 
 
 @final
-@dataclass(frozen=True)
 class Outliers(ScatterEffect):
     """Noise with heavy tails: Student's t instead of the normal distribution."""
 
     noise = "student"
+    estimated = single("inverse_nu", 0.2, one_signed=True)
     card: ClassVar[Card] = Card(
         name="outliers",
         place="noise",
@@ -171,6 +164,82 @@ class Outliers(ScatterEffect):
         disturbance=True,
     )
 
+
+def _frequencies(ranges: Ranges, fewest: float) -> Vector:
+    """Half a cycle per record apart, from `fewest` cycles up to 40 or a quarter of the sampling rate."""
+    highest = min(40.0, ranges.span / (4 * ranges.period))
+    return np.arange(fewest, max(highest, fewest + 0.5), 0.5) / ranges.span
+
+
+def _wave(scene: Scene, frequency: float) -> Matrix:
+    """Cosine and sine, (2, samples)."""
+    phase = 2 * np.pi * frequency * scene.times
+    return np.stack((np.cos(phase), np.sin(phase)))
+
+
+@final
+@dataclass(frozen=True)
+class Vibration(ParallelEffect):
+    """A vibration of the mount, with a phase of its own in every record."""
+
+    frequency: float
+    """[cycles per time unit]."""
+
+    additive = True
+    units = MappingProxyType({"frequency": "1/time"})
+    card: ClassVar[Card] = Card(
+        name="vibration",
+        place="noise",
+        formula="y += a cos(2 pi f t) + b sin(2 pi f t), a and b per record and axis",
+        source="optical tables, 20 to 300 Hz, 1e-5 to 2e-4 rad",
+        reveals="quiet stretches, repeats",
+        mistaken_for="pointing_drift at a low frequency; flicker",
+        per_record=True,
+        disturbance=True,
+        resting=True,
+    )
+
+    @classmethod
+    def grid(cls, ranges: Ranges) -> tuple[Self, ...]:
+        """From two and a half cycles on: fewer are a drift, and imitate what follows the drive."""
+        return tuple(cls(float(f)) for f in _frequencies(ranges, 2.5))
+
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """1 / nu [-]."""
-        return single("inverse_nu", 0.2, one_signed=True)
+        """a and b [response unit] per axis."""
+        return per_axis(ranges, ("a", "b"), 0.005)
+
+    def added(self, scene: Scene, psi: Vector) -> Matrix:
+        """Linear in a and b."""
+        return np.asarray((psi.reshape(-1, 2) @ _wave(scene, self.frequency)).T)
+
+
+@final
+@dataclass(frozen=True)
+class Flicker(ReadoutEffect):
+    """A ripple in proportion to the deflection, with a phase of its own in every record."""
+
+    frequency: float
+    """[cycles per time unit]."""
+
+    linear = True
+    units = MappingProxyType({"frequency": "1/time"})
+    estimated = (*single("a", 0.005), *single("b", 0.005))
+    card: ClassVar[Card] = Card(
+        name="flicker",
+        place="noise",
+        formula="y += (a cos(2 pi f t) + b sin(2 pi f t)) |y|, a and b per record",
+        source="Balondrade and Popoff: modulator fluctuation, usually 100 to 400 Hz",
+        reveals="holds at several deflections",
+        mistaken_for="vibration (which does not scale with the deflection)",
+        per_record=True,
+        disturbance=True,
+    )
+
+    @classmethod
+    def grid(cls, ranges: Ranges) -> tuple[Self, ...]:
+        """From six cycles on: fewer in a short record are a drift, and imitate what follows the drive."""
+        return tuple(cls(float(f)) for f in _frequencies(ranges, 6.0))
+
+    def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
+        """Pointwise."""
+        return np.asarray(y + (psi @ _wave(scene, self.frequency))[:, None] * np.abs(y))

@@ -1,4 +1,4 @@
-"""Effects on the deflection where it is read: static curves, mixing of axes, limits of the sensor."""
+"""Effects on the deflection where it is read: static curves, mixing of axes, limits, waiting centroid."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from typing import ClassVar, Self, final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.model.effects.effect import Card, Coefficient, Ranges, ReadoutEffect, Scene, single
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.model.effects.effect import Card, Ranges, ReadoutEffect, Scene, single
 from lcopa_bayes.model.layout import Layout
 
 _STEERING = "diffraction angle against tilt, see lcopa_bayes.optics"
 
 
 @final
-@dataclass(frozen=True)
 class OddCurvature(ReadoutEffect):
     """Soft saturation, alike in both directions."""
 
     linear = True
+    estimated = single("c", 0.03)
     card: ClassVar[Card] = Card(
         name="odd_curvature",
         place="output",
@@ -29,21 +29,17 @@ class OddCurvature(ReadoutEffect):
         mistaken_for="gain; voltage_knee",
     )
 
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """c [-]."""
-        return single("c", 0.03)
-
     def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """Pointwise."""
         return np.asarray(y + psi[0] * y * (y / scene.ranges.response) ** 2)
 
 
 @final
-@dataclass(frozen=True)
 class EvenCurvature(ReadoutEffect):
     """Curvature that differs between the two directions."""
 
     linear = True
+    estimated = single("c", 0.03)
     card: ClassVar[Card] = Card(
         name="even_curvature",
         place="output",
@@ -53,21 +49,17 @@ class EvenCurvature(ReadoutEffect):
         mistaken_for="gain",
     )
 
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """c [-]."""
-        return single("c", 0.03)
-
     def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """Pointwise."""
         return np.asarray(y + psi[0] * y**2 / scene.ranges.response)
 
 
 @final
-@dataclass(frozen=True)
 class BilinearCrosstalk(ReadoutEffect):
     """Each axis gains by the product of two axes."""
 
     linear = True
+    estimated = single("c", 0.03)
     card: ClassVar[Card] = Card(
         name="bilinear_crosstalk",
         place="output",
@@ -82,10 +74,6 @@ class BilinearCrosstalk(ReadoutEffect):
         """Only with two response axes or more."""
         return len(layout.responses) > 1
 
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """c [-]."""
-        return single("c", 0.03)
-
     def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """Products with the next axis, over its range."""
         part = y / scene.ranges.response
@@ -94,10 +82,10 @@ class BilinearCrosstalk(ReadoutEffect):
 
 
 @final
-@dataclass(frozen=True)
 class AxisRotation(ReadoutEffect):
     """Camera and device axes at an angle."""
 
+    estimated = single("phi", 0.03)
     card: ClassVar[Card] = Card(
         name="axis_rotation",
         place="output",
@@ -111,10 +99,6 @@ class AxisRotation(ReadoutEffect):
     def applies(cls, layout: Layout) -> bool:
         """Only with two response axes."""
         return len(layout.responses) == 2
-
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """phi [rad]."""
-        return single("phi", 0.03)
 
     def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """An exact rotation."""
@@ -134,6 +118,7 @@ class Clipping(ReadoutEffect):
     the limit is measured in."""
 
     linear = True
+    estimated = single("c", 0.6, one_signed=True)
     card: ClassVar[Card] = Card(
         name="clipping",
         place="output",
@@ -147,10 +132,6 @@ class Clipping(ReadoutEffect):
     def grid(cls, ranges: Ranges) -> tuple[Self, ...]:
         """From half the range to its end."""
         return tuple(cls(level) for level in (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.94, 0.97, 0.985))
-
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """c [-]."""
-        return single("c", 0.6, one_signed=True)
 
     def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """Pointwise."""
@@ -168,6 +149,7 @@ class CentroidLocking(ReadoutEffect):
     """Pixels within the largest deflection [-]."""
 
     linear = True
+    estimated = single("a", 0.01)
     card: ClassVar[Card] = Card(
         name="centroid_locking",
         place="output",
@@ -182,11 +164,73 @@ class CentroidLocking(ReadoutEffect):
         """Two to 30 pixels, in steps that shift the last by a third of a pixel."""
         return tuple(cls(float(cycles)) for cycles in np.arange(2.0, 30.0, 1 / 3))
 
-    def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """a over the largest deflection [-]."""
-        return single("a", 0.01)
-
     def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """Pointwise."""
         size = scene.ranges.response
         return np.asarray(y + psi[0] * size * np.sin(2 * np.pi * self.cycles * y / size))
+
+
+@final
+class CrossFade(ReadoutEffect):
+    """The far field passes from one diffraction order to the next: the centroid waits, then hurries.
+
+    Homogeneous of degree 1, so that an amplitude series does not show it. A transition that is
+    interrupted starts anew from the director's deflection; its distance from the director then fades with it.
+    """
+
+    per_command: ClassVar[bool] = True
+    estimated = single("strength", 0.6, one_signed=True)
+    card: ClassVar[Card] = Card(
+        name="cross_fade",
+        place="output",
+        formula="y = y0 + (y1 - y0) q / (q + q'), q = sinc^2(1 - a), q' = sinc^2(a), "
+        "a = progress from y0 to y1",
+        source="efficiencies of a re-written blaze, scalar diffraction",
+        reveals="interrupted steps; not an amplitude series",
+        mistaken_for="delay and order together",
+    )
+
+    def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
+        """Segment by segment between commands."""
+        out = y.copy()
+        changes = np.unique(np.concatenate([drive.times for drive in scene.drives]))
+        if not changes.size:  # no drive moves: there is no transition
+            return out
+        for axis in range(y.shape[1]):
+            starts = changes + scene.direct(axis)[3]
+            origins = np.interp(starts, scene.times, y[:, axis])
+            firsts = np.searchsorted(scene.times, starts)
+            lasts = np.append(firsts[1:], scene.times.size)
+            distance = 0.0  # distance of the centroid from the director as a segment begins
+            for start, origin, change, first, last in zip(
+                starts, origins, changes, firsts, lasts, strict=True
+            ):
+                travel = _target(scene, axis, float(change)) - origin
+                out[first:last, axis] += _distance(
+                    y[first:last, axis] - origin, travel, distance, float(psi[0])
+                )
+                later = starts[starts > start]
+                if later.size:
+                    there = np.interp(later[:1], scene.times, y[:, axis]) - origin
+                    distance = float(_distance(there, travel, distance, float(psi[0]))[0])
+        return out
+
+
+def _target(scene: Scene, axis: int, change: float) -> float:
+    """Deflection that the commands from `change` on lead to."""
+    total = 0.0
+    for j, drive in enumerate(scene.drives):
+        held = int(np.searchsorted(drive.times, change, side="right"))
+        level = scene.rest[j] + (drive.values[held - 1] if held else 0.0)
+        total += float(scene.gains[axis, j] * level)
+    return total
+
+
+def _distance(moved: Array, travel: float, distance: float, strength: float) -> Array:
+    """Centroid minus director after `moved` of a `travel`; `distance` is that at its begin."""
+    a = moved / travel if travel != 0.0 else np.ones(moved.shape)
+    inside = (a > 0) & (a < 1)
+    q, other = np.sinc(1 - a[inside]) ** 2, np.sinc(a[inside]) ** 2
+    out = distance * (1 - np.clip(a, 0.0, 1.0))
+    out[inside] += strength * travel * (q / (q + other) - a[inside])
+    return np.asarray(out)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import ClassVar, final
 
 import numpy as np
@@ -18,7 +17,6 @@ _SERIES = 24
 
 
 @final
-@dataclass(frozen=True)
 class SensorLag(SensorEffect):
     """First-order lag of sensor or read-out."""
 
@@ -66,7 +64,6 @@ def _moments(rate: float) -> Vector:
 
 
 @final
-@dataclass(frozen=True)
 class Exposure(SensorEffect):
     """Camera samples that are means over the exposure before them."""
 

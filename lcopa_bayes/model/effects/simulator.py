@@ -107,7 +107,7 @@ class Simulator:
     def moved(self, plant: Plant, psi: Vector) -> list[Moved]:
         """Every record up to its reading; the latest few are kept.
 
-        Effects whose coefficients are all 0 are left out, and what only changes commands is simulated by
+        Effects whose coefficients are all 0 are omitted, and what only changes commands is simulated by
         the forward model itself.
         """
         parts = [psi[self._slices[e]] for e, f in enumerate(self.effects) if isinstance(f, UPSTREAM)]
@@ -118,12 +118,12 @@ class Simulator:
             acting = self._bending(psi)
             scenes = self.scenes(plant, psi)
             model = self.driven(scenes)
-            made = (
+            moved = (
                 passed(model, scenes, plant, [self._acting(acting, psi, r) for r in range(len(scenes))])
                 if any(acting)
                 else linear(model, scenes, plant, self._known(plant))
             )
-            self._kept[key] = made
+            self._kept[key] = moved
             while len(self._kept) > _KEPT:
                 self._kept.popitem(last=False)
         return self._kept[key]

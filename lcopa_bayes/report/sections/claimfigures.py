@@ -6,14 +6,14 @@ from math import pi
 
 import numpy as np
 
-from lcopa_bayes.data.drive import Drive
-from lcopa_bayes.data.literature import PAPER, Stated
+from lcopa_bayes.data.drive import AxisDrive
+from lcopa_bayes.model.literature import PAPER, Stated
 from lcopa_bayes.optics.array import LinearArray, paper_array
-from lcopa_bayes.optics.chain import geometry_check, linearisation_error
 from lcopa_bayes.optics.lobes import strongest_grating_lobe
+from lcopa_bayes.optics.steering import geometry_check, linearisation_error
 from lcopa_bayes.optics.tiltlaw import continuous_law, printed_law
-from lcopa_bayes.paper.crosstalkclaims import crosstalk_rules
 from lcopa_bayes.paper.equation import response_to
+from lcopa_bayes.paper.modelclaims import crosstalk_rules
 from lcopa_bayes.paper.numericsclaims import delay_costs
 from lcopa_bayes.paper.opticsclaims import FAR_WEAKER, tilt_checks
 from lcopa_bayes.paper.printedmodel import RECORD_LENGTH, SETTLING_BANDS, PrintedModel, integer_rival
@@ -109,7 +109,7 @@ def _steady(stated: Stated) -> str:
                 label=f"within {band:.0%}",
             )
         panel.plot(times, model.step_on[at], color=BAND, label="Eq. 65")
-        drive = Drive(np.zeros(1), np.full(1, given.step_drive))
+        drive = AxisDrive(np.zeros(1), np.full(1, given.step_drive))
         integer = response_to(drive, rival.model, times)
         panel.plot(times, integer, color=CYCLE[1], ls=(0, (4, 2)), label="closest integer order")
         panel.axhline(
@@ -160,9 +160,9 @@ def _delays(stated: Stated) -> str:
     panel = figure.subplots()
     for k, (cost, colour) in enumerate(zip(delay_costs(stated), (CYCLE[0], CYCLE[1]), strict=True)):
         at = np.arange(len(cost.shifts)) + 0.36 * (k - 0.5)
-        sizes = [abs(shift.in_sd) for shift in cost.shifts]
+        sizes = [abs(shift) for shift in cost.shifts.values()]
         panel.bar(at, sizes, 0.36, color=colour, label=f"{cost.delay:g} held at {cost.rounded:g} ms")
-    panel.set_xticks(range(len(cost.shifts)), [shift.name.replace("_", " ") for shift in cost.shifts])
+    panel.set_xticks(range(len(cost.shifts)), [name.replace("_", " ") for name in cost.shifts])
     panel.set_ylabel("shift [sd]")
     panel.set_ylim(top=panel.get_ylim()[1] * 1.25)
     panel.legend(loc="upper left", ncols=2)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from lcopa_bayes.optics.tiltlaw import RANGES, continuous_law, printed_law
+from lcopa_bayes.optics.tiltlaw import continuous_law, printed_law
 from lcopa_bayes.paper.staticoptics import StaticOptics
 from lcopa_bayes.report.formatting import NONE, figures
 from lcopa_bayes.report.section import Column, Drawing, Section, Table
 from lcopa_bayes.report.theme import CYCLE, HELD_OUT, STEADY, blank, svg_of
+
+_LAWS = {"printed": "as printed", "continuous": "continuous", "best": "best of this form"}
 
 
 def sections(calculated: StaticOptics) -> list[Section]:
@@ -16,7 +18,7 @@ def sections(calculated: StaticOptics) -> list[Section]:
     plan = calculated.plan
     text = (
         "Tilt counts from the plates; the director lies in one plane and varies across the cell only "
-        f"(Eq. 20). Field: {plan.field.value}; pretilt {figures(plan.pretilt)} rad. Threshold "
+        f"(Eq. 20). Field: {plan.field}; pretilt {figures(plan.pretilt)} rad. Threshold "
         f"pi sqrt(k1 / deps) = {figures(calculated.check.threshold, 4)} V."
     )
     director = Section(
@@ -84,17 +86,21 @@ def _chain(calculated: StaticOptics) -> str:
     chain = calculated.chain
     figure = blank(4.2)
     (tilt, phase), (angle, error) = figure.subplots(2, 2, sharex=True)
-    tilt.plot(chain.voltage, chain.tilt)
+    tilt.plot(chain["voltage_V"], chain["tilt_rad"])
     tilt.set_ylabel("mean tilt [rad]")
-    phase.plot(chain.voltage, chain.phase)
+    phase.plot(chain["voltage_V"], chain["phase_rad"])
     phase.set_ylabel("phase step [rad]")
-    angle.plot(chain.voltage, np.degrees(chain.angle), label="exact")
+    angle.plot(chain["voltage_V"], np.degrees(chain["angle_rad"]), label="exact")
     angle.plot(
-        chain.voltage, np.degrees(chain.linearised), color=HELD_OUT, ls=(0, (4, 2)), label="linearised"
+        chain["voltage_V"],
+        np.degrees(chain["angle_linearised_rad"]),
+        color=HELD_OUT,
+        ls=(0, (4, 2)),
+        label="linearised",
     )
     angle.set_ylabel("angle [deg]")
     angle.legend(loc="upper left")
-    error.plot(chain.voltage, 100 * chain.relative_error, color=HELD_OUT)
+    error.plot(chain["voltage_V"], 100 * chain["relative_error"], color=HELD_OUT)
     error.axhline(0, color="#b0b0b0", lw=0.6, zorder=0)
     error.set_ylabel("error of Eq. 26 [%]")
     for panel in (angle, error):
@@ -108,10 +114,7 @@ def _tilts(calculated: StaticOptics) -> Table:
         *(Column("largest tilt [rad]", "number"), Column("Eq. 24 as printed [rad]", "number")),
         Column("Eq. 24, continuous [rad]", "number"),
     )
-    rows = tuple(
-        tuple(figures(float(value), 4) for value in (p.voltage, p.mean, p.largest, printed, continuous))
-        for p, printed, continuous in zip(calculated.profiles, *calculated.laws, strict=True)
-    )
+    rows = tuple(tuple(figures(value, 4) for value in row.values()) for row in calculated.values["mean_tilt"])
     return Table(columns, rows)
 
 
@@ -122,22 +125,15 @@ def _fits(calculated: StaticOptics) -> Table:
         Column("largest relative error", "number"),
     )
     rows = []
-    for k, name in enumerate(RANGES):
-        laws = (calculated.check.printed, calculated.check.continuous, calculated.check.best)
-        for law, fit in zip(("as printed", "continuous", "best of this form"), laws, strict=True):
-            law_fit = fit[k]
-            relative = law_fit.largest_relative_error
+    for entry in calculated.values["tilt_law"]:
+        for law, said in _LAWS.items():
+            fit, ends = entry[law], (figures(entry["from_V"]), figures(entry["to_V"]))
+            relative = fit["largest_relative_error"]
             rows.append(
                 (
-                    *(
-                        name,
-                        figures(law_fit.lower),
-                        figures(law_fit.upper),
-                        law,
-                        figures(law_fit.r_squared, 4),
-                    ),
-                    figures(law_fit.largest_error),
-                    NONE if not np.isfinite(relative) else f"{100 * relative:.3g} %",
+                    *(entry["range"], *ends, said),
+                    *(figures(fit["r_squared"], 4), figures(fit["largest_error_rad"])),
+                    NONE if relative is None else f"{100 * relative:.3g} %",
                 )
             )
     caption = (

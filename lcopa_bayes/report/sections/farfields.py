@@ -7,7 +7,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.paper.staticoptics import StaticOptics
 from lcopa_bayes.report.decimation import extremes
-from lcopa_bayes.report.formatting import figures
+from lcopa_bayes.report.formatting import NONE, figures
 from lcopa_bayes.report.section import Column, Drawing, Section, Table
 from lcopa_bayes.report.theme import HELD_OUT, blank, grid, svg_of
 
@@ -78,7 +78,7 @@ def _planar(calculated: StaticOptics) -> str:
     figure = blank(3.7)
     panels = figure.subplots(1, len(calculated.planar), squeeze=False)[0]
     for panel, pattern in zip(panels, calculated.planar, strict=True):
-        ends = (pattern.u[0], pattern.u[-1], pattern.v[0], pattern.v[-1])
+        ends = (pattern.axis[0], pattern.axis[-1]) * 2
         shown = panel.imshow(
             _decibel(pattern.intensity).T, origin="lower", extent=ends, vmin=_FLOOR, vmax=0, cmap="viridis"
         )
@@ -105,12 +105,12 @@ def _steering(calculated: StaticOptics) -> Table:
     )
     rows = tuple(
         (
-            figures(float(np.degrees(each.target))),
-            figures(each.phase_step, 4),
-            figures(float(np.degrees(each.main_lobe)), 5),
-            figures(float(10 * np.log10(each.side_lobe))),
+            figures(each["target_deg"]),
+            figures(each["phase_step_rad"], 4),
+            figures(each["main_lobe_deg"], 5),
+            NONE if each["side_lobe"] is None else figures(float(10 * np.log10(each["side_lobe"]))),
         )
-        for each in calculated.steered
+        for each in calculated.values["steering"]
     )
     return Table(columns, rows, "Steering by sin(angle) = wavelength x phase step / (2 pi pitch), Eq. 5.")
 
@@ -123,13 +123,13 @@ def _lobes(calculated: StaticOptics) -> Table:
     )
     rows = tuple(
         (
-            figures(float(np.degrees(row.target))),
-            str(row.order),
-            figures(float(np.degrees(row.angle))),
-            figures(row.isotropic),
-            figures(row.with_element if row.with_element > 1e-12 else 0.0),
+            figures(row["target_deg"]),
+            str(row["order"]),
+            figures(row["angle_deg"]),
+            figures(row["isotropic"]),
+            figures(row["with_element"] if row["with_element"] > 1e-12 else 0.0),
         )
-        for row in calculated.lobes
+        for row in calculated.values["grating_lobes"]
     )
     return Table(
         columns,

@@ -6,41 +6,33 @@ One frozen table: a claim is tested against these fields, and a copy with anothe
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import pi
 from typing import final
 
+from lcopa_bayes.model.path import TransferPath
 
-@final
-@dataclass(frozen=True)
-class StatedPath:
-    """One path of the identified model, ``gain exp(-delay s) / (sum_i eta_i s^order_i + stiffness)``."""
-
-    gain: float
-    """b [rad per rad of drive phase, before division by the stiffness]."""
-    etas: tuple[float, ...]
-    """Viscosities [ms^order], one per order."""
-    orders: tuple[float, ...]
-    """Fractional orders [-], decreasing."""
-    stiffness: float
-    """k [-]."""
-    delay: float = 3.027
-    """tau [ms]; printed as seconds, yet the whole record is about 25 ms long."""
-
-
-_DIRECT = {"etas": (16.02, 12.51, 1.0), "orders": (1.8, 0.9, 0.6), "stiffness": 5.57}
-_CROSS = {"etas": (7.3076, 6.9062), "orders": (1.8, 0.9), "stiffness": 2.82}
+_DELAY = 3.027
+"""Of every path [ms]; printed as seconds, yet the whole record is about 25 ms long."""
+_XX = TransferPath(0.100008, _DELAY, etas=(16.02, 12.51, 1.0), orders=(1.8, 0.9, 0.6), stiffness=5.57)
+_XY = TransferPath(0.005228, _DELAY, etas=(7.3076, 6.9062), orders=(1.8, 0.9), stiffness=2.82)
+_YX, _YY = replace(_XY, gain=0.003235), replace(_XX, gain=0.100001)
 
 
 @final
 @dataclass(frozen=True)
 class StatedPlant:
-    """The identified 2 x 2 model, Eq. 65; the first letter is the output axis."""
+    """The identified 2 x 2 model, Eq. 65, in milliseconds and radians; the first letter is the output."""
 
-    xx: StatedPath = StatedPath(0.100008, **_DIRECT)  # type: ignore[arg-type]
-    xy: StatedPath = StatedPath(0.005228, **_CROSS)  # type: ignore[arg-type]
-    yx: StatedPath = StatedPath(0.003235, **_CROSS)  # type: ignore[arg-type]
-    yy: StatedPath = StatedPath(0.100001, **_DIRECT)  # type: ignore[arg-type]
+    xx: TransferPath = _XX
+    xy: TransferPath = _XY
+    yx: TransferPath = _YX
+    yy: TransferPath = _YY
+
+    @property
+    def paths(self) -> tuple[tuple[TransferPath, ...], ...]:
+        """The four paths, ``[output][drive]``."""
+        return ((self.xx, self.xy), (self.yx, self.yy))
 
 
 @final
@@ -60,8 +52,6 @@ class StatedOptics:
     """Polar and azimuthal steering angle of Fig. 5b [deg]."""
     k1: float = 11.1e-12
     """Splay constant [N]."""
-    k2: float = 7.4e-12
-    """Twist constant [N]."""
     k3: float = 17.1e-12
     """Bend constant [N]."""
     permittivity: float = 4.6e-11
@@ -138,8 +128,6 @@ class StatedRecords:
     """Crosstalk gains said to follow from Eq. 65 [-]."""
     two_axis_drive: tuple[float, float] = (pi / 3, pi / 5)
     """Drives of Fig. 17, x and y [rad]."""
-    two_axis_ideal: tuple[float, float] = (0.0181, 0.0109)
-    """Ideal responses of Fig. 17 [rad]."""
     two_axis_steady: tuple[float, float] = (0.0184, 0.0124)
     """Measured steady responses of Fig. 17 [rad]."""
     refresh_rate: float = 1.0

@@ -1,0 +1,331 @@
+"""Noise of the loop: its law, and samples that hold no signal to measure it by.
+
+Such samples are those before the drive moves and inside the delay, and differences of repeats. The law is
+that of a fit, white noise plus a correlated part (`inference.mixednoise`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import final
+
+import numpy as np
+from scipy.signal import correlate
+from scipy.special import logsumexp
+from scipy.stats import chi2
+
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.inference.defaultpriors import Scales
+from lcopa_bayes.inference.mixednoise import WhiteAR1
+from lcopa_bayes.inference.observations import Observed, Samples
+from lcopa_bayes.inference.restnoise import PlausibleNoise, mixed_shapes
+
+FEWEST = 50
+"""Fewer quiet samples than this know the noise scale to worse than a tenth [-]."""
+_SAFE = 0.8
+"""Share of the fitted delay inside which a response is surely at rest [-]."""
+_LAGS = 2000
+"""Autocorrelations of a noise that are summed at most [-]."""
+_WINDOW = 5.0
+"""Lags over which autocorrelations are summed, over that sum (Sokal 1997, NATO ASI B 361) [-]."""
+_ALIKE = 1e-3
+"""p-value below which repeats differ by more than the quiet noise [-]."""
+_REPEATED = 200
+"""Plausible noise laws over which a number is averaged [-]."""
+_SEED = 5
+_CORRELATIONS = 120
+"""Correlations of noise without a white part that are tried [-]."""
+_SEEN = 0.02
+"""Part of the power at which a correlation is mentioned [-]."""
+_SHARES = (1e-3, 5e-3, 3e-2)
+"""Shares of outliers tried [-]."""
+_WIDTHS = (6.0, 30.0)
+"""Standard deviations of an outlier over that of the noise tried [-]."""
+
+
+@final
+@dataclass(frozen=True)
+class Law:
+    """Stationary white noise plus a correlated part; either may vanish."""
+
+    sigma: float
+    """Standard deviation of the white part [response unit]."""
+    sigma_ar: float = 0.0
+    """Standard deviation of the correlated part [response unit]."""
+    rho: float = 0.0
+    """Its correlation one sampling period apart [-]."""
+
+    @classmethod
+    def of(cls, posterior: PlausibleNoise) -> Law:
+        """The likeliest."""
+        return cls(*posterior.estimate.tolist())
+
+    @property
+    def parameters(self) -> Vector:
+        """As `WhiteAR1` takes them, (3,)."""
+        return np.array([self.sigma, self.sigma_ar, self.rho])
+
+    @property
+    def sd(self) -> float:
+        """Standard deviation [response unit]."""
+        return float(np.hypot(self.sigma, self.sigma_ar))
+
+    @property
+    def share(self) -> float:
+        """Correlated part of the power [-]."""
+        return (self.sigma_ar / self.sd) ** 2
+
+    def whiten(self, columns: Array, gaps: Vector) -> Array:
+        """Standardised prediction errors of columns (..., n), same shape [-]; `gaps` in sampling periods."""
+        flat = columns.reshape(1, -1, gaps.size)
+        return np.reshape(WhiteAR1().whiten(flat, self.parameters[None], gaps)[0], columns.shape)
+
+    def correlated(self, lags: int) -> float:
+        """Samples of a long stretch that count as one independent sample of a power [-], 1 or more.
+
+        ``1 + 2 sum_k rho_k^2`` (Bayley and Hammersley 1946, J. R. Stat. Soc. Suppl. 8), rho_k the
+        autocorrelation at lag k, summed over `lags` lags with weights ``1 - k / (lags + 1)``: the mean
+        square of ``lags + 1`` samples scatters as that of so many times fewer independent ones.
+        """
+        k = np.arange(1, lags + 1)
+        squares = self.share**2 * self.rho ** (2.0 * k)
+        return float(1.0 + 2.0 * ((1.0 - k / (lags + 1)) * squares).sum())
+
+
+def plausible(pieces: Sequence[Observed], scales: Scales) -> PlausibleNoise:
+    """Posterior of the noise given pieces of it.
+
+    To equal parts noise of a single correlation, under Jeffreys' prior ``1 / sqrt(1 - rho^2)`` (Berger and
+    Yang 1994, Econometric Theory 10; under a flat one noise of correlation near 1 raises more alarms than
+    stated), and white noise with a correlated part that a record holds twenty times, as a fit has it.
+    """
+    single = np.sin(0.5 * np.pi * (np.arange(_CORRELATIONS) + 0.5) / _CORRELATIONS)
+    alone = np.column_stack([np.zeros_like(single), np.ones_like(single), single])
+    mixed, log_prior = mixed_shapes(scales.correlations)
+    log_prior -= np.log(np.exp(log_prior).sum())
+    even = np.full(_CORRELATIONS, -np.log(_CORRELATIONS))
+    return PlausibleNoise.of(pieces, np.vstack([alone, mixed]), np.concatenate([even, log_prior]))
+
+
+def laws(drawn: Matrix) -> list[Law]:
+    """Drawn parameters, (draws, 3), one by one."""
+    return [Law(*row) for row in drawn.tolist()]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class AxisNoise:
+    """Noise of one response axis and where it is known from."""
+
+    law: Law
+    posterior: PlausibleNoise
+    """What the samples leave plausible."""
+    samples: int
+    """Samples it was estimated from [-]."""
+    source: str
+    """One of "quiet", "repeats", "joint"."""
+    sentence: str
+    dependence: float = 1.0
+    """Samples that count as one independent sample [-]; above 1 only when fitted jointly."""
+
+    @classmethod
+    def of(cls, posterior: PlausibleNoise, samples: int, source: str, sentence: str) -> AxisNoise:
+        """Noise measured apart from the fit, at the estimate from its pieces."""
+        return cls(Law.of(posterior), posterior, samples, source, sentence)
+
+    @cached_property
+    def independent(self) -> float:
+        """Independent samples that the samples are worth for the noise scale, median of the posterior [-]."""
+        drawn = laws(self.posterior.draw(_REPEATED, np.random.default_rng(_SEED)))
+        return self.samples / float(np.median([one.correlated(self.samples) for one in drawn]))
+
+    @property
+    def caution(self) -> str:
+        """Why no verdict is better than tentative beside this noise; empty when it is known well."""
+        if not self.known:
+            return self.sentence
+        if self.independent >= FEWEST:
+            return ""
+        return (
+            f"{self.sentence.rstrip('.')}; successive ones are so alike that they count as "
+            f"{self.independent:.0f} independent ones ({FEWEST} are needed): what is slow in the noise is "
+            "known too roughly for a firm verdict. Record a longer stretch before the first command."
+        )
+
+    @property
+    def known(self) -> bool:
+        """Whether it was measured apart from the fit."""
+        return self.source != "joint"
+
+
+def quiet_samples(record: Samples, axis: int, delay: float) -> int:
+    """Number of samples of an axis before anything can have arrived [-]; `delay` as in `quiet_pieces`."""
+    until = record.first_change + _SAFE * delay
+    return int(np.searchsorted(record.times[record.axes[axis].index], until))
+
+
+def quiet_pieces(samples: Sequence[Samples], axis: int, delay: float) -> list[Observed]:
+    """Samples of an axis before anything can have arrived [response unit].
+
+    `delay` is the shortest fitted delay [time unit]; 0.8 of it counts as dead time.
+    """
+    counts = [quiet_samples(record, axis, delay) for record in samples]
+    return [_first(one.axes[axis], count) for one, count in zip(samples, counts, strict=True) if count > 1]
+
+
+def _first(observed: Observed, count: int) -> Observed:
+    return Observed(observed.index[:count], observed.values[:count], observed.gaps[:count])
+
+
+def repeat_pieces(samples: Sequence[Samples], axis: int) -> list[Observed]:
+    """Differences over sqrt(2) of records with the same drive and sample times [response unit]."""
+    out, taken = [], set()
+    for k, one in enumerate(samples):
+        for j in range(k + 1, len(samples)):
+            other = samples[j]
+            if k in taken or j in taken or not _repeats(one, other, axis):
+                continue
+            taken |= {k, j}
+            difference = (one.axes[axis].values - other.axes[axis].values) / np.sqrt(2)
+            out.append(replace(one.axes[axis], values=difference))
+    return [piece for piece in out if piece.values.size > 1]
+
+
+def _repeats(one: Samples, other: Samples, axis: int) -> bool:
+    first, second = one.record, other.record
+    return (
+        first.time.shape == second.time.shape
+        and np.array_equal(first.drive, second.drive)
+        and np.allclose(first.time, second.time)
+        and np.array_equal(one.axes[axis].index, other.axes[axis].index)
+    )
+
+
+def axis_noise(
+    samples: Sequence[Samples], axis: int, delay: float, name: str, scales: Scales
+) -> AxisNoise | None:
+    """Noise of an axis from quiet samples, and from repeats where these agree; None when too few.
+
+    Repeats that differ by more than the quiet noise hold a disturbance from record to record (a trigger that
+    jitters, a mount that shakes): then they are no measure of the noise, and the sentence says so.
+    """
+    quiet, repeats = quiet_pieces(samples, axis, delay), repeat_pieces(samples, axis)
+    count = sum(piece.values.size - 1 for piece in quiet)
+    again = sum(piece.values.size - 1 for piece in repeats)
+    usable = [piece for piece in quiet if np.ptp(piece.values) > 0]
+    if count >= FEWEST and usable:
+        alone = plausible(usable, scales)
+        said = f"{name}: {_named(alone)} from {count} quiet samples"
+        if not again:
+            return AxisNoise.of(alone, count, "quiet", f"{said}.")
+        ratio, p = _repeated(alone, repeats)
+        if p > _ALIKE:
+            both = plausible([*usable, *repeats], scales)
+            said = f"{name}: {_named(both)} from {count} quiet samples and {again} differences of repeats"
+            return AxisNoise.of(both, count + again, "quiet", f"{said}, which agree.")
+        differ = f"repeats differ by {ratio:.2f} times the quiet noise (p = {p:.1g})"
+        return AxisNoise.of(alone, count, "quiet", f"{said}; {differ}: something varies between records.")
+    if again >= FEWEST:
+        alone = plausible([piece for piece in repeats if np.ptp(piece.values) > 0], scales)
+        said = f"{name}: {_named(alone)} from {again} differences of repeats"
+        return AxisNoise.of(alone, again, "repeats", f"{said}; {count} quiet samples are too few.")
+    return None
+
+
+def _named(posterior: PlausibleNoise) -> str:
+    law = Law.of(posterior)
+    if law.share * law.rho < _SEEN:
+        return f"white noise of sd {law.sd:.3g}"
+    part = "" if law.share > 1 - _SEEN else f" in {100 * law.share:.0f} % of its power"
+    return f"noise of sd {law.sd:.3g} and correlation {law.rho:.2f}{part}"
+
+
+def joint_noise(residual: Sequence[Observed], name: str, quiet: int, scales: Scales) -> AxisNoise:
+    """Noise of an axis fitted together with the plant, from its residual on each record [response unit].
+
+    Coloured noise as free as the residual would take every slow effect for noise, and a fit whitened by it
+    predicts the next sample and not the response. So the fit weighs all samples alike, and what its residual
+    is worth as evidence is divided by ``sum_k rho_k^2``, the samples per independent one of a power (Bayley
+    and Hammersley 1946, J. R. Stat. Soc. Suppl. 8), rho_k its autocorrelations.
+    """
+    pieces = [piece.values for piece in residual]
+    count = sum(piece.size for piece in pieces)
+    power = sum(float(((piece - piece.mean()) ** 2).sum()) for piece in pieces)
+    law = Law(max(float(np.sqrt(power / count)), 1e-300))
+    coloured = plausible([piece for piece in residual if piece.values.size > 1], scales)
+    dependence = _dependence(pieces, Law.of(coloured))
+    sentence = (
+        f"{name}: {quiet} quiet samples and no repeats are too few to know the noise ({FEWEST} are needed), "
+        f"so noise of sd {law.sd:.3g} is fitted to the residual together with the plant, and {count} "
+        f"samples count as {count / dependence:.0f} independent ones: what it takes for noise may be an "
+        "effect, so no verdict is better than tentative. Record a stretch before the first command, or a "
+        "repeat."
+    )
+    return AxisNoise(law, coloured, count, "joint", sentence, dependence)
+
+
+def _dependence(pieces: Sequence[Vector], coloured: Law) -> float:
+    """Samples per independent one of a power, from pieces and the noise that describes them best [-].
+
+    The lesser of two estimates, as each errs upwards where its assumption fails: the law where a smooth
+    misfit makes it nearly a random walk, the pieces' own autocorrelations where a ripple goes on for ever.
+    """
+    longest = max(piece.size for piece in pieces)
+    products = np.zeros(longest)
+    for piece in pieces:
+        apart = piece - piece.mean()
+        products[: piece.size] += correlate(apart, apart, mode="full", method="fft")[piece.size - 1 :]
+    if products[0] == 0.0:
+        return 1.0
+    summed = 1.0 + 2.0 * np.cumsum((products[1:] / products[0]) ** 2)
+    wide = np.flatnonzero(np.arange(1, longest) >= _WINDOW * summed)
+    own = float(summed[wide[0]] if wide.size else summed[-1]) if longest > 1 else 1.0
+    return min(own, coloured.correlated(min(longest - 1, _LAGS)))
+
+
+def _repeated(posterior: PlausibleNoise, repeats: Sequence[Observed]) -> tuple[float, float]:
+    """Root mean square of whitened repeats, and the p-value of noise alone over all that is plausible [-]."""
+    count = sum(piece.values.size - 1 for piece in repeats)
+    drawn = laws(posterior.draw(_REPEATED, np.random.default_rng(_SEED)))
+    powers = np.array([_power(law, repeats) for law in drawn])
+    above, below = chi2.sf(powers, count).mean(), chi2.cdf(powers, count).mean()
+    ratio = np.sqrt(_power(Law.of(posterior), repeats) / count)
+    return float(ratio), float(2 * min(above, below))
+
+
+def _power(law: Law, pieces: Sequence[Observed]) -> float:
+    """Squares of whitened pieces about their own levels [-]."""
+    squares = 0.0
+    for piece in pieces:
+        white, ones = law.whiten(np.stack([piece.values, np.ones_like(piece.values)]), piece.gaps)
+        squares += float(white @ white) - float(ones @ white) ** 2 / float(ones @ ones)
+    return squares
+
+
+def scatter_evidence(white: Vector) -> float:
+    """Log Bayes factor of a mixture of N(0, s^2) and rare wide outliers against N(0, s^2) [nat].
+
+    Averaged over shares and widths, each s at its best. Samples are taken against the mean of their two
+    neighbours, so that a smooth residual is no outlier; every other sample makes these differences nearly
+    independent, and the evidence is the mean of both halves.
+    """
+    apart = white[1:-1] - 0.5 * (white[:-2] + white[2:])
+    return 0.5 * (_mixture(apart[::2]) + _mixture(apart[1::2]))
+
+
+def _mixture(apart: Vector) -> float:
+    scale = float(np.sqrt(np.mean(apart**2))) if apart.size else 0.0
+    core = min(scale, float(np.median(np.abs(apart))) / 0.6744897501960817) if apart.size else 0.0
+    if core == 0.0:
+        return 0.0
+    plain = -0.5 * (apart / scale) ** 2 - np.log(scale)
+    z2 = (apart / core) ** 2
+    found = []
+    for share in _SHARES:
+        for width in _WIDTHS:
+            inner = np.log1p(-share) - 0.5 * z2
+            outer = np.log(share / width) - 0.5 * z2 / width**2
+            found.append(float((np.logaddexp(inner, outer) - np.log(core) - plain).sum()))
+    return float(logsumexp(found) - np.log(len(found)))
