@@ -134,7 +134,7 @@ def results_of() -> dict:
             estimate("settling_5[x]", "ms", None, None, "reliable", lower=7.5),
             estimate("overshoot[x]", "-", 0.04, 0.002, "reliable"),
         ],
-        "ridges": [],
+        "modes": [],
         "rival": None,
         "log_evidence": -12.345,
         "log_evidence_sd": 0.0123,
@@ -450,11 +450,11 @@ def with_results(folder: Path, **more: object):
     return type(run)({**run.results, **more}, run.provenance, run.tables, run.draws)
 
 
-def test_several_ridges_are_shown_with_their_shares(folder):
+def test_several_modes_are_shown_with_their_shares(folder):
     assert len(parameters.section(load_run(folder)).tables) == 2
     found = Modes("time_1", "ms", (1.1,), np.array([[0.3, 0.7], [0.5, 0.5]]), np.full((2, 2), 0.02))
     row = found.as_json() | {"grade": "tentative"}
-    table = parameters.section(with_results(folder, ridges=[row])).tables[1]
+    table = parameters.section(with_results(folder, modes=[row])).tables[1]
     assert table.rows[0][:6] == (
         *("time_1", "1.10", "ms", "0.40 ± 0.10, 0.60 ± 0.10", "0.30 to 0.50, 0.50 to 0.70", "tentative"),
     )
