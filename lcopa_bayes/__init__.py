@@ -57,7 +57,7 @@ _PLACES = {
     "verbs.simulate": ("Simulation", "simulate"),
     "verbs.stored": ("load_result",),
 }
-"""Where the public names stand; a module is imported when one of its names is first used."""
+"""Modules of the public names; a module is imported when one of its names is first used."""
 _OF = {name: place for place, names in _PLACES.items() for name in names}
 __all__ = sorted(_OF)
 

@@ -62,15 +62,15 @@ class Verb:
     text: str
     """What it does, in a line."""
     options: Callable[[argparse.ArgumentParser], None]
-    carry_out: Callable[[argparse.Namespace], Outcome]
+    perform: Callable[[argparse.Namespace], Outcome]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Carry out one verb; returns the exit code."""
+    """Run one verb; returns the exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     options = _parser(given[:1]).parse_args(given)
     try:
-        outcome = _carried_out(options, ["lcopa-bayes", *given])
+        outcome = _outcome(options, ["lcopa-bayes", *given])
     except InputError as error:
         for problem in error.problems:
             print(f"error: {problem}", file=sys.stderr)
@@ -88,11 +88,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _carried_out(options: argparse.Namespace, command: Sequence[str]) -> Outcome:
+def _outcome(options: argparse.Namespace, command: Sequence[str]) -> Outcome:
     from lcopa_bayes.results.provenance import commanded
 
     with commanded(command):
-        return VERBS[options.verb].carry_out(options)
+        return VERBS[options.verb].perform(options)
 
 
 def _parser(wanted: Sequence[str]) -> argparse.ArgumentParser:
@@ -118,8 +118,8 @@ def _source(options: argparse.Namespace) -> FitLike:
     """The study asked for, with the seed of the command line if one is given, or a finished fit."""
     from lcopa_bayes.verbs.sources import finished, study_of
 
-    made = finished(options.source)
-    if made is None:
+    fitted = finished(options.source)
+    if fitted is None:
         study = study_of(options.source, held_out=options.held_out)
         return study if options.seed is None else study.with_seed(options.seed)
     if options.held_out or options.seed is not None:
@@ -127,7 +127,7 @@ def _source(options: argparse.Namespace) -> FitLike:
             f"{options.source[0]}: is the run folder of a finished fit, which --held-out and --seed do not "
             "change; score a record with `predict`, or name the study to fit it again"
         )
-    return made
+    return fitted
 
 
 def _folder(options: argparse.Namespace, source: FitLike, *inside: str) -> Path:
@@ -149,14 +149,14 @@ def _jobs(options: argparse.Namespace) -> int:
 def _on_study(
     verb: str, *keys: str, module: str = "", inside: str = "", anew: bool = False, **derived: Derived
 ) -> Callable[[argparse.Namespace], Outcome]:
-    """What carries out a public function of a study or a finished fit.
+    """What runs a public function of a study or a finished fit.
 
     `keys` are options that it takes by their names, `derived` gives others from the options and the source,
     `module` is that of the function where it is not public; `anew` calls it with the study alone, and the run
     folder is then one `inside` another by the name of the study.
     """
 
-    def carry_out(options: argparse.Namespace) -> Outcome:
+    def perform(options: argparse.Namespace) -> Outcome:
         from lcopa_bayes.verbs.sources import study_of
 
         source = _source(options)
@@ -167,7 +167,7 @@ def _on_study(
         folder = _folder(options, source, *filter(None, [inside]))
         return _reported(function(source, folder=folder, jobs=_jobs(options), **given), folder)
 
-    return carry_out
+    return perform
 
 
 def _rival(options: argparse.Namespace, study: Any) -> bool:
@@ -215,8 +215,8 @@ def _claims(options: argparse.Namespace) -> Outcome:
 def _bundled(file: str) -> list[Path]:
     """Run folders of the bundled studies that hold a file, one's own before the published ones."""
     places = ([RUNS / name, PUBLISHED / name] for name in BUNDLED)
-    found = (next((place for place in each if (place / file).is_file()), None) for each in places)
-    return [place for place in found if place is not None]
+    matches = (next((place for place in each if (place / file).is_file()), None) for each in places)
+    return [place for place in matches if place is not None]
 
 
 def _report(options: argparse.Namespace) -> Outcome:
@@ -232,9 +232,9 @@ def _report(options: argparse.Namespace) -> Outcome:
 def _simulate(options: argparse.Namespace) -> Outcome:
     from lcopa_bayes.verbs.simulate import simulate
 
-    made = simulate(options.campaign, seed=options.seed)
-    paths = made.save(options.out, overwrite=options.overwrite)
-    verdict = f"{len(made.records)} records in {options.out}"
+    simulation = simulate(options.campaign, seed=options.seed)
+    paths = simulation.save(options.out, overwrite=options.overwrite)
+    verdict = f"{len(simulation.records)} records in {options.out}"
     return Outcome({"verdict": verdict, "files": [str(path) for path in paths]}, verdict)
 
 

@@ -142,7 +142,7 @@ class Replication:
         return (*out, Quantity("log_likelihood", "log likelihood", "nat"))
 
     def attempt(self, number: int) -> Outcome | Failure:
-        """The replica, or what went wrong with it: the others go on, and it is told with its seed."""
+        """The replica, or what went wrong with it: the others go on, and it is reported with its seed."""
         try:
             with threadpool_limits(1):
                 return self(number)
@@ -226,9 +226,9 @@ class Replication:
         look = None
         if self.engine == "importance" and problem.posterior.simulation is not None:
             problem = resolved(problem)
-            found = weighted_run(problem.posterior, replace(self.plan, seed=seed), quick=True)
-            if found is not None and found[0].weighted is not None:
-                return problem, found[1], "importance", found[0].weighted.pareto_k
+            result = weighted_run(problem.posterior, replace(self.plan, seed=seed), quick=True)
+            if result is not None and result[0].weighted is not None:
+                return problem, result[1], "importance", result[0].weighted.pareto_k
         elif self.engine == "importance":
             optima = find_optima(problem.posterior, rng, starts=_LOOK.starts)
             problem = resolved(problem, optima)

@@ -18,13 +18,13 @@ _ADVICE = "leave out --resume to start anew, or choose another --out"
 
 def store_fingerprint(replication: Replication) -> str:
     """Hash of everything an outcome depends on besides its number."""
-    told = (
+    values = (
         fingerprint(replication.problem.study, replication.plan),
         replication.truths.digest,
         replication.engine,
         [list(quantity) for quantity in replication.quantities],
     )
-    return hashlib.sha256(json.dumps(told).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(values).encode()).hexdigest()
 
 
 @final
@@ -64,11 +64,11 @@ class Store:
 
     def _outcome(self, path: Path) -> Outcome:
         try:
-            told: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-            own = told.pop("fingerprint") == self.fingerprint
+            values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+            own = values.pop("fingerprint") == self.fingerprint
             if own:
-                tuples = {"truths": tuple(told["truths"]), "ranks": tuple(told["ranks"])}
-                return Outcome(**told | tuples | {"inside": tuple(tuple(row) for row in told["inside"])})
+                tuples = {"truths": tuple(values["truths"]), "ranks": tuple(values["ranks"])}
+                return Outcome(**values | tuples | {"inside": tuple(tuple(row) for row in values["inside"])})
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
             raise InputError(
                 f"{path}: not a replica this program wrote, or damaged ({error}); {_ADVICE}"

@@ -30,39 +30,39 @@ _FEWEST = 50
 _COVERED = ("parameter", "step response")
 
 
-def results(made: Calibration) -> dict[str, Any]:
+def results(calibration: Calibration) -> dict[str, Any]:
     """Every number of a calibration as plain JSON values; only `seconds` differs from run to run."""
-    replication = made.replication
+    replication = calibration.replication
     study, truths = replication.problem.study, replication.truths
-    reliable = [outcome for outcome in made.outcomes if outcome.grade == "reliable"]
-    everything = over(made.outcomes, replication.quantities)
-    grade, reason = graded(made, len(reliable))
-    spent = np.array([outcome.seconds for outcome in made.outcomes])
-    gaps = np.array([outcome.gap for outcome in made.outcomes])
-    told: dict[str, Any] = {
+    reliable = [outcome for outcome in calibration.outcomes if outcome.grade == "reliable"]
+    everything = over(calibration.outcomes, replication.quantities)
+    grade, reason = graded(calibration, len(reliable))
+    spent = np.array([outcome.seconds for outcome in calibration.outcomes])
+    gaps = np.array([outcome.gap for outcome in calibration.outcomes])
+    values: dict[str, Any] = {
         "study": study.name,
-        "verdict": verdict(everything, made),
+        "verdict": verdict(everything, calibration),
         "grade": grade,
         "grade_reason": reason,
         "time_unit": study.time_unit,
         "seed": study.seed,
-        "asked": made.asked,
+        "asked": calibration.asked,
         **everything,
         "reliable": over(reliable, replication.quantities) if reliable else None,
-        "grades": grades(made),
+        "grades": grades(calibration),
         "not_reliable": [
             {"replica": o.replica, "seed": o.seed, "grade": o.grade, "reason": o.reason}
-            for o in made.outcomes
+            for o in calibration.outcomes
             if o.grade != "reliable"
         ],
-        "failures": [{"replica": f.replica, "seed": f.seed, "error": f.error} for f in made.failures],
+        "failures": [{"replica": f.replica, "seed": f.seed, "error": f.error} for f in calibration.failures],
         "truths": {
             "from": _origin(truths),
             "folder": truths.folder or None,
             "grade": truths.grade or None,
             "stated": dict(truths.stated) or None,
         },
-        "engine": engines(made),
+        "engine": engines(calibration),
         "model_gap": {
             "unit": "noise scale",
             "median": np.median(gaps),
@@ -72,22 +72,22 @@ def results(made: Calibration) -> dict[str, Any]:
         "discretisation": {
             "largest_negligible": LARGEST,
             "unit": "posterior sd",
-            "negligible": sum(outcome.resolved for outcome in made.outcomes),
-            "median": np.median([outcome.shift for outcome in made.outcomes]),
-            "largest": max(outcome.shift for outcome in made.outcomes),
-            "largest_refinement": max(outcome.refinement for outcome in made.outcomes),
+            "negligible": sum(outcome.resolved for outcome in calibration.outcomes),
+            "median": np.median([outcome.shift for outcome in calibration.outcomes]),
+            "largest": max(outcome.shift for outcome in calibration.outcomes),
+            "largest_refinement": max(outcome.refinement for outcome in calibration.outcomes),
         },
         "seconds": {"total": spent.sum(), "median": np.median(spent), "largest": spent.max()},
     }
     plan = replication.plan
-    told["sampler"] = {
+    values["sampler"] = {
         "ensembles": plan.ensembles,
         "walkers": plan.walkers,
         "most_steps": plan.steps,
         "thin": plan.thin,
         "target_ess": plan.target_ess,
     }
-    return plain(told)
+    return plain(values)
 
 
 def over(outcomes: Sequence[Outcome], quantities: Sequence[Quantity]) -> dict[str, Any]:
@@ -127,34 +127,34 @@ def _origin(truths: Truths) -> str:
     return "stated" if truths.fixed else "stated and prior" if truths.stated else "prior"
 
 
-def engines(made: Calibration) -> dict[str, Any]:
+def engines(calibration: Calibration) -> dict[str, Any]:
     """Number of replicas that each engine gave the draws of, and the Pareto k of importance weights."""
-    known = [outcome.pareto_k for outcome in made.outcomes if outcome.pareto_k is not None]
+    known = [outcome.pareto_k for outcome in calibration.outcomes if outcome.pareto_k is not None]
     return {
-        "wanted": made.replication.engine,
-        **{name: sum(outcome.engine == name for outcome in made.outcomes) for name in ENGINES},
+        "wanted": calibration.replication.engine,
+        **{name: sum(outcome.engine == name for outcome in calibration.outcomes) for name in ENGINES},
         "largest_good_k": LARGEST_K,
         "median_k": np.median(known) if known else None,
         "largest_k": max(known, default=None),
     }
 
 
-def grades(made: Calibration) -> dict[str, int]:
+def grades(calibration: Calibration) -> dict[str, int]:
     """Number of replicas of each grade."""
-    found = Counter(outcome.grade for outcome in made.outcomes)
-    return {level: found[level] for level in ("reliable", "tentative", "unusable")} | {
-        "failed": len(made.failures)
+    result = Counter(outcome.grade for outcome in calibration.outcomes)
+    return {level: result[level] for level in ("reliable", "tentative", "unusable")} | {
+        "failed": len(calibration.failures)
     }
 
 
-def graded(made: Calibration, reliable: int) -> tuple[str, str]:
+def graded(calibration: Calibration, reliable: int) -> tuple[str, str]:
     """How far a calibration speaks of runs one would use, and why."""
-    share, count = reliable / made.asked, len(made.outcomes)
-    said = f"{reliable} of {made.asked} replicas are graded reliable"
+    share, count = reliable / calibration.asked, len(calibration.outcomes)
+    said = f"{reliable} of {calibration.asked} replicas are graded reliable"
     if share < 0.5:
         return "unusable", f"{said}; give the sampler of the study more steps"
-    if made.failures:
-        return "tentative", f"{said} and {len(made.failures)} failed"
+    if calibration.failures:
+        return "tentative", f"{said} and {len(calibration.failures)} failed"
     if share < _MOST_OF_THEM:
         return "tentative", f"{said}; give the sampler of the study more steps"
     if count < _FEWEST:
@@ -162,9 +162,9 @@ def graded(made: Calibration, reliable: int) -> tuple[str, str]:
     return "reliable", said
 
 
-def verdict(told: dict[str, Any], made: Calibration) -> str:
+def verdict(values: dict[str, Any], calibration: Calibration) -> str:
     """One or two sentences: which intervals cover, whether ranks are uniform, what the truths were."""
-    rows, count, p = told["coverage"], told["replicas"], told["p_value"]
+    rows, count, p = values["coverage"], values["replicas"], values["p_value"]
     outside = [row for row in rows if not row["within"]]
     band = f"its Monte Carlo band (simultaneous {_percent(SIMULTANEOUS)}, {count} replicas)"
     if outside:
@@ -181,35 +181,35 @@ def verdict(told: dict[str, Any], made: Calibration) -> str:
             f"Coverage of {levels} intervals is within {band} for every one of {parameters} parameters "
             "and every step response."
         ]
-    truths = made.replication.truths
+    truths = calibration.replication.truths
     if truths.stated:
         parts.append(
             f"The truth was {'' if truths.fixed else 'in part '}stated, not drawn from the prior: coverage "
             "is then nominal as far as the priors are wide beside the posterior and the likelihood is smooth "
             "at the truth, and ranks need not be uniform."
         )
-        return " ".join([*parts, *_failed(made)])
-    uneven = [row["parameter"] for row in told["ranks"] if len(told["ranks"]) * row["p_value"] < SMALL_P]
+        return " ".join([*parts, *_failed(calibration)])
+    uneven = [row["parameter"] for row in values["ranks"] if len(values["ranks"]) * row["p_value"] < SMALL_P]
     parts.append(
         f"Ranks are not uniform (overall p = {p:.2g}): {', '.join(uneven)}."
         if p < SMALL_P
-        else f"Ranks are uniform as far as so many replicas tell (overall p = {p:.2g})."
+        else f"Ranks are uniform as far as so many replicas show (overall p = {p:.2g})."
     )
     if truths.pool is not None:
         parts.append(
             "Truths came from an earlier posterior while every replica was inferred under the prior of the "
             "study: exact coverage is expected only where that prior is flat over the posterior."
         )
-    return " ".join([*parts, *_failed(made)])
+    return " ".join([*parts, *_failed(calibration)])
 
 
-def _failed(made: Calibration) -> list[str]:
-    if not made.failures:
+def _failed(calibration: Calibration) -> list[str]:
+    if not calibration.failures:
         return []
-    first = made.failures[0]
+    first = calibration.failures[0]
     return [
-        f"{len(made.failures)} of {made.asked} replicas failed and are not counted, the first being "
-        f"number {first.replica} (seed {first.seed}): {first.error}."
+        f"{len(calibration.failures)} of {calibration.asked} replicas failed and are not counted, the first "
+        f"being number {first.replica} (seed {first.seed}): {first.error}."
     ]
 
 
@@ -217,9 +217,9 @@ def _percent(share: float) -> str:
     return f"{100 * share:.0f} %"
 
 
-def tables(made: Calibration) -> dict[str, pd.DataFrame]:
+def tables(calibration: Calibration) -> dict[str, pd.DataFrame]:
     """Tables by file name: one row per replica, and one per replica and quantity."""
-    quantities = made.replication.quantities
+    quantities = calibration.replication.quantities
     return {
         "replicas": pd.DataFrame(
             [
@@ -236,7 +236,7 @@ def tables(made: Calibration) -> dict[str, pd.DataFrame]:
                     "pareto_k": o.pareto_k,
                     "seconds": o.seconds,
                 }
-                for o in made.outcomes
+                for o in calibration.outcomes
             ]
         ),
         "ranks": pd.DataFrame(
@@ -246,7 +246,7 @@ def tables(made: Calibration) -> dict[str, pd.DataFrame]:
                     f"inside_{level:.0%}".rstrip("%"): held
                     for level, held in zip(LEVELS, inside, strict=True)
                 }
-                for o in made.outcomes
+                for o in calibration.outcomes
                 for q, truth, rank, inside in zip(quantities, o.truths, o.ranks, o.inside, strict=True)
             ]
         ),

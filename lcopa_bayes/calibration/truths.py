@@ -105,7 +105,7 @@ def truths_around(folder: Path, table: ParameterTable) -> Truths:
         raise InputError(f"{folder}: holds no posterior.nc; {advice}")
     try:
         with xr.open_dataset(path, group="posterior", engine="h5netcdf") as posterior:
-            found = {
+            draws = {
                 str(held.attrs.get("parameter", name)): (
                     str(held.attrs.get("units", "")),
                     held.to_numpy().ravel(),
@@ -117,15 +117,15 @@ def truths_around(folder: Path, table: ParameterTable) -> Truths:
     except (OSError, ValueError, KeyError) as error:
         raise InputError(f"{path}: cannot be read as draws ({error}); {advice}") from None
     pool = np.tile(
-        [row.value for row in table.rows], (max((v.size for _, v in found.values()), default=0), 1)
+        [row.value for row in table.rows], (max((v.size for _, v in draws.values()), default=0), 1)
     )
     free = {row.name: k for k, row in enumerate(table.rows) if row.free}
     problems = [
-        f"{path}: has the parameter {name!r}, which this study does not infer" for name in found.keys() - free
+        f"{path}: has the parameter {name!r}, which this study does not infer" for name in draws.keys() - free
     ]
-    problems += [f"{path}: has no draws of {name!r}, which this study infers" for name in free.keys() - found]
-    for name in free.keys() & found:
-        row, (unit, values) = table.rows[free[name]], found[name]
+    problems += [f"{path}: has no draws of {name!r}, which this study infers" for name in free.keys() - draws]
+    for name in free.keys() & draws:
+        row, (unit, values) = table.rows[free[name]], draws[name]
         if unit != row.unit:
             problems.append(f"{path}: {name!r} is in {unit}, in this study in {row.unit}")
         elif values.size != pool.shape[0] or not values.size or np.isneginf(row.log_prior(values)).any():

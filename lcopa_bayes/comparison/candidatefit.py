@@ -39,7 +39,7 @@ _CLIMBED = 4
 @final
 @dataclass(frozen=True, eq=False)
 class Criteria:
-    """AIC and BIC, for those who want them: they know neither priors nor ridges."""
+    """AIC and BIC, for those who want them: they ignore priors and confounded parameters."""
 
     values: Vector
     """Table values at the maximum, (rows,)."""
@@ -74,7 +74,7 @@ class Criteria:
 
 
 def criteria(fit: Fit, also: Sequence[Peak] = ()) -> Criteria:
-    """From the highest of a few draws, climbed, and maxima `also` known."""
+    """From a search that starts at the highest of a few draws, and maxima `also` known."""
     landscape = Landscape(fit.problem.posterior)
     peak = max([highest(landscape, fit.draws.thinned(200)), *also], key=lambda one: one.log_likelihood)
     return Criteria(peak.values, peak.log_likelihood, len(landscape.free), fit.problem.posterior.size)
@@ -95,7 +95,7 @@ WALKERS = 32
 [-]. Ensembles and effective draws are those of a fit, so that a grade means the same."""
 _STARTS = 64
 """Draws kept as starts of richer models [-]."""
-_VERSION = 2
+_VERSION = 3
 """Raised when what a card holds changes."""
 
 
@@ -116,13 +116,13 @@ class Contender:
     def fingerprint(self) -> str:
         """Hash of everything the scores depend on."""
         study = self.candidate.study
-        told = (
+        entries = (
             fingerprint(study, plan_of(problem_of(study), quick=self.quick)),
             self.candidate.improper,
             _VERSION,
             [digest(record) for record in study.held_out],
         )
-        return hashlib.sha256(json.dumps(told).encode()).hexdigest()
+        return hashlib.sha256(json.dumps(entries).encode()).hexdigest()
 
     def stored(self) -> Mapping[str, Any] | None:
         """The card of an earlier run of the same candidate; None when there is none."""
@@ -130,29 +130,29 @@ class Contender:
         if not self.resume or path is None or not path.is_file():
             return None
         try:
-            told: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-            own = told["fingerprint"] == self.fingerprint
+            entries: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+            own = entries["fingerprint"] == self.fingerprint
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise InputError(
                 f"{path}: not a candidate this program wrote, or damaged ({error}); leave out --resume to "
                 "start anew, or choose another --out"
             ) from None
-        return told if own else None
+        return entries if own else None
 
     def __call__(self) -> Mapping[str, Any]:
         """The card: from the folder where it is complete, else by fitting. Deterministic given the study."""
-        found = self.stored()
-        if found is not None:
-            return found
+        result = self.stored()
+        if result is not None:
+            return result
         with threadpool_limits(1):
             began = time.perf_counter()
-            made = self._fitted(self.candidate.study, self.folder)
-            if made.draws.grade.level == "unusable" and self.patient != self.candidate.study.sampler:
+            fitted = self._fitted(self.candidate.study, self.folder)
+            if fitted.draws.grade.level == "unusable" and self.patient != self.candidate.study.sampler:
                 longer = replace(self.candidate.study, sampler=self.patient)
-                made = self._fitted(longer, None if self.folder is None else self.folder / "longer")
-            told = self.scored(made) | {"seconds": time.perf_counter() - began}
-        self.store(told)
-        return told
+                fitted = self._fitted(longer, None if self.folder is None else self.folder / "longer")
+            entries = self.scored(fitted) | {"seconds": time.perf_counter() - began}
+        self.store(entries)
+        return entries
 
     def fitted_from(self, starts: Matrix) -> Fit:
         """The candidate fitted as its study asks, with modes known from elsewhere, table values
@@ -160,22 +160,22 @@ class Contender:
         study = replace(self.candidate.study, sampler=self.patient)
         return self._fitted(study, None if self.folder is None else self.folder / "again", starts)
 
-    def scored(self, made: Fit, also: Sequence[Peak] = ()) -> dict[str, Any]:
+    def scored(self, fitted: Fit, also: Sequence[Peak] = ()) -> dict[str, Any]:
         """The card of a fit; `also` are maxima of its likelihood known from elsewhere."""
-        told, found_parts = card(self.candidate, made, also)
-        return told | {
+        entries, predicted = card(self.candidate, fitted, also)
+        return entries | {
             "fingerprint": self.fingerprint,
-            "pointwise": _pointwise(found_parts),
-            "curves": _curves(made),
+            "pointwise": _pointwise(predicted),
+            "curves": _curves(fitted),
         }
 
-    def store(self, told: Mapping[str, Any]) -> None:
+    def store(self, entries: Mapping[str, Any]) -> None:
         """Keep a card and its tables in the folder, where there is one."""
         if self.folder is not None:
             tables = writable_folder(self.folder / "tables")
-            save_table(pd.DataFrame(told["curves"]), tables / "curves.csv")
-            save_table(pd.DataFrame(told["pointwise"]), tables / "pointwise.csv")
-            save_json(told, self.folder / CARD)
+            save_table(pd.DataFrame(entries["curves"]), tables / "curves.csv")
+            save_table(pd.DataFrame(entries["pointwise"]), tables / "pointwise.csv")
+            save_json(entries, self.folder / CARD)
 
     def _fitted(self, study: Study, folder: Path | None, starts: Matrix | None = None) -> Fit:
         return fit(study, folder=folder, resume=self.resume, quick=self.quick, quiet=True, starts=starts)
@@ -195,15 +195,15 @@ def contender(candidate: Candidate, folder: Path | None, *, quick: bool, resume:
 
 
 def card(
-    candidate: Candidate, made: Fit, also: Sequence[Peak] = ()
+    candidate: Candidate, fitted: Fit, also: Sequence[Peak] = ()
 ) -> tuple[dict[str, Any], tuple[Predicted, ...]]:
     """Everything a comparison needs of a fitted candidate, as plain values, and its predictions."""
-    grade = made.draws.grade
+    grade = fitted.draws.grade
     usable = grade.level != "unusable"
-    weighed = None if candidate.improper else made.evidence
-    parts = predictions(made) if usable else ()
-    found = criteria(made, also)
-    told: dict[str, Any] = plain(
+    weighed = None if candidate.improper else fitted.evidence
+    parts = predictions(fitted) if usable else ()
+    result = criteria(fitted, also)
+    entries: dict[str, Any] = plain(
         {
             "name": candidate.name,
             "about": candidate.about,
@@ -211,7 +211,7 @@ def card(
             "integer": candidate.integer,
             "terms": candidate.terms,
             "settings": settings_of(candidate.study),
-            "time_unit": made.study.time_unit,
+            "time_unit": fitted.study.time_unit,
             "grade": grade.level,
             "grade_reason": grade.reason,
             "usable": usable,
@@ -221,17 +221,17 @@ def card(
             "evidence_undefined": (
                 f"improper prior of {', '.join(candidate.improper)}" if candidate.improper else ""
             ),
-            "prior_widths": [one.as_json() for one in widths(made)] if usable and weighed else [],
-            **found.as_json(),
-            "starts": {"optimum": found.values, "draws": made.draws.thinned(_STARTS)},
-            "refinement": made.problem.refinement,
-            "residual_rms": residual_rms(made),
-            "fit_scores": scores(made, held_out=False),
-            "held_out": scores(made, held_out=True),
+            "prior_widths": [one.as_json() for one in widths(fitted)] if usable and weighed else [],
+            **result.as_json(),
+            "starts": {"optimum": result.values, "draws": fitted.draws.thinned(_STARTS)},
+            "refinement": fitted.problem.refinement,
+            "residual_rms": residual_rms(fitted),
+            "fit_scores": scores(fitted, held_out=False),
+            "held_out": scores(fitted, held_out=True),
             "predictions": [one.as_json() | {"grade": one.grade(grade.level)} for one in parts],
-            "order_is_integer": [one.as_json() for one in integer_orders(made)],
-            "parameters_told": [one.as_json() for one in made.draws.estimates()],
-            "step_metrics": [one.as_json() for one in made.metrics],
+            "order_is_integer": [one.as_json() for one in integer_orders(fitted)],
+            "estimates": [one.as_json() for one in fitted.draws.estimates()],
+            "step_metrics": [one.as_json() for one in fitted.metrics],
             "residual_tests": [
                 {
                     "record": one.record,
@@ -241,38 +241,38 @@ def card(
                     "rms": one.rms,
                     "lag_1": float(one.autocorrelation[0]) if one.autocorrelation.size else None,
                 }
-                for one in made.residuals
+                for one in fitted.residuals
             ],
-            "ess": made.draws.ess,
+            "ess": fitted.draws.ess,
         }
     )
-    return told, parts
+    return entries, parts
 
 
 def _pointwise(parts: tuple[Predicted, ...]) -> dict[str, list[Any]]:
     """Log predictive density of every sample predicted, one list per column."""
-    told: dict[str, list[Any]] = {"part": [], "kind": [], "axis": [], "time": [], "log_density": []}
+    entries: dict[str, list[Any]] = {"part": [], "kind": [], "axis": [], "time": [], "log_density": []}
     for one in parts:
-        told["part"] += [one.part.name] * one.time.size
-        told["kind"] += [one.part.kind] * one.time.size
-        told["axis"] += list(one.axis)
-        told["time"] += one.time.tolist()
-        told["log_density"] += one.log_density.tolist()
-    return told
+        entries["part"] += [one.part.name] * one.time.size
+        entries["kind"] += [one.part.kind] * one.time.size
+        entries["axis"] += list(one.axis)
+        entries["time"] += one.time.tolist()
+        entries["log_density"] += one.log_density.tolist()
+    return entries
 
 
-def _curves(made: Fit) -> dict[str, list[Any]]:
+def _curves(fitted: Fit) -> dict[str, list[Any]]:
     """Observed, median and 90 % band of every record, one list per column."""
-    told: dict[str, list[Any]] = {
+    entries: dict[str, list[Any]] = {
         name: []
         for name in ("record", "axis", "unit", "held_out", "time", "observed", "middle", "low", "high")
     }
-    for band in made.bands:
+    for band in fitted.bands:
         size = band.time.size
-        told["record"] += [band.record] * size
-        told["axis"] += [band.axis] * size
-        told["unit"] += [band.unit] * size
-        told["held_out"] += [band.held_out] * size
+        entries["record"] += [band.record] * size
+        entries["axis"] += [band.axis] * size
+        entries["unit"] += [band.unit] * size
+        entries["held_out"] += [band.held_out] * size
         for name, values in (
             ("time", band.time),
             ("observed", band.observed),
@@ -280,5 +280,5 @@ def _curves(made: Fit) -> dict[str, list[Any]]:
             ("low", band.noisy[0]),
             ("high", band.noisy[4]),
         ):
-            told[name] += np.asarray(values).tolist()
-    return told
+            entries[name] += np.asarray(values).tolist()
+    return entries

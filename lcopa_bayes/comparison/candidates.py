@@ -15,7 +15,7 @@ from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.model.layout import Layout
 
 STUDY = "study"
-"""Name of the candidate that is the study as it stands."""
+"""Name of the candidate that is the study unchanged."""
 KNOWN = (STUDY, "fractional-1", "fractional-2", "fractional-3", "first-order", "second-order", "integer-kept")
 """Candidates any study has."""
 VARIANTS: Mapping[str, str] = {
@@ -40,7 +40,7 @@ class Candidate:
     """In words."""
     notes: tuple[str, ...] = ()
     improper: tuple[str, ...] = ()
-    """Parameters whose prior was said to be improper."""
+    """Parameters whose prior is improper."""
 
     @property
     def integer(self) -> bool:
@@ -58,29 +58,29 @@ class Candidate:
 def known_settings(name: str, study: Study) -> CandidateSettings:
     """Settings of a candidate any study has, by its name; InputError for any other name."""
     base, variants = name, []
-    while (found := re.fullmatch(rf"(.+)-({'|'.join(VARIANTS)})", base)) is not None:
-        base = found[1]
-        variants.append(found[2])
+    while (result := re.fullmatch(rf"(.+)-({'|'.join(VARIANTS)})", base)) is not None:
+        base = result[1]
+        variants.append(result[2])
     most = _most_terms(study.model)
-    told: dict[str, object] = {}
+    entries: dict[str, object] = {}
     fractional = re.fullmatch(r"fractional-([1-6])", base)
     if fractional:
-        told["terms"] = int(fractional[1])
+        entries["terms"] = int(fractional[1])
     elif base == "first-order":
-        told["orders"] = (1.0,)
+        entries["orders"] = (1.0,)
     elif base == "second-order":
-        told["orders"] = (2.0, 1.0)
+        entries["orders"] = (2.0, 1.0)
     elif base == "integer-kept":
-        told["orders"] = (2.0, *[1.0] * (most - 1)) if most > 1 else (1.0,)
+        entries["orders"] = (2.0, *[1.0] * (most - 1)) if most > 1 else (1.0,)
     elif base != STUDY:
         raise InputError(
             f"no candidate {name!r}{nearest(base, KNOWN)}; any of them may end in "
             f"{', '.join('-' + key for key in VARIANTS)}; or describe it under [[candidates]]"
         )
-    told |= {"share": "none"} if "separate" in variants else {}
-    told |= {"delay": "path"} if "delays" in variants else {}
-    told |= {"effects": ()} if "no-effects" in variants else {}
-    return CandidateSettings(name, cross="no-cross" not in variants, **told)  # type: ignore[arg-type]
+    entries |= {"share": "none"} if "separate" in variants else {}
+    entries |= {"delay": "path"} if "delays" in variants else {}
+    entries |= {"effects": ()} if "no-effects" in variants else {}
+    return CandidateSettings(name, cross="no-cross" not in variants, **entries)  # type: ignore[arg-type]
 
 
 def derived(study: Study, settings: CandidateSettings) -> Candidate:
@@ -90,14 +90,14 @@ def derived(study: Study, settings: CandidateSettings) -> Candidate:
     fixed: dict[str, PriorSettings] = {}
     if not settings.cross:
         model, fixed = _uncrossed(study, settings.name, model)
-    made = replace(
+    candidate = replace(
         study,
         model=model,
         noise=settings.noise_settings(study.noise),
         effects=settings.effects_settings(study.effects),
         priors={},
     )
-    names = _names(made)
+    names = _names(candidate)
     priors = dict(study.priors)
     if model.orders != "free":
         priors = {name: prior for name, prior in priors.items() if not name.startswith("order_")}
@@ -115,11 +115,11 @@ def derived(study: Study, settings: CandidateSettings) -> Candidate:
             f"the prior of {name} is improper, so the evidence is undefined; the other scores are under the "
             "default prior in its place"
         )
-    made = replace(made, priors=priors | stated | fixed)
+    candidate = replace(candidate, priors=priors | stated | fixed)
     about = _about(study, model, settings.cross)
-    if study.effects.use or made.effects.use:
-        about += f", {', '.join(made.effects.use) or 'no effects'}"
-    return Candidate(settings.name, made, about, tuple(notes), improper)
+    if study.effects.use or candidate.effects.use:
+        about += f", {', '.join(candidate.effects.use) or 'no effects'}"
+    return Candidate(settings.name, candidate, about, tuple(notes), improper)
 
 
 def candidates_of(
@@ -132,16 +132,16 @@ def candidates_of(
     own = {one.name: one for one in (*study.candidates, *extra)}
     wanted = pick if pick is not None else (study.compare.pick or (*_short_list(study), *own))
     problems: list[str] = []
-    made: list[Candidate] = []
+    candidates: list[Candidate] = []
     for name in dict.fromkeys(wanted):
         try:
-            made.append(derived(study, own[name] if name in own else known_settings(name, study)))
+            candidates.append(derived(study, own[name] if name in own else known_settings(name, study)))
         except InputError as error:
             problems += [f"candidate {name!r}: {p}" if name not in p else p for p in error.problems]
     if problems:
         raise InputError(problems)
     distinct: list[Candidate] = []
-    for one in made:
+    for one in candidates:
         alike = [other for other in distinct if _same(one, other)]
         if not alike:
             distinct.append(one)

@@ -48,8 +48,8 @@ def compare(
         tasks.append(contender(one, own, quick=quick, resume=resume))
     cards: dict[str, Mapping[str, Any]] = {}
     with tqdm(total=len(tasks), unit="candidate", disable=quiet, desc="comparing") as bar:
-        for told in _performed(tasks, jobs):
-            cards[str(told["name"])] = told
+        for values in _performed(tasks, jobs):
+            cards[str(values["name"])] = values
             bar.update()
         bar.set_description("holding against contained models")
         for wave in _by_size(tasks, cards):
@@ -65,8 +65,8 @@ def compare(
                 )
                 for task in wave
             ]
-            for told in _performed(checks, jobs):
-                cards[str(told["name"])] = told
+            for values in _performed(checks, jobs):
+                cards[str(values["name"])] = values
     return judged([cards[one.name] for one in candidates], candidates[0].study)
 
 

@@ -1,8 +1,8 @@
 """A richer candidate held against those it contains: it is at least as likely, or has missed a mode.
 
-The optimum of every contained model is set into the richer one and the likelihood climbed from there. Where
-that ends higher than any climb from the richer model's own draws, its ensembles have missed a mode, and it is
-sampled again with that mode among the proposals (`inference.knownmodes`).
+The optimum of every contained model is set into the richer one and the likelihood maximised from there. Where
+that ends higher than any search from the richer model's own draws, its ensembles have missed a mode, and it
+is sampled again with that mode among the proposals (`inference.knownmodes`).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from lcopa_bayes.sampling.evidence import charted_density
 from lcopa_bayes.sampling.knownmodes import around
 
 TOLERANCE = 0.5
-"""Log likelihood by which a climb from a contained optimum may exceed the model's own [nat]: no more than a
+"""Log likelihood by which a search from a contained optimum may exceed the model's own [nat]: no more than a
 reliable log evidence may err."""
 _COPIES = 8
 """Ways in which the terms that a contained model lacks are added to its optimum [-]."""
@@ -62,9 +62,9 @@ class Check:
         if self.card.get("containment", {}).get("key") == self._key:
             return self.card
         with threadpool_limits(1):
-            told = self._checked()
-        self.contender.store(told)
-        return told
+            entries = self._checked()
+        self.contender.store(entries)
+        return entries
 
     @property
     def _key(self) -> str:
@@ -79,10 +79,10 @@ class Check:
             problem = problem.refined(int(self.card["refinement"]))
         own, rows, peaks, starts = float(self.card["max_log_likelihood"]), [], [], []
         for candidate, other in self.others:
-            found = reached(problem, candidate, other)
-            if found is None:
+            result = reached(problem, candidate, other)
+            if result is None:
                 continue
-            peak, draws = found
+            peak, draws = result
             missed = peak.log_likelihood > own + TOLERANCE
             rows.append(
                 {
@@ -96,33 +96,33 @@ class Check:
             if missed:
                 peaks.append(peak)
                 starts.append(np.concatenate([np.repeat(peak.values[None], _COPIES, axis=0), draws]))
-        told = {"key": self._key, "contains": rows, "sampled_again": bool(peaks), "met": True}
+        entries = {"key": self._key, "contains": rows, "sampled_again": bool(peaks), "met": True}
         if not peaks:
-            return dict(self.card) | {"containment": told}
+            return dict(self.card) | {"containment": entries}
         began = time.perf_counter()
         try:
-            made, limitations = self._again(np.concatenate(starts), peaks)
+            fitted, limitations = self._again(np.concatenate(starts), peaks)
         except (
             InputError
         ) as error:  # the mode cannot be sampled: what was sampled without it stands for nothing
-            told["met"] = False
+            entries["met"] = False
             refused = {"usable": False, "grade": "unusable", "grade_reason": str(error)}
-            return dict(self.card) | refused | {"containment": told}
-        told["met"] = not limitations
-        scored = self.contender.scored(made, also=peaks)
+            return dict(self.card) | refused | {"containment": entries}
+        entries["met"] = not limitations
+        scored = self.contender.scored(fitted, also=peaks)
         seconds = float(self.card["seconds"]) + time.perf_counter() - began
-        return scored | {"containment": told, "seconds": seconds}
+        return scored | {"containment": entries, "seconds": seconds}
 
     def _again(self, starts: Matrix, peaks: Sequence[Peak]) -> tuple[Fit, tuple[Limitation, ...]]:
         """The fit with these starts, limited where it still has not met a mode that matters."""
-        made = self.contender.fitted_from(starts)
+        fitted = self.contender.fitted_from(starts)
         best = max(peaks, key=lambda one: one.log_likelihood)
-        own = criteria(made).log_likelihood
+        own = criteria(fitted).log_likelihood
         if own + TOLERANCE >= best.log_likelihood:
-            return made, ()
-        share = share_of(made, starts)
+            return fitted, ()
+        share = share_of(fitted, starts)
         if share < _NEGLIGIBLE:
-            return made, ()
+            return fitted, ()
         limitations = (
             Limitation(
                 "unusable",
@@ -132,22 +132,22 @@ class Check:
                 "sample more steps, or narrow its priors to the mode that is meant",
             ),
         )
-        return replace(made, draws=made.draws.limited(limitations)), limitations
+        return replace(fitted, draws=fitted.draws.limited(limitations)), limitations
 
 
 def reached(problem: Problem, candidate: Candidate, card: Card) -> tuple[Peak, Matrix] | None:
-    """The maximum of the likelihood climbed from the optimum of a contained candidate, and that
+    """The maximum of the likelihood searched from the optimum of a contained candidate, and that
     candidate's draws set into the richer model; None where it is not contained or lies outside the prior."""
     source, target = problem_of(candidate.study).posterior, problem.posterior
     rng = np.random.default_rng([problem.study.seed, 10])
     optimum = np.repeat(np.array([card["starts"]["optimum"]], dtype=float), _COPIES, axis=0)
-    found = [
+    result = [
         lifted(values, source, target, rng)
         for values in (optimum, np.array(card["starts"]["draws"], dtype=float))
     ]
-    if found[0] is None or found[1] is None:
+    if result[0] is None or result[1] is None:
         return None
-    inside = [values[_inside(target, values)] for values in found if values is not None]
+    inside = [values[_inside(target, values)] for values in result if values is not None]
     if not len(inside[0]):
         return None
     landscape = Landscape(target)
@@ -166,14 +166,14 @@ def _inside(posterior: Posterior, values: Matrix) -> Flags:
     return inside
 
 
-def share_of(made: Fit, starts: Matrix) -> float:
+def share_of(fitted: Fit, starts: Matrix) -> float:
     """Share of the posterior on the modes of `starts`, by importance draws of the mixture around them [-]."""
-    posterior, seed = made.problem.posterior, made.run.plan.seed
+    posterior, seed = fitted.problem.posterior, fitted.run.plan.seed
     mixture = around(posterior, starts, seed)
     random = np.random.RandomState(np.random.MT19937(np.random.SeedSequence(seed, spawn_key=(5_000,))))
     drawn = mixture.draw(_PROBED, random)
     ratio = charted_density(posterior, Chart.of(posterior), drawn) - mixture.log_density(drawn)
     mass = float(logsumexp(ratio) - np.log(_PROBED))
-    if made.evidence is None or mass == -np.inf:
+    if fitted.evidence is None or mass == -np.inf:
         return float(mass > -np.inf)
-    return float(1 / (1 + np.exp(made.evidence.value - mass)))
+    return float(1 / (1 + np.exp(fitted.evidence.value - mass)))

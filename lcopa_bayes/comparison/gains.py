@@ -12,7 +12,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Index, Vector
 
 BLOCKS = 10
-"""Stretches of each axis of each predicted part whose sums tell the error of a total [-]."""
+"""Stretches of each axis of each predicted part whose sums give the error of a total [-]."""
 Card = Mapping[str, Any]
 
 TIE = log(3)

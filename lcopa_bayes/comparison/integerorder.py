@@ -15,7 +15,7 @@ from lcopa_bayes.results.fit import Fit
 DECISIVE = 3.0
 """Bayes factor from which it counts as more than worth a bare mention [-] (Jeffreys 1961, App. B)."""
 _WIDEST = 0.1
-"""Widest distance from the integer that counts as at it [-]: no record tells such an order from it."""
+"""Widest distance from the integer that counts as at it [-]: no record tells the two apart."""
 _SHARE = 0.25
 """Half width of the window in posterior standard deviations [-]: 3 of them off, the mean density in it is
 8 % above that at the integer."""
@@ -90,7 +90,7 @@ def savage_dickey(posterior: Vector, prior: Vector, estimate: Estimate) -> Integ
 
     ``B = p(order | y) / p(order)`` there (Dickey 1971, Ann. Math. Statist. 42). Densities are shares of
     draws within a window per width of the window: a quarter of a posterior standard deviation, 0.1 at most,
-    for the posterior, and 0.005 at least for the prior. Where fewer than ten effective draws stand in it, the
+    for the posterior, and 0.005 at least for the prior. Where fewer than ten effective draws lie in it, the
     posterior density is that of a normal distribution of the draws' mean and standard deviation: good
     enough to say that the integer lies far out, and its error grows with the distance as that of both
     moments does. `prior` draws are independent; those of the posterior are worth the effective sample size

@@ -22,14 +22,14 @@ Card = Mapping[str, Any]
 
 
 def judged(cards: Sequence[Card], study: Study) -> dict[str, Any]:
-    """What `compare` tells, as plain values.
+    """The result of `compare` as plain values.
 
     Unusable candidates keep their card and the reason, but are ranked nowhere.
     """
     rows = [dict(card) for card in cards]
     _evidences(rows, study.seed)
     _predictions(rows)
-    found = decided(rows)
+    result = decided(rows)
     fractional = [row for row in rows if not row["integer"]]
     return plain(
         {
@@ -38,7 +38,7 @@ def judged(cards: Sequence[Card], study: Study) -> dict[str, Any]:
             "seed": study.seed,
             "fit": [record.name for record in study.fit],
             "held_out": [record.name for record in study.held_out],
-            **found,
+            **result,
             "order_is_integer": [
                 {"model": row["name"]} | dict(one) for row in fractional for one in row["order_is_integer"]
             ],

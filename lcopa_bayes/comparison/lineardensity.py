@@ -2,7 +2,7 @@
 
 Given orders, times, delays and the noise, a record is linear in gains and levels: what is known of them from
 other records is a normal law, and every sample of the predicted record sharpens it before the next is
-predicted (recursive least squares). So a gain that nothing but the predicted record tells costs a few nats,
+predicted (recursive least squares). So a gain that only the predicted record determines costs a few nats,
 as many as its prior is wide, and no draw of it has to come near.
 """
 

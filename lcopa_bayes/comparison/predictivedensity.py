@@ -1,4 +1,4 @@
-"""Expected log predictive density of what was left out, and the way by which it was computed."""
+"""Expected log predictive density of what was left out, and the method by which it was computed."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Predicted:
     @property
     def plausible(self) -> bool:
         """Whether the density is no larger than where the samples themselves were fitted; else the draws
-        do not stand for the posterior without them."""
+        do not represent the posterior without them."""
         if np.isnan(self.in_sample):
             return True
         excess = float(self.log_density.sum()) - self.in_sample
@@ -127,7 +127,7 @@ def predictions(fit: Fit, *, held_out_only: bool = False) -> tuple[Predicted, ..
         if k <= usable_k(len(values)) and effective(weights) >= FEWEST_EFFECTIVE:
             # gains and levels are drawn anew: those of the draws have seen what is to be predicted
             values = target.complete(posterior.coordinates(values), rng)
-            found = scored(values, weights, "importance weights", k=k, known=target)
+            result = scored(values, weights, "importance weights", k=k, known=target)
         else:
             seed = fit.run.plan.seed + 7_000 + len(out)
             moved = transferred(source, target, positions, seed, jump=False)
@@ -136,9 +136,9 @@ def predictions(fit: Fit, *, held_out_only: bool = False) -> tuple[Predicted, ..
             flat = moved.coordinates.reshape(-1, posterior.dimension)
             chosen = np.linspace(0, len(flat) - 1, min(_DRAWS, len(flat))).astype(int)
             values = target.complete(flat[chosen], rng)
-            found = scored(values, None, "refit", k=k, ess=moved.ess, rhat=moved.rhat, known=target)
+            result = scored(values, None, "refit", k=k, ess=moved.ess, rhat=moved.rhat, known=target)
         total = float(seen.log_density.sum())
-        out.append(replace(found, in_sample=total, in_sample_error=seen.error))
+        out.append(replace(result, in_sample=total, in_sample_error=seen.error))
     return tuple(out)
 
 

@@ -54,7 +54,7 @@ def widths(fit: Fit) -> tuple[Width, ...]:
     widened upwards alone.
 
     ``Z' / Z = E[p'(theta) / p(theta)]`` over the draws where the new support lies inside the old one and
-    the weights are usable; else walkers are carried to the new posterior and bridged anew (`evidence`).
+    the weights are usable; else walkers are moved to the new posterior and bridged anew (`evidence`).
     Empty when the fit has no evidence.
     """
     if fit.evidence is None:
@@ -103,17 +103,17 @@ def _width(fit: Fit, factor: float) -> Width:
 def _refit(
     posterior: Posterior, target: Posterior, fit: Fit, factor: float, k_hat: float, names: tuple[str, ...]
 ) -> Width:
-    """From walkers carried over: all draws that the new priors allow take part."""
+    """From walkers moved to the new posterior: all draws that the new priors allow take part."""
     coordinates = fit.run.kept()[0]
     shape = coordinates.shape
     allowed = np.isfinite(target.log_density(coordinates[:, :, -1].reshape(-1, shape[-1])))
     if not allowed.reshape(shape[:2]).any(axis=1).all():
         return Width(factor, None, None, "undefined", 0.0, k_hat, names)
     seed = fit.run.plan.seed + round(9_000 * factor)
-    found = transferred(posterior, target, coordinates[:, :, -1], seed, jump=True)
-    again = evidence(target, found.coordinates, found.ess, seed)
+    result = transferred(posterior, target, coordinates[:, :, -1], seed, jump=True)
+    again = evidence(target, result.coordinates, result.ess, seed)
     assert again is not None
-    return Width(factor, again.value, again.sd, "refit", found.ess, k_hat, names)
+    return Width(factor, again.value, again.sd, "refit", result.ess, k_hat, names)
 
 
 def _contains(old: Parameter, new: Parameter) -> bool:
@@ -124,19 +124,19 @@ def _scaled(row: Parameter, factor: float) -> Parameter:
     """The parameter with a prior `factor` times as wide; itself where its prior stays."""
     if row.prior is None or row.kind not in _WIDENED:
         return row
-    told = dict(row.prior.parameters)
+    values = dict(row.prior.parameters)
     if row.prior.dist == "loguniform":
-        ends, extra = (log(told["a"]), log(told["b"])), (factor - 1) * log(told["b"] / told["a"])
+        ends, extra = (log(values["a"]), log(values["b"])), (factor - 1) * log(values["b"] / values["a"])
         # the lower end of a time is what sampling resolves: below it the model is not computed well
         low, high = (0.0, extra) if factor > 1 and row.kind == "time" else (-0.5 * extra, 0.5 * extra)
-        told |= {"a": exp(ends[0] + low), "b": exp(ends[1] + high)}
-    elif row.prior.dist == "uniform" and row.kind == "delay" and told.get("loc", 0.0) == 0.0:
-        told["scale"] = told.get("scale", 1.0) * factor  # a delay is counted from zero
+        values |= {"a": exp(ends[0] + low), "b": exp(ends[1] + high)}
+    elif row.prior.dist == "uniform" and row.kind == "delay" and values.get("loc", 0.0) == 0.0:
+        values["scale"] = values.get("scale", 1.0) * factor  # a delay is counted from zero
     elif row.prior.dist == "uniform":
-        width = told.get("scale", 1.0)
-        told |= {"loc": told.get("loc", 0.0) + 0.5 * width * (1 - factor), "scale": width * factor}
+        width = values.get("scale", 1.0)
+        values |= {"loc": values.get("loc", 0.0) + 0.5 * width * (1 - factor), "scale": width * factor}
     elif row.prior.dist == "norm":
-        told["scale"] = told.get("scale", 1.0) * factor
+        values["scale"] = values.get("scale", 1.0) * factor
     else:
         return row
-    return replace(row, prior=Prior(row.prior.dist, told))
+    return replace(row, prior=Prior(row.prior.dist, values))

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 
 
 class InputError(ValueError):
-    """Input that cannot be used; carries every problem found, one sentence each.
+    """Input that cannot be used; with every problem, one sentence each.
 
     The command line prints the problems and exits with code 2.
     """

@@ -37,7 +37,7 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     Raises InputError with file, reason and remedy when the system refuses (disk full, no permission,
     file too large); what else `write` raises passes through. No temporary file is left either way.
     """
-    with told_as(path):
+    with writing(path):
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
         os.close(handle)
         beside = Path(name)
@@ -67,7 +67,7 @@ def save_json(values: Mapping[str, Any], path: Path) -> None:
 
 
 @contextmanager
-def told_as(path: Path) -> Iterator[None]:
+def writing(path: Path) -> Iterator[None]:
     """Within it, what the system refuses becomes an InputError about `path`."""
     try:
         yield

@@ -42,7 +42,7 @@ class Workers(ABC, Generic[S]):
         inputs: Sequence[T],
         failed: Callable[[T, BaseException], R] | None = None,
     ) -> Iterator[R]:
-        """Results in the order in which they are finished. Where a task could not be carried out, `failed`
+        """Results in the order in which they are finished. Where a task could not be done, `failed`
         gives its result; without it the error is raised."""
 
     def map(self, function: Callable[[T], R], inputs: Sequence[T]) -> Iterator[R]:

@@ -95,7 +95,7 @@ def _rules(kind: type[Any]) -> dict[str, Rule]:
 class Ruled:
     """A frozen dataclass that raises InputError with every value that breaks the rule of its field.
 
-    The rule stands in the annotation, ``Annotated[int, whole(1)]``; a literal type is its own. None obeys any
+    The rule is in the annotation, ``Annotated[int, whole(1)]``; a literal type is its own. None obeys any
     rule where it is the default.
     """
 
@@ -119,10 +119,10 @@ class Ruled:
         return rebuilt(self)
 
 
-def rebuilt(made: Any) -> tuple[object, ...]:
+def rebuilt(result: Any) -> tuple[object, ...]:
     """For ``__reduce__``: make anew from the fields; a mapping proxy cannot go to another process."""
 
     def plain(value: object) -> object:
         return {k: plain(v) for k, v in value.items()} if isinstance(value, Mapping) else value
 
-    return type(made), tuple(plain(getattr(made, f.name)) for f in dataclasses.fields(made))
+    return type(result), tuple(plain(getattr(result, f.name)) for f in dataclasses.fields(result))

@@ -18,7 +18,7 @@ SUFFIXES = (".csv", ".parquet")
 FORM = "time_<unit>, drive_<axis>_<unit> or response_<axis>_<unit>"
 """How columns are named."""
 _MOST = 5
-"""Problems told per column, so that one shifted column does not bury the others."""
+"""Problems named per column, so that one shifted column does not bury the others."""
 
 
 @final
@@ -33,12 +33,12 @@ class CellTable:
     problems: list[str]
 
     def place(self, column: int, row: int | None = None) -> str:
-        """Where a column or one of its cells stands, in the words of the user's file."""
+        """Place of a column or of one of its cells in the user's file."""
         count = "line" if self.path.suffix.lower() == ".csv" else "row"
         middle = "" if row is None else f", {count} {self.rows[row]}"
         return f"{self.path}{middle}, column {self.names[column]!r}"
 
-    def tell(self, problems: Sequence[str], place: str) -> None:
+    def add(self, problems: Sequence[str], place: str) -> None:
         """Add the first problems of a kind and the number of the others."""
         self.problems.extend(problems[:_MOST])
         if len(problems) > _MOST:
@@ -72,7 +72,7 @@ def _csv_cells(path: Path) -> CellTable:
     if len(names) == 1 and any(separator in names[0] for separator in ";\t"):
         refuse(path, "line 1: the columns are not separated by commas; separate them by commas")
     table = CellTable(path, names, rows, [*zip(*cells, strict=True)] if cells else [()] * len(names), [])
-    table.tell(ragged, str(path))
+    table.add(ragged, str(path))
     return table
 
 

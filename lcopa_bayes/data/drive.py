@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from lcopa_bayes.core.arrays import Matrix, Vector, frozen
 from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.core.rules import rebuilt
 from lcopa_bayes.core.units import TIME_UNITS, in_time_unit
 from lcopa_bayes.data.record import Axis, Columns, Driven
 
@@ -72,7 +73,7 @@ class AxisDrive:
 
     @cached_property
     def _pieces(self) -> tuple[Vector, Vector, Vector]:
-        """Start of, value on, and integral up to each piece; a resting piece stands in front."""
+        """Start of, value on, and integral up to each piece; a resting piece comes first."""
         integral = np.cumsum(self.values[:-1] * np.diff(self.times))
         return (
             np.concatenate(([0.0], self.times)),
@@ -140,38 +141,32 @@ class Drive:
     """Whether axes of the study that are not named here stay at rest; otherwise all must be named."""
 
     def __post_init__(self) -> None:
-        problems = [f"drive {self.name!r}: the axis {a!r} is given twice" for a in _repeated(self.axes)]
+        problems = [f"the axis {a!r} is given twice" for a in sorted({*self.axes}) if self.axes.count(a) > 1]
         try:
             object.__setattr__(self, "time", frozen(self.time, name="time"))
             values = frozen(self.values, name="values", ndim=2, missing=self.partial)
             object.__setattr__(self, "values", values)
         except ValueError as error:
-            raise InputError([*problems, f"drive {self.name!r}: {error}"]) from None
+            raise _refused(self.name, [*problems, str(error)]) from None
         if self.values.shape != (self.time.size, len(self.axes)) or not self.values.size:
             problems.append(
-                f"drive {self.name!r}: needs one or more times and one column per axis; got values of shape "
-                f"{self.values.shape} for {self.time.size} times and {len(self.axes)} axes"
+                f"needs one or more times and one column per axis; got values of shape {self.values.shape} "
+                f"for {self.time.size} times and {len(self.axes)} axes"
             )
-        late = np.flatnonzero(np.diff(self.time) <= 0)
-        if late.size:
-            problems.append(
-                f"drive {self.name!r}: times must increase; {self.time[late[0] + 1]:.6g} comes after "
-                f"{self.time[late[0]]:.6g}"
-            )
+        for k in np.flatnonzero(np.diff(self.time) <= 0)[:1]:
+            problems.append(f"times must increase; {self.time[k + 1]:.6g} comes after {self.time[k]:.6g}")
         if self.time_unit is not None and self.time_unit not in TIME_UNITS:
             known = nearest(str(self.time_unit), TIME_UNITS)
-            problems.append(f"drive {self.name!r}: unknown time unit {self.time_unit!r}{known}")
+            problems.append(f"unknown time unit {self.time_unit!r}{known}")
         if self.until is not None and self.time.size and not self.until >= self.time[-1]:
-            problems.append(
-                f"drive {self.name!r}: `until` must not be before the last row; got {self.until!r}"
-            )
+            problems.append(f"`until` must not be before the last row; got {self.until!r}")
         if not self.rest and not problems:
             object.__setattr__(self, "rest", tuple(float(value) for value in self.values[0]))
         wrong = [value for value in self.rest if value is not None and not np.isfinite(value)]
         if wrong or len(self.rest) != len(self.axes) or len(self.units) != len(self.axes):
-            problems.append(f"drive {self.name!r}: give one finite resting value and one unit per axis")
+            problems.append("give one finite resting value and one unit per axis")
         if problems:
-            raise InputError(problems)
+            raise _refused(self.name, problems)
 
     @classmethod
     def steps(
@@ -195,35 +190,26 @@ class Drive:
         not given.
         """
         given = {**(changes or {}), **axes}
-        problems = [f"drive {name!r}: axis {a!r} has no (time, value)" for a, c in given.items() if not c]
-        problems += _unknown("rest", rest, given, name) + _unknown("units", units, given, name)
+        problems = [f"axis {axis!r} has no (time, value)" for axis, change in given.items() if not change]
+        problems += _unknown("rest", rest, given) + _unknown("units", units, given)
         if not given:
-            problems.append(f"drive {name!r}: names no axis; give one, as in Drive.steps(x=[(0, 1.57)])")
+            problems.append("names no axis; give one, as in Drive.steps(x=[(0, 1.57)])")
         try:
             pairs = {axis: np.array(list(change), dtype=float) for axis, change in given.items()}
         except (TypeError, ValueError):
-            pairs, problems = {}, [*problems, f"drive {name!r}: steps are pairs of numbers (time, value)"]
+            pairs, problems = {}, [*problems, "steps are pairs of numbers (time, value)"]
         for axis, pair in pairs.items():
             if pair.size and (pair.ndim != 2 or pair.shape[1] != 2 or not np.isfinite(pair).all()):
-                problems.append(f"drive {name!r}: axis {axis!r} needs pairs of finite numbers (time, value)")
+                problems.append(f"axis {axis!r} needs pairs of finite numbers (time, value)")
             elif pair.size and (np.diff(pair[:, 0]) <= 0).any():
-                problems.append(f"drive {name!r}: the times of axis {axis!r} must increase")
+                problems.append(f"the times of axis {axis!r} must increase")
         if problems:
-            raise InputError(problems)
+            raise _refused(name, problems)
         times = np.unique(np.concatenate([pair[:, 0] for pair in pairs.values()]))
         resting = tuple((rest or {}).get(axis) for axis in pairs)
-        columns = [_held(pair, times) for pair in pairs.values()]
-        return cls(
-            name,
-            times,
-            np.column_stack(columns),
-            tuple(pairs),
-            _units(units, tuple(pairs)),
-            time_unit,
-            resting,
-            until,
-            partial=True,
-        )
+        values = np.column_stack([_held(pair, times) for pair in pairs.values()])
+        names = tuple(pairs)
+        return cls(name, times, values, names, _units(units, names), time_unit, resting, until, partial=True)
 
     @classmethod
     def of_arrays(
@@ -242,12 +228,12 @@ class Drive:
         The plant rests under the first row; all axes of the study must be given. InputError as for the class.
         """
         given = {**(columns or {}), **axes}
-        if problems := _unknown("units", units, given, name):
-            raise InputError(problems)
+        if problems := _unknown("units", units, given):
+            raise _refused(name, problems)
         try:
             values = np.column_stack([np.asarray(column, dtype=float) for column in given.values()])
         except ValueError as error:
-            raise InputError(f"drive {name!r}: one number per time and axis is needed ({error})") from None
+            raise _refused(name, [f"one number per time and axis is needed ({error})"]) from None
         names = tuple(given)
         at = np.asarray(time, dtype=float)
         last = float(at[-1]) if at.ndim == 1 and at.size else None
@@ -262,27 +248,26 @@ class Drive:
         """The drive with the axes of a study, in their order, and its time unit.
 
         Parameters: `rest` of each axis of the study [drive unit], taken where the drive states none; `period`
-        [time unit], how long before its first change the drive's row at rest stands. InputError for axes and
+        [time unit], how long before its first change its row at rest is put. InputError for axes and
         units that are not the study's.
         """
         known = {axis.name: axis for axis in axes}
         problems = [
-            f"drive {self.name!r}: the study has no drive axis {name!r}{nearest(name, known)}"
+            f"the study has no drive axis {name!r}{nearest(name, known)}"
             for name in self.axes
             if name not in known
         ]
         problems += [
-            f"drive {self.name!r}: axis {name!r} is in {unit}, in the study it is in {known[name].unit}; "
-            "convert its values"
+            f"axis {name!r} is in {unit}, in the study it is in {known[name].unit}; convert its values"
             for name, unit in zip(self.axes, self.units, strict=True)
             if name in known and unit not in (None, known[name].unit)
         ]
         absent = [axis for axis in axes if axis.name not in self.axes]
         if absent and not self.partial:
             which = ", ".join(f"{axis.name!r} [{axis.unit}]" for axis in absent)
-            problems.append(f"drive {self.name!r}: the study's drive axis {which} is absent; add a column")
+            problems.append(f"the study's drive axis {which} is absent; add a column")
         if problems:
-            raise InputError(problems)
+            raise _refused(self.name, problems)
         given = self.time_unit or time_unit
         time = in_time_unit(self.time, given, time_unit)
         until = None if self.until is None else float(in_time_unit(self.until, given, time_unit))
@@ -315,10 +300,12 @@ class Drive:
         span = f"{self.time[0]:.6g} to {self.time[-1]:.6g} {self.time_unit or ''}".rstrip()
         return f"Drive({self.name!r}, {axes}, {self.time.size} rows from {span})"
 
-    def __reduce__(self) -> tuple[object, ...]:
-        """Rebuild rather than restore, so that a copy in another process is locked too."""
-        arrays = (self.name, self.time, self.values, self.axes, self.units)
-        return Drive, (*arrays, self.time_unit, self.rest, self.until, self.partial)
+    __reduce__ = rebuilt  # a copy in another process is locked too
+
+
+def _refused(name: str, problems: Sequence[str]) -> InputError:
+    """The error that names the drive in each of its problems."""
+    return InputError([f"drive {name!r}: {problem}" for problem in problems])
 
 
 def drive_of(columns: Columns) -> Drive:
@@ -335,17 +322,12 @@ def _held(pair: Matrix, times: Vector) -> Vector:
     return np.asarray(np.append(np.nan, pair[:, 1])[place])
 
 
-def _repeated(words: Sequence[str]) -> list[str]:
-    return sorted({word for word in words if words.count(word) > 1})
-
-
-def _unknown(key: str, given: object, axes: Mapping[str, object], name: str) -> list[str]:
+def _unknown(key: str, given: object, axes: Mapping[str, object]) -> list[str]:
     """Problems of a mapping that names axes the drive does not have."""
-    if not isinstance(given, Mapping):
-        return []
+    named = given if isinstance(given, Mapping) else ()
     return [
-        f"drive {name!r}: `{key}` names the axis {axis!r}, which is not given{nearest(axis, axes)}"
-        for axis in given
+        f"`{key}` names the axis {axis!r}, which is not given{nearest(axis, axes)}"
+        for axis in named
         if axis not in axes
     ]
 

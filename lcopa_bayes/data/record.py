@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from lcopa_bayes.core.arrays import Matrix, Vector, frozen
 from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.core.files import write_whole
+from lcopa_bayes.core.rules import rebuilt
 from lcopa_bayes.core.units import TIME_UNITS, in_time_unit
 from lcopa_bayes.data.cells import FORM, SUFFIXES, CellTable, frame_cells, read_cells, refuse
 
@@ -104,15 +105,12 @@ class Record:
         span = f"{self.time[0]:.6g} to {self.time[-1]:.6g} {self.time_unit}"
         return f"Record({self.name!r}, {axes}, {self.time.size} rows from {span})"
 
-    def __reduce__(self) -> tuple[object, ...]:
-        """Rebuild rather than restore, so that a copy in another process is locked too."""
-        arrays = (self.time, self.drive, self.response)
-        return Record, (self.name, *arrays, self.drive_axes, self.response_axes, self.time_unit)
+    __reduce__ = rebuilt  # a copy in another process is locked too
 
 
 def _roles(table: CellTable, needed: Sequence[str] = _ROLES) -> tuple[str, dict[str, dict[int, Axis]]]:
     """Time unit, and the axis of every usable column by role; what is wrong joins `table.problems`."""
-    found: dict[str, dict[int, Axis]] = {role: {} for role in _ROLES}
+    result: dict[str, dict[int, Axis]] = {role: {} for role in _ROLES}
     for index, name in enumerate(table.names):
         role, _, rest = name.partition("_")
         axis, _, unit = ("time", "", rest) if role == "time" else rest.rpartition("_")
@@ -122,16 +120,16 @@ def _roles(table: CellTable, needed: Sequence[str] = _ROLES) -> tuple[str, dict[
             problem = f"the time unit {unit!r} is not known{nearest(unit, TIME_UNITS)}"
         elif not (axis.strip() and unit.strip() and name.isprintable()):
             problem = f"expected {role}_<axis>_<unit>, as in {role}_x_rad"
-        elif any(axis == other.name for other in found[role].values()):
+        elif any(axis == other.name for other in result[role].values()):
             problem = f"the {role} of axis {axis!r}, or the time, has a column already; keep one"
         else:
-            found[role][index] = Axis(axis.strip(), unit.strip())
+            result[role][index] = Axis(axis.strip(), unit.strip())
             continue
         table.problems.append(f"{table.place(index)} (column {index + 1} of {len(table.names)}): {problem}")
     for role in needed:
         if not any(name.partition("_")[0] == role for name in table.names):
             table.problems.append(f"{table.path}: has no {role} column; columns are {FORM}")
-    return next((axis.unit for axis in found["time"].values()), "s"), found
+    return next((axis.unit for axis in result["time"].values()), "s"), result
 
 
 def _numbers(table: CellTable, column: int, *, missing: bool) -> Vector:
@@ -149,7 +147,7 @@ def _numbers(table: CellTable, column: int, *, missing: bool) -> Vector:
             what = f"{text!r} is not a finite number" if text else "the cell is empty"
             needed = "a number, or nothing for a missing sample" if missing else "a number in every row"
             bad.append(f"{table.place(column, row)}: {what}; expected {needed}")
-    table.tell(bad, table.place(column))
+    table.add(bad, table.place(column))
     return out
 
 
@@ -197,8 +195,8 @@ def _columns(table: CellTable, time_unit: str | None, *, responses: bool) -> Col
     for column, time in zip(axes["time"], values["time"], strict=True):
         late = [int(i) for i in np.flatnonzero(time[1:] <= time[:-1])]
         rule = "does not come after the time of the row before,"
-        told = [f"{table.place(column, i + 1)}: {time[i + 1]} {rule} {time[i]}; sort the rows" for i in late]
-        table.tell(told, table.place(column))
+        lines = [f"{table.place(column, i + 1)}: {time[i + 1]} {rule} {time[i]}; sort the rows" for i in late]
+        table.add(lines, table.place(column))
     if n_rows < 2:
         table.problems.append(f"{table.path}: has {n_rows} row(s) of data; a record needs two or more")
     if responses and not table.problems and np.isnan(values["response"]).all():
@@ -262,7 +260,7 @@ def records_of(
 
 
 def several(given: RecordLike | Iterable[RecordLike]) -> list[RecordLike]:
-    """What stands for records as a list, also where it is one."""
+    """One or several records, always as a list."""
     return [given] if isinstance(given, Record | Path | str | pd.DataFrame | Mapping) else list(given)
 
 

@@ -32,7 +32,7 @@ _SHARE = 0.1
 _UNMOVED = 0.01
 """Deviation of a drive from its first row that counts as no change, over its range in the records [-]."""
 _FEWEST = 8
-"""Fewer samples cannot tell a relaxation from noise [-]."""
+"""Fewer samples cannot distinguish a relaxation from noise [-]."""
 _MEANS = 24
 """Means of neighbours that a long stretch is reduced to, at most twice as many [-]."""
 _RHO = 1.0 - np.concatenate(([1.0], np.geomspace(0.7, 1e-4, 20)))

@@ -43,7 +43,7 @@ Method: TypeAlias = Literal["auto", "ensembles"]
 _IMPROPER = ("flat", "improper", "jeffreys")
 """Words for a prior that is no distribution."""
 STAGES = ("fit", "rival")
-"""What `run` may be told to do."""
+"""Stages that `run` knows."""
 _CANDIDATES = texts('a list of candidates, as in ["fractional-1", "second-order"]')
 _EFFECTS = texts('a list of names, as in ["cubic_stiffness"]')
 _FILES = texts('a list of file names, as in ["a.csv", "b.csv"]')
@@ -227,7 +227,7 @@ class PriorSettings(Ruled):
 
     @property
     def improper(self) -> bool:
-        """Whether this is said to be no distribution."""
+        """Whether this is no distribution."""
         return self.dist in _IMPROPER
 
     def frozen(self) -> rv_frozen:

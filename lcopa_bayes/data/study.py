@@ -36,7 +36,7 @@ class Study:
     ``Study(fit=["on.csv", frame], held_out=[record], terms=3, priors={"delay": 5.0})`` is the study that a
     study file with these keys describes: records are `Record`, paths, frames or arrays (`records_of`), tables
     of settings are their keys and values. Raises InputError with every problem unless the records have
-    distinct names, one time unit and the same axes, those to fit can tell something about the dynamics (a
+    distinct names, one time unit and the same axes, those to fit hold information on the dynamics (a
     drive changes before a sample), and every setting is known and allowed.
     """
 

@@ -33,7 +33,7 @@ class Candidate:
 
 
 Shape = Callable[[int, np.random.Generator], Vector]
-"""Share of the way from the near end (0) to the far end (1) of a range, on so many refreshes, [-]."""
+"""Position from the near end (0) to the far end (1) of a range, on so many refreshes, [-]."""
 
 
 def candidates(limits: Limits, time: float, rng: np.random.Generator, *, unit: str) -> tuple[Candidate, ...]:
@@ -44,15 +44,15 @@ def candidates(limits: Limits, time: float, rng: np.random.Generator, *, unit: s
     periodic ones are shifted), and two of them one axis alone.
     """
     ticks, axes = max(2, round(time / limits.refresh)), limits.rest.size
-    made: list[Candidate] = []
+    drives: list[Candidate] = []
     for name, family, words, shape in _shapes(ticks, limits.refresh, unit):
         shares = _stacked(name, shape, ticks, axes, rng)
-        made.append(Candidate(name, family, words, _command(limits, shares)))
+        drives.append(Candidate(name, family, words, _command(limits, shares)))
     for axis in range(axes if axes > 1 else 0):
         for name, shape in ((PLAIN, _step), ("binary, every refresh", _binary(1))):
             alone = np.zeros((ticks, axes))
             alone[:, axis] = shape(ticks, rng)
-            made.append(
+            drives.append(
                 Candidate(
                     f"{name}, axis {axis + 1} alone",
                     "one axis",
@@ -60,7 +60,7 @@ def candidates(limits: Limits, time: float, rng: np.random.Generator, *, unit: s
                     _command(limits, alone),
                 )
             )
-    return tuple(made)
+    return tuple(drives)
 
 
 def _stacked(name: str, shape: Shape, ticks: int, axes: int, rng: np.random.Generator) -> Matrix:
@@ -89,8 +89,8 @@ def _shapes(ticks: int, refresh: float, unit: str) -> Iterator[tuple[str, str, s
     yield PLAIN, "step", f"on at 0 and held for {whole}", _step
     holds = sorted({max(1, ticks // k) for k in (2, 8, 32, 128)} | {1} & {ticks // 2})
     for hold in reversed(holds):
-        told = f"{hold * refresh:.4g} {unit}"
-        yield f"on/off, {told}", "on/off", f"on for {told}, off for as long, repeated", _square(hold)
+        values = f"{hold * refresh:.4g} {unit}"
+        yield f"on/off, {values}", "on/off", f"on for {values}, off for as long, repeated", _square(hold)
     if ticks >= 2 * _LEVELS:
         words = f"steps to 1/{_LEVELS}, 2/{_LEVELS}, ... of the range, each followed by as long a rest"
         yield "amplitude series", "amplitude series", words, _series
@@ -98,9 +98,9 @@ def _shapes(ticks: int, refresh: float, unit: str) -> Iterator[tuple[str, str, s
         yield "staircase", "staircase", words, _staircase
     for hold in (1, 4, 16):
         if ticks >= 4 * hold:
-            told = f"{hold * refresh:.4g} {unit}"
-            name = "binary, every refresh" if hold == 1 else f"binary, {told}"
-            yield name, "pseudo-random binary", f"low or high, drawn anew every {told}", _binary(hold)
+            values = f"{hold * refresh:.4g} {unit}"
+            name = "binary, every refresh" if hold == 1 else f"binary, {values}"
+            yield name, "pseudo-random binary", f"low or high, drawn anew every {values}", _binary(hold)
     if ticks >= 16:
         words = f"low and high by turns, dwells log-uniform from {refresh:.4g} {unit} to a quarter of {whole}"
         yield "telegraph", "random telegraph", words, _telegraph

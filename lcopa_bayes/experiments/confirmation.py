@@ -78,9 +78,9 @@ class Confirmation:
 
     @property
     def sentence(self) -> str:
-        """What the simulation says."""
+        """Result of the simulation."""
         count = self.winner.errors.shape[0]
-        told = (
+        values = (
             f"{self.where}, {count} simulated records and fits each: the worst standard deviation achieved "
             f"is {self.factor:.3g} times ({100 * LEVEL:g} %: {self.lower:.3g} to {self.upper:.3g}) smaller "
             "than after the plain step"
@@ -93,7 +93,7 @@ class Confirmation:
             f"; {held} of {count} fits after the step lean on the end of a prior, so that its scatter is "
             "smaller than the data alone would leave it"
         ) * (held > 0)
-        return f"{'confirmed' if self.confirmed else 'not confirmed'}: {told} ({promised}){bound}"
+        return f"{'confirmed' if self.confirmed else 'not confirmed'}: {values} ({promised}){bound}"
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; infinite ones are None."""
@@ -141,7 +141,7 @@ def _row(achieved: Achieved, k: int) -> dict[str, Any]:
     }
 
 
-def confirm(made: Design, *, replicas: int = REPLICAS, jobs: int = 1) -> tuple[Confirmation, ...]:
+def confirm(design: Design, *, replicas: int = REPLICAS, jobs: int = 1) -> tuple[Confirmation, ...]:
     """Simulate and fit records of the winner and of the plain step; nothing when these are the same drive.
 
     Truths are two draws of the posterior: the one with the middle factor among those where the winner's
@@ -149,9 +149,9 @@ def confirm(made: Design, *, replicas: int = REPLICAS, jobs: int = 1) -> tuple[C
     output-error least squares within the support of the study's priors, started at the truth. One record
     per fit, whatever the `repeats` of the design.
     """
-    if not made.determined.any() or made.winner is made.step:
+    if not design.determined.any() or design.winner is design.step:
         return ()
-    worst, factors = made.winner.worst(made.determined), made.factors(made.winner)
+    worst, factors = design.winner.worst(design.determined), design.factors(design.winner)
     finite = np.flatnonzero(np.isfinite(worst))
     small = finite[worst[finite] <= LINEAR]
     places: dict[int, str] = {}
@@ -160,13 +160,13 @@ def confirm(made: Design, *, replicas: int = REPLICAS, jobs: int = 1) -> tuple[C
         places[int(ranked[(small.size - 1) // 2])] = "where linear bounds can be believed"
     ranked = finite[np.argsort(worst[finite])]
     places.setdefault(int(ranked[(finite.size - 1) // 2]), "at the draw of median precision")
-    return tuple(_confirmed(made, k, told, replicas, jobs) for k, told in places.items())
+    return tuple(_confirmed(design, k, values, replicas, jobs) for k, values in places.items())
 
 
-def confirmed(made: Design, *, jobs: int = 1, replicas: int = REPLICAS) -> dict[str, Any]:
+def confirmed(design: Design, *, jobs: int = 1, replicas: int = REPLICAS) -> dict[str, Any]:
     """`confirm` as plain values under the key `confirmed`: the verdict and factor of the first trial, where
     bounds can be believed if they can anywhere, and whether every trial agrees."""
-    trials = confirm(made, jobs=jobs, replicas=replicas)
+    trials = confirm(design, jobs=jobs, replicas=replicas)
     sentence = (
         "; ".join(one.sentence for one in trials) or "nothing to confirm: no drive beats the plain step"
     )
@@ -182,34 +182,34 @@ def confirmed(made: Design, *, jobs: int = 1, replicas: int = REPLICAS) -> dict[
     }
 
 
-def _confirmed(made: Design, chosen: int, where: str, replicas: int, jobs: int) -> Confirmation:
+def _confirmed(design: Design, chosen: int, where: str, replicas: int, jobs: int) -> Confirmation:
     """Both drives at one truth; a replica has the same noise whatever the number of processes."""
-    problem, period = made.fit.problem, made.limits.period
-    device = device_of(problem, made.draws[chosen])
+    problem, period = design.fit.problem, design.limits.period
+    device = device_of(problem, design.draws[chosen])
     camera = VirtualBench(camera=period, exposure=problem.study.exposure)
     tasks = []
-    for which, each in enumerate((made.winner, made.step)):
+    for which, each in enumerate((design.winner, design.step)):
         clean = truth(device, camera, each.candidate.command, duration=each.time, name="simulated")
         bench = Bench(problem, each.time, period)
         tasks += [
-            Trial(bench, clean, made.draws[chosen], made.names, (problem.study.seed, 9, chosen, which, k))
+            Trial(bench, clean, design.draws[chosen], design.names, (problem.study.seed, 9, chosen, which, k))
             for k in range(replicas)
         ]
-    found = list(_performed(tasks, min(jobs, replicas)))
+    result = list(_performed(tasks, min(jobs, replicas)))
     winner, step = (
         Achieved(
             promise.candidate.name,
             np.array([errors for errors, _ in part]),
-            np.sqrt(np.diagonal(promise.covariance[chosen])) * np.sqrt(made.repeats),
+            np.sqrt(np.diagonal(promise.covariance[chosen])) * np.sqrt(design.repeats),
             np.array([bound for _, bound in part]),
         )
-        for promise, part in ((made.winner, found[:replicas]), (made.step, found[replicas:]))
+        for promise, part in ((design.winner, result[:replicas]), (design.step, result[replicas:]))
     )
-    rng = np.random.default_rng([made.fit.study.seed, 10])
-    factor, low, high = _factor(winner.errors, step.errors, made.determined, rng)
-    columns = [made.fit.draws.table.names.index(name) for name in made.names]
-    at = made.draws[chosen, columns]
-    return Confirmation(where, made.names, made.determined, at, winner, step, factor, low, high)
+    rng = np.random.default_rng([design.fit.study.seed, 10])
+    factor, low, high = _factor(winner.errors, step.errors, design.determined, rng)
+    columns = [design.fit.draws.table.names.index(name) for name in design.names]
+    at = design.draws[chosen, columns]
+    return Confirmation(where, design.names, design.determined, at, winner, step, factor, low, high)
 
 
 def _performed(tasks: list[Trial], jobs: int) -> Iterator[tuple[Vector, Flags]]:
@@ -233,6 +233,6 @@ def _factor(
         worst(errors[rng.integers(0, errors.shape[0], (_RESAMPLED, errors.shape[0]))])
         for errors in (step, winner)
     ]
-    told = (drawn[0] > 0) & (drawn[1] > 0)  # a resample of one record, over and over, has no spread
-    low, high = np.quantile(drawn[0][told] / drawn[1][told], (0.5 - LEVEL / 2, 0.5 + LEVEL / 2))
+    values = (drawn[0] > 0) & (drawn[1] > 0)  # a resample of one record, over and over, has no spread
+    low, high = np.quantile(drawn[0][values] / drawn[1][values], (0.5 - LEVEL / 2, 0.5 + LEVEL / 2))
     return float(worst(step) / worst(winner)), float(low), float(high)

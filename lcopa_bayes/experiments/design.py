@@ -144,9 +144,9 @@ class Design:
         unit = self.fit.study.time_unit
         if not self.determined.any():
             return f"no drive tried determines any parameter within {self.time:g} {unit}"
-        told = f"{self.winner.candidate.name} for {self.time:g} {unit}"
+        entries = f"{self.winner.candidate.name} for {self.time:g} {unit}"
         if self.winner is self.step:
-            return f"{told}: no drive tried is better for the worst parameter than the plain step"
+            return f"{entries}: no drive tried is better for the worst parameter than the plain step"
         factor = self.factor.value
         gained = (
             f"{factor:.3g} times smaller than after the plain step of equal time"
@@ -157,7 +157,7 @@ class Design:
             f"; linear bounds can be believed at {100 * self.linear:.0f} % of the draws, elsewhere they say "
             "which drive is better but not how precise it will be"
         ) * (self.linear < 1)
-        return f"{told}: the worst relative standard deviation (mostly {self.worst}) is {gained}{few}"
+        return f"{entries}: the worst relative standard deviation (mostly {self.worst}) is {gained}{few}"
 
 
 def checked(
@@ -213,12 +213,12 @@ def design(
             raise InputError(f"no candidate drive lies inside the amplitude limit at {each:g}")
         bench = Bench(problem, each, limits.period)
         tried.append(tuple(promises(bench, possible, averaged, repeats=repeats, prior=known)))
-    found = _symmetries(first, limits, np.concatenate([averaged, believed[:_PRIOR_POINTS]]))
-    return Design(fit, limits, repeats, chosen, averaged, first.names, tuple(tried), found)
+    result = _symmetries(first, limits, np.concatenate([averaged, believed[:_PRIOR_POINTS]]))
+    return Design(fit, limits, repeats, chosen, averaged, first.names, tuple(tried), result)
 
 
 def _symmetries(bench: Bench, limits: Limits, points: Matrix) -> Structure:
-    """What no drive can tell apart, from all candidates of the shortest bench time together."""
+    """What no drive can distinguish, from all candidates of the shortest bench time together."""
     unit = bench.problem.study.time_unit
     drives = candidates(limits, bench.time, np.random.default_rng(0), unit=unit)
     slopes, values = [], []

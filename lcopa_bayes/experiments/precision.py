@@ -85,17 +85,17 @@ def promises(
     """What each drive promises at draws (draws, rows) of table values.
 
     `prior`, (parameters,): standard deviations that count as information beforehand, in the coordinates of
-    `Bench.slopes`; None: the measurement stands alone.
+    `Bench.slopes`; None: the measurement alone.
     """
-    found: list[list[Matrix]] = [[] for _ in drives]
+    result: list[list[Matrix]] = [[] for _ in drives]
     for values in draws:
         elements, sizes = bench.elements(values), bench.sizes(values)
         for place, drive in enumerate(drives):
             gram = repeats * bench.gram(values, elements, drive.command)
             if prior is not None:
                 gram[np.diag_indices_from(gram)] += prior**-2.0
-            found[place].append(cramer_rao(gram * np.outer(sizes, sizes)))
-    return [Promise(drive, bench.time, np.array(each)) for drive, each in zip(drives, found, strict=True)]
+            result[place].append(cramer_rao(gram * np.outer(sizes, sizes)))
+    return [Promise(drive, bench.time, np.array(each)) for drive, each in zip(drives, result, strict=True)]
 
 
 def cramer_rao(gram: Matrix) -> Matrix:

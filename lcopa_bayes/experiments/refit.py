@@ -45,8 +45,8 @@ class Trial:
         """Relative errors, and which estimates lean on a bound."""
         problem, values, rng = self.bench.problem, self.truth, np.random.default_rng(self.seed)
         again = refit(problem, _noisy(problem, self.clean, values, rng), self.bench)
-        found = _solve(again, _moved(problem, again, values))
-        return _errors(problem, again, found, values, self.names), _leaning(again, found, self.names)
+        result = _solve(again, _moved(problem, again, values))
+        return _errors(problem, again, result, values, self.names), _leaning(again, result, self.names)
 
 
 @final
@@ -151,7 +151,7 @@ def _solve(problem: Problem, start: Vector) -> Vector:
     least = LeastSquares(problem.posterior)
     low, high = least.bounds
     near = np.clip(least.coordinates(start), low, high)  # a start only
-    found = least_squares(
+    result = least_squares(
         *least.functions(start, near),
         bounds=(low, high),
         x_scale="jac",
@@ -160,16 +160,16 @@ def _solve(problem: Problem, start: Vector) -> Vector:
         gtol=_CONVERGED,
         max_nfev=_EVALUATIONS,
     )
-    return np.asarray(problem.posterior.table.canonical(least.values(found.x, start)[None])[0])
+    return np.asarray(problem.posterior.table.canonical(least.values(result.x, start)[None])[0])
 
 
 def _errors(
-    before: Problem, problem: Problem, found: Vector, values: Vector, names: tuple[str, ...]
+    before: Problem, problem: Problem, result: Vector, values: Vector, names: tuple[str, ...]
 ) -> Vector:
     table, old = problem.posterior.table, before.posterior.table
     out = []
     for name in names:
-        estimate, true = found[table.names.index(name)], values[old.names.index(name)]
+        estimate, true = result[table.names.index(name)], values[old.names.index(name)]
         if old.rows[old.names.index(name)].kind == "time":
             out.append(np.log(estimate / true))
         else:
@@ -177,11 +177,11 @@ def _errors(
     return np.array(out)
 
 
-def _leaning(problem: Problem, found: Vector, names: tuple[str, ...]) -> Flags:
-    """Whether each parameter stands at an end of its search, (parameters,)."""
+def _leaning(problem: Problem, result: Vector, names: tuple[str, ...]) -> Flags:
+    """Whether each parameter is at an end of its search, (parameters,)."""
     least, table = LeastSquares(problem.posterior), problem.posterior.table
     low, high = least.bounds
-    at = least.coordinates(found)
+    at = least.coordinates(result)
     close = np.minimum(at - low, high - at) < _AT_BOUND
     leaning = {table.names[k]: bool(one) for k, one in zip(least.columns, close, strict=True)}
     return np.array([leaning[name] for name in names])

@@ -15,104 +15,104 @@ from lcopa_bayes.experiments.precision import Promise, median
 from lcopa_bayes.results.predictive import Predictive
 
 
-def as_json(made: Design) -> dict[str, Any]:
+def as_json(result: Design) -> dict[str, Any]:
     """Every number of a design; what is infinite or undefined is None and has a reason in words."""
-    study, table = made.fit.study, made.fit.draws.table
-    determined = bool(made.determined.any())
+    study, table = result.fit.study, result.fit.draws.table
+    determined = bool(result.determined.any())
     return plain(
         {
             "study": study.name,
-            "verdict": made.sentence,
-            "grade": made.fit.draws.grade.level,
-            "grade_reason": made.fit.draws.grade.reason,
-            "time": made.time,
+            "verdict": result.sentence,
+            "grade": result.fit.draws.grade.level,
+            "grade_reason": result.fit.draws.grade.reason,
+            "time": result.time,
             "time_unit": study.time_unit,
-            "repeats": made.repeats,
-            "draws": made.draws.shape[0],
-            "refresh": made.limits.refresh,
-            "period": made.limits.period,
+            "repeats": result.repeats,
+            "draws": result.draws.shape[0],
+            "refresh": result.limits.refresh,
+            "period": result.limits.period,
             "range": [
                 {"axis": axis.name, "unit": axis.unit, "rest": rest, "low": low, "high": high}
                 for axis, rest, low, high in zip(
-                    study.drive_axes, made.limits.rest, made.limits.low, made.limits.high, strict=True
+                    study.drive_axes, result.limits.rest, result.limits.low, result.limits.high, strict=True
                 )
             ],
-            "winner": _row(made, made.winner) if determined else None,
-            "d_optimal": made.overall.candidate.name if determined else None,
-            "factor_over_step": made.factor.as_json() | {"parameter": made.worst} if determined else None,
-            "linear_share": made.linear if determined else None,
+            "winner": _row(result, result.winner) if determined else None,
+            "d_optimal": result.overall.candidate.name if determined else None,
+            "factor_over_step": result.factor.as_json() | {"parameter": result.worst} if determined else None,
+            "linear_share": result.linear if determined else None,
             "parameters": [
-                _parameter(made, name, table.rows[table.names.index(name)].unit) for name in made.names
+                _parameter(result, name, table.rows[table.names.index(name)].unit) for name in result.names
             ],
-            "table": [_row(made, one) for one in made.here],
-            "curve": _curve(made),
-            "structure": [one.as_json() for one in made.structure.symmetries],
+            "table": [_row(result, one) for one in result.here],
+            "curve": _curve(result),
+            "structure": [one.as_json() for one in result.structure.symmetries],
         }
     )
 
 
-def _row(made: Design, promise: Promise) -> dict[str, Any]:
+def _row(result: Design, promise: Promise) -> dict[str, Any]:
     """One drive at one bench time."""
-    among = made.determined
+    among = result.determined
     return {
         "drive": promise.candidate.name,
         "family": promise.candidate.family,
         "words": promise.candidate.words if promise.excites else "excites nothing that could be seen",
         "changes": promise.candidate.command.times.size,
         "time": promise.time,
-        "worst": made.worst_of(promise).as_json() if among.any() else None,
-        "factor_over_step": median(made.factors(promise)[:, None])[0] if among.any() else None,
+        "worst": result.worst_of(promise).as_json() if among.any() else None,
+        "factor_over_step": median(result.factors(promise)[:, None])[0] if among.any() else None,
         "typical": promise.typical(among) if among.any() else None,
         "relative_sd": [
-            made.estimate(promise, name).as_json() if made.determined[k] else None
-            for k, name in enumerate(made.names)
+            result.estimate(promise, name).as_json() if result.determined[k] else None
+            for k, name in enumerate(result.names)
         ],
     }
 
 
-def _parameter(made: Design, name: str, unit: str) -> dict[str, Any]:
+def _parameter(result: Design, name: str, unit: str) -> dict[str, Any]:
     """What becomes of one parameter."""
-    at, needed, reason = made.names.index(name), made.time_needed(name), made.reason(name)
-    best = made.best(name, made.here)
-    sizes = np.abs(made.draws[:, made.fit.draws.table.names.index(name)])
+    at, needed, reason = result.names.index(name), result.time_needed(name), result.reason(name)
+    best = result.best(name, result.here)
+    sizes = np.abs(result.draws[:, result.fit.draws.table.names.index(name)])
     spread: Vector = best.relative[:, at] * sizes
-    told = "not by any drive tried"
+    values = "not by any drive tried"
     if needed is not None:
-        told = f"{'at most ' * needed[1]}{needed[0]:.3g} {made.fit.study.time_unit}"
+        values = f"{'at most ' * needed[1]}{needed[0]:.3g} {result.fit.study.time_unit}"
     return {
         "name": name,
         "unit": unit,
         "reason": reason,
         "best_drive": None if reason else best.candidate.name,
-        "relative_sd": None if reason else made.estimate(best, name).as_json(),
+        "relative_sd": None if reason else result.estimate(best, name).as_json(),
         "sd": None
         if reason
         else Estimate.of(
-            name, unit, spread, ess=float(spread.size), grade=made.fit.draws.grade.level
+            name, unit, spread, ess=float(spread.size), grade=result.fit.draws.grade.level
         ).as_json(),
-        "relative_sd_step": None if reason else made.estimate(made.step, name).as_json(),
-        "relative_sd_winner": None if reason else made.estimate(made.winner, name).as_json(),
+        "relative_sd_step": None if reason else result.estimate(result.step, name).as_json(),
+        "relative_sd_winner": None if reason else result.estimate(result.winner, name).as_json(),
         "time_for_10_percent": None if needed is None else needed[0],
         "time_is_upper_bound": needed is not None and needed[1],
-        "time_words": told,
+        "time_words": values,
     }
 
 
-def _curve(made: Design) -> list[dict[str, Any]]:
+def _curve(result: Design) -> list[dict[str, Any]]:
     """Per bench time, the best drive and the plain step for every parameter."""
     out = []
-    for row in made.tried:
-        best = {name: made.best(name, row) for name in made.names if name not in made.structure.blind}
+    for row in result.tried:
+        best = {name: result.best(name, row) for name in result.names if name not in result.structure.blind}
         out.append(
             {
                 "time": row[0].time,
-                "best": {name: one.expected[made.names.index(name)] for name, one in best.items()},
+                "best": {name: one.expected[result.names.index(name)] for name, one in best.items()},
                 "drive": {
                     name: one.candidate.name
                     for name, one in best.items()
-                    if np.isfinite(one.expected[made.names.index(name)])
+                    if np.isfinite(one.expected[result.names.index(name)])
                 },
-                "step": {name: row[0].expected[made.names.index(name)] for name in best},
+                "step": {name: row[0].expected[result.names.index(name)] for name in best},
             }
         )
     return out
@@ -132,30 +132,30 @@ def next_measurement(fit: Predictive, parameters: Sequence[Mapping[str, Any]]) -
     if not left:
         return None
     try:
-        made = design(fit, draws=_DRAWS, ladder=False)
+        result = design(fit, draws=_DRAWS, ladder=False)
     except InputError as error:
         return {"drive": None, "reason": "; ".join(error.problems), "parameters": []}
     rows = []
     for name in left:
-        if name not in made.names:
+        if name not in result.names:
             rows.append({"name": name, "drive": None, "reason": "no parameter of the plant"})
             continue
-        best, reason = made.best(name, made.here), made.reason(name)
+        best, reason = result.best(name, result.here), result.reason(name)
         rows.append(
             {
                 "name": name,
                 "drive": None if reason else best.candidate.name,
                 "reason": reason,
-                "expected_relative_sd": None if reason else made.estimate(best, name).as_json(),
-                "expected_relative_sd_step": None if reason else made.estimate(made.step, name).as_json(),
+                "expected_relative_sd": None if reason else result.estimate(best, name).as_json(),
+                "expected_relative_sd_step": None if reason else result.estimate(result.step, name).as_json(),
             }
         )
     return plain(
         {
-            "drive": made.winner.candidate.name if made.determined.any() else None,
-            "words": made.winner.candidate.words if made.determined.any() else "",
-            "reason": made.sentence,
-            "time": made.time,
+            "drive": result.winner.candidate.name if result.determined.any() else None,
+            "words": result.winner.candidate.words if result.determined.any() else "",
+            "reason": result.sentence,
+            "time": result.time,
             "time_unit": fit.study.time_unit,
             "parameters": rows,
         }

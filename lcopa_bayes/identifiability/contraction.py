@@ -100,7 +100,7 @@ class Belief:
                 "parameter": self.parameter,
                 "contraction": self.contraction,
                 "companions": dict(zip(self.companions, self.correlations, strict=True)),
-                "hills": self.modes,
+                "modes": self.modes,
                 "power_scaling": None if self.sensitivity is None else self.sensitivity.diagnosis,
             }
         )

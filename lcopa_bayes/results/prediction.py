@@ -19,8 +19,6 @@ from lcopa_bayes.model.forward import ForwardModel
 from lcopa_bayes.results.bands import LEVELS, POINTWISE, Bands, named
 from lcopa_bayes.sampling.draws import Draws
 
-BEFORE_DRIVE = "samples before the drive acts"
-"""Source of an offset."""
 _CELLS = 2_000_000
 """Draws times samples behind the bands of one axis of one record."""
 _FEWEST = 200
@@ -256,14 +254,8 @@ def offset_draws(
         return values[:, places[axis, -1]], "shared with the fit records", 0
     if not held_out:
         return values[:, places[axis, r]], "fitted", 0
-    observed = record.axes[axis]
-    quiet = record.times[observed.index] <= record.first_change
-    used, source = quiet, BEFORE_DRIVE
-    if quiet.all():
-        source = "all samples of the held-out record, whose drive does not change before the last of them"
-    elif not quiet.any():
-        used, source = ~quiet, "all samples of the held-out record, none of which is before the drive acts"
-    offset = _given(observed, used, response, noise, table, values, axis, rng)
+    used, source = record.level_samples(axis)
+    offset = _given(record.axes[axis], used, response, noise, table, values, axis, rng)
     return offset, source, int(used.sum())
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.core.files import save_json, told_as, writable_folder
+from lcopa_bayes.core.files import save_json, writable_folder, writing
 
 try:
     import fcntl
@@ -97,7 +97,7 @@ def _locked(folder: Path) -> Iterator[None]:
                 del _held[place]
         return
     path = place / LOCK
-    with told_as(path):
+    with writing(path):
         file = _exclusive(path, folder)
     with file:
         _held[place] = 1

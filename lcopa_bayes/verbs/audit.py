@@ -56,10 +56,10 @@ def audit(
     fit, the run folder of one, or a study, which is fitted first, with `resume`, `quick` and `quiet` as in
     `fit`; `jobs`, processes to use; `folder`, a run folder to write into. InputError as `fit`.
     """
-    made = basis(source, jobs=jobs, folder=folder, resume=resume, quick=quick, quiet=quiet)
-    values = audited(made, jobs=jobs).as_json()
-    values["next_measurement"] = next_measurement(made, values["parameters"])
-    result = AuditResult(values, origin_of(made, "audit"), fit=made)
+    fitted = basis(source, jobs=jobs, folder=folder, resume=resume, quick=quick, quiet=quiet)
+    values = audited(fitted, jobs=jobs).as_json()
+    values["next_measurement"] = next_measurement(fitted, values["parameters"])
+    result = AuditResult(values, origin_of(fitted, "audit"), fit=fitted)
     if folder is not None:
         result.save(folder)
     return result

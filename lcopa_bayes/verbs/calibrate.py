@@ -63,7 +63,7 @@ def calibrate(
     wanted = study_of(study)
     origin = plain(provenance(wanted, "calibrate"))
     with nullcontext() if folder is None else opened(folder, origin) as place:
-        made = calibrated(
+        calibration = calibrated(
             wanted,
             replicas=replicas,
             around=None if around is None else Path(around),
@@ -76,8 +76,10 @@ def calibrate(
             quick=quick,
             quiet=quiet,
         )
-        texts = {f"tables/{name}.csv": table.to_csv(index=False) for name, table in tables(made).items()}
-        result = CalibrationResult(results(made), origin, texts)
+        texts = {
+            f"tables/{name}.csv": table.to_csv(index=False) for name, table in tables(calibration).items()
+        }
+        result = CalibrationResult(results(calibration), origin, texts)
         if place is not None:
             result.save(place)
     return result

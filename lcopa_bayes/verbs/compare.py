@@ -65,7 +65,7 @@ def compare(
 ) -> Comparison:
     """Fit several models of the same records, score them by evidence and by prediction, and decide.
 
-    Parameters: `study`, from which candidates are derived (a fit stands for its study), or several studies of
+    Parameters: `study`, from which candidates are derived (of a fit, its study), or several studies of
     the same records, which are the candidates; `candidates`, names such as ``fractional-2`` or
     ``second-order``, by default those of the study or a short list; `described`, further candidates, or a
     file of them; `jobs`, processes to use; `folder`, a run folder to write into, from which `resume` goes on;
@@ -89,8 +89,8 @@ def compare(
         opened(place, origin) as path,
     ):
         values = compared(models, jobs=jobs, folder=path, resume=resume, quick=quick, quiet=quiet)
-        found = sorted(one for pattern in Comparison.beside for one in path.glob(pattern))
-        texts = {str(one.relative_to(path)): one.read_text(encoding="utf-8") for one in found}
+        outcome = sorted(one for pattern in Comparison.beside for one in path.glob(pattern))
+        texts = {str(one.relative_to(path)): one.read_text(encoding="utf-8") for one in outcome}
         result = Comparison(values, origin, texts)
         if folder is not None:
             result.save(folder)

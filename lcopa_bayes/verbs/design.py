@@ -97,7 +97,7 @@ def design(
     wanted = {"time": bench_time, "repeats": repeats, "amplitude": amplitude, "refresh": refresh}
     checked(problem_of(study_of(source)), **wanted)  # type: ignore[arg-type]  # before a long fit
     fit = basis(source, jobs=jobs, folder=folder, resume=resume, quick=quick, quiet=quiet)
-    made = designed(
+    planned = designed(
         fit,
         time=bench_time,
         repeats=repeats,
@@ -106,10 +106,10 @@ def design(
         with_prior=with_prior,
         draws=DRAWS // _QUICK if quick else DRAWS,
     )
-    trials = confirmed(made, jobs=jobs, replicas=REPLICAS // 2 if quick else REPLICAS)
-    values, texts = as_json(made) | trials | {"template": None}, {}
+    trials = confirmed(planned, jobs=jobs, replicas=REPLICAS // 2 if quick else REPLICAS)
+    values, texts = as_json(planned) | trials | {"template": None}, {}
     if values["winner"] is not None:
-        texts[TEMPLATE] = template(fit.study, made.limits, made.winner.candidate.command, made.time)
+        texts[TEMPLATE] = template(fit.study, planned.limits, planned.winner.candidate.command, planned.time)
         values["template"] = TEMPLATE
     result = DesignResult(values, origin_of(fit, "design"), texts, fit)
     if folder is not None:

@@ -39,7 +39,7 @@ def fit(
     """
     wanted = study_of(study)
     with nullcontext() if folder is None else opened(folder, provenance(wanted, "fit")) as place:
-        made = sampled(
+        fitted = sampled(
             wanted,
             jobs=jobs,
             folder=place,
@@ -49,10 +49,10 @@ def fit(
             quiet=quiet,
         )
         if rival:
-            made = replace(made, rival=integer_rival(made, jobs=jobs, quick=quick, quiet=quiet))
+            fitted = replace(fitted, rival=integer_rival(fitted, jobs=jobs, quick=quick, quiet=quiet))
         if place is not None:
-            made.save(place)
-    return made
+            fitted.save(place)
+    return fitted
 
 
 def basis(
@@ -65,7 +65,7 @@ def basis(
     quiet: bool,
 ) -> Predictive:
     """The finished fit that is given or named, else the fit of the study that is; parameters as `fit`."""
-    found = finished(source)
-    if found is not None:
-        return found
+    result = finished(source)
+    if result is not None:
+        return result
     return fit(study_of(source), jobs=jobs, folder=folder, resume=resume, quick=quick, quiet=quiet)

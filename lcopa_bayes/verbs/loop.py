@@ -47,16 +47,16 @@ class LoopResult(StoredResult):
 
     def summary(self) -> pd.DataFrame:
         """One row per parameter of an effect that was named: value and ends of the 90 % interval [`unit`],
-        grade, and the effects it cannot be told apart from; no row when none was."""
+        grade, and the effects it is confounded with; no row when none was."""
         columns = ["effect", "place", "parameter", "value", "lower", "upper", "unit", "grade"]
         rows = [
             {"effect": effect["name"], "place": effect["place"], "parameter": one["name"]}
             | {key: one[key] for key in columns[3:]}
-            | {"confused_with": ", ".join(effect["group"][1:])}
+            | {"confounded_with": ", ".join(effect["group"][1:])}
             for effect in self.values["effects"]
             for one in effect["parameters"]
         ]
-        return pd.DataFrame(rows, columns=pd.Index([*columns, "confused_with"]))
+        return pd.DataFrame(rows, columns=pd.Index([*columns, "confounded_with"]))
 
     def save(self, folder: Path | str) -> Path:
         """Write the result into a run folder, with `explained.toml`, the study of what was found, and its
@@ -96,10 +96,10 @@ def loop(
     problem_of(wanted)  # what is wrong with the study is said before anything is written
     origin = plain(provenance(wanted, "loop"))
     with nullcontext() if folder is None else opened(folder, origin):
-        found = searched(wanted, jobs=jobs, quick=quick, as_stated=as_stated)
-        curves = json.dumps(plain(drawn(found)), indent=1, allow_nan=False) + "\n"
-        values = results(found) | {"explained": EXPLAINED}
-        result = LoopResult(values, origin, {CURVES: curves}, study=found.study)
+        outcome = searched(wanted, jobs=jobs, quick=quick, as_stated=as_stated)
+        curves = json.dumps(plain(drawn(outcome)), indent=1, allow_nan=False) + "\n"
+        values = results(outcome) | {"explained": EXPLAINED}
+        result = LoopResult(values, origin, {CURVES: curves}, study=outcome.study)
         if folder is not None:
             result.save(folder)
     return result

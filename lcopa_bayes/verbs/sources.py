@@ -25,9 +25,9 @@ def study_of(source: FitLike, *, held_out: Sequence[Path] = ()) -> Study:
 
     InputError with all that is wrong in its file, and in what of it can still be fitted together.
     """
-    found = finished(source)
-    if found is not None:
-        return found.study
+    result = finished(source)
+    if result is not None:
+        return result.study
     if isinstance(source, Study):
         return source
     try:

@@ -239,7 +239,7 @@ def test_a_missed_mode_is_found_and_the_richer_model_sampled_again(misled, monke
     assert held["sampled_again"]
     assert held["met"]
     assert richer["max_log_likelihood"] >= one["max_log_likelihood"] - 0.5
-    delay = next(row for row in richer["parameters_told"] if row["name"] == "delay")
+    delay = next(row for row in richer["estimates"] if row["name"] == "delay")
     assert delay["value"] == pytest.approx(2.37, abs=0.1)
     (flag,) = [flag for flag in told["flags"] if flag["kind"] == "missed mode"]
     assert flag["model"] == "fractional-2"
