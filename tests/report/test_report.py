@@ -20,7 +20,7 @@ from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.inference import defaultpriors
 from lcopa_bayes.report import write_page, write_report
 from lcopa_bayes.report.decimation import extremes
-from lcopa_bayes.report.formatting import NOT_REACHED, figures, interval, to_spread
+from lcopa_bayes.report.formatting import NOT_REACHED, figures, interval, sentence, stopped, to_spread
 from lcopa_bayes.report.savedrun import load_run
 from lcopa_bayes.report.section import Column, Drawing, Section, Table
 from lcopa_bayes.report.sections import pairs, parameters, records, residuals, sensitivity, steps
@@ -443,6 +443,11 @@ def test_step_table_is_left_out_when_there_are_no_metrics(folder, tmp_path):
     run = load_run(folder)
     bare = type(run)({**run.results, "step_metrics": []}, run.provenance, run.tables, run.draws)
     assert steps.section(bare).tables == ()
+
+
+def test_a_clause_becomes_a_sentence_once():
+    assert sentence("the data bound it") == sentence("The data bound it.") == "The data bound it."
+    assert stopped("on/off, 14 ms is best") == "on/off, 14 ms is best."
 
 
 def with_results(folder: Path, **more: object):
