@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import inf, sqrt
-from typing import final
+from typing import Annotated, final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,6 +14,7 @@ from lcopa_bayes.bench.command import Command
 from lcopa_bayes.bench.device import Responsive
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.rules import POSITIVE, Rule, Ruled, is_number
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.model.literature import PAPER
 
@@ -21,40 +22,34 @@ _SAME = 1e-9
 """A change closer than this part of a camera period to a sample is at that sample."""
 
 
+_NOT_NEGATIVE = Rule("at least 0 and finite", lambda value: is_number(value) and value >= 0)
+_DEVIATIONS = Rule(
+    "at least 0 and finite", lambda value: all(map(_NOT_NEGATIVE.holds, np.atleast_1d(np.asarray(value))))
+)
+_CORRELATION = Rule("a number between -1 and 1", lambda value: is_number(value) and -1 < value < 1)
+
+
 @final
 @dataclass(frozen=True)
-class Bench:
-    """How a device is driven and watched. Times in the unit of the device.
+class Bench(Ruled):
+    """How a device is driven and watched, with times in the unit of the device; InputError with all that is
+    wrong."""
 
-    Raises InputError unless ``refresh >= 0``, ``camera > 0``, ``0 <= exposure <= camera``, no standard
-    deviation is negative and ``-1 < noise_correlation < 1``.
-    """
-
-    refresh: float = 0.0
+    refresh: Annotated[float, _NOT_NEGATIVE] = 0.0
     """Period of the drive refresh [ms]; commands act at its next multiple; 0: at once."""
-    camera: float = 0.1
+    camera: Annotated[float, POSITIVE] = 0.1
     """Period of the camera [ms]."""
-    exposure: float = 0.0
-    """Each sample is the mean over this time up to its own [ms]; 0: instantaneous."""
-    noise_sd: float | tuple[float, ...] = 0.0
+    exposure: Annotated[float, _NOT_NEGATIVE] = 0.0
+    """Each sample is the mean over this time up to its own [ms], at most a camera period; 0: none."""
+    noise_sd: Annotated[float | tuple[float, ...], _DEVIATIONS] = 0.0
     """Stationary standard deviation of a sample [response unit], one for all response axes or one each."""
-    noise_correlation: float = 0.0
+    noise_correlation: Annotated[float, _CORRELATION] = 0.0
     """rho [-], correlation of successive camera samples (AR(1)); 0: white. Axes are independent."""
 
-    def __post_init__(self) -> None:
-        problems = []
-        if not 0 <= self.refresh < inf:
-            problems.append(f"`refresh` must be at least 0 and finite; got {self.refresh}")
-        if not 0 < self.camera < inf:
-            problems.append(f"`camera` must be positive and finite; got {self.camera}")
-        if not 0 <= self.exposure <= self.camera:
-            problems.append(f"`exposure` must lie between 0 and the camera period; got {self.exposure}")
-        if not all(0 <= sd < inf for sd in np.atleast_1d(self.noise_sd)):
-            problems.append(f"`noise_sd` must be at least 0 and finite; got {self.noise_sd}")
-        if not -1 < self.noise_correlation < 1:
-            problems.append(f"`noise_correlation` must lie between -1 and 1; got {self.noise_correlation}")
-        if problems:
-            raise InputError(problems)
+    def contradictions(self) -> list[str]:
+        """An exposure longer than the camera period."""
+        wrong = self.exposure > self.camera
+        return [f"`exposure` must be at most the camera period; got {self.exposure}"] if wrong else []
 
     def noise(self, n: int, n_responses: int, rng: np.random.Generator) -> Matrix:
         """Stationary AR(1) noise, ``e_k = rho e_(k-1) + sd sqrt(1 - rho^2) z_k``, (n, n_responses).

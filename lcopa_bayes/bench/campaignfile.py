@@ -30,8 +30,9 @@ import json
 import os
 import tempfile
 import tomllib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, final
 
@@ -44,14 +45,28 @@ from lcopa_bayes.bench.inversion import unsuited
 from lcopa_bayes.bench.undeclared import UndeclaredPlan
 from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.core.files import writable_folder, write_text, writing
+from lcopa_bayes.core.rules import FLAG, Rule, is_number, whole
 from lcopa_bayes.data.record import Axis, Record, save_record
 from lcopa_bayes.model.path import TransferPath
 
+_TEXT = Rule("text", lambda value: isinstance(value, str) and value != "")
+_NUMBER = Rule("a number", is_number)
+_NUMBERS = Rule("a list of numbers", lambda value: isinstance(value, list) and all(map(is_number, value)))
+_PAIR = Rule("a list of two numbers", lambda value: _NUMBERS.holds(value) and len(value) == 2)
+_EITHER = Rule("a number or a list of numbers", lambda value: is_number(value) or _NUMBERS.holds(value))
+_TEXTS = Rule("a list of texts", lambda value: isinstance(value, list) and all(map(_TEXT.holds, value)))
+_HEADING = {"name": _TEXT, "seed": whole(0)}
+_BENCH = {field.name: _NUMBER for field in fields(Bench)} | {"noise_sd": _EITHER}
+_PATH = {
+    **{"response": _TEXT, "drive": _TEXT, "gain": _NUMBER, "delay": _NUMBER},
+    **{"etas": _NUMBERS, "orders": _NUMBERS, "stiffness": _NUMBER},
+}
+_RECORD = {"name": _TEXT, "duration": _NUMBER, "held_out": FLAG}
+_KINDS = {"step": _NUMBER, "on_off": _NUMBER, "staircase": _NUMBERS, "prbs": _PAIR}
+_DRIVE = {**_KINDS, "at": _NUMBER, "rest": _NUMBER, "hold": _NUMBER}
+_TABLE = Rule("a table such as { step = 1.5 }", lambda value: isinstance(value, dict))
+_UNDECLARED = {"effects": _TEXTS, "drives": _TEXT, "correlation": _NUMBER, "noise_sd": _NUMBER}
 _TABLES = {"campaign", "bench", "path", "record", "undeclared"}
-_MEASURED = ("bench", "path", "record")
-_KINDS = {"step", "on_off", "staircase", "prbs"}
-_COMMAND_KEYS = _KINDS | {"at", "rest", "hold"}
-_PATH_KEYS = {"response", "drive"} | {field.name for field in fields(TransferPath)}
 
 
 @final
@@ -100,57 +115,87 @@ def load_plan(path: Path) -> Plan | UndeclaredPlan:
         f"{path}: unknown table [{key}]{nearest(key, _TABLES)}" for key in tables if key not in _TABLES
     ]
     heading = tables.get("campaign", {})
-    problems += _unknown(path, "[campaign]", heading, {"name", "seed"})
-    if "undeclared" in tables and not problems:
-        return _undeclared(path, tables)
-    bench_keys = {field.name for field in fields(Bench)}
-    problems += _unknown(path, "[bench]", tables.get("bench", {}), bench_keys)
-    for number, entry in enumerate(tables.get("path", []), start=1):
-        problems += _unknown(path, f"[[path]] {number}", entry, _PATH_KEYS)
-        problems += _missing(path, f"[[path]] {number}", entry, _PATH_KEYS)
-    records = tables.get("record", [])
+    problems += _wrong(f"{path}: [campaign]", heading, _HEADING)
+    problems += [
+        f"{path}: write each {name} as a table [[{name}]]"
+        for name in ("path", "record")
+        if not isinstance(tables.get(name, []), list)
+    ]
+    if problems:
+        raise InputError(problems)
+    name, seed = heading.get("name", path.stem), heading.get("seed", 0)
+    if "undeclared" in tables:
+        return _undeclared(path, tables, name, seed)
+    settings, paths, records = tables.get("bench", {}), tables.get("path", []), tables.get("record", [])
+    problems += _wrong(f"{path}: [bench]", settings, _BENCH)
+    for number, entry in enumerate(paths, start=1):
+        problems += _wrong(f"{path}: [[path]] {number}", entry, _PATH, _PATH)
     if not records:
         problems.append(f"{path}: has no [[record]]; add one with `name`, `duration` and a drive")
     if problems:
         raise InputError(problems)
-    device = _device(path, tables.get("path", []))
-    known = {"name", "duration", "held_out"} | {axis.name for axis in device.drive_axes}
+    with _about(path):
+        bench = replace(PAPER_BENCH, **_tuples(settings))
+    device = _device(path, paths)
+    known = _RECORD | {axis.name: _TABLE for axis in device.drive_axes}
     for number, entry in enumerate(records, start=1):
-        problems += _unknown(path, f"[[record]] {number}", entry, known)
-        problems += _missing(path, f"[[record]] {number}", entry, {"name", "duration"})
+        where = f"{path}: [[record]] {number}"
+        problems += _wrong(where, entry, known, ("name", "duration"))
         for axis in device.drive_axes:
-            problems += _drive_problems(f"{path}: [[record]] {number}, {axis.name}", entry.get(axis.name))
+            if isinstance(entry, dict) and isinstance(entry.get(axis.name), dict):
+                problems += _wrong_drive(f"{where}, {axis.name}", entry[axis.name])
     if problems:
         raise InputError(problems)
-    settings = {name: getattr(PAPER_BENCH, name) for name in bench_keys} | tables.get("bench", {})
-    sd = settings["noise_sd"]
-    bench = Bench(**settings | {"noise_sd": tuple(sd) if isinstance(sd, list) else sd})
-    return Plan(heading.get("name", path.stem), int(heading.get("seed", 0)), device, bench, tuple(records))
+    return Plan(name, seed, device, bench, tuple(records))
 
 
-def _undeclared(path: Path, tables: Mapping[str, Any]) -> UndeclaredPlan:
+def _undeclared(path: Path, tables: Mapping[str, Any], name: str, seed: int) -> UndeclaredPlan:
     """A campaign with hidden effects."""
-    heading, table = tables.get("campaign", {}), tables["undeclared"]
-    known = {field.name for field in fields(UndeclaredPlan)} - {"name", "seed"}
-    problems = _unknown(path, "[undeclared]", table, known)
+    problems = _wrong(f"{path}: [undeclared]", tables["undeclared"], _UNDECLARED)
     problems += [
-        f"{path}: [{k}] is not used beside [undeclared]; remove it" for k in tables if k in _MEASURED
+        f"{path}: [{key}] is not used beside [undeclared]; remove it"
+        for key in ("bench", "path", "record")
+        if key in tables
     ]
     if problems:
         raise InputError(problems)
-    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table.items()}
+    with _about(path):
+        return UndeclaredPlan(name, seed, **_tuples(tables["undeclared"]))
+
+
+def _wrong(where: str, table: object, rules: Mapping[str, Rule], needed: Iterable[str] = ()) -> list[str]:
+    """Everything wrong in a table: unknown keys, keys that it needs, values that break their rule."""
+    if not isinstance(table, dict):
+        return [f"{where}: must be a table; got {table!r}"]
+    problems = [f"unknown key {key!r}{nearest(key, rules)}" for key in table if key not in rules]
+    problems += [f"has no `{key}`; add it" for key in sorted(needed) if key not in table]
+    for key in [key for key in table if key in rules]:
+        problems += rules[key].problems(key, table[key])
+    return [f"{where}: {problem}" for problem in problems]
+
+
+def _wrong_drive(where: str, entry: Mapping[str, Any]) -> list[str]:
+    """Everything wrong in the drive of one axis."""
+    problems, kinds = _wrong(where, entry, _DRIVE), [key for key in entry if key in _KINDS]
+    if len(kinds) != 1:
+        problems.append(f"{where}: name exactly one of {', '.join(sorted(_KINDS))}; got {kinds}")
+    elif kinds[0] != "step" and "hold" not in entry:
+        problems.append(f"{where}: {kinds[0]} needs `hold`, the time of each level [ms]")
+    return problems
+
+
+def _tuples(table: Mapping[str, Any]) -> dict[str, Any]:
+    """The table with lists as tuples."""
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in table.items()}
+
+
+@contextmanager
+def _about(path: Path, where: str = "") -> Iterator[None]:
+    """Within it, InputErrors name the file."""
     try:
-        return UndeclaredPlan(heading.get("name", path.stem), int(heading.get("seed", 0)), **values)
+        yield
     except InputError as error:
-        raise InputError([f"{path}: {problem}" for problem in error.problems]) from None
-
-
-def _unknown(path: Path, where: str, table: Mapping[str, Any], known: set[str]) -> list[str]:
-    return [f"{path}: {where}: unknown key {key!r}{nearest(key, known)}" for key in table if key not in known]
-
-
-def _missing(path: Path, where: str, table: Mapping[str, Any], needed: set[str]) -> list[str]:
-    return [f"{path}: {where}: has no `{key}`; add it" for key in sorted(needed) if key not in table]
+        raise InputError([f"{path}: {where}{problem}" for problem in error.problems]) from None
 
 
 def _device(path: Path, entries: list[Mapping[str, Any]]) -> Device:
@@ -162,39 +207,19 @@ def _device(path: Path, entries: list[Mapping[str, Any]]) -> Device:
     dead = TransferPath(0.0, 0.0, (1.0,), (1.0,), 1.0)
     table = [[dead for _ in drives] for _ in responses]
     for entry in entries:
-        values = {key: entry[key] for key in _PATH_KEYS - {"response", "drive"}}
-        values |= {"etas": tuple(entry["etas"]), "orders": tuple(entry["orders"])}
-        try:
+        values = _tuples(entry)
+        drive, response = values.pop("drive"), values.pop("response")
+        with _about(path, "[[path]] "):
             listed = TransferPath(**values)
             if problems := unsuited(listed):
                 raise InputError(problems)
-        except InputError as error:
-            raise InputError([f"{path}: [[path]] {problem}" for problem in error.problems]) from None
-        table[responses.index(entry["response"])][drives.index(entry["drive"])] = listed
+        table[responses.index(response)][drives.index(drive)] = listed
     return Device(
         tuple(tuple(row) for row in table),
         tuple(Axis(name, "rad") for name in drives),
         tuple(Axis(name, "rad") for name in responses),
         tuple(0.0 for _ in responses),
     )
-
-
-def _drive_problems(where: str, entry: object) -> list[str]:
-    if entry is None:
-        return []
-    if not isinstance(entry, dict):
-        return [f"{where}: must be a table such as {{ step = 1.5 }}; got {entry!r}"]
-    problems = [
-        f"{where}: unknown key {key!r}{nearest(key, _COMMAND_KEYS)}"
-        for key in entry
-        if key not in _COMMAND_KEYS
-    ]
-    kinds = [key for key in entry if key in _KINDS]
-    if len(kinds) != 1:
-        problems.append(f"{where}: name exactly one of {', '.join(sorted(_KINDS))}; got {kinds}")
-    elif kinds[0] != "step" and "hold" not in entry:
-        problems.append(f"{where}: {kinds[0]} needs `hold`, the time of each level [ms]")
-    return problems
 
 
 def _command(record: Mapping[str, Any], device: Device, rng: np.random.Generator) -> Command:

@@ -19,6 +19,7 @@ from lcopa_bayes.bench.driveeffects import joined
 from lcopa_bayes.bench.hiddeneffects import STEPS, Hidden, HiddenDevice, Shot
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.core.rules import Ruled
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.model.path import TransferPath
 
@@ -249,7 +250,7 @@ def shot_of(device: Device, epoch: float, rng: np.random.Generator) -> Shot:
 
 @final
 @dataclass(frozen=True)
-class UndeclaredPlan:
+class UndeclaredPlan(Ruled):
     """A campaign file with a table ``[undeclared]``: effects by name, at sizes drawn from the seed.
 
     Raises InputError for an unknown effect, unknown drives or a correlation out of range.
@@ -269,11 +270,14 @@ class UndeclaredPlan:
     settings: ClassVar[str] = '[model]\nterms = { direct = 2, cross = 1 }\nshare = "paper"'
     """Model table of the study file, without any effect."""
 
-    def __post_init__(self) -> None:
-        drawn(self.effects, np.random.default_rng(0))
-        if self.drives not in ("rich", "plain"):
-            raise InputError(f'[undeclared] drives must be "rich" or "plain"; got {self.drives!r}')
-        Bench(noise_sd=self.noise_sd, noise_correlation=self.correlation)
+    def contradictions(self) -> list[str]:
+        """Unknown effects, and noise that no bench has."""
+        try:
+            drawn(self.effects, np.random.default_rng(0))
+            Bench(noise_sd=self.noise_sd, noise_correlation=self.correlation)
+        except InputError as error:
+            return list(error.problems)
+        return []
 
     def draw(self, rng: np.random.Generator) -> Campaign:
         """The campaign with what only the evaluation may read."""

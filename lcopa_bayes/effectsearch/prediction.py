@@ -11,7 +11,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
-from lcopa_bayes.effectsearch.noise import Law, quiet_samples
+from lcopa_bayes.effectsearch.noise import Law
 from lcopa_bayes.effectsearch.whitening import parts, stacked
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.declared import campaign_places
@@ -95,56 +95,13 @@ def _shared(own: Effected, there: Effected, by_psi: Matrix, psi: Vector) -> tupl
     return shared, extra
 
 
-@final
-@dataclass(frozen=True)
-class LevelPrior:
-    """What the fit records say of the level of another record."""
-
-    mean: float
-    """[response unit]."""
-    variance: float
-    """Scatter of levels between records, and error of the mean [response unit^2]; infinite when nothing is
-    known."""
-
-    @classmethod
-    def of(cls, model: ExtendedModel, x: Vector, covariance: Matrix, axis: int) -> LevelPrior:
-        """From the fitted offsets of an axis: their mean, and their scatter beyond their errors
-        (DerSimonian and
-        Laird 1986, Control. Clin. Trials 7)."""
-        rows, columns = model.base.posterior.table.rows, model.base.least.columns
-        own = [p for p, k in enumerate(columns) if rows[k].kind == "offset" and rows[k].place.first == axis]
-        if len(own) < 3:
-            return cls(0.0, np.inf)
-        levels, errors = x[own], np.diag(covariance)[own]
-        weights = 1.0 / errors
-        mean = float(weights @ levels / weights.sum())
-        excess = float(weights @ (levels - mean) ** 2) - (levels.size - 1)
-        between = max(0.0, excess / float(weights.sum() - (weights**2).sum() / weights.sum()))
-        weights = 1.0 / (errors + between)
-        mean = float(weights @ levels / weights.sum())
-        return cls(mean, between + 1.0 / float(weights.sum()))
-
-
-FLAT = LevelPrior(0.0, np.inf)
-"""Nothing is known of the level."""
-
-
-def levelled(
-    record: Samples, axis: int, misfit: Vector, noise: Law, delay: float, prior: LevelPrior = FLAT
-) -> tuple[float, float, str]:
+def level_of(record: Samples, axis: int, misfit: Vector, noise: Law) -> tuple[float, float, str]:
     """Level of a record that is not known from the fit, its variance and where it comes from.
 
-    From the samples before the drive can have acted, else from the whole record, by generalised least
-    squares,
-    and from what the levels of the fit records make likely.
+    By generalised least squares from the samples that a fit takes the offset of a held-out record from.
     """
-    count = quiet_samples(record, axis, delay)
-    source = "samples before the drive acts" if count >= 3 else "the record itself"
-    used = misfit[:count] if count >= 3 else misfit
-    gaps = record.axes[axis].gaps[: used.size]
-    white, ones = noise.whiten(np.stack([used, np.ones_like(used)]), gaps)
-    power = float(ones @ ones) + 1.0 / prior.variance
-    pull = float(ones @ white) + (prior.mean / prior.variance if np.isfinite(prior.variance) else 0.0)
-    if np.isfinite(prior.variance):
-        source += " and the levels of the fit records"
-    return pull / power, 1.0 / power, source
+    used, source = record.level_samples(axis)
+    columns = np.stack([misfit[used], np.ones(np.count_nonzero(used))])
+    white, ones = noise.whiten(columns, record.axes[axis].gaps[used])
+    power = float(ones @ ones)
+    return float(ones @ white) / power, 1.0 / power, source

@@ -14,7 +14,7 @@ from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.crossvalidation import groups, shifts
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.gaussnewton import Optimum
-from lcopa_bayes.effectsearch.prediction import FLAT, LevelPrior, levelled, predicted
+from lcopa_bayes.effectsearch.prediction import level_of, predicted
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import Problem
 
@@ -102,7 +102,9 @@ def fit_scores(state: State) -> list[Score]:
     """On the records that were fitted."""
     tangents = state.optimum.tangents
     variance = np.einsum("nk,kl,nl->n", tangents, state.covariance, tangents, optimize=True)
-    return _scores(state, state.whitening.observed - state.optimum.residual, variance, "the fit", None)
+    return _scores(
+        state, state.whitening.observed - state.optimum.residual, variance, "the fit", own_levels=False
+    )
 
 
 def left_out_scores(state: State) -> list[Score]:
@@ -114,9 +116,8 @@ def left_out_scores(state: State) -> list[Score]:
         tangents = state.optimum.tangents[group.rows]
         mean[group.rows] += tangents @ shift
         variance[group.rows] = np.einsum("nk,kl,nl->n", tangents, covariance, tangents, optimize=True)
-    several = len(state.whitening.samples) > 1
-    delay = state.model.dead_time(state.optimum.x) if several and _own_levels(state) else None
-    return _scores(state, mean, variance, "the other records", delay)
+    own = len(state.whitening.samples) > 1 and _own_levels(state)
+    return _scores(state, mean, variance, "the other records", own_levels=own)
 
 
 def held_out_scores(state: State, problem: Problem) -> list[Score]:
@@ -129,12 +130,8 @@ def held_out_scores(state: State, problem: Problem) -> list[Score]:
         state.covariance,
         state.widening,
     )
-    if not _own_levels(state):
-        return _scores(elsewhere, told.mean, told.variance, "the fit records", None)
-    axes = range(len(state.whitening.noise))
-    delay = state.model.dead_time(state.optimum.x)
-    priors = [LevelPrior.of(state.model, state.optimum.x, state.covariance, axis) for axis in axes]
-    return _scores(elsewhere, told.mean, told.variance, "the fit records", delay, priors)
+    own = _own_levels(state)
+    return _scores(elsewhere, told.mean, told.variance, "the fit records", own_levels=own)
 
 
 def _own_levels(state: State) -> bool:
@@ -144,14 +141,9 @@ def _own_levels(state: State) -> bool:
 
 
 def _scores(
-    state: State,
-    mean: Vector,
-    variance: Vector,
-    level_from: str,
-    delay: float | None,
-    priors: Sequence[LevelPrior] = (),
+    state: State, mean: Vector, variance: Vector, level_from: str, *, own_levels: bool
 ) -> list[Score]:
-    """One score per record and axis; with a `delay` each record's level is found first."""
+    """One score per record and axis; with `own_levels` each record's level is taken from its samples."""
     whitening, out = state.whitening, []
     for part in whitening.parts:
         record = whitening.samples[part.record]
@@ -160,9 +152,8 @@ def _scores(
             continue
         noise = whitening.noise[part.axis]
         centre, spread, source = mean[part.rows], variance[part.rows], level_from
-        if delay is not None:
-            prior = priors[part.axis] if priors else FLAT
-            level, doubt, source = levelled(record, part.axis, observed.values - centre, noise, delay, prior)
+        if own_levels:
+            level, doubt, source = level_of(record, part.axis, observed.values - centre, noise)
             # what the fit did not know about the level is known now
             centre, spread = centre + level, _without_level(spread, doubt)
         if state.widening is not None:

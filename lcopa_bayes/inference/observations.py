@@ -9,8 +9,11 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Index, Matrix, Vector
+from lcopa_bayes.core.arrays import Flags, Index, Matrix, Vector
 from lcopa_bayes.data.record import Record
+
+BEFORE_DRIVE = "samples before the drive acts"
+"""Source of an offset."""
 
 
 @final
@@ -71,6 +74,18 @@ class Samples:
         observed = self.axes[axis]
         n = int(np.searchsorted(self.times[observed.index], self.first_change, side="right"))
         return Observed(observed.index[:n], observed.values[:n], observed.gaps[:n])
+
+    def level_samples(self, axis: int) -> tuple[Flags, str]:
+        """Samples of an axis that give the offset of a record that was not fitted, and what they are."""
+        quiet = self.times[self.axes[axis].index] <= self.first_change
+        if quiet.all():
+            return (
+                quiet,
+                "all samples of the held-out record, whose drive does not change before the last of them",
+            )
+        if not quiet.any():
+            return ~quiet, "all samples of the held-out record, none of which is before the drive acts"
+        return quiet, BEFORE_DRIVE
 
     def matrix(self) -> Matrix:
         """Responses at `times`, (samples, axes), NaN where missing [response unit]."""

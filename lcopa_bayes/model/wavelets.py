@@ -22,7 +22,7 @@ import timeit
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -122,26 +122,17 @@ def _system(path: TransferPath, integration: Callable[[float], Matrix]) -> Matri
     return system
 
 
-@final
-@dataclass(frozen=True)
-class FormCost:
+class FormCost(NamedTuple):
     """What the wavelet form costs and changes against the block-pulse form (claim N1)."""
 
     n: int
     """Blocks [-]."""
-    wavelet_seconds: float
-    """Fastest wavelet-form solve [s]; Psi and its inverse are ready and not counted."""
-    block_pulse_seconds: float
-    """Fastest block-pulse solve [s]."""
+    ratio: float
+    """Cost of the wavelet form in block-pulse solves [-]; Psi and its inverse are ready and not counted."""
     difference: float
     """Largest difference of the two responses over the largest response [-]."""
     largest_overlap: float
     """Largest inner product of two different basis functions [-]."""
-
-    @property
-    def ratio(self) -> float:
-        """Cost of the wavelet form in block-pulse solves [-]."""
-        return self.wavelet_seconds / self.block_pulse_seconds
 
 
 def form_cost(path: TransferPath, drive: float, span: float, n: int, *, repeats: int = 5) -> FormCost:
@@ -154,14 +145,6 @@ def form_cost(path: TransferPath, drive: float, span: float, n: int, *, repeats:
     plain = partial(block_pulse_response, path, step, span, late)
     wavelet = partial(wavelet_response, path, step, basis, span, late)
     reference = plain()
-    return FormCost(
-        n,
-        difference=float(np.abs(wavelet() - reference).max() / np.abs(reference).max()),
-        wavelet_seconds=_fastest(wavelet, repeats),
-        block_pulse_seconds=_fastest(plain, repeats),
-        largest_overlap=basis.largest_overlap,
-    )
-
-
-def _fastest(work: Callable[[], object], repeats: int) -> float:
-    return min(timeit.repeat(work, number=1, repeat=repeats))
+    seconds = [min(timeit.repeat(form, number=1, repeat=repeats)) for form in (wavelet, plain)]
+    difference = float(np.abs(wavelet() - reference).max() / np.abs(reference).max())
+    return FormCost(n, seconds[0] / seconds[1], difference, basis.largest_overlap)

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isfinite, pi
-from typing import final
+from math import pi
+from typing import Annotated, final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lcopa_bayes.core.arrays import Array
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.rules import Ruled, whole
 from lcopa_bayes.model.literature import PAPER, StatedOptics
-from lcopa_bayes.optics.checks import finite, unless_positive
+from lcopa_bayes.optics.checks import LENGTH, SHARE, finite
 
 _ROUNDING = 4 * float(np.finfo(float).eps)
 """A direction cosine beyond 1 by no more than this [-] is end-fire within rounding."""
@@ -20,28 +21,17 @@ _ROUNDING = 4 * float(np.finfo(float).eps)
 
 @final
 @dataclass(frozen=True)
-class LinearArray:
+class LinearArray(Ruled):
     """Equally spaced elements in a row; InputError for an impossible array, all problems at once."""
 
-    elements: int
-    """N [-]; at least 2."""
-    pitch: float
+    elements: Annotated[int, whole(2)]
+    """N [-]; one alone steers nothing."""
+    pitch: Annotated[float, LENGTH]
     """d, centre to centre [m]."""
-    wavelength: float
+    wavelength: Annotated[float, LENGTH]
     """lambda [m]."""
-    fill_factor: float = 0.0
-    """Width of an element over the pitch [-], in [0, 1]; 0 is a point, which radiates isotropically."""
-
-    def __post_init__(self) -> None:
-        problems: list[str] = []
-        if isinstance(self.elements, bool) or not isinstance(self.elements, int) or self.elements < 2:
-            problems.append(f"`elements` must be an integer >= 2; got {self.elements!r}: one steers nothing.")
-        problems += unless_positive("pitch", self.pitch, "metres")
-        problems += unless_positive("wavelength", self.wavelength, "metres")
-        if not (isfinite(self.fill_factor) and 0 <= self.fill_factor <= 1):
-            problems.append(f"`fill_factor` must be in [0, 1]; got {self.fill_factor!r}: 0 means points.")
-        if problems:
-            raise InputError(problems)
+    fill_factor: Annotated[float, SHARE] = 0.0
+    """Width of an element over the pitch [-]; 0 is a point, which radiates isotropically."""
 
     @property
     def period(self) -> float:

@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from math import isfinite, pi, sqrt
-from typing import final
+from math import pi, sqrt
+from typing import Annotated, final
 
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.rules import POSITIVE, Ruled
 from lcopa_bayes.model.literature import PAPER, StatedOptics
-from lcopa_bayes.optics.checks import unless_positive
+from lcopa_bayes.optics.checks import PRETILT
 
 
 class Field(Enum):
@@ -30,28 +30,19 @@ class Field(Enum):
 
 @final
 @dataclass(frozen=True)
-class Cell:
+class Cell(Ruled):
     """Nematic of positive dielectric anisotropy between parallel plates; InputError for anything else."""
 
-    k1: float
+    k1: Annotated[float, POSITIVE]
     """Splay constant [N]."""
-    k3: float
+    k3: Annotated[float, POSITIVE]
     """Bend constant [N]."""
-    permittivity: float
+    permittivity: Annotated[float, POSITIVE]
     """eps, perpendicular to the director [F/m]."""
-    permittivity_anisotropy: float
+    permittivity_anisotropy: Annotated[float, POSITIVE]
     """deps [F/m]; positive, or the field would not tilt the director."""
-    pretilt: float = 0.0
-    """Tilt at both plates [rad], in [0, pi/2); the same sense on both."""
-
-    def __post_init__(self) -> None:
-        problems = unless_positive("k1", self.k1, "newtons") + unless_positive("k3", self.k3, "newtons")
-        problems += unless_positive("permittivity", self.permittivity, "F/m")
-        problems += unless_positive("permittivity_anisotropy", self.permittivity_anisotropy, "F/m")
-        if not (isfinite(self.pretilt) and 0 <= self.pretilt < pi / 2):
-            problems.append(f"`pretilt` must be in [0, pi/2) rad; got {self.pretilt!r}: give it in radians.")
-        if problems:
-            raise InputError(problems)
+    pretilt: Annotated[float, PRETILT] = 0.0
+    """Tilt at both plates [rad]; the same sense on both."""
 
     @property
     def threshold(self) -> float:

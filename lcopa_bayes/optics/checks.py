@@ -1,21 +1,21 @@
-"""Sentences about numbers that cannot be used, shared by the optics modules."""
+"""What numbers must be, shared by the optics modules."""
 
 from __future__ import annotations
 
-from math import inf, isfinite
+from math import inf, pi
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lcopa_bayes.core.arrays import Array
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.rules import POSITIVE, Rule, is_number
 
-
-def unless_positive(name: str, value: float, unit: str) -> list[str]:
-    """One sentence, with `name` and `unit`, if `value` is not a positive finite number; else none."""
-    if isfinite(value) and value > 0:
-        return []
-    return [f"`{name}` must be a positive number of {unit}; got {value!r}: give it in SI units."]
+LENGTH = Rule("a positive number of metres", POSITIVE.holds)
+SHARE = Rule("a number from 0 to 1", lambda value: is_number(value) and 0 <= value <= 1)
+PRETILT = Rule(
+    "a tilt in radians, from 0 to below pi/2", lambda value: is_number(value) and 0 <= value < pi / 2
+)
 
 
 def finite(

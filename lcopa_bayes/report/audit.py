@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from lcopa_bayes.report.formatting import NONE, ends, figures, percent
 from lcopa_bayes.report.page import write_graded
 from lcopa_bayes.report.savedrun import SavedRun, load_run
-from lcopa_bayes.report.section import Drawing, Section, Table
+from lcopa_bayes.report.section import Drawing, Section, Table, paged
 from lcopa_bayes.report.theme import (
     BAND,
     CYCLE,
@@ -220,11 +220,7 @@ def _profiles(results: Mapping[str, Any], run: SavedRun) -> Section:
         "Line: fall of twice the log likelihood along the profile, its 90 % level dashed, an open side where "
         "the line stays below to the end. Filled: marginal posterior on the scale of the axis."
     )
-    pages = [rows[k : k + _PER_FIGURE] for k in range(0, len(rows), _PER_FIGURE)]
-    drawings = tuple(
-        Drawing(f"profiles_{number:02d}", _profile_page(page, run), caption)
-        for number, page in enumerate(pages, start=1)
-    )
+    drawings = paged("profiles", rows, _PER_FIGURE, lambda part: _profile_page(part, run), caption)
     return Section("Profiles and marginals", drawings=drawings)
 
 

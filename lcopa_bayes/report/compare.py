@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from lcopa_bayes.comparison.compare import folder_name
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.report.decimation import extremes
+from lcopa_bayes.report.decimation import draw_band, draw_line
 from lcopa_bayes.report.formatting import NONE, figures, interval, percent, to_spread
 from lcopa_bayes.report.page import Verdict, write_graded
 from lcopa_bayes.report.section import Drawing, Section, Table
@@ -312,8 +312,7 @@ def _drawn(
     some = parts[rows[0]["name"]]
     colour, unit = HELD_OUT if held else SEEN, str(some["unit"].iloc[0])
     seen, time = some["observed"].to_numpy(), some["time"].to_numpy()
-    at = extremes(seen)
-    top.plot(time[at], seen[at], ".", ms=2.5, mew=0, color=colour, label="observed", zorder=1)
+    draw_line(top, time, seen, ".", ms=2.5, mew=0, color=colour, label="observed", zorder=1)
     for row, own in zip(rows, CYCLE * len(rows), strict=False):
         _rival(
             top, below, parts[row["name"]], plain(row["name"]), own, row["name"] == results["preferred"], held
@@ -335,12 +334,9 @@ def _rival(
     residual = part["observed"].to_numpy() - middle
     if held or preferred:
         low, high = part["low"].to_numpy(), part["high"].to_numpy()
-        at = extremes(low, high)
-        top.fill_between(time[at], low[at], high[at], color=colour, alpha=0.12, lw=0)
-    at = extremes(middle)
-    top.plot(time[at], middle[at], color=colour, lw=1.6 if preferred else 1.0, label=name, zorder=2)
-    at = extremes(residual)
-    below.plot(time[at], residual[at], color=colour, lw=0.9 if preferred else 0.6)
+        draw_band(top, time, low, high, color=colour, alpha=0.12)
+    draw_line(top, time, middle, color=colour, lw=1.6 if preferred else 1.0, label=name, zorder=2)
+    draw_line(below, time, residual, color=colour, lw=0.9 if preferred else 0.6)
 
 
 def _caption(rows: Sequence[Mapping[str, Any]], record: str, axis: str, *, held: bool) -> str:

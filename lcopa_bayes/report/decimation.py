@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from matplotlib.axes import Axes
 
 from lcopa_bayes.core.arrays import Index, Vector
 
@@ -33,6 +36,18 @@ def extremes(*curves: Vector, most: int = MOST) -> Index:
             order = np.lexsort((filled, owner))
             picked.append(order[edges])
     return np.unique(np.concatenate(picked))
+
+
+def draw_line(panel: Axes, x: Vector, y: Vector, *args: Any, **style: Any) -> None:
+    """`panel.plot` through the extremes of a curve (n,)."""
+    at = extremes(y)
+    panel.plot(x[at], y[at], *args, **style)
+
+
+def draw_band(panel: Axes, x: Vector, low: Vector, high: Vector, **style: Any) -> None:
+    """`panel.fill_between` through the extremes of both ends (n,), without an edge."""
+    at = extremes(low, high)
+    panel.fill_between(x[at], low[at], high[at], lw=0, **style)
 
 
 def said(size: int, *, most: int = MOST) -> str:

@@ -6,16 +6,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.report.decimation import extremes
+from lcopa_bayes.report.decimation import draw_line
 from lcopa_bayes.report.formatting import ends, figures
 from lcopa_bayes.report.page import write_graded
 from lcopa_bayes.report.section import Drawing, Section, Table, score_columns
-from lcopa_bayes.report.theme import BAND, CYCLE, HELD_OUT, NOISE, blank, label, plain, svg_of
+from lcopa_bayes.report.sections.records import draw_bands, draw_drives
+from lcopa_bayes.report.theme import BAND, HELD_OUT, NOISE, blank, label, svg_of
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
 from lcopa_bayes.results.newdrive import BANDS, DRIVES
 from lcopa_bayes.results.stored import stored_values
@@ -88,17 +88,7 @@ def _drawn(values: Mapping[str, Any], rows: pd.DataFrame, drives: pd.DataFrame) 
             shade = "outside the fitted range" if panel is top else None
             panel.axvspan(float(beyond[0]), last, color=_OUTSIDE, lw=0, zorder=-1, label=shade)
     for panel, unit in zip(below, units, strict=True):
-        own = drives[drives["unit"] == unit]
-        names = list(dict.fromkeys(own["axis"]))
-        for name, colour in zip(names, CYCLE * len(names), strict=False):
-            one = own[own["axis"] == name]
-            at, value = one["time"].to_numpy(), one["drive"].to_numpy()
-            at, value = np.append(at, max(last, at[-1])), np.append(value, value[-1])
-            panel.plot(at, value, drawstyle="steps-post", color=colour, label=plain(name))
-        panel.set_ylabel(label(names[0] if len(names) == 1 else "drive", unit))
-        panel.margins(y=0.12)
-        if len(names) > 1:
-            panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+        draw_drives(panel, drives[drives["unit"] == unit], unit, until=last)
     top.set_ylabel(label(str(rows["axis"].iloc[0]), str(rows["unit"].iloc[0])))
     margin = 0.02 * (last - first)
     top.set_xlim(first - margin, last + margin)
@@ -110,27 +100,23 @@ def _drawn(values: Mapping[str, Any], rows: pd.DataFrame, drives: pd.DataFrame) 
 
 def _bands(panel: Axes, rows: pd.DataFrame, *, measured: bool) -> None:
     time = rows["time"].to_numpy()
-    for what, kind, low, high, colour, alpha, name in (
-        ("noisy", POINTWISE, "05", "95", NOISE, 0.30, f"90 % with noise, {POINTWISE}"),
-        ("plant", POINTWISE, "05", "95", BAND, 0.30, f"90 % plant, {POINTWISE}"),
-        ("plant", POINTWISE, "25", "75", BAND, 0.55, f"50 % plant, {POINTWISE}"),
-    ):
-        lower, upper = (rows[f"{what}_{kind}_{end}"].to_numpy() for end in (low, high))
-        at = extremes(lower, upper)
-        panel.fill_between(time[at], lower[at], upper[at], color=colour, alpha=alpha, lw=0, label=name)
+    draw_bands(
+        panel,
+        rows,
+        (
+            ("noisy", "05", "95", NOISE, 0.30, f"90 % with noise, {POINTWISE}"),
+            ("plant", "05", "95", BAND, 0.30, f"90 % plant, {POINTWISE}"),
+            ("plant", "25", "75", BAND, 0.55, f"50 % plant, {POINTWISE}"),
+        ),
+    )
     for what, colour, name in (("noisy", NOISE, "with noise"), ("plant", BAND, "plant")):
         for end in ("05", "95"):
             edge = rows[f"{what}_{SIMULTANEOUS}_{end}"].to_numpy()
-            at = extremes(edge)
             text = f"90 % {name}, {SIMULTANEOUS}" if end == "05" else None
-            panel.plot(time[at], edge[at], color=colour, lw=0.7, ls=(0, (4, 3)), label=text)
-    middle = rows[f"plant_{POINTWISE}_50"].to_numpy()
-    at = extremes(middle)
-    panel.plot(time[at], middle[at], color=BAND, label="median")
+            draw_line(panel, time, edge, color=colour, lw=0.7, ls=(0, (4, 3)), label=text)
     if measured:
         seen = rows["observed"].to_numpy()
-        at = extremes(seen)
-        panel.plot(time[at], seen[at], ".", ms=2.5, mew=0, color=HELD_OUT, label="observed", zorder=3)
+        draw_line(panel, time, seen, ".", ms=2.5, mew=0, color=HELD_OUT, label="observed", zorder=3)
 
 
 def _range(values: Mapping[str, Any]) -> Section:

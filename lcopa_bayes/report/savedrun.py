@@ -15,16 +15,15 @@ import xarray as xr
 
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
+from lcopa_bayes.results.bands import POINTWISE, QUANTILE_NAMES, SIMULTANEOUS
 from lcopa_bayes.results.runfolder import ORIGINS
 
-_BAND = ("05", "25", "50", "75", "95")
 _WORDS = ("record", "axis", "unit", "name", "path", "prior", "from")
 _FLAGS = ("held_out", "log_scale", "integrated_out")
 _TABLES: Mapping[str, tuple[str, ...]] = {
     "bands": (
         *("record", "axis", "unit", "held_out", "time", "observed"),
-        *(f"{kind}_{q}" for kind in ("plant", "noisy") for q in _BAND),
+        *(f"{kind}_{POINTWISE}_{q}" for kind in ("plant", "noisy") for q in QUANTILE_NAMES),
     ),
     "drives": ("record", "axis", "unit", "time", "drive"),
     "residuals": ("record", "axis", "unit", "held_out", "time", "residual"),
@@ -32,12 +31,12 @@ _TABLES: Mapping[str, tuple[str, ...]] = {
     "spectrum": ("record", "axis", "frequency", "power_over_white"),
     "step_response": (
         *("path", "unit", "time"),
-        *(f"response_{q}" for q in _BAND),
+        *(f"response_{q}" for q in QUANTILE_NAMES),
         *("steady_05", "steady_50", "steady_95"),
     ),
     "frequency_response": (
         *("path", "unit", "frequency"),
-        *(f"{curve}_{POINTWISE}_{q}" for curve in ("gain", "phase") for q in _BAND),
+        *(f"{curve}_{POINTWISE}_{q}" for curve in ("gain", "phase") for q in QUANTILE_NAMES),
         *(f"{curve}_{SIMULTANEOUS}_{q}" for curve in ("gain", "phase") for q in ("05", "95")),
     ),
     "priors": ("name", "unit", "prior", "from", "integrated_out"),

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias, final
+from typing import Any, Literal, TypeAlias, TypeVar, final
 
 from lcopa_bayes.report.formatting import figures, percent
 
@@ -13,6 +13,7 @@ Kind = Literal["text", "number", "grade", "code", "interval", "prose"]
 Row: TypeAlias = Mapping[str, Any]
 """What a row of a table is about."""
 Cell: TypeAlias = str | Callable[[Row], str]
+T = TypeVar("T")
 
 
 @final
@@ -81,6 +82,14 @@ class Drawing:
     caption: str
     mark: str = ""
     """A word set before the caption that must not be overlooked, such as "held out"."""
+
+
+def paged(
+    stem: str, names: Sequence[T], most: int, draw: Callable[[Sequence[T]], str], caption: str
+) -> tuple[Drawing, ...]:
+    """Figures `<stem>_01` and so on, each of up to `most` of the `names`, as `draw` gives them."""
+    parts = [names[k : k + most] for k in range(0, len(names), most)]
+    return tuple(Drawing(f"{stem}_{k:02d}", draw(part), caption) for k, part in enumerate(parts, start=1))
 
 
 @final

@@ -11,6 +11,7 @@ size from the same draws would cover too little when points are many and draws f
 from __future__ import annotations
 
 from math import ceil
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,6 +26,30 @@ LEVELS = (0.5, 0.9)
 """Probabilities inside the bands [-]."""
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 """Of the pointwise bands and their median."""
+QUANTILE_NAMES = ("05", "25", "50", "75", "95")
+"""What columns of tables call them."""
+
+
+class Bands(NamedTuple):
+    """Bands of one curve over its points."""
+
+    pointwise: Matrix
+    """5, 25, 50, 75, 95 % quantiles, (5, n)."""
+    simultaneous: Matrix
+    """Lower end at 90 and 50 %, upper end at 50 and 90 %, (4, n)."""
+
+    @classmethod
+    def of(cls, curves: Matrix) -> Bands:
+        """Bands of curves (draws, n)."""
+        quantiles = pointwise(curves)
+        return cls(quantiles, simultaneous(curves, quantiles))
+
+
+def named(name: str, bands: Bands) -> dict[str, Vector]:
+    """Columns of a table: the ends of the bands by kind and percentage."""
+    columns = {f"{name}_{POINTWISE}_{q}": row for q, row in zip(QUANTILE_NAMES, bands.pointwise, strict=True)}
+    rows = zip(("05", "25", "75", "95"), bands.simultaneous, strict=True)
+    return columns | {f"{name}_{SIMULTANEOUS}_{q}": row for q, row in rows}
 
 
 def pointwise(curves: Matrix) -> Matrix:

@@ -149,7 +149,7 @@ def optimum_shift(problem: Problem, values: Vector) -> float:
     precision = jacobian.T @ jacobian + _prior_precision(here)
     covariance = np.asarray(np.linalg.pinv(precision, hermitian=True), dtype=float)
     finer = [LeastSquares(problem.refined(factor).posterior) for factor in FACTORS]
-    changes = [each.residual(x, values)[0] - residual for each in finer]
+    changes = [each.misfit(x, values) - residual for each in finer]  # slopes with effects cost most
     return largest_shift(covariance, jacobian, changes)
 
 

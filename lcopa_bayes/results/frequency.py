@@ -5,7 +5,7 @@ At ``s = i 2 pi f`` (Ta et al. 2026, Eq. 31, stiffness divided out)."""
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 import numpy as np
 import pandas as pd
@@ -16,7 +16,7 @@ from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import Estimate, plain
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.model.transfer import denominator
-from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS, pointwise, simultaneous
+from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS, Bands, named
 from lcopa_bayes.results.result import notebook_table
 from lcopa_bayes.sampling.draws import Draws
 
@@ -32,21 +32,6 @@ fit records resolve [-]."""
 _SEARCH_POINTS = 300
 _SIGN = 0.05
 """Share of draws with a gain of the other sign from which the phase has two values [-]."""
-
-
-class Bands(NamedTuple):
-    """Bands of one curve over its points."""
-
-    pointwise: Matrix
-    """5, 25, 50, 75, 95 % quantiles, (5, n)."""
-    simultaneous: Matrix
-    """Lower end at 90 and 50 %, upper end at 50 and 90 %, (4, n)."""
-
-    @classmethod
-    def of(cls, curves: Matrix) -> Bands:
-        """Bands of curves (draws, n)."""
-        quantiles = pointwise(curves)
-        return cls(quantiles, simultaneous(curves, quantiles))
 
 
 @final
@@ -139,16 +124,6 @@ class FrequencyResponse:
 
     def _repr_html_(self) -> str:
         return notebook_table(self.summary())
-
-
-def named(name: str, bands: Bands) -> dict[str, Vector]:
-    """Columns of a table: the ends of the bands by kind and percentage."""
-    columns = {
-        f"{name}_{POINTWISE}_{q}": row
-        for q, row in zip(("05", "25", "50", "75", "95"), bands.pointwise, strict=True)
-    }
-    rows = zip(("05", "25", "75", "95"), bands.simultaneous, strict=True)
-    return columns | {f"{name}_{SIMULTANEOUS}_{q}": row for q, row in rows}
 
 
 def transfer_function(table: ParameterTable, values: Matrix, frequency: Vector) -> tuple[Array, Array]:

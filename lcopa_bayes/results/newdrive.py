@@ -20,7 +20,7 @@ from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
 from lcopa_bayes.results.fittedrange import FittedRange, Outside
-from lcopa_bayes.results.frequency import Bands, named, transfer_function
+from lcopa_bayes.results.frequency import transfer_function
 from lcopa_bayes.results.prediction import (
     Band,
     band_of,
@@ -98,19 +98,8 @@ class Prediction(Result):
         """One row per axis and time: ends of the bands by kind, plant alone and with noise [`unit`], and
         whether the time lies within the fitted range of amplitude and duration."""
         since = min((one.since for one in self.outside if one.since is not None), default=np.inf)
-        frames = []
-        for band in self.bands:
-            columns: dict[str, Any] = {
-                "axis": band.axis,
-                "unit": band.unit,
-                "time": band.time,
-                "observed": band.observed,
-            }
-            columns |= named("plant", Bands(band.plant, band.plant_simultaneous))
-            columns |= named("noisy", Bands(band.noisy, band.noisy_simultaneous))
-            columns["inside"] = band.time < since
-            frames.append(pd.DataFrame(columns))
-        return pd.concat(frames, ignore_index=True)
+        frames = [band.table().assign(inside=band.time < since) for band in self.bands]
+        return pd.concat(frames, ignore_index=True).drop(columns=["record", "held_out"])
 
     def drives(self) -> pd.DataFrame:
         """One row per drive axis and row of the drive: its value from there on [`unit`]."""

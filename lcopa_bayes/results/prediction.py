@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, final
 
 import numpy as np
+import pandas as pd
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.data.record import Axis
@@ -15,11 +16,9 @@ from lcopa_bayes.inference.observations import Observed, Samples
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.simulation import Simulation
 from lcopa_bayes.model.forward import ForwardModel
-from lcopa_bayes.results.bands import LEVELS, POINTWISE, pointwise, simultaneous
+from lcopa_bayes.results.bands import LEVELS, POINTWISE, Bands, named
 from lcopa_bayes.sampling.draws import Draws
 
-BEFORE_DRIVE = "samples before the drive acts"
-"""Source of an offset."""
 _CELLS = 2_000_000
 """Draws times samples behind the bands of one axis of one record."""
 _FEWEST = 200
@@ -58,6 +57,19 @@ class Band:
     """Samples of a held-out record that its own offset was taken from [-]; 0 for an offset of the fit."""
     draws: int
     """Draws behind the quantiles."""
+
+    def table(self) -> pd.DataFrame:
+        """One row per time: what was observed, and the ends of the bands by kind [`unit`]."""
+        columns: dict[str, Any] = {
+            "record": self.record,
+            "axis": self.axis,
+            "unit": self.unit,
+            "held_out": self.held_out,
+            "time": self.time,
+            "observed": self.observed,
+        }
+        columns |= named("plant", Bands(self.plant, self.plant_simultaneous))
+        return pd.DataFrame(columns | named("noisy", Bands(self.noisy, self.noisy_simultaneous)))
 
     @property
     def own_offset(self) -> bool:
@@ -204,7 +216,7 @@ def band_of(
     level, source, used = offset
     response = response + level[:, None]
     noisy = response + noises
-    plant_quantiles, noisy_quantiles = pointwise(response), pointwise(noisy)
+    plant, with_noise = Bands.of(response), Bands.of(noisy)
     return Band(
         name,
         axis.name,
@@ -212,10 +224,10 @@ def band_of(
         held_out,
         times,
         observed,
-        plant_quantiles,
-        noisy_quantiles,
-        simultaneous(response, plant_quantiles),
-        simultaneous(noisy, noisy_quantiles),
+        plant.pointwise,
+        with_noise.pointwise,
+        plant.simultaneous,
+        with_noise.simultaneous,
         source,
         used,
         response.shape[0],
@@ -242,14 +254,8 @@ def offset_draws(
         return values[:, places[axis, -1]], "shared with the fit records", 0
     if not held_out:
         return values[:, places[axis, r]], "fitted", 0
-    observed = record.axes[axis]
-    quiet = record.times[observed.index] <= record.first_change
-    used, source = quiet, BEFORE_DRIVE
-    if quiet.all():
-        source = "all samples of the held-out record, whose drive does not change before the last of them"
-    elif not quiet.any():
-        used, source = ~quiet, "all samples of the held-out record, none of which is before the drive acts"
-    offset = _given(observed, used, response, noise, table, values, axis, rng)
+    used, source = record.level_samples(axis)
+    offset = _given(record.axes[axis], used, response, noise, table, values, axis, rng)
     return offset, source, int(used.sum())
 
 

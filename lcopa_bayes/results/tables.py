@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from lcopa_bayes.results.bands import SIMULTANEOUS
+from lcopa_bayes.results.bands import QUANTILE_NAMES, QUANTILES
 from lcopa_bayes.results.summary import results
 from lcopa_bayes.sampling.crosscheck import CrossCheck
 
 if TYPE_CHECKING:
     from lcopa_bayes.results.fit import Fit
+    from lcopa_bayes.results.residuals import Residual
 
-_QUANTILE_NAMES = ("05", "25", "50", "75", "95")
 _PRIOR_POINTS = 200
 _BINS = 30
 
@@ -30,36 +31,33 @@ def tables(fit: Fit) -> dict[str, pd.DataFrame]:
             [row | {"held_out": False} for row in told["fit_scores"]]
             + [row | {"held_out": True} for row in told["held_out"]]
         ),
-        "bands": _bands(fit),
+        "bands": pd.concat([band.table() for band in fit.bands], ignore_index=True),
         "drives": _drives(fit),
-        "residuals": _residuals(fit),
-        "autocorrelation": _autocorrelation(fit),
-        "spectrum": _spectrum(fit),
+        "residuals": _of_residuals(
+            fit,
+            lambda one: {
+                "unit": one.unit,
+                "time": one.time,
+                "residual": one.values,
+                "innovation": one.innovations,
+            },
+        ),
+        "autocorrelation": _of_residuals(
+            fit,
+            lambda one: {
+                "lag": np.arange(1, one.autocorrelation.size + 1),
+                "autocorrelation": one.autocorrelation,
+                "white_band_95": one.white_band,
+            },
+        ),
+        "spectrum": _of_residuals(
+            fit, lambda one: {"frequency": one.frequency, "power_over_white": one.spectrum}
+        ),
         "step_response": _step_response(fit),
         "frequency_response": fit.frequency.table(),
         "priors": _priors(fit),
         "prior_density": _prior_density(fit),
     } | ({} if fit.cross_check is None else _cross_check(fit, fit.cross_check))
-
-
-def _bands(fit: Fit) -> pd.DataFrame:
-    frames = []
-    for band in fit.bands:
-        columns = {
-            "record": band.record,
-            "axis": band.axis,
-            "unit": band.unit,
-            "held_out": band.held_out,
-            "time": band.time,
-            "observed": band.observed,
-        }
-        columns |= {f"plant_{q}": row for q, row in zip(_QUANTILE_NAMES, band.plant, strict=True)}
-        columns |= {f"noisy_{q}": row for q, row in zip(_QUANTILE_NAMES, band.noisy, strict=True)}
-        for name, ends in (("plant", band.plant_simultaneous), ("noisy", band.noisy_simultaneous)):
-            rows = zip(("05", "25", "75", "95"), ends, strict=True)
-            columns |= {f"{name}_{SIMULTANEOUS}_{q}": row for q, row in rows}
-        frames.append(pd.DataFrame(columns))
-    return pd.concat(frames, ignore_index=True)
 
 
 def _drives(fit: Fit) -> pd.DataFrame:
@@ -79,55 +77,13 @@ def _drives(fit: Fit) -> pd.DataFrame:
     return pd.concat(frames, ignore_index=True)
 
 
-def _residuals(fit: Fit) -> pd.DataFrame:
+def _of_residuals(fit: Fit, columns: Callable[[Residual], dict[str, Any]]) -> pd.DataFrame:
+    """Columns of every residual below each other; empty when every record is too short for one."""
     frames = [
-        pd.DataFrame(
-            {
-                "record": left.record,
-                "axis": left.axis,
-                "unit": left.unit,
-                "held_out": left.held_out,
-                "time": left.time,
-                "residual": left.values,
-                "innovation": left.innovations,
-            }
-        )
-        for left in fit.residuals
+        pd.DataFrame({"record": one.record, "axis": one.axis, "held_out": one.held_out, **columns(one)})
+        for one in fit.residuals
     ]
-    return _stacked(frames)
-
-
-def _autocorrelation(fit: Fit) -> pd.DataFrame:
-    frames = [
-        pd.DataFrame(
-            {
-                "record": left.record,
-                "axis": left.axis,
-                "held_out": left.held_out,
-                "lag": np.arange(1, left.autocorrelation.size + 1),
-                "autocorrelation": left.autocorrelation,
-                "white_band_95": left.white_band,
-            }
-        )
-        for left in fit.residuals
-    ]
-    return _stacked(frames)
-
-
-def _spectrum(fit: Fit) -> pd.DataFrame:
-    frames = [
-        pd.DataFrame(
-            {
-                "record": left.record,
-                "axis": left.axis,
-                "held_out": left.held_out,
-                "frequency": left.frequency,
-                "power_over_white": left.spectrum,
-            }
-        )
-        for left in fit.residuals
-    ]
-    return _stacked(frames)
+    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
 
 
 def _step_response(fit: Fit) -> pd.DataFrame:
@@ -135,14 +91,14 @@ def _step_response(fit: Fit) -> pd.DataFrame:
     for i, response in enumerate(layout.responses):
         for j, drive in enumerate(layout.drives):
             response_curve = curves.gains[:, i, j, None] * curves.normalised[curves.curve_of[i][j]]
-            rows = np.quantile(response_curve, (0.05, 0.25, 0.5, 0.75, 0.95), axis=0)
+            rows = np.quantile(response_curve, QUANTILES, axis=0)
             steady = np.quantile(curves.gains[:, i, j], (0.05, 0.5, 0.95))
             columns = {
                 "path": layout.path_name(i, j) or response.name,
                 "unit": f"{response.unit}/{drive.unit}",
                 "time": curves.time,
             }
-            columns |= {f"response_{q}": row for q, row in zip(_QUANTILE_NAMES, rows, strict=True)}
+            columns |= {f"response_{q}": row for q, row in zip(QUANTILE_NAMES, rows, strict=True)}
             columns |= {f"steady_{q}": v for q, v in zip(("05", "50", "95"), steady, strict=True)}
             frames.append(pd.DataFrame(columns))
     return pd.concat(frames, ignore_index=True)
@@ -213,8 +169,3 @@ def _cross_check(fit: Fit, check: CrossCheck) -> dict[str, pd.DataFrame]:
         "cross_check": pd.DataFrame(rows),
         "cross_check_density": pd.concat(densities, ignore_index=True),
     }
-
-
-def _stacked(frames: list[pd.DataFrame]) -> pd.DataFrame:
-    """Frames below each other; empty when every record is too short for a residual test."""
-    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()

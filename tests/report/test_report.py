@@ -50,7 +50,7 @@ def bands_of(record: str, held: bool, size: int) -> pd.DataFrame:
     table = {"record": record, "axis": "x", "unit": "rad", "held_out": held, "time": time}
     table["observed"] = middle + 1e-4 * np.sin(40 * time)
     for kind, scale in (("plant", 1e-4), ("noisy", 2e-4)):
-        table |= {f"{kind}_{q}": middle + scale * z for q, z in QUANTILES.items()}
+        table |= {f"{kind}_pointwise_{q}": middle + scale * z for q, z in QUANTILES.items()}
     return pd.DataFrame(table)
 
 

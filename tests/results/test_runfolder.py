@@ -64,7 +64,7 @@ def test_tables_read_back(fitted, folder):
         assert len(read) == len(table) > 0, name
     bands = pd.read_csv(folder / "tables" / "bands.csv")
     assert set(bands["record"]) == {"a", "b", "held"}
-    assert (bands["noisy_05"] <= bands["noisy_95"]).all()
+    assert (bands["noisy_pointwise_05"] <= bands["noisy_pointwise_95"]).all()
     priors = pd.read_csv(folder / "tables" / "priors.csv").set_index("name")
     assert priors.loc["delay", "prior"] == "fixed at 0.73"
     assert priors.loc["gain", "integrated_out"] == (fitted.problem.posterior.noise.kind == "white")

@@ -163,6 +163,18 @@ def test_simulate_writes_a_study_that_loads(tmp_path, capsys):
     assert (tmp_path / "demo" / "a.csv").read_bytes() == before
 
 
+BAD_PATH = """[[record]]
+name = "a"
+duration = 5
+[[path]]
+response = "x"
+drive = "x"
+delay = 1.0
+orders = [1.0]
+stiffness = 1.0
+"""
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -171,6 +183,16 @@ def test_simulate_writes_a_study_that_loads(tmp_path, capsys):
         ('[[record]]\nname = "a"\nduration = 5\nx = { stp = 1 }\n', ["stp", "step"]),
         ('[[record]]\nname = "a"\nduration = 5\nx = { on_off = 1 }\n', ["hold"]),
         ('[bensch]\n[[record]]\nname = "a"\nduration = 5\n', ["bensch", "bench"]),
+        ('[[record]]\nname = "a"\nduration = "x"\n', ["[[record]] 1", "`duration` must be a number"]),
+        ('[[record]]\nname = "a"\nduration = 5\nx = 3\n', ["`x` must be a table such as"]),
+        ('[[record]]\nname = "a"\nduration = 5\nx = { step = "b" }\n', ["`step` must be a number"]),
+        ('[record]\nname = "a"\n', ["[[record]]"]),
+        ('[bench]\ncamera = "x"\nnoise_sd = []\n[[record]]\nname = "a"\n', ["`camera` must be a number"]),
+        ('[bench]\ncamera = -1.0\n[[record]]\nname = "a"\nduration = 5\n', ["campaign.toml", "`camera`"]),
+        ('[campaign]\nseed = "x"\n[[record]]\nname = "a"\nduration = 5\n', ["`seed` must be a whole"]),
+        ('[undeclared]\neffects = "cubic_stiffness"\n', ["`effects` must be a list"]),
+        (f"{BAD_PATH}gain = '0.1'\n", ["[[path]] 1", "`gain` must be a number"]),
+        (f"{BAD_PATH}gain = -0.1\netas = [-1.0]\n", ["[[path]]", "must be positive"]),
     ],
 )
 def test_a_bad_campaign_is_told(tmp_path, capsys, text, words):

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
 
 from lcopa_bayes.report.formatting import NONE, figures, interval, to_spread
 from lcopa_bayes.report.savedrun import SavedRun
-from lcopa_bayes.report.section import Column, Drawing, Section, Table
-from lcopa_bayes.report.theme import BAND, HELD_OUT, grid, label, log_ticks, svg_of
+from lcopa_bayes.report.section import Column, Section, Table, paged
+from lcopa_bayes.report.sections.priors import density_axis, marginals
+from lcopa_bayes.report.theme import BAND, HELD_OUT
 
 _TITLE = "Second method"
 _PER_FIGURE = 12
@@ -37,7 +37,6 @@ def section(run: SavedRun) -> Section:
     said = str(check["sentence"])
     density = run.tables["cross_check_density"]
     names = list(dict.fromkeys(density["name"]))
-    pages = [names[k : k + _PER_FIGURE] for k in range(0, len(names), _PER_FIGURE)]
     caption = (
         "Marginals by both methods, over 99.8 % of their draws. Where the axis is logarithmic, densities are "
         "per natural logarithm of the parameter."
@@ -45,10 +44,7 @@ def section(run: SavedRun) -> Section:
     return Section(
         _TITLE,
         (f"{said[0].upper()}{said[1:]}.", _HOW.format(alarm=figures(check["alarm"], 1))),
-        tuple(
-            Drawing(f"cross_check_{number:02d}", _drawn(run, page), caption)
-            for number, page in enumerate(pages, start=1)
-        ),
+        paged("cross_check", names, _PER_FIGURE, lambda part: marginals(run, part, _panel), caption),
         (_marginals(check), _evidences(check)),
     )
 
@@ -108,27 +104,10 @@ def _with_error(value: float | None, error: float | None) -> str:
     return NONE if value is None or error is None else f"{value:.2f} ± {error:.2f}"
 
 
-def _drawn(run: SavedRun, names: Sequence[str]) -> str:
-    figure, panels = grid(len(names), columns=3, height=1.5)
-    for panel, name in zip(panels, names, strict=True):
-        _panel(panel, run, name)
-        panel.set_xlabel(label(name, run.units[name]), fontsize=8)
-        panel.set_yticks([])
-        panel.spines["left"].set_visible(False)
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
-    return svg_of(figure)
-
-
 def _panel(panel: Axes, run: SavedRun, name: str) -> None:
     whole = run.tables["cross_check_density"]
     own = whole[whole["name"] == name]
     edges = np.append(own["left"].to_numpy(), own["right"].to_numpy()[-1])
     panel.stairs(own["ensembles"].to_numpy(), edges, fill=True, color=BAND, alpha=0.5, label="ensembles")
     panel.stairs(own["nested"].to_numpy(), edges, color=HELD_OUT, linewidth=1.1, label="nested sampling")
-    if own["log_scale"].any():
-        panel.set_xscale("log")
-        log_ticks(panel.xaxis, float(edges[0]), float(edges[-1]))
-    else:
-        panel.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
-    panel.set_ylim(bottom=0.0)
-    panel.margins(x=0.0)
+    density_axis(panel, float(edges[0]), float(edges[-1]), log=bool(own["log_scale"].any()))

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from lcopa_bayes.report.formatting import figures
+from lcopa_bayes.report.formatting import figures, percent
 from lcopa_bayes.report.savedrun import SavedRun
-from lcopa_bayes.report.section import Column, Section, Table
+from lcopa_bayes.report.section import Section, Table
 
 _TITLE = "Evidence"
 _HOW = (
@@ -33,20 +33,24 @@ def section(run: SavedRun) -> Section:
 
 
 def _errors(results: Mapping[str, Any], rival: Mapping[str, Any]) -> Table:
-    columns = (
-        *(Column("record", "code"), Column("axis", "code"), Column("role"), Column("unit")),
-        *(Column("free orders: RMSE", "number"), Column("in 90 % band", "number")),
-        *(Column("integer orders: RMSE", "number"), Column("in 90 % band", "number")),
-    )
-    rows = []
-    for key, role in (("fit_scores", "fit"), ("held_out", "held out")):
-        for own, other in zip(results[key], rival[key], strict=True):
-            cells = [str(own["record"]), str(own["axis"]), role, str(own["unit"])]
-            for entry in (own, other):
-                cells += [figures(entry["rmse"], 3), f"{100 * entry['coverage_90']:.0f} %"]
-            rows.append(tuple(cells))
     weighed = rival["log_evidence"]
     caption = f"The rival's grade is {rival['grade']}: {rival['grade_reason']}." + (
         "" if weighed is None else f" Its log evidence is {weighed:.2f} ± {rival['log_evidence_sd']:.2f} nat."
     )
-    return Table(columns, tuple(rows), caption)
+    pairs = [
+        own | {"role": role, "rival": other}
+        for key, role in (("fit_scores", "fit"), ("held_out", "held out"))
+        for own, other in zip(results[key], rival[key], strict=True)
+    ]
+    return Table.of(
+        pairs,
+        ("record", "code", "record"),
+        ("axis", "code", "axis"),
+        ("role", "text", "role"),
+        ("unit", "text", "unit"),
+        ("free orders: RMSE", "number", "rmse"),
+        ("in 90 % band", "number", lambda row: percent(row["coverage_90"])),
+        ("integer orders: RMSE", "number", lambda row: figures(row["rival"]["rmse"])),
+        ("in 90 % band", "number", lambda row: percent(row["rival"]["coverage_90"])),
+        caption=caption,
+    )

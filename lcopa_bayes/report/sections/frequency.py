@@ -9,7 +9,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from lcopa_bayes.report.savedrun import SavedRun
-from lcopa_bayes.report.section import Drawing, Section
+from lcopa_bayes.report.section import Section, paged
 from lcopa_bayes.report.theme import BAND, grid, label, log_ticks, plain, svg_of
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
 
@@ -21,16 +21,12 @@ def section(run: SavedRun) -> Section:
     """Gain and phase with their bands."""
     table = run.tables["frequency_response"]
     paths = list(dict.fromkeys(table["path"]))
-    pages = [paths[k : k + _PER_FIGURE] for k in range(0, len(paths), _PER_FIGURE)]
     caption = (
         f"Gain and phase of each path: median, {POINTWISE} 50 and 90 % bands, and the {SIMULTANEOUS} "
         "90 % band (dashed), which holds the whole curve. From one cycle in the longest fit record to one in "
         "two sampling periods."
     )
-    drawings = tuple(
-        Drawing(f"frequency_{number:02d}", _drawn(run, table, page), caption)
-        for number, page in enumerate(pages, start=1)
-    )
+    drawings = paged("frequency", paths, _PER_FIGURE, lambda part: _drawn(run, table, part), caption)
     return Section("Frequency response", drawings=drawings)
 
 

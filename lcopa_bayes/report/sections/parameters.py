@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from lcopa_bayes.report.formatting import figures, interval, percent, to_spread
+from lcopa_bayes.report.formatting import NONE, figures, interval, percent, to_spread
 from lcopa_bayes.report.savedrun import SavedRun
-from lcopa_bayes.report.section import Column, Section, Table
+from lcopa_bayes.report.section import Section, Table
 
 
 def section(run: SavedRun) -> Section:
@@ -15,26 +15,35 @@ def section(run: SavedRun) -> Section:
     free, fixed = run.results["parameters"], run.results["fixed"]
     kind = ", ".join(dict.fromkeys(f"{percent(row['level'])} {row['interval']}" for row in free))
     tables = [
-        Table(
+        Table.of(
+            free,
+            ("name", "code", "name"),
+            ("median", "number", lambda row: to_spread(row["value"], row["sd"])),
+            ("unit", "text", "unit"),
             (
-                *(Column("name", "code"), Column("median", "number"), Column("unit")),
-                *(Column("90 % interval" if _all_at(free, 0.9) else "interval", "number"),),
-                *(Column("mean", "number"), Column("sd", "number"), Column("ESS", "number")),
-                *(Column("R-hat", "number"), Column("grade", "grade")),
+                "90 % interval" if all(row["level"] == 0.9 for row in free) else "interval",
+                "number",
+                lambda row: interval(row["lower"], row["upper"], row["sd"]),
             ),
-            tuple(_row(row) for row in free),
-            f"Intervals are {kind}. Digits end at the second significant digit of the standard deviation. "
-            "ESS is the smaller of the effective sample sizes of bulk and tails; R-hat compares independent "
-            "ensembles.",
+            ("mean", "number", lambda row: to_spread(row["mean"], row["sd"])),
+            ("sd", "number", lambda row: figures(row["sd"], 2)),
+            ("ESS", "number", _ess),
+            ("R-hat", "number", lambda row: NONE if row.get("rhat") is None else f"{row['rhat']:.3f}"),
+            ("grade", "grade", "grade"),
+            caption=f"Intervals are {kind}. Digits end at the second significant digit of the standard "
+            "deviation. ESS is the smaller of the effective sample sizes of bulk and tails; R-hat compares "
+            "independent ensembles.",
         )
     ]
     if run.results["ridges"]:
         tables.append(_modes(run.results["ridges"]))
     if fixed:
         tables.append(
-            Table(
-                (Column("fixed parameter", "code"), Column("value", "number"), Column("unit")),
-                tuple((str(row["name"]), figures(row["value"], 6), str(row["unit"])) for row in fixed),
+            Table.of(
+                fixed,
+                ("fixed parameter", "code", "name"),
+                ("value", "number", lambda row: figures(row["value"], 6)),
+                ("unit", "text", "unit"),
             )
         )
     text = () if fixed else ("No parameter was fixed.",)
@@ -43,46 +52,28 @@ def section(run: SavedRun) -> Section:
 
 def _modes(rows: list[Mapping[str, Any]]) -> Table:
     """Shares of the modes of parameters whose marginal has several."""
-    columns = (
-        *(Column("several modes in", "code"), Column("split at", "number"), Column("unit")),
-        *(Column("shares of all draws", "interval"), Column("range over ensembles", "interval")),
-        *(Column("grade", "grade"), Column("statement", "prose")),
-    )
-    shown = []
-    for row in rows:
-        pooled = zip(row["pooled"], row["pooled_mcse"], strict=True)
-        by_mode = zip(*row["shares"], strict=True)
-        shown.append(
-            (
-                *(str(row["parameter"]), ", ".join(figures(end) for end in row["boundaries"])),
-                *(str(row["unit"]), ", ".join(f"{share:.2f} ± {error:.2f}" for share, error in pooled)),
-                ", ".join(f"{min(shares):.2f} to {max(shares):.2f}" for shares in by_mode),
-                *(str(row["grade"]), str(row["sentence"])),
-            )
-        )
-    return Table(
-        columns,
-        tuple(shown),
-        "The draws of these parameters lie in separate modes; medians and intervals mix them. "
+    return Table.of(
+        rows,
+        ("several modes in", "code", "parameter"),
+        ("split at", "number", lambda row: ", ".join(figures(end) for end in row["boundaries"])),
+        ("unit", "text", "unit"),
+        ("shares of all draws", "interval", _shares),
+        (
+            "range over ensembles",
+            "interval",
+            lambda row: ", ".join(f"{min(s):.2f} to {max(s):.2f}" for s in zip(*row["shares"], strict=True)),
+        ),
+        ("grade", "grade", "grade"),
+        ("statement", "prose", "sentence"),
+        caption="The draws of these parameters lie in separate modes; medians and intervals mix them. "
         "± is the Monte Carlo standard error.",
     )
 
 
-def _row(row: Mapping[str, Any]) -> tuple[str, ...]:
-    sd = row["sd"]
-    rhat = row.get("rhat")
-    return (
-        str(row["name"]),
-        to_spread(row["value"], sd),
-        str(row["unit"]),
-        interval(row["lower"], row["upper"], sd),
-        to_spread(row["mean"], sd),
-        figures(sd, 2),
-        figures(row["ess"]) if (row["ess"] or 0) < 100 else f"{row['ess']:.0f}",
-        "–" if rhat is None else f"{rhat:.3f}",  # noqa: RUF001
-        str(row["grade"]),
-    )
+def _shares(row: Mapping[str, Any]) -> str:
+    pairs = zip(row["pooled"], row["pooled_mcse"], strict=True)
+    return ", ".join(f"{share:.2f} ± {error:.2f}" for share, error in pairs)
 
 
-def _all_at(rows: list[Mapping[str, Any]], level: float) -> bool:
-    return all(row["level"] == level for row in rows)
+def _ess(row: Mapping[str, Any]) -> str:
+    return figures(row["ess"]) if (row["ess"] or 0) < 100 else f"{row['ess']:.0f}"

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from lcopa_bayes.report.decimation import extremes, said
+from lcopa_bayes.report.decimation import draw_band, draw_line, extremes, said
 from lcopa_bayes.report.formatting import figures, percent
 from lcopa_bayes.report.savedrun import SavedRun
 from lcopa_bayes.report.section import Drawing, Section, Table, score_columns
@@ -17,9 +17,9 @@ from lcopa_bayes.report.theme import BAND, CYCLE, HELD_OUT, NOISE, SEEN, blank, 
 from lcopa_bayes.results.bands import POINTWISE
 
 _BANDS = (
-    ("noisy_05", "noisy_95", NOISE, 0.30, "90 % with noise"),
-    ("plant_05", "plant_95", BAND, 0.30, "90 % plant"),
-    ("plant_25", "plant_75", BAND, 0.55, "50 % plant"),
+    ("noisy", "05", "95", NOISE, 0.30, "90 % with noise"),
+    ("plant", "05", "95", BAND, 0.30, "90 % plant"),
+    ("plant", "25", "75", BAND, 0.55, "50 % plant"),
 )
 
 
@@ -68,7 +68,7 @@ def _drawn(run: SavedRun, rows: pd.DataFrame, record: str, axis: str, *, held: b
     top.set_ylabel(label(axis, rows["unit"].iloc[0]))
     top.set_title(plain(f"{record}, {axis}: {'held out' if held else 'fit'}"), loc="left", color=colour)
     for panel, unit in zip(below, units, strict=True):
-        _drives(panel, drives[drives["unit"] == unit], unit)
+        draw_drives(panel, drives[drives["unit"] == unit], unit, until=float(rows["time"].max()))
     margin = 0.02 * float(np.ptp(rows["time"]))
     top.set_xlim(rows["time"].min() - margin, rows["time"].max() + margin)
     (below[-1] if below else top).set_xlabel(label("time", run.time_unit))
@@ -79,33 +79,32 @@ def _drawn(run: SavedRun, rows: pd.DataFrame, record: str, axis: str, *, held: b
 
 def _bands(panel: Axes, rows: pd.DataFrame, marked: str) -> None:
     time = rows["time"].to_numpy()
-    for low, high, colour, alpha, name in _BANDS:
-        lower, upper = rows[low].to_numpy(), rows[high].to_numpy()
-        at = extremes(lower, upper)
-        panel.fill_between(time[at], lower[at], upper[at], color=colour, alpha=alpha, lw=0, label=name)
-    middle, seen = rows["plant_50"].to_numpy(), rows["observed"].to_numpy()
-    at = extremes(middle)
-    panel.plot(time[at], middle[at], color=BAND, label="median")
-    at = extremes(seen)
-    panel.plot(
-        time[at],
-        seen[at],
-        ".",
-        ms=2.5 if at.size > 300 else 3.2,
-        mew=0,
-        color=marked,
-        label="observed",
-        zorder=3,
-    )
+    draw_bands(panel, rows, _BANDS)
+    seen = rows["observed"].to_numpy()
+    size = 2.5 if extremes(seen).size > 300 else 3.2
+    draw_line(panel, time, seen, ".", ms=size, mew=0, color=marked, label="observed", zorder=3)
 
 
-def _drives(panel: Axes, drives: pd.DataFrame, unit: str) -> None:
+def draw_bands(
+    panel: Axes, rows: pd.DataFrame, which: Sequence[tuple[str, str, str, str, float, str]]
+) -> None:
+    """Pointwise bands of a response, by column, ends, colour, opacity and label, and the median."""
+    time = rows["time"].to_numpy()
+    for column, low, high, colour, alpha, name in which:
+        lower, upper = (rows[f"{column}_{POINTWISE}_{end}"].to_numpy() for end in (low, high))
+        draw_band(panel, time, lower, upper, color=colour, alpha=alpha, label=name)
+    draw_line(panel, time, rows[f"plant_{POINTWISE}_50"].to_numpy(), color=BAND, label="median")
+
+
+def draw_drives(panel: Axes, drives: pd.DataFrame, unit: str, *, until: float) -> None:
+    """Drives of one unit; the last row of each holds on to the time `until`."""
     names = list(dict.fromkeys(drives["axis"]))
     for name, colour in zip(names, CYCLE * len(names), strict=False):
         own = drives[drives["axis"] == name]
         time, drive = own["time"].to_numpy(), own["drive"].to_numpy()
-        at = extremes(drive)
-        panel.plot(time[at], drive[at], drawstyle="steps-post", color=colour, label=plain(name))
+        if until > time[-1]:
+            time, drive = np.append(time, until), np.append(drive, drive[-1])
+        draw_line(panel, time, drive, drawstyle="steps-post", color=colour, label=plain(name))
     panel.set_ylabel(label(names[0] if len(names) == 1 else "drive", unit))
     panel.margins(y=0.12)
     if len(names) > 1:

@@ -9,7 +9,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from lcopa_bayes.core.arrays import Index, Vector
-from lcopa_bayes.report.decimation import extremes, said
+from lcopa_bayes.report.decimation import draw_line, extremes, said
 from lcopa_bayes.report.formatting import figures, probability
 from lcopa_bayes.report.savedrun import SavedRun
 from lcopa_bayes.report.section import Drawing, Section
@@ -47,10 +47,9 @@ def _drawn(run: SavedRun, rows: pd.DataFrame, record: str, axis: str, *, held: b
     figure = blank(3.9)
     panels = figure.subplot_mosaic([["time", "time"], ["lags", "spectrum"]], height_ratios=[1.0, 1.15])
     time, residual = rows["time"].to_numpy(), rows["residual"].to_numpy()
-    at = extremes(residual)
     colour = HELD_OUT if held else SEEN
     panels["time"].axhline(0.0, color=NOISE, lw=0.7)
-    panels["time"].plot(time[at], residual[at], ".-", ms=2, mew=0, lw=0.5, color=colour)
+    draw_line(panels["time"], time, residual, ".-", ms=2, mew=0, lw=0.5, color=colour)
     panels["time"].set_title(
         plain(f"{record}, {axis}: {'held out' if held else 'fit'}"), loc="left", color=colour
     )

@@ -7,7 +7,7 @@ from typing import Any
 
 from lcopa_bayes.report.formatting import NONE, figures
 from lcopa_bayes.report.savedrun import SavedRun
-from lcopa_bayes.report.section import Column, Section, Table
+from lcopa_bayes.report.section import Section, Table
 
 _MOST = 20
 """Parameters shown; the others are in the table of the run folder."""
@@ -40,32 +40,27 @@ def section(run: SavedRun) -> Section:
         text.append(
             f"The {_MOST} most affected of {len(rows)} are shown; tables/sensitivity.csv has them all."
         )
-    columns = (
-        *(Column("name", "code"), Column("prior", "number"), Column("likelihood", "number")),
-        *(Column("diagnosis", "prose"), Column("Pareto k", "number"), Column("grade", "grade")),
-        Column("note", "prose"),
+    table = Table.of(
+        rows[:_MOST],
+        ("name", "code", "parameter"),
+        ("prior", "number", lambda row: _with_error(row, "prior")),
+        ("likelihood", "number", lambda row: _with_error(row, "likelihood")),
+        ("diagnosis", "prose", "diagnosis"),
+        ("Pareto k", "number", _pareto_k),
+        ("grade", "grade", "grade"),
+        ("note", "prose", "note"),
+        caption="± is the Monte Carlo standard error; Pareto k is the larger of those of the weights that "
+        "scale the prior and the likelihood; the grade is that of the parameter's draws.",
     )
-    caption = (
-        "± is the Monte Carlo standard error; Pareto k is the larger of those of the weights that scale the "
-        "prior and the likelihood; the grade is that of the parameter's draws."
-    )
-    table = Table(columns, tuple(_row(row) for row in rows[:_MOST]), caption)
     return Section("Prior sensitivity", tuple(text), tables=(table,) if rows else ())
 
 
-def _row(row: Mapping[str, Any]) -> tuple[str, ...]:
+def _pareto_k(row: Mapping[str, Any]) -> str:
     ks = [row[key] for key in ("prior_k", "likelihood_k") if row[key] is not None]
-    return (
-        str(row["parameter"]),
-        _with_error(row["prior"], row["prior_mcse"]),
-        _with_error(row["likelihood"], row["likelihood_mcse"]),
-        str(row["diagnosis"]),
-        figures(max(ks), 2) if ks else NONE,
-        str(row["grade"]),
-        str(row["note"]),
-    )
+    return figures(max(ks), 2) if ks else NONE
 
 
-def _with_error(value: float | None, error: float | None) -> str:
+def _with_error(row: Mapping[str, Any], key: str) -> str:
     """`value ± error` to a thousandth."""
+    value, error = row[key], row[f"{key}_mcse"]
     return NONE if value is None or error is None else f"{value:.3f} ± {error:.3f}"

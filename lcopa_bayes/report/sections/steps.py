@@ -8,10 +8,10 @@ from typing import Any
 import pandas as pd
 from matplotlib.axes import Axes
 
-from lcopa_bayes.report.decimation import extremes
+from lcopa_bayes.report.decimation import draw_band, draw_line
 from lcopa_bayes.report.formatting import NOT_REACHED, OPEN, figures, interval, to_spread
 from lcopa_bayes.report.savedrun import SavedRun
-from lcopa_bayes.report.section import Column, Drawing, Section, Table
+from lcopa_bayes.report.section import Section, Table, paged
 from lcopa_bayes.report.theme import BAND, STEADY, grid, plain, svg_of
 from lcopa_bayes.results.bands import POINTWISE
 
@@ -32,15 +32,11 @@ def section(run: SavedRun) -> Section:
     """Bands of the response to a unit step, and the table of step metrics."""
     curves = run.tables["step_response"]
     paths = list(dict.fromkeys(curves["path"]))
-    pages = [paths[k : k + _PER_FIGURE] for k in range(0, len(paths), _PER_FIGURE)]
     caption = (
         "Response of the plant to a unit step at time 0, over the longest record: median, "
         f"{POINTWISE} 50 and 90 % bands. Dashed: median and 90 % interval of the steady state it tends to."
     )
-    drawings = tuple(
-        Drawing(f"step_{number:02d}", _drawn(run, curves, page), caption)
-        for number, page in enumerate(pages, start=1)
-    )
+    drawings = paged("step", paths, _PER_FIGURE, lambda part: _drawn(run, curves, part), caption)
     tables = (_metrics(run.results["step_metrics"]),) if run.results["step_metrics"] else ()
     return Section("Step responses", drawings=drawings, tables=tables)
 
@@ -61,11 +57,8 @@ def _path(panel: Axes, rows: pd.DataFrame) -> None:
     time = rows["time"].to_numpy()
     for low, high, alpha, name in (("05", "95", 0.30, "90 %"), ("25", "75", 0.45, "50 %")):
         lower, upper = rows[f"response_{low}"].to_numpy(), rows[f"response_{high}"].to_numpy()
-        at = extremes(lower, upper)
-        panel.fill_between(time[at], lower[at], upper[at], color=BAND, alpha=alpha, lw=0, label=name)
-    middle = rows["response_50"].to_numpy()
-    at = extremes(middle)
-    panel.plot(time[at], middle[at], color=BAND, label="median")
+        draw_band(panel, time, lower, upper, color=BAND, alpha=alpha, label=name)
+    draw_line(panel, time, rows["response_50"].to_numpy(), color=BAND, label="median")
     for quantile, width, name in (("50", 1.1, "steady state"), ("05", 0.7, ""), ("95", 0.7, "")):
         level = float(rows[f"steady_{quantile}"].iloc[0])
         panel.axhline(level, color=STEADY, lw=width, ls=(0, (4, 3)), label=name or None)
@@ -73,32 +66,38 @@ def _path(panel: Axes, rows: pd.DataFrame) -> None:
 
 
 def _metrics(metrics: Sequence[Mapping[str, Any]]) -> Table:
-    columns = (
-        *(Column("path"), Column("metric"), Column("median", "interval"), Column("unit")),
-        *(Column("90 % interval", "interval"), Column("sd", "number"), Column("grade", "grade")),
-        Column("note", "prose"),
-    )
-    return Table(
-        columns,
-        tuple(_row(metric) for metric in metrics),
-        "Times count from the step. Intervals are 90 % equal-tailed credible; where they are open, the "
-        "response of that share of the draws does not reach them within the record, or does not remain "
+    return Table.of(
+        metrics,
+        ("path", "text", lambda row: _kind(row)[1]),
+        ("metric", "text", lambda row: _WORDS.get(_kind(row)[0], _kind(row)[0].replace("_", " "))),
+        ("median", "interval", _median),
+        ("unit", "text", "unit"),
+        ("90 % interval", "interval", _interval),
+        ("sd", "number", lambda row: figures(row["sd"], 2)),
+        ("grade", "grade", "grade"),
+        ("note", "prose", lambda row: str(row.get("note", ""))),
+        caption="Times count from the step. Intervals are 90 % equal-tailed credible; where they are open, "
+        "the response of that share of the draws does not reach them within the record, or does not remain "
         "there after it.",
     )
 
 
-def _row(metric: Mapping[str, Any]) -> tuple[str, ...]:
+def _kind(metric: Mapping[str, Any]) -> tuple[str, str]:
+    """Kind and path of a metric."""
     kind, _, where = str(metric["name"]).partition("[")
-    never = NOT_REACHED if kind.startswith(_TIMES) else OPEN
-    lower, upper, sd = metric["lower"], metric["upper"], metric["sd"]
-    ends = interval(lower, upper, sd, nothing=never)
-    return (
-        where.rstrip("]"),
-        _WORDS.get(kind, kind.replace("_", " ")),
-        never if metric["value"] is None else to_spread(metric["value"], sd),
-        str(metric["unit"]),
-        ends if (lower is None) == (upper is None) or never == OPEN else ends.replace(OPEN, never),
-        figures(sd, 2),
-        str(metric["grade"]),
-        str(metric.get("note", "")),
-    )
+    return kind, where.rstrip("]")
+
+
+def _open(metric: Mapping[str, Any]) -> str:
+    """What an end says that no draw bounds."""
+    return NOT_REACHED if _kind(metric)[0].startswith(_TIMES) else OPEN
+
+
+def _median(metric: Mapping[str, Any]) -> str:
+    return _open(metric) if metric["value"] is None else to_spread(metric["value"], metric["sd"])
+
+
+def _interval(metric: Mapping[str, Any]) -> str:
+    lower, upper, never = metric["lower"], metric["upper"], _open(metric)
+    ends = interval(lower, upper, metric["sd"], nothing=never)
+    return ends if (lower is None) == (upper is None) else ends.replace(OPEN, never)

@@ -8,7 +8,7 @@ from itertools import cycle
 import numpy as np
 
 from lcopa_bayes.report.savedrun import SavedRun
-from lcopa_bayes.report.section import Drawing, Section
+from lcopa_bayes.report.section import Section, paged
 from lcopa_bayes.report.theme import CYCLE, grid, label, log_ticks, svg_of
 
 _PER_FIGURE = 12
@@ -18,10 +18,10 @@ _PER_FIGURE = 12
 def section(run: SavedRun) -> Section:
     """Traces with the ensembles in colours and R-hat in the titles."""
     names = list(run.units)
-    pages = [names[k : k + _PER_FIGURE] for k in range(0, len(names), _PER_FIGURE)]
-    drawings = tuple(
-        Drawing(f"trace_{number:02d}", _drawn(run, page), _caption(run, page))
-        for number, page in enumerate(pages, start=1)
+    ensembles, draws = run.draws[names[0]].shape
+    caption = (
+        f"{draws} draws of each of {ensembles} ensembles, thinned evenly from the kept part of the run, "
+        "walkers side by side within a step."
     )
     return Section(
         "Traces",
@@ -29,15 +29,7 @@ def section(run: SavedRun) -> Section:
             "Each colour is an independent ensemble. Draws whose colours separate or drift have not "
             "converged.",
         ),
-        drawings,
-    )
-
-
-def _caption(run: SavedRun, names: Sequence[str]) -> str:
-    ensembles, draws = run.draws[names[0]].shape
-    return (
-        f"{draws} draws of each of {ensembles} ensembles, thinned evenly from the kept part of the run, "
-        "walkers side by side within a step."
+        paged("trace", names, _PER_FIGURE, lambda part: _drawn(run, part), caption),
     )
 
 
