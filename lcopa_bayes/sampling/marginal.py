@@ -26,8 +26,10 @@ from lcopa_bayes.inference.conditional import Conditional, screened
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.conditionaldraws import kept
+from lcopa_bayes.sampling.ensemble import Ensemble, advance
 from lcopa_bayes.sampling.importanceweights import effective, usable_k
 from lcopa_bayes.sampling.mixture import Mixture, spread_evenly
+from lcopa_bayes.sampling.mixturemoves import learned
 from lcopa_bayes.sampling.outer import Outer, PriorOrders, conditional_of
 from lcopa_bayes.sampling.proposal import Seen, clustered, tempered
 from lcopa_bayes.sampling.weighted import Weighted, resampled
@@ -61,6 +63,10 @@ _MOST = 12_000
 """Most points of a round."""
 _VISITED = 6_000
 """Most points that a first proposal is learned from."""
+_TEACHING, _WALKERS, _WALK = 3_000, 256, (20, 5)
+"""Draws that the moves of walkers are learned from, walkers, and draws kept of each and steps per draw."""
+_LOOKED_AT, _HEAVIER = 1_000, 1.5
+"""Points of theirs that are weighted, and factor on the expected mean weight that shows a missed region."""
 _POPULATION = 50.0
 """Effective draws of all points at which ensembles may start from them."""
 _SPARE = 1.15
@@ -191,7 +197,9 @@ class Search:
             if weighted is None:
                 return None
             worth = weighted.smallest_ess(self._rng) if weighted.ess > 2.0 else 0.0
-            if worth >= wanted and weighted.pareto_k <= usable_k(weighted.count):
+            enough = worth >= wanted and weighted.pareto_k <= usable_k(weighted.count)
+            walked = self._walked(weighted) if count > _LEARNING or enough else None
+            if enough and walked is not None and not self._misses(proposal, weighted, walked):
                 return weighted
             larger += count > _LEARNING
             if larger == _LARGER:
@@ -199,6 +207,10 @@ class Search:
             proposal = clustered(
                 np.concatenate(self._seen.points), self._seen.log_weights(), int(self._rng.integers(2**31))
             )
+            if walked is not None:
+                y = spread_evenly(walked, _VISITED)
+                own = clustered(y, np.zeros(len(y)), int(self._rng.integers(2**31)))
+                proposal = proposal.blended(own, 0.5)
             # a larger round only where the proposal is close to the posterior
             needed = int(min(_SPARE * count * wanted / max(worth, 1.0), _MOST))
             more = min(needed, _GROWTH * count) if weighted.ess >= _HELPFUL * count else 0
@@ -220,6 +232,25 @@ class Search:
         exists = np.isfinite(raw)
         kept_draws = point.coordinates[exists], point.log_density[exists], raw[exists]
         return Weighted.of(self.posterior, *kept_draws, count, smooth=False)
+
+    def _walked(self, weighted: Weighted) -> Matrix:
+        """Where emcee goes from draws of equal weight, (points, size): into what no draw has met."""
+        z = weighted.coordinates[weighted.resampled(_TEACHING, self._rng)]
+        mixture = learned(self.posterior, [z[None]], int(self._rng.integers(2**31)))
+        walkers = max(_WALKERS, 2 * self.posterior.dimension + 2)
+        seed = np.random.SeedSequence(int(self._rng.integers(2**31)))
+        begin = Ensemble.started(z[:walkers], self.posterior.log_density(z[:walkers]), z, seed)
+        chain = advance(self.posterior, begin, *_WALK, mixture).chain
+        visited = chain[len(chain) // 2 :].reshape(-1, z.shape[1])
+        return self.outer.y(self.posterior.values(visited))
+
+    def _misses(self, proposal: Proposal, weighted: Weighted, walked: Matrix) -> bool:
+        """Whether the mean weight of points that walkers went to is larger than the draws' own weights say: a
+        region that the proposal hardly draws from shows in no weight of its draws."""
+        y = spread_evenly(walked, _LOOKED_AT)
+        raw = self._evaluated(y, self.outer.values(y), None).log_marginal - proposal.log_density(y)
+        mean = float(logsumexp(raw) - np.log(len(y)) - weighted.log_evidence)
+        return bool(mean > np.log(_HEAVIER * weighted.count / weighted.ess))
 
     def _evaluated(self, y: Matrix, values: Matrix, starts: Matrix | None) -> _Point:
         """Optima and draws at points; the first of a search twice, the second time from their neighbours."""
