@@ -171,7 +171,7 @@ def _cautions(noise: Sequence[AxisNoise], optimum: Optimum) -> tuple[str, ...]:
     out = [one.caution for one in noise if one.caution]
     if optimum.at_bound:
         out.append(
-            f"{', '.join(optimum.at_bound)} stand(s) at the end of its prior in the base fit; widen the "
+            f"{', '.join(optimum.at_bound)} at the end of the prior in the base fit; widen the "
             "prior "
             "or take the parameter out: what a bound takes away may look like an effect"
         )

@@ -14,7 +14,7 @@ from lcopa_bayes.inference.noise import White
 from lcopa_bayes.inference.posterior import Posterior
 
 _MERGED = 1e-6
-"""Orders closer than this stand at the end of their support [-]."""
+"""Orders closer than this are at the end of their support [-]."""
 
 
 class Curve(Protocol):
@@ -141,7 +141,7 @@ class BaseModel:
     def supported(self, x: Matrix, *, every: bool = True) -> Flags:
         """Whether orders decrease and terms are resolved, of coordinates (batch, k), (batch,).
 
-        Unless `every`, terms that can be exchanged may stand in any sequence.
+        Unless `every`, terms that can be exchanged may be in any sequence.
         """
         table = self.posterior.table
         values = np.tile(self.template, (len(x), 1))

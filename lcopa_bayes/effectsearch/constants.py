@@ -74,10 +74,10 @@ def polished(
 def _likely(
     model: ExtendedModel, x: Vector, whitening: Whitening, names: Sequence[str]
 ) -> tuple[ExtendedModel, Vector]:
-    """The model with constants back on the grid, of likely values, where the fit does not tell them apart.
+    """The model with constants back on the grid, of likely values, where the fit does not separate them.
 
     A phase and a delay move together until a command falls to another refresh, which other records may show.
-    A noise that still holds what the effect takes away tells too little apart.
+    A noise that still holds what the effect takes away separates too little.
     """
     if whitening.dependence:
         return model, x

@@ -33,7 +33,7 @@ _SIZES = (1.0, -1.0)
 
 
 def rough(seen: Trace) -> bool:
-    """Whether a residual stands far above the noise."""
+    """Whether a residual is far above the noise."""
     return float(np.mean(seen.residual**2)) > ROUGH**2
 
 

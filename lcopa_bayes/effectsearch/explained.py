@@ -17,10 +17,8 @@ from lcopa_bayes.inference.declared import coefficient_prior
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.effect import Effect
 from lcopa_bayes.model.effects.records import Outliers
-from lcopa_bayes.results.discretisation import resolved
-from lcopa_bayes.results.fit import plan_of
+from lcopa_bayes.results.fit import plan_of, weighted_fit
 from lcopa_bayes.sampling.draws import Draws
-from lcopa_bayes.sampling.weightedrun import weighted_run
 
 
 def explained_study(study: Study, model: ExtendedModel, outliers: Outlying | None = None) -> Study:
@@ -63,8 +61,8 @@ def declarable(study: Study, effects: Sequence[Effect]) -> bool:
 def explained_draws(study: Study, *, jobs: int = 1, quick: bool = False) -> Draws | None:
     """Draws of an explained study, the same that a fit of it gives; None where importance sampling does not
     hold, and a fit takes ensembles from the prior."""
-    problem = resolved(problem_of(study))
-    result = weighted_run(problem.posterior, plan_of(problem, quick=False), jobs=jobs, quick=quick)
+    problem = problem_of(study)
+    _, result = weighted_fit(problem, plan_of(problem, quick=False), jobs=jobs, quick=quick)
     return None if result is None else result[1]
 
 

@@ -133,8 +133,8 @@ class ExtendedModel:
         """
         kept = tuple(e for e in self.effects if not isinstance(e, ForceEffect))
         more = self.having(*kept, effect)
-        told, old = self.effected.coefficients, self.effected.effects
-        own = [k for k, one in enumerate(told) if old[one.effect] in kept]
+        placed, old = self.effected.coefficients, self.effected.effects
+        own = [k for k, one in enumerate(placed) if old[one.effect] in kept]
         coordinates = np.concatenate([x[: self.plant_size], x[self.plant_size :][own]])
         new = more.scale.size - len(own)
         values, psi = more.split(np.concatenate([coordinates, np.zeros(new)]))

@@ -18,7 +18,7 @@ _GAIN = 1e-3
 """A step expected to gain less ends the descent [nat]."""
 _HALVINGS = 6
 _AT_END = 1e-3
-"""Closer to an end of its support than this share of it, a coordinate stands at its bound [-]."""
+"""Closer to an end of its support than this share of it, a coordinate is at its bound [-]."""
 
 
 @final

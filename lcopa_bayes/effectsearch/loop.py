@@ -29,7 +29,7 @@ from lcopa_bayes.effectsearch.rounds import CLEAR, SINGLE, Round, search
 from lcopa_bayes.effectsearch.scores import Score, State, fit_scores, held_out_scores, left_out_scores
 from lcopa_bayes.effectsearch.terms import fitted_base
 from lcopa_bayes.effectsearch.trace import Trace
-from lcopa_bayes.effectsearch.verdict import ALONE, EXPLAINED, Found, Verdict, beside, decide
+from lcopa_bayes.effectsearch.verdict import ALONE, EXPLAINED, Findings, Verdict, beside, decide
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.effect import Effect
@@ -66,7 +66,7 @@ class Loop:
     effects: tuple[Effect, ...]
     """Named effects of the final model; none when the verdict is `unexplained` or `clean`."""
     groups: tuple[tuple[str, ...], ...]
-    """For each effect, the names it cannot be told apart from, its own first."""
+    """For each effect, the names it is confounded with, its own first."""
     verdict: Verdict
     before: Side
     after: Side
@@ -166,7 +166,7 @@ def _looped(
     before = _side(problem, start)
     cautions = (*base.caution, *_alone(study))
     if base.failed:
-        found = Found(base.failed, cautions, False, np.nan, np.nan, (), (), 0, 0, "", 0, 0, "", np.nan)
+        found = Findings(base.failed, cautions, False, np.nan, np.nan, (), (), 0, 0, "", 0, 0, "", np.nan)
         verdict = decide(found)
         return Loop(
             *(problem, base, enlarged, (), (), (), verdict, before, before, not study.held_out, cautions),
@@ -184,7 +184,7 @@ def _looped(
     reached = _side(problem, searched.state)
     names = tuple(effect.name for effect in searched.state.model.effects)
     verdict = decide(
-        Found(
+        Findings(
             failed="",
             cautions=cautions,
             alarmed=first.alarmed or bool(names),
@@ -239,16 +239,16 @@ def _looped(
 
 
 def _alone(study: Study) -> tuple[str, ...]:
-    """What a single record cannot tell."""
+    """What a single record leaves open."""
     if len(study.fit) > 1:
         return ()
-    told = "a single record cannot tell an effect of the device from a peculiarity of that record"
+    said = "an effect of the device and a peculiarity of a single record are confounded"
     if not study.held_out:
-        told += (
+        said += (
             f": an effect is named only where the residual is {CLEAR:g} times the noise and it takes "
             f"{100 * SINGLE:.0f} % of its power"
         )
-    return (f"{told}; fit a second one",)
+    return (f"{said}; fit a second record",)
 
 
 def _side(problem: Problem, state: State) -> Side:

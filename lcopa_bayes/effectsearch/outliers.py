@@ -94,13 +94,13 @@ def outlying(study: Study, fit: BaseFit) -> Outlying | None:
     shares = counts[:, 1] / np.maximum(counts[:, 0], 1)
     if counts[0, 1] < _FEWEST or shares[1] > _ALIKE * shares[0]:
         return None
-    told = np.concatenate(sizes)
+    widths = np.concatenate(sizes)
     return Outlying(
         replace(study, fit=tuple(_without(one, number, far) for number, one in enumerate(samples))),
         study.fit,
-        told.size,
-        float(told.size / counts[:, 0].sum()),
-        float(np.sqrt(np.mean(told**2))),
+        widths.size,
+        float(widths.size / counts[:, 0].sum()),
+        float(np.sqrt(np.mean(widths**2))),
         scatter_evidence(fit.optimum.white),
     )
 

@@ -127,14 +127,14 @@ class Refit:
         """Coordinates of an effect's coefficients."""
         first = self.model.plant_size
         effects = self.model.effects
-        told = self.model.effected.coefficients
-        return [first + k for k, one in enumerate(told) if effects[one.effect].name == name]
+        placed = self.model.effected.coefficients
+        return [first + k for k, one in enumerate(placed) if effects[one.effect].name == name]
 
     @property
     def new(self) -> tuple[Placed, ...]:
         """Coefficients of the new effects."""
-        told, effects = self.model.effected.coefficients, self.model.effects
-        return tuple(one for one in told if effects[one.effect].name in self.added)
+        placed, effects = self.model.effected.coefficients, self.model.effects
+        return tuple(one for one in placed if effects[one.effect].name in self.added)
 
     @cached_property
     def significant(self) -> bool:
@@ -189,17 +189,17 @@ def _no_worse(model: ExtendedModel, whitening: Whitening, reached: Optimum, befo
     return min(reached, other, key=lambda one: one.cost)
 
 
-def under_one_noise(made: Sequence[Refit]) -> list[Refit]:
+def under_one_noise(candidates: Sequence[Refit]) -> list[Refit]:
     """Refits of one residual, by falling evidence.
 
     Where noise is known from residuals alone it holds the misfit too: then all are judged under that of the
     refit that leaves least.
     """
-    if made and made[0].whitening.dependence:
-        least = max(made, key=lambda one: one.taken)
+    if candidates and candidates[0].whitening.dependence:
+        least = max(candidates, key=lambda one: one.taken)
         noise = renewed(least.model.base, least.optimum, least.whitening)
-        made = [one.under(noise) for one in made]
-    return sorted(made, key=lambda one: -one.log_bayes_factor)
+        candidates = [one.under(noise) for one in candidates]
+    return sorted(candidates, key=lambda one: -one.log_bayes_factor)
 
 
 def log_bayes_factor(before: Optimum, after: Optimum, quiet: float) -> float:

@@ -17,7 +17,7 @@ from lcopa_bayes.effectsearch.whitening import Part
 _BINS = 12
 _LAGS = 60
 _SEEN = 1e-3
-"""p-value below which a dependence is told as one [-]."""
+"""p-value below which a dependence is reported [-]."""
 _BANDS = 24
 
 
@@ -29,9 +29,9 @@ class View:
     name: str
     axis: str
     across: str
-    """What stands on the horizontal axis, with its unit."""
+    """What is on the horizontal axis, with its unit."""
     along: str
-    """What stands on the vertical axis, with its unit."""
+    """What is on the vertical axis, with its unit."""
     x: Vector
     """[unit in `across`]."""
     y: Vector
@@ -42,8 +42,8 @@ class View:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        told = {"name": self.name, "axis": self.axis, "across": self.across, "along": self.along}
-        return told | {"x": self.x, "y": self.y, "error": self.error, "sentence": self.sentence}
+        labels = {"name": self.name, "axis": self.axis, "across": self.across, "along": self.along}
+        return labels | {"x": self.x, "y": self.y, "error": self.error, "sentence": self.sentence}
 
 
 @final

@@ -52,7 +52,7 @@ class Search:
     rounds: tuple[Round, ...]
     state: State
     groups: tuple[tuple[str, ...], ...]
-    """For each effect of the state, the names it cannot be told apart from, its own first."""
+    """For each effect of the state, the names it is confounded with, its own first."""
     gained: float
     """Log evidence of the final model over the base model [nat]."""
     share: float
@@ -70,7 +70,7 @@ def search(
     alone: bool = False,
 ) -> Search:
     """Add effects one at a time, up to three, while evidence, records left out and significance all speak
-    for it, from a record that stands `alone` only large ones; then try pairs where something remains, and
+    for it, from a record that is `alone` only large ones; then try pairs where something remains, and
     take back what is no longer significant."""
     state, rounds, groups = start, [], {}
     for number in range(MOST + 1):
@@ -94,12 +94,12 @@ def search(
             seen = trace(state, library, rng, noise_samples=noise_samples, draws=draws)
             rounds += [Round(rounds[0].trace, (paired,), (), paired), Round(seen, (), (), None)]
     names = [effect.name for effect in state.model.effects]
-    told = tuple(groups.get(name, (name,)) for name in names)
+    confounded = tuple(groups.get(name, (name,)) for name in names)
     gained, dropped = _gained(start, state, float(sum(noise_samples)))
     last = rounds[-1].trace
     left = last.scale.drop(last.largest) if last.alarmed else 0.0
     share = dropped / (dropped + left) if dropped > 0 else float(left <= 0)
-    return Search(tuple(rounds), state, told, gained, share)
+    return Search(tuple(rounds), state, confounded, gained, share)
 
 
 def _gained(start: State, state: State, quiet: float) -> tuple[float, float]:
@@ -122,14 +122,20 @@ def leading(start: State, seen: Trace) -> float:
     return max(accepted, default=0.0)
 
 
-def _accepted(made: Refit, seen: Trace, bar: float) -> bool:
+def _accepted(candidate: Refit, seen: Trace, bar: float) -> bool:
     generic = max((g.log_bayes_factor for g in seen.traced if g.card.place == "generic"), default=-np.inf)
-    ahead = made.log_bayes_factor > generic + MARGIN
-    return made.log_bayes_factor > bar and ahead and made.left_out > 0 and made.significant and made.resting
+    ahead = candidate.log_bayes_factor > generic + MARGIN
+    return (
+        candidate.log_bayes_factor > bar
+        and ahead
+        and candidate.left_out > 0
+        and candidate.significant
+        and candidate.resting
+    )
 
 
-def _large(made: Refit) -> bool:
-    return made.taken > SINGLE and made.excess > CLEAR
+def _large(candidate: Refit) -> bool:
+    return candidate.taken > SINGLE and candidate.excess > CLEAR
 
 
 def _leader(accepted: Sequence[Refit]) -> Refit | None:
@@ -140,24 +146,24 @@ def _leader(accepted: Sequence[Refit]) -> Refit | None:
     return next(shared, accepted[0] if accepted else None)
 
 
-def _state(made: Refit) -> State:
-    return State(made.model, made.optimum, made.whitening, made.optimum.covariance)
+def _state(candidate: Refit) -> State:
+    return State(candidate.model, candidate.optimum, candidate.whitening, candidate.optimum.covariance)
 
 
-def _kept(made: Refit) -> State:
+def _kept(candidate: Refit) -> State:
     """Without effects that are no longer significant beside the new one, and not missed when they go."""
     idle = [
         effect.name
-        for effect in made.model.effects
-        if effect.name not in made.added and made.wald(effect.name) > SIGNIFICANT
+        for effect in candidate.model.effects
+        if effect.name not in candidate.added and candidate.wald(effect.name) > SIGNIFICANT
     ]
     if not idle:
-        return _state(made)
-    model, x = made.without(idle)
-    optimum = Regression(model, made.whitening).descend(x, most=12, gain=0.02)
-    if log_bayes_factor(optimum, made.optimum, made.quiet) > MARGIN:
-        return _state(made)
-    return State(model, optimum, made.whitening, optimum.covariance)
+        return _state(candidate)
+    model, x = candidate.without(idle)
+    optimum = Regression(model, candidate.whitening).descend(x, most=12, gain=0.02)
+    if log_bayes_factor(optimum, candidate.optimum, candidate.quiet) > MARGIN:
+        return _state(candidate)
+    return State(model, optimum, candidate.whitening, optimum.covariance)
 
 
 def _paired(start: State, state: State, seen: Trace) -> Refit | None:
@@ -182,12 +188,12 @@ def _paired(start: State, state: State, seen: Trace) -> Refit | None:
         size = _best(pair[0]).columns.shape[1]
         added = [(_best(pair[0]).effect, inner[:size]), (_best(pair[1]).effect, inner[size:])]
         try:
-            made = refit(start.model, start.optimum, start.whitening, added, seen.scale.quiet)
+            candidate = refit(start.model, start.optimum, start.whitening, added, seen.scale.quiet)
         except ArithmeticError:
             continue
-        made = replace(under_one_noise([made])[0], paid=made.paid - choice)
-        if made.log_bayes_factor > bar and _accepted(made, seen, seen.threshold):
-            bar, best = made.log_bayes_factor, made
+        candidate = replace(under_one_noise([candidate])[0], paid=candidate.paid - choice)
+        if candidate.log_bayes_factor > bar and _accepted(candidate, seen, seen.threshold):
+            bar, best = candidate.log_bayes_factor, candidate
     return best
 
 
@@ -198,7 +204,7 @@ def _best(one: Traced) -> Signature:
 def group(
     chosen: Refit, refits: Sequence[Refit], seen: Trace, signatures: Mapping[str, Signature]
 ) -> tuple[str, ...]:
-    """Names that these records cannot tell from the chosen one.
+    """Names that these records confound with the chosen one, its own first.
 
     A rival that was refitted belongs to the group when it lost by less than 3 nat; one that was not, when the
     margin expected at the fitted size, which the angle between projected signatures sets, is below 3 nat.

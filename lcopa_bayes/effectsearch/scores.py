@@ -122,16 +122,16 @@ def left_out_scores(state: State) -> list[Score]:
 
 def held_out_scores(state: State, problem: Problem) -> list[Score]:
     """On the study's held-out records."""
-    told = predicted(problem, state.model, state.optimum.x, state.covariance, problem.study.held_out)
+    unseen = predicted(problem, state.model, state.optimum.x, state.covariance, problem.study.held_out)
     elsewhere = State(
         state.model,
         state.optimum,
-        Whitening(told.samples, state.whitening.noise),
+        Whitening(unseen.samples, state.whitening.noise),
         state.covariance,
         state.widening,
     )
     own = _own_levels(state)
-    return _scores(elsewhere, told.mean, told.variance, "the fit records", own_levels=own)
+    return _scores(elsewhere, unseen.mean, unseen.variance, "the fit records", own_levels=own)
 
 
 def _own_levels(state: State) -> bool:

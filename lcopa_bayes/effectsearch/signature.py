@@ -158,12 +158,12 @@ def signature_of(
     model: ExtendedModel, x: Vector, whitening: Whitening, project: Projection, effect: Effect
 ) -> Signature:
     """Signature of one more effect beside those of `model`; ArithmeticError where it cannot be simulated."""
-    raw, told = model.signature(x, effect)
+    raw, placed = model.signature(x, effect)
     if not np.isfinite(raw).all():
         raise FloatingPointError(f"{effect.name}: its signature is not finite")
     white = whitening(raw.T).T
     left = project(white)
-    one_signed = len(told) == 1 and told[0].coefficient.one_signed
+    one_signed = len(placed) == 1 and placed[0].coefficient.one_signed
     return Signature.of(effect, left, survival(white, left), one_signed)
 
 

@@ -61,14 +61,14 @@ def started(study: Study, fit: BaseFit) -> Mended | None:
     gain = 0.5 * count * np.log(power / found.fun) - 0.5 * first.size * np.log(count)
     if not gain > MARGIN:
         return None
-    told = " and ".join(
+    levels = " and ".join(
         f"{value:.4g} {axis.unit} of {axis.name}"
         for value, axis in zip(found.x, study.drive_axes, strict=True)
     )
     return Mended(
         _begun(study, found.x),
         "No record shows the plant at rest, and it did not rest under the first row's drive: a drive before "
-        f"the first row, the same for all records, was fitted ({told}, worth {gain:.0f} nat); an early row "
+        f"the first row, the same for all records, was fitted ({levels}, worth {gain:.0f} nat); an early row "
         "with a drive and no response would state it.",
     )
 

@@ -27,7 +27,7 @@ def results(found: Loop) -> dict[str, Any]:
     """Every number of the loop; `None` is open or undefined."""
     trace, unit = found.trace, found.problem.study.time_unit
     chances = trace.probabilities if trace else {}
-    told: dict[str, Any] = {
+    numbers: dict[str, Any] = {
         "study": found.problem.study.name,
         "verdict": found.verdict.kind,
         "confidence": found.verdict.confidence,
@@ -70,7 +70,7 @@ def results(found: Loop) -> dict[str, Any]:
         },
         "seed": found.problem.study.seed,
     }
-    values: dict[str, Any] = plain(told)
+    values: dict[str, Any] = plain(numbers)
     return values
 
 
@@ -109,7 +109,7 @@ def _effects(found: Loop, chances: dict[str, float]) -> list[dict[str, Any]]:
     model, optimum = found.after.state.model, found.after.state.optimum
     first, out = model.plant_size, []
     for number, effect in enumerate(found.effects):
-        told = [(k, one) for k, one in enumerate(model.effected.coefficients) if one.effect == number]
+        own = [(k, one) for k, one in enumerate(model.effected.coefficients) if one.effect == number]
         out.append(
             {
                 "name": effect.name,
@@ -123,10 +123,10 @@ def _effects(found: Loop, chances: dict[str, float]) -> list[dict[str, Any]]:
                 "parameters": [
                     found.estimate(first + k)
                     | {"prior_sd": one.coefficient.scale, "one_signed": one.coefficient.one_signed}
-                    for k, one in told
+                    for k, one in own
                 ],
                 "disturbance": effect.card.disturbance,
-                "significance": float(np.abs(optimum.x[first + told[0][0]] / optimum.sd[first + told[0][0]])),
+                "significance": float(np.abs(optimum.x[first + own[0][0]] / optimum.sd[first + own[0][0]])),
             }
         )
     return out
@@ -189,13 +189,13 @@ def _round(one: Round) -> dict[str, Any]:
         ],
         "refits": [
             {
-                "added": list(made.added),
-                "log_bayes_factor": made.log_bayes_factor,
-                "left_out_gain": made.left_out,
-                "significant": made.significant,
-                "converged": made.optimum.converged,
+                "added": list(candidate.added),
+                "log_bayes_factor": candidate.log_bayes_factor,
+                "left_out_gain": candidate.left_out,
+                "significant": candidate.significant,
+                "converged": candidate.optimum.converged,
             }
-            for made in one.refits
+            for candidate in one.refits
         ],
         "failures": list(one.failures),
         "chosen": list(one.chosen.added) if one.chosen else [],
@@ -227,29 +227,29 @@ def _curve(before: Score, after: Score, most: int = 1500) -> dict[str, Any]:
     }
 
 
-def words(told: dict[str, Any]) -> Sequence[str]:
+def words(numbers: dict[str, Any]) -> Sequence[str]:
     """Lines for a reader."""
-    out = [f"{told['verdict']} ({told['confidence']}): {told['sentence']}"]
-    out += [one for one in (told["base_enlarged"], *(f"caution: {c}" for c in told["cautions"])) if one]
-    for effect in told["effects"]:
-        group = f" (cannot be told from {', '.join(effect['group'][1:])})" if len(effect["group"]) > 1 else ""
+    out = [f"{numbers['verdict']} ({numbers['confidence']}): {numbers['sentence']}"]
+    out += [one for one in (numbers["base_enlarged"], *(f"caution: {c}" for c in numbers["cautions"])) if one]
+    for effect in numbers["effects"]:
+        group = f" (confounded with {', '.join(effect['group'][1:])})" if len(effect["group"]) > 1 else ""
         out.append(f"effect {effect['name']}, acts on the {effect['place']}{group}")
         out += [
             f"  {p['name']} = {p['value']:.4g} [{p['lower']:.4g}, {p['upper']:.4g}] {p['unit']}, {p['grade']}"
             for p in effect["parameters"][:6]
         ]
-    after = told["after"]
-    for axis, value in told["before"]["fit_rmse"].items():
+    after = numbers["after"]
+    for axis, value in numbers["before"]["fit_rmse"].items():
         out.append(
             f"axis {axis}: fit RMSE {value:.4g} -> {after['fit_rmse'][axis]:.4g}, unseen "
-            f"{told['before']['held_out_rmse'][axis]:.4g} -> {after['held_out_rmse'][axis]:.4g} "
-            f"({told['unseen_by']})"
+            f"{numbers['before']['held_out_rmse'][axis]:.4g} -> {after['held_out_rmse'][axis]:.4g} "
+            f"({numbers['unseen_by']})"
         )
-    coverage = [told[side]["held_out_coverage_90"] for side in ("before", "after")]
+    coverage = [numbers[side]["held_out_coverage_90"] for side in ("before", "after")]
     if None not in coverage:
         first, last = (f"{100 * share:.0f} %" for share in coverage)
         out.append(f"pointwise 90 % bands hold {first} of unseen samples before, {last} after")
-    out += [f"next measurement: {told['next_measurement']}"] if told["next_measurement"] else []
+    out += [f"next measurement: {numbers['next_measurement']}"] if numbers["next_measurement"] else []
     return out
 
 
@@ -293,7 +293,7 @@ def next_measurement(found: Loop) -> str:
     for group in found.groups:
         if len(group) > 1:
             wanted = _wanted([cards[name] for name in group if name in cards])
-            return f"To tell {', '.join(group)} apart, record {wanted}."
+            return f"To separate {', '.join(group)}, record {wanted}."
     if found.verdict.kind == "unexplained":
         near = [one for one in trace.traced if one.card.place != "generic"][:2]
         return f"To find what is missing, record {_wanted([one.card for one in near])}." if near else ""
@@ -306,5 +306,5 @@ def next_measurement(found: Loop) -> str:
 
 def _wanted(cards: Sequence[Card]) -> str:
     """What reveals these effects, each excitation once."""
-    told = (part.strip() for card in cards for part in card.reveals.split(";")[0].split(","))
-    return ", ".join(dict.fromkeys(told))
+    excitations = (part.strip() for card in cards for part in card.reveals.split(";")[0].split(","))
+    return ", ".join(dict.fromkeys(excitations))

@@ -41,7 +41,7 @@ _BELOW = 0.5
 _LONGER = 2.0
 """Factor on the default prior of a delay that ends at it: 0.4 becomes 0.8 of the records' span [-]."""
 _AT_END = 1e-2
-"""Closer to the end of its prior than this share, a delay stands at it [-]."""
+"""Closer to the end of its prior than this share, a delay is at it [-]."""
 
 
 class Base(NamedTuple):
@@ -85,17 +85,17 @@ def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: boo
                 continue
             break
         if base.fit.failed:
-            told = f"The base model has {terms} viscous terms, because with fewer {base.fit.failed}."
+            said = f"The base model has {terms} viscous terms, because with fewer {base.fit.failed}."
         else:
             rng = np.random.default_rng([study.seed, 12, terms])
             named = _named(base, library, rng, draws)
             if named >= gain and not gain + _named(wider, library, rng, draws) > named + _GAIN:
                 break
-            told = (
+            said = (
                 f"The base model has {terms} viscous terms: one more than {terms - 1} is worth {gain:.0f} "
                 "nat, with the effects that each leaves to be named."
             )
-        base = wider._replace(sentence=f"{base.sentence} {told}".strip())
+        base = wider._replace(sentence=f"{base.sentence} {said}".strip())
     return base
 
 
@@ -130,7 +130,7 @@ def _lifted(model: BaseModel, base: Base, rng: np.random.Generator) -> list[Vect
 
 
 def _based(study: Study, *key: int, contained: Base | None = None) -> Base:
-    """A study's base fit as it stands; `key` tells its random numbers from others'. It starts from the
+    """A study's base fit as stated; `key` separates its random numbers from others'. It starts from the
     optimum of a `contained` model too."""
     problem = problem_of(study)
     fit = _fit(problem, key, contained)
@@ -176,7 +176,7 @@ def _named(base: Base, library: Sequence[type[Effect]], rng: np.random.Generator
 
 
 def _later(study: Study, fit: BaseFit) -> Mended | None:
-    """The study with a longer default prior of its delays, where one stands at the end of it; else None."""
+    """The study with a longer default prior of its delays, where one is at the end of it; else None."""
     model = fit.model
     stuck = []
     for position, k in enumerate(model.least.columns):
@@ -193,5 +193,5 @@ def _later(study: Study, fit: BaseFit) -> Mended | None:
     names = ", ".join(f"{name} (ends at {end:.4g} {model.time_unit})" for name, end in stuck)
     return Mended(
         replace(study, priors={**study.priors, **longer}),
-        f"The default prior of {names} is too short for these records and was made twice as long.",
+        f"The default prior of {names} is too short for these records and was doubled.",
     )

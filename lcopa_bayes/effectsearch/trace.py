@@ -153,8 +153,8 @@ def trace(
             continue
         if issubclass(kind, ScatterEffect):
             joint = "the noise is known from the residual alone" if whitening.dependence else ""
-            told = -np.inf if joint else scatter_evidence(optimum.white)
-            found.append(Traced(kind.card, (), told, 0, joint))
+            scattered = -np.inf if joint else scatter_evidence(optimum.white)
+            found.append(Traced(kind.card, (), scattered, 0, joint))
             continue
         commands = max(commands_of(one.record.drive) for one in whitening.samples)
         if kind.per_command and commands > MOST_COMMANDS:
@@ -165,9 +165,9 @@ def trace(
     maxima = _chance(project, whitening, found, rng, draws, scale)
     found.sort(key=lambda one: -one.log_bayes_factor)
     threshold, low, high = threshold_of(maxima)
-    made = Trace(tuple(found), threshold, (low, high), np.nan, draws, residual, scale)
-    beaten = int(np.count_nonzero(maxima >= made.largest))
-    return replace(made, p_value=(beaten + 1) / (draws + 1))
+    held = Trace(tuple(found), threshold, (low, high), np.nan, draws, residual, scale)
+    beaten = int(np.count_nonzero(maxima >= held.largest))
+    return replace(held, p_value=(beaten + 1) / (draws + 1))
 
 
 def threshold_of(maxima: Vector) -> tuple[float, float, float]:

@@ -33,7 +33,7 @@ class Verdict:
 
 @final
 @dataclass(frozen=True)
-class Found:
+class Findings:
     """What a loop found, as far as the verdict depends on it."""
 
     failed: str
@@ -75,7 +75,7 @@ class Found:
     nothing: no such records, no such error, or effects that differ from record to record."""
 
 
-def decide(found: Found) -> Verdict:
+def decide(found: Findings) -> Verdict:
     """The verdict; an effect is never named from a base fit that failed."""
     confidence: Confidence = "tentative" if found.cautions or found.failed else "firm"
     if found.failed:
@@ -132,7 +132,7 @@ def decide(found: Found) -> Verdict:
     return Verdict("explained", confidence, f"{named} {verb} missing, worth {found.gained:.0f} nat." + rest)
 
 
-def _quiet(found: Found, confidence: Confidence) -> Verdict:
+def _quiet(found: Findings, confidence: Confidence) -> Verdict:
     """The verdict where the fitted records show nothing."""
     nothing = (
         "Nothing is missing that these records could show: the largest log Bayes factor of any effect is "
@@ -157,7 +157,7 @@ def _quiet(found: Found, confidence: Confidence) -> Verdict:
 
 
 def beside(verdict: Verdict, said: str) -> Verdict:
-    """The verdict on records with outliers, which `said` tells of: they disturb, and nothing else changes."""
+    """The verdict on records with outliers, which `said` describes: they disturb, nothing else changes."""
     kind: Kind = "disturbance" if verdict.kind == "clean" else verdict.kind
     return Verdict(kind, verdict.confidence, f"{said} {verdict.sentence}")
 

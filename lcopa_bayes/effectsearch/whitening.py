@@ -31,7 +31,7 @@ class Part:
 
 
 def parts(samples: Sequence[Samples]) -> tuple[Part, ...]:
-    """Where each record's axes stand in the stack: records in their order, axes within."""
+    """Where each record's axes are in the stack: records in their order, axes within."""
     out, start = [], 0
     for r, record in enumerate(samples):
         for axis, observed in enumerate(record.axes):

@@ -14,7 +14,6 @@ Samples an axis misses are filled too: choose with ``samples[r].axes[a].index``.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -153,32 +152,16 @@ def effected(
 ) -> Effected:
     """The fit records of a posterior with effects; scales are taken from the base fit `values`.
 
-    `epochs` [-]: place of each record in the campaign, by default `epochs_of` their names.
+    `epochs` [-]: place of each record in the campaign, by default evenly from -1/2 to 1/2.
     """
     names = tuple(one.record.name for one in posterior.samples)
     n, fit = len(names), tuple(range(len(names)))
-    at = epochs_of(names)[0] if epochs is None else epochs
+    evenly = np.linspace(-0.5, 0.5, n) if n > 1 else np.zeros(1)
+    at = evenly if epochs is None else epochs
     times = tuple(one.times for one in posterior.samples)
     ranges = ranges_of(posterior.model, plant_of(posterior.table, values, fit, n), times)
     simulator = Simulator(posterior.model, tuple(effects), ranges, at, times)
     return Effected(posterior.table, simulator, names, fit)
-
-
-def epochs_of(fit: Sequence[str], held_out: Sequence[str] = ()) -> tuple[Vector, Vector]:
-    """Places of the records to fit and of those held out in the campaign, -1/2 to 1/2 [-].
-
-    By the number that ends their names when every name has one, all differ and what precedes is the same;
-    otherwise records to fit come first, in their order.
-    """
-    names = [*fit, *held_out]
-    parts = [re.fullmatch(r"(.*?)(\d+)", name) for name in names]
-    numbers = [int(part[2]) for part in parts if part]
-    stems = {part[1] for part in parts if part}
-    order = np.arange(len(names), dtype=float)
-    if len(set(numbers)) == len(names) and len(stems) == 1:
-        order = np.argsort(np.argsort(numbers)).astype(float)
-    places = order / max(len(names) - 1, 1) - (0.5 if len(names) > 1 else 0.0)
-    return places[: len(fit)], places[len(fit) :]
 
 
 def carried(psi: Vector, source: Effected, target: Effected) -> Vector:

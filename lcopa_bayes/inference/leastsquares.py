@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from typing import final
@@ -24,6 +24,8 @@ _NORMAL = ("norm", "halfnorm")
 """Priors whose logarithm is a square."""
 _EVALUATIONS = 30
 """Most responses with effects that a descent takes [-]."""
+_ENOUGH = 1e-7
+"""Relative gain of the sum of squares that ends such a descent [-]: 5e-4 nat of ten thousand samples."""
 _TAIL = 1e-9
 """Prior mass beyond either end of the search on a logarithmic scale [-]."""
 
@@ -209,18 +211,17 @@ class LeastSquares:
     def solve(self, values: Vector) -> tuple[Vector, Matrix]:
         """From a start to a local minimum: table values and the Jacobian there.
 
-        With effects first by slopes of the plant alone. UnstableError where these leave no bounded response
-        at the start.
+        UnstableError where effects leave no bounded response at the start.
         """
-        if self.exact and self.posterior.simulation is not None:
-            values = replace(self, exact=False).solve(values)[0]
         low, high = self.bounds_around(values)
         start = np.clip(self.coordinates(values), low, high)
+        plain = self.posterior.simulation is None
         found = least_squares(
             *self.functions(values, start),
             bounds=(low, high),
             x_scale="jac",
-            max_nfev=100 if self.posterior.simulation is None else _EVALUATIONS,
+            max_nfev=100 if plain else _EVALUATIONS,
+            ftol=1e-8 if plain else _ENOUGH,
         )
         solution = self.posterior.table.canonical(self.values(found.x, values)[None])[0]
         return solution, np.asarray(found.jac)

@@ -1,4 +1,4 @@
-"""Least squares from many starts: where the posterior's hills stand."""
+"""Least squares from many starts: the modes of the posterior."""
 
 from __future__ import annotations
 
@@ -16,6 +16,10 @@ from lcopa_bayes.model.effects.effect import UnstableError
 
 _SCREENED = 1024
 """Prior draws whose misfit is looked at."""
+_SAME = 1e-2
+"""Optima closer than this in every sampled coordinate are one [natural log or parameter unit]."""
+_WEIGHTLESS = 30.0
+"""Log density below the best from which an optimum has no weight [nat]."""
 _DISTINCT = 0.5
 """Starts closer than this in every sampled coordinate count as one [natural log or parameter unit]."""
 
@@ -43,7 +47,7 @@ def find_optima(posterior: Posterior, rng: np.random.Generator, *, starts: int =
     table = posterior.table
     if posterior.simulation is not None:
         alone = find_optima(posterior.without_effects, rng, starts=starts)
-        return _kept(posterior, _descended(posterior, effect_starts(posterior, alone, rng)))
+        return _kept(posterior, _descended(posterior, _near(posterior, effect_starts(posterior, alone, rng))))
     drawn = table.draw(_SCREENED, rng)
     for axis, scale in enumerate(_spread(posterior)):
         for name, value in posterior.noise.nearly_white(0.05 * scale).items():
@@ -56,13 +60,37 @@ def find_optima(posterior: Posterior, rng: np.random.Generator, *, starts: int =
     return _kept(posterior, _descended(posterior, _distinct(posterior, chosen, starts)))
 
 
-def _descended(posterior: Posterior, starts: Sequence[Vector]) -> list[Optimum]:
+def again(posterior: Posterior, optima: Sequence[Optimum]) -> tuple[Optimum, ...]:
+    """Optima of a posterior that hardly differs from the one whose `optima` are given, as on other blocks;
+    without those of no weight."""
+    best = max(one.log_density for one in optima)
+    near = [one.values for one in optima if one.log_density > best - _WEIGHTLESS]
+    return _kept(posterior, _descended(posterior, near, rounds=1))
+
+
+def _near(posterior: Posterior, starts: Sequence[Vector]) -> list[Vector]:
+    """Table values to which effects and plant descend by slopes of the plant alone, fifty times cheaper than
+    those with the effects in place; duplicates removed."""
+    rough, kept = LeastSquares(posterior, exact=False), list[Vector]()
+    for start in starts:
+        values = posterior.complete(posterior.coordinates(start[None]), None)[0]
+        try:
+            values = rough.with_noise(rough.solve(values)[0])
+        except UnstableError:
+            continue
+        here = posterior.coordinates(values[None])[0]
+        if all(np.abs(here - posterior.coordinates(v[None])[0]).max() > _SAME for v in kept):
+            kept.append(values)
+    return kept
+
+
+def _descended(posterior: Posterior, starts: Sequence[Vector], *, rounds: int = 2) -> list[Optimum]:
     """Optima from table values; a start from which effects leave no bounded response gives none."""
     problem, optima = LeastSquares(posterior), []
     for values in starts:
         values = posterior.complete(posterior.coordinates(values[None]), None)[0]
         try:
-            for _ in range(2):
+            for _ in range(rounds):
                 values, _ = problem.solve(values)
                 values = problem.with_noise(values)
         except UnstableError:
@@ -79,7 +107,9 @@ def _kept(posterior: Posterior, optima: list[Optimum]) -> tuple[Optimum, ...]:
     optima.sort(key=lambda optimum: -optimum.log_density)
     kept: list[Optimum] = []
     for optimum in optima:
-        close = (np.abs(_plain(posterior, optimum) - _plain(posterior, other)).max() < 1e-2 for other in kept)
+        close = (
+            np.abs(_plain(posterior, optimum) - _plain(posterior, other)).max() < _SAME for other in kept
+        )
         if np.isfinite(optimum.log_density) and not any(close):
             kept.append(optimum)
     return tuple(kept)

@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.leastsquares import LeastSquares
-from lcopa_bayes.inference.optimum import Optimum, find_optima
+from lcopa_bayes.inference.optimum import Optimum, again, find_optima
 from lcopa_bayes.sampling.convergence import Limitation
 from lcopa_bayes.sampling.draws import Draws
 
@@ -117,6 +117,15 @@ def resolved(problem: Problem, optima: Sequence[Optimum] | None = None) -> Probl
             return problem
         best = optima[0].values
         return narrowed(problem, lambda each: optimum_shift(each, best))
+
+
+def resolved_optima(problem: Problem, *, starts: int) -> tuple[Problem, tuple[Optimum, ...]]:
+    """`resolved`, and the optima there: with effects a search from the prior is too dear to be made twice."""
+    rng = np.random.default_rng([problem.study.seed, 6])
+    with threadpool_limits(1):
+        optima = find_optima(problem.posterior, rng, starts=starts)
+        narrow = resolved(problem, optima)
+        return narrow, optima if narrow is problem else again(narrow.posterior, optima)
 
 
 def narrowed(problem: Problem, shift: Callable[[Problem], float]) -> Problem:

@@ -19,7 +19,7 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.results.adequacy import limitations
 from lcopa_bayes.results.datatree import POSTERIOR, posterior_tree, save_tree
-from lcopa_bayes.results.discretisation import Discretisation, discretisation, resolved
+from lcopa_bayes.results.discretisation import Discretisation, discretisation, resolved, resolved_optima
 from lcopa_bayes.results.frequency import FrequencyResponse, frequency_response
 from lcopa_bayes.results.prediction import Band, bands
 from lcopa_bayes.results.predictive import Predictive
@@ -37,7 +37,7 @@ from lcopa_bayes.sampling.draws import Draws, gather
 from lcopa_bayes.sampling.evidence import Evidence, evidence_of
 from lcopa_bayes.sampling.nested import NestedPlan, nested
 from lcopa_bayes.sampling.sampler import Run, SamplePlan, sample
-from lcopa_bayes.sampling.weightedrun import weighted_run
+from lcopa_bayes.sampling.weightedrun import QUICK_STARTS, STARTS, weighted_run
 
 if TYPE_CHECKING:
     from lcopa_bayes.results.integerrival import Rival
@@ -138,10 +138,11 @@ def fit(
     problem = problem_of(study)
     if folder:
         writable_folder(folder)
-    problem = resolved(problem)
-    plan = plan_of(problem, quick=quick)
-    effective = problem.posterior.simulation is not None and plan.method == "auto"
-    weighted_result = weighted_run(problem.posterior, plan, jobs=jobs, quick=quick) if effective else None
+    plan, weighted_result = plan_of(problem, quick=quick), None
+    if problem.posterior.simulation is not None and plan.method == "auto":
+        problem, weighted_result = weighted_fit(problem, plan, jobs=jobs, quick=quick)
+    else:
+        problem = resolved(problem)
     if weighted_result is not None:
         run, draws = weighted_result
     else:
@@ -198,6 +199,15 @@ def fit(
         response,
         check,
     )
+
+
+def weighted_fit(
+    problem: Problem, plan: SamplePlan, *, jobs: int = 1, quick: bool = False
+) -> tuple[Problem, tuple[Run, Draws] | None]:
+    """A plant with effects on blocks as narrow as its records need, and weighted draws of it with their run;
+    no draws where importance sampling does not hold."""
+    problem, optima = resolved_optima(problem, starts=QUICK_STARTS if quick else STARTS)
+    return problem, weighted_run(problem.posterior, plan, jobs=jobs, quick=quick, optima=optima)
 
 
 def plan_of(problem: Problem, *, quick: bool) -> SamplePlan:

@@ -8,6 +8,7 @@ and ensembles follow where weights fail.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -29,8 +30,12 @@ from lcopa_bayes.sampling.proposal import weighty
 from lcopa_bayes.sampling.sampler import Run, SamplePlan
 from lcopa_bayes.sampling.weighted import BATCHES, Weighted
 
-_PLAN = ImportancePlan((Effort(4_000, 1_500, 6), Effort(8_000, 3_000, 6), Effort(16_000, 6_000, 4)), starts=4)
-_QUICK = ImportancePlan((Effort(2_000, 1_000, 5), Effort(4_000, 2_000, 4)), starts=2)
+STARTS, QUICK_STARTS = 4, 2
+"""Starts of the search for optima [-]."""
+_PLAN = ImportancePlan(
+    (Effort(4_000, 1_500, 6), Effort(8_000, 3_000, 6), Effort(16_000, 6_000, 4)), starts=STARTS
+)
+_QUICK = ImportancePlan((Effort(2_000, 1_000, 5), Effort(4_000, 2_000, 4)), starts=QUICK_STARTS)
 _STREAM = 12
 """Marks the randomness of such a run."""
 _FEWEST = 100.0
@@ -48,18 +53,24 @@ _SMALL = 0.5
 
 
 def weighted_run(
-    posterior: Posterior, plan: SamplePlan, *, jobs: int = 1, quick: bool = False
+    posterior: Posterior,
+    plan: SamplePlan,
+    *,
+    jobs: int = 1,
+    quick: bool = False,
+    optima: Sequence[Optimum] = (),
 ) -> tuple[Run, Draws] | None:
     """Importance draws as a run, and its draws; None where no weights are usable.
 
-    Deterministic given the plan's seed, whatever `jobs` [processes].
+    `optima` are those of the posterior where they are known; else they are searched for. Deterministic given
+    the plan's seed, whatever `jobs` [processes].
     """
     rng = np.random.default_rng([plan.seed, _STREAM])
     size = min(plan.target_ess, 400.0) if quick else plan.target_ess
     wanted = replace(_QUICK if quick else _PLAN, wanted=size)
     with workers(None, jobs=jobs) as crew:
         mapped = crew.map
-        optima = find_optima(posterior, rng, starts=wanted.starts)
+        optima = optima or find_optima(posterior, rng, starts=wanted.starts)
         if not optima:
             return None
         near, weighted, share = posterior, None, 0.0

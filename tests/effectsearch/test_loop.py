@@ -23,7 +23,7 @@ from lcopa_bayes.effectsearch.heldouteffects import unseen_share
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.noise import axis_noise, repeat_pieces
 from lcopa_bayes.effectsearch.summary import drawn, results, words
-from lcopa_bayes.effectsearch.verdict import Found, decide
+from lcopa_bayes.effectsearch.verdict import Findings, decide
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.defaultpriors import Scales
@@ -253,7 +253,7 @@ def test_errors_on_held_out_records_count_while_the_drive_stays_in_range(clean):
     assert unseen_share(made, [before], [worse], state) > 1.0
 
 
-FOUND = Found("", (), True, 50.0, 3.0, ("a",), (), 48.0, 20.0, "smooth", 1.0, 3.0, "b", 1.0)
+FOUND = Findings("", (), True, 50.0, 3.0, ("a",), (), 48.0, 20.0, "smooth", 1.0, 3.0, "b", 1.0)
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from lcopa_bayes.data.settings import EffectsSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.inference.declared import campaign_places
 from lcopa_bayes.inference.effects import Effected, effected
 from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.leastsquares import LeastSquares
@@ -350,3 +351,11 @@ def test_a_force_that_runs_away_is_left_to_the_single_plant():
     told = simulation(values)
     assert told[0].bounded.tolist() == [True, False, True]
     assert_array_equal(told[0].base[0, 1], 0.0)
+
+
+def test_places_in_the_campaign_go_by_name_and_numbers_by_value():
+    taken = [replace(record(), name=name) for name in ("run1", "run10", "run3", "run2")]
+    made = Study("campaign", None, "ms", 1, tuple(taken[:3]), (taken[3],))
+    places = campaign_places(made)
+    found = [places[name] for name in ("run1", "run2", "run3", "run10")]
+    assert found == pytest.approx([-0.5, -1 / 6, 1 / 6, 0.5])

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from lcopa_bayes.inference.linear import NormalEquations
+from lcopa_bayes.inference.posterior import NormalEquations
 
 LOG_2PI = np.log(2 * np.pi)
 

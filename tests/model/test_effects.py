@@ -17,7 +17,7 @@ from lcopa_bayes.bench.device import Device
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Axis
-from lcopa_bayes.inference.effects import Effected, carried, effected, epochs_of
+from lcopa_bayes.inference.effects import Effected, carried, effected
 from lcopa_bayes.model.effects import balance, sensor
 from lcopa_bayes.model.effects.catalogue import bundled, catalogue
 from lcopa_bayes.model.effects.commands import Hysteresis, RefreshHold
@@ -356,13 +356,6 @@ def test_two_effects_do_not_only_add():
     parts = [both.responses(VALUES, psi * mask) for mask in ([1, 0], [0, 1])]
     summed = [a + b - c for a, b, c in zip(*parts, PLAIN, strict=True)]
     assert 1e-4 < apart(both.responses(VALUES, psi), summed) < 0.05
-
-
-def test_epochs_by_number_or_by_order():
-    fit, held = epochs_of(["run1", "run10", "run3"], ["run2"])
-    assert_allclose(np.r_[fit, held], np.array([0, 3, 2, 1]) / 3 - 0.5)
-    fit, held = epochs_of(["a", "b"], ["c"])
-    assert_allclose(np.r_[fit, held], [-0.5, 0.0, 0.5])
 
 
 def test_campaign_speed_is_told_by_the_grid():
