@@ -150,7 +150,7 @@ class SamplerSettings(Ruled):
     thin: Annotated[int | None, whole(1)] = None
     """Steps per kept draw [-]; None: 5."""
     method: Method | None = None
-    """"auto": importance draws where a cover of the posterior gives enough of them, else ensembles;
+    """"auto": importance draws where a proposal gives enough of them, else ensembles;
     "ensembles": these in any case. None: ensembles where `steps` or `thin` is stated, which concern them
     alone, else "auto". Where the plant has effects "auto" is importance sampling around the optima, and
     ensembles only where its weights fail."""

@@ -7,8 +7,7 @@ a few ellipsoids cover a posterior that is thin and curved in the sampled coordi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import final
 
@@ -36,15 +35,6 @@ class Chart:
         """Chart of a posterior; its bounds are those of the priors."""
         ends = np.array([posterior.table.rows[k].sampled_domain for k in posterior.sampled]).reshape(-1, 2)
         return cls(Terrain.of(posterior), ends[:, 0], ends[:, 1])
-
-    def holding(self, terms: Sequence[int | None]) -> Chart:
-        """The same chart with one term of each element held, or none: a held term keeps its own time, which
-        is charted by its logit between the bounds of its prior."""
-        elements = tuple(
-            element if term is None else element.holding(term)
-            for element, term in zip(self.terrain.elements, terms, strict=True)
-        )
-        return replace(self, terrain=replace(self.terrain, elements=elements))
 
     @cached_property
     def _bounded(self) -> Flags:
@@ -98,8 +88,7 @@ class Chart:
         exists &= self.terrain.in_order(z)
         for element, frequencies in zip(self.terrain.elements, self._frequencies, strict=True):
             safe = np.where(exists[:, None], z[:, element.orders], 1.0)
-            held = None if element.held is None else np.where(exists, z[:, element.times[element.held]], 0.0)
-            times = element.log_times(y[:, element.following], safe, frequencies, held)
+            times = element.log_times(y[:, element.following], safe, frequencies)
             exists &= np.isfinite(times).all(axis=1)
             z[:, element.following] = np.where(exists[:, None], times, 0.0)
             level = element.shape(z, frequencies).log_level

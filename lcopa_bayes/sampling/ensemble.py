@@ -12,7 +12,7 @@ from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.ridgemoves import emcee_sampler
-from lcopa_bayes.sampling.tempering import CROWD, temper
+from lcopa_bayes.sampling.tempering import temper
 
 
 @final
@@ -40,19 +40,27 @@ class Ensemble:
     """Moves of tempering per walker [-]."""
 
     @classmethod
+    def started(
+        cls, position: Matrix, log_density: Vector, trail: Matrix, seed: np.random.SeedSequence
+    ) -> Ensemble:
+        """Walkers at a population that is nearly the posterior's; `trail` others of it."""
+        random = tuple(np.random.RandomState(np.random.MT19937(seed)).get_state())
+        nothing = np.empty((0, *position.shape)), np.empty((0, len(position)))
+        return cls(*nothing, position, log_density, np.zeros(len(position)), 0, random, trail, 0)
+
+    @classmethod
     def tempered(
         cls,
         posterior: Posterior,
         walkers: int,
         sweeps: int,
         seed: np.random.SeedSequence,
-        crowd: int = CROWD,
     ) -> Ensemble:
         """A population tempered from the prior; emcee needs a legacy generator, seeded here and nowhere
         else."""
         draw, moves = seed.spawn(2)
         random = tuple(np.random.RandomState(np.random.MT19937(moves)).get_state())
-        population, random = temper(posterior, walkers, sweeps, np.random.default_rng(draw), random, crowd)
+        population, random = temper(posterior, walkers, sweeps, np.random.default_rng(draw), random)
         return cls(
             np.empty((0, walkers, posterior.dimension)),
             np.empty((0, walkers)),

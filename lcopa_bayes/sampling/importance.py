@@ -20,7 +20,7 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.inference.optimum import Optimum, find_optima
+from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.coordinates import Chart
 from lcopa_bayes.sampling.evidence import Mapped, charted_density
@@ -82,20 +82,6 @@ class Importance:
         if own.pareto_k > usable_k(own.count) or own.ess < max(wanted, LEAST_EFFICIENCY * own.count):
             return False
         return bool(min(own.centre_ess.min(), own.tail_ess.min()) >= _SURPLUS * wanted)
-
-
-def first_look(
-    posterior: Posterior,
-    rng: np.random.Generator,
-    plan: ImportancePlan = ImportancePlan(),
-    mapped: Mapped = map,
-) -> Importance | None:
-    """Optima of a posterior from several starts, and importance sampling around them.
-
-    None where no start led to an optimum of positive density.
-    """
-    optima = find_optima(posterior, rng, starts=plan.starts)
-    return importance(posterior, optima, rng, plan, mapped) if optima else None
 
 
 def importance(

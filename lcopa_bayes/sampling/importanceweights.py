@@ -33,7 +33,8 @@ def smoothed(log_weights: Vector, *, r_eff: float = 1.0) -> tuple[Vector, float]
     """
     if log_weights.size < _FEWEST_DRAWS or _bounded(log_weights):
         return np.asarray(log_weights - logsumexp(log_weights)), float("nan")
-    smoothed, k = array_stats.psislw(-log_weights, r_eff=r_eff)  # type: ignore[no-untyped-call]
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # no finite tail: k is far above 1
+        smoothed, k = array_stats.psislw(-log_weights, r_eff=r_eff)  # type: ignore[no-untyped-call]
     out = np.asarray(smoothed, dtype=float)
     return np.asarray(out - logsumexp(out)), float(k)
 

@@ -66,16 +66,8 @@ class Mixture:
 
     def blended(self, other: Mixture, share: float) -> Mixture:
         """A mixture of both, `share` of it the other."""
-        return self.scaled(1 - share).with_components(other.scaled(share))
-
-    def scaled(self, share: float) -> Mixture:
-        """The same components with weights that are `share` times as large: part of a larger mixture."""
-        return Mixture(share * self.weights, self.means, self.factors)
-
-    def with_components(self, other: Mixture) -> Mixture:
-        """The components of both with their own weights."""
         return Mixture(
-            np.concatenate([self.weights, other.weights]),
+            np.concatenate([(1 - share) * self.weights, share * other.weights]),
             np.concatenate([self.means, other.means]),
             np.concatenate([self.factors, other.factors]),
         )

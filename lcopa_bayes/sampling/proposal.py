@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import final
+from dataclasses import dataclass, replace
+from typing import Protocol, final
 
 import numpy as np
 from scipy.special import logsumexp
+from sklearn.cluster import KMeans
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.inference.optimum import Optimum
@@ -40,6 +41,14 @@ _NO_WEIGHT = 1e-9
 """Draws with less than this share of the mean weight do not take part in the fit [-]."""
 _NO_MASS = 1e-4
 """Components with less than this share of the weight are omitted [-]."""
+_CLUSTERS, _PER_CLUSTER, _CLUSTER_STEPS = 20, 20, 15
+"""Most clusters of a proposal, effective draws per dimension for each of them, and steps that improve it."""
+_LEAST_SIZE = 1e-4
+"""Least variance of a cluster along every coordinate, over that of the weighted draws [-]."""
+_EQUAL = 6
+"""Largest weights for each dimension that are made equal (Koblents and Miguez 2015) [-]."""
+_LEVELLED, _WIDE = 0.3, 0.15
+"""Share of such a proposal whose clusters have equal weights, and of one that is wider [-]."""
 
 
 def weighty(optima: Sequence[Optimum]) -> list[Optimum]:
@@ -95,17 +104,24 @@ def _charted(posterior: Posterior, chart: Chart, z: Matrix) -> Matrix:
     return chart.usable(z[posterior.log_prior(z) > -np.inf])[1]
 
 
+class HasDensity(Protocol):
+    """A proposal whose density can be evaluated."""
+
+    def log_density(self, points: Matrix, /) -> Vector:
+        """Log density, (n,)."""
+
+
 @final
 @dataclass(frozen=True)
 class Seen:
     """Draws of all proposals so far, weighted as draws of their mixture (Cornuet, Marin, Mira and Robert
     2012, Scand. J. Statist. 39)."""
 
-    proposals: tuple[Mixture, ...]
+    proposals: tuple[HasDensity, ...]
     points: tuple[Matrix, ...]
     log_densities: tuple[Vector, ...]
 
-    def joined(self, proposal: Mixture, y: Matrix, log_density: Vector) -> Seen:
+    def joined(self, proposal: HasDensity, y: Matrix, log_density: Vector) -> Seen:
         """With the draws of another proposal."""
         return Seen((*self.proposals, proposal), (*self.points, y), (*self.log_densities, log_density))
 
@@ -127,11 +143,7 @@ def fitted(core: Mixture, y: Matrix, log_weights: Vector) -> tuple[Mixture, Mixt
     Weights of few effective draws are raised to a power below 1 that leaves enough of them (Koblents and
     Miguez 2015, Statistics and Computing 25): the proposal nears the posterior without collapsing before.
     """
-    wanted = min(_PER_DIMENSION * y.shape[1], 0.25 * log_weights.size)
-    power = 1.0
-    while effective(power * log_weights - logsumexp(power * log_weights)) < wanted:
-        power *= 0.9
-    weights = np.exp(power * log_weights - logsumexp(power * log_weights))
+    weights = tempered(log_weights, min(_PER_DIMENSION * y.shape[1], 0.25 * log_weights.size))
     kept = weights > _NO_WEIGHT / weights.size
     y, weights = y[kept], weights[kept] / weights[kept].sum()
     centre = weights @ y
@@ -142,6 +154,47 @@ def fitted(core: Mixture, y: Matrix, log_weights: Vector) -> tuple[Mixture, Mixt
     around_all = Mixture(np.ones(1), centre[None], _WIDER * np.linalg.cholesky(whole + floor)[None])
     wider = Mixture(core.weights, core.means, _WIDER * core.factors)
     return core, core.blended(wider.blended(around_all, 0.5), _DEFENSIVE)
+
+
+def clustered(y: Matrix, log_weights: Vector, seed: int) -> Mixture:
+    """A proposal of clusters of weighted draws (n, dimension), improved by expectation maximisation; in part
+    with equal weights, so that a small mode is drawn from often enough, and in part wider."""
+    weights = tempered(log_weights, min(_PER_CLUSTER * y.shape[1], 0.25 * log_weights.size))
+    # the largest weights made equal: a cluster around one draw would cover nothing of what it stands for
+    equal = min(_EQUAL * y.shape[1], weights.size)
+    weights = np.minimum(weights, np.partition(weights, -equal)[-equal])
+    weights /= weights.sum()
+    count = int(np.clip(1 / (weights @ weights) / (_PER_CLUSTER * y.shape[1]), 1, _CLUSTERS))
+    kept = weights > _NO_WEIGHT / weights.size
+    y, weights = y[kept], weights[kept] / weights[kept].sum()
+    centre = weights @ y
+    whole = (weights[:, None] * (y - centre)).T @ (y - centre)
+    floor = np.diag(_LEAST_SIZE * np.diag(whole) + 1e-300)
+    found = KMeans(count, n_init=3, random_state=seed).fit(y / np.sqrt(np.diag(floor)), sample_weight=weights)
+    masses, means, factors = [], [], []
+    for cluster in range(count):
+        own = weights * (found.labels_ == cluster)
+        if own.sum() > _NO_MASS:
+            mean = own @ y / own.sum()
+            masses.append(own.sum())
+            means.append(mean)
+            factors.append(np.linalg.cholesky((own[:, None] * (y - mean)).T @ (y - mean) / own.sum() + floor))
+    core = Mixture(np.array(masses) / np.sum(masses), np.array(means), np.array(factors))
+    for _ in range(_CLUSTER_STEPS):
+        core = _maximised(core, y, weights, floor)
+    around_all = Mixture(np.ones(1), centre[None], _WIDER * np.linalg.cholesky(whole + floor)[None])
+    wider = replace(core.levelled(), factors=_WIDER * core.factors).blended(around_all, 0.3)
+    return core.blended(core.levelled(), _LEVELLED).blended(wider, _WIDE)
+
+
+def tempered(log_weights: Vector, wanted: float) -> Vector:
+    """Normalised weights to the largest power up to 1 that leaves as many effective draws as are wanted; half
+    of the draws with any weight where that is less."""
+    wanted = min(wanted, 0.5 * np.count_nonzero(np.isfinite(log_weights)))
+    power = 1.0
+    while effective(power * log_weights - logsumexp(power * log_weights)) < wanted:
+        power *= 0.9
+    return np.asarray(np.exp(power * log_weights - logsumexp(power * log_weights)))
 
 
 def _maximised(proposal: Mixture, y: Matrix, weights: Vector, floor: Matrix) -> Mixture:

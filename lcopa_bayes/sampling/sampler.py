@@ -1,4 +1,4 @@
-"""Independent ensembles from the prior, advanced in rounds until they agree or the budget is spent."""
+"""Importance draws of a search, or independent ensembles advanced in rounds until they agree."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ import numpy as np
 from tqdm import tqdm
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix
-from lcopa_bayes.core.parallel import Workers, workers
+from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.data.settings import Method
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.chainfile import Chain, load_chain, save_chain
 from lcopa_bayes.sampling.convergence import CERTAIN, Quality, drifts, qualities
-from lcopa_bayes.sampling.coverdraws import cover_draws
 from lcopa_bayes.sampling.ensemble import Ensemble, advance
 from lcopa_bayes.sampling.knownmodes import around
 from lcopa_bayes.sampling.learning import due, taught
+from lcopa_bayes.sampling.marginal import Search
 from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.modes import Modes, modes_of
-from lcopa_bayes.sampling.tempering import CROWD
+from lcopa_bayes.sampling.outer import applies
 from lcopa_bayes.sampling.weighted import BATCHES, CHAIN, Weighted
 
 _ROUND = 20
@@ -43,12 +43,10 @@ _TREND = 2.0
 [-]: there chance is the less likely reason, and to go on costs little."""
 _THIN = 5
 """Steps per kept draw unless the study says otherwise."""
-_FEW, _FEW_SWEEPS = 2, 15
-"""How many times more walkers come from the prior than are kept, and most moves at each temperature, for the
-first short run."""
-_EFFICIENT = 0.3
-"""Effective draws per draw of a cover from which a posterior counts as easy [-]: two-term posteriors with
-several modes stay below 0.2."""
+_CONFIRMED_AFTER = 4
+"""Rounds before importance draws around where the ensembles have been are tried."""
+_TRAIL = 1_500
+"""Draws per ensemble that the first mixture is learned from, where a search gave them."""
 _DELIVERED = 500
 """Fewest importance draws of a batch that are delivered."""
 _PER_WANTED = 10.0
@@ -75,7 +73,7 @@ class SamplePlan:
     seed: int
     """Root of all randomness of the run."""
     method: Method = "ensembles"
-    """Importance draws where a cover of the posterior gives them, or ensembles in any case."""
+    """Importance draws where their weights converge, or ensembles in any case."""
 
     @classmethod
     def of(
@@ -111,7 +109,7 @@ class Run:
     ensembles: tuple[Ensemble, ...]
     plan: SamplePlan
     weighted: Weighted | None = None
-    """Importance draws, where a cover of the posterior gave enough of them."""
+    """Importance draws, where a proposal gave enough of them."""
     unconfirmed: tuple[str, ...] = ()
     """Parameters with modes that filled while the ensembles ran, whose shares importance draws could not
     confirm."""
@@ -157,9 +155,10 @@ def sample(
     quiet: bool = True,
     starts: Matrix | None = None,
 ) -> Run:
-    """Sample a posterior: populations tempered from the prior, then rounds of emcee; and, as the plan allows,
-    importance draws of a cover of where these have been (`coverdraws`), which are the result where their
-    weights converge. Where a short run of small populations shows an easy posterior, its cover is enough.
+    """Sample a posterior, as the plan allows by importance draws from a search over orders, delays and noise
+    (`marginal`). Where their weights do not converge, rounds of emcee go on from the points of the search,
+    and importance draws around where the walkers have been are tried again. Populations tempered from the
+    prior begin where no search is possible, or the plan asks for ensembles.
 
     The draws depend on the arguments alone, not on `jobs` nor on interruptions: with `resume`, a run killed
     at any moment continues from the last complete round in `chain_file`. `starts`, table values (starts,
@@ -173,54 +172,53 @@ def sample(
     ensembles = stored.ensembles
     rounds = max(2, -(-plan.steps // (_ROUND * plan.thin)))
     done = ensembles[0].steps // (_ROUND * plan.thin) if ensembles else 0
+    wanted = _SURPLUS * plan.target_ess
+    searched = plan.method == "auto" and applies(posterior)
     with (
-        workers(posterior, jobs=min(jobs, plan.ensembles)) as crew,
+        workers(posterior, jobs=jobs) as crew,
         tqdm(total=rounds, initial=done, unit="round", disable=quiet, desc="from the prior") as bar,
     ):
         if not ensembles:
             seeds = np.random.SeedSequence(plan.seed).spawn(plan.ensembles)
-            if plan.method == "auto" and known is None:
-                easy = _easy(posterior, plan, seeds, crew)
-                if easy is not None:
-                    _store(chain_file, Chain(*easy), fingerprint)
-                    return Run(easy[0], plan, easy[1])
-            ensembles = tuple(crew.each(_Birth(plan.walkers), seeds))
+            if searched and known is None:
+                search = Search(posterior, plan.seed, crew)
+                weighted = search.run(wanted)
+                if weighted is not None:
+                    _store(chain_file, Chain((), weighted), fingerprint)
+                    return Run((), plan, weighted)
+                ensembles = _begun(search, plan, seeds)
+            ensembles = ensembles or tuple(crew.each(_Birth(plan.walkers), seeds))
             _store(chain_file, Chain(ensembles), fingerprint)
         bar.set_description("sampling")
         mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
         hardest = max(ensemble.tempering_moves for ensemble in ensembles)
         least = max(_LEAST, round(_AS_LONG * hardest / (_ROUND * plan.thin)))
-        while not (done >= rounds or (done >= least and finished(posterior, Run(ensembles, plan), bar))):
+        while True:
+            last = done >= rounds or (done >= least and finished(posterior, Run(ensembles, plan), bar))
+            if searched and (last or (done >= _CONFIRMED_AFTER and due(done))):
+                visited = Run(ensembles, plan).visited
+                weighted = Search(posterior, plan.seed + done, crew).around(visited, wanted)
+                if weighted is not None:
+                    _store(chain_file, Chain(ensembles, weighted), fingerprint)
+                    return Run(ensembles, plan, weighted)
+            if last:
+                run = Run(ensembles, plan)
+                return Run(ensembles, plan, None, _filling(posterior, run) if searched else ())
             if due(done):
                 mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
             ensembles = tuple(crew.each(_Round(plan.thin, mixture), ensembles))
             done += 1
             _store(chain_file, Chain(ensembles), fingerprint)
             bar.update()
-        run = Run(ensembles, plan)
-        if plan.method == "ensembles":
-            return run
-        bar.set_description("importance draws")
-        weighted = cover_draws(posterior, run.visited, _SURPLUS * plan.target_ess, plan.seed, crew)
-        _store(chain_file, Chain(ensembles, weighted), fingerprint)
-        return Run(ensembles, plan, weighted, _filling(posterior, run) if weighted is None else ())
 
 
-def _easy(
-    posterior: Posterior, plan: SamplePlan, seeds: Sequence[np.random.SeedSequence], crew: Workers[Posterior]
-) -> tuple[tuple[Ensemble, ...], Weighted] | None:
-    """Small populations from the prior after two rounds and importance draws of a cover of the second; None
-    where these are not efficient enough to show that the cover is close to the posterior."""
-    ensembles = tuple(crew.each(_Birth(plan.walkers, _FEW_SWEEPS, _FEW), seeds))
-    mixture = taught(posterior, ensembles, _ROUND, plan.seed, None)
-    for _ in range(2):
-        ensembles = tuple(crew.each(_Round(plan.thin, mixture), ensembles))
-    visited = np.concatenate(
-        [ensemble.chain[_ROUND:].reshape(-1, posterior.dimension) for ensemble in ensembles]
+def _begun(search: Search, plan: SamplePlan, seeds: Sequence[np.random.SeedSequence]) -> tuple[Ensemble, ...]:
+    """Ensembles at independent parts of the points of a search; none where these are too few."""
+    populations = search.population(plan.ensembles, max(_TRAIL, plan.walkers))
+    return tuple(
+        Ensemble.started(z[: plan.walkers], density[: plan.walkers], z, seed)
+        for (z, density), seed in zip(populations, seeds, strict=False)
     )
-    wanted = _SURPLUS * plan.target_ess
-    weighted = cover_draws(posterior, visited, wanted, plan.seed, crew, least=_EFFICIENT)
-    return None if weighted is None else (ensembles, weighted)
 
 
 def _filling(posterior: Posterior, run: Run) -> tuple[str, ...]:
@@ -306,11 +304,9 @@ class _Birth:
     """Task: a new ensemble of a seed."""
 
     walkers: int
-    sweeps: int = _SWEEPS
-    crowd: int = CROWD
 
     def __call__(self, posterior: Posterior, seed: np.random.SeedSequence) -> Ensemble:
-        return Ensemble.tempered(posterior, self.walkers, self.sweeps, seed, self.crowd)
+        return Ensemble.tempered(posterior, self.walkers, _SWEEPS, seed)
 
 
 @final

@@ -29,7 +29,7 @@ _NEAR = 0.1
 """From this power on populations are kept: they cover the posterior, only wider."""
 _EFFECTIVE = 0.5
 """Share of the population that stays effective in one rise of the temperature."""
-CROWD = 4
+_CROWD = 4
 """How many times more walkers come from the prior than are kept."""
 _BLOCK = 5
 """Moves of every walker between two checks of how far they have moved."""
@@ -58,16 +58,15 @@ def temper(
     sweeps: int,
     rng: np.random.Generator,
     random: tuple[Any, ...],
-    factor: int = CROWD,
 ) -> tuple[Population, tuple[Any, ...]]:
     """A population of the posterior and the state of emcee's generator afterwards.
 
     At each temperature every walker makes moves until the population has lost its correlation with its start,
-    at most `sweeps` of them and a third while the temperature is low. `factor` times as many walkers come
+    at most `sweeps` of them and a third while the temperature is low. `_CROWD` times as many walkers come
     from the prior as are kept; those with a likelihood of 0 are drawn again. Deterministic given `rng` and
     `random`. InputError when no draw of the prior has a likelihood above 0.
     """
-    crowd = factor * walkers
+    crowd = _CROWD * walkers
     position = posterior.coordinates(posterior.table.draw(crowd, rng))
     prior = posterior.log_prior(position)
     likelihood = posterior.log_density(position) - prior
@@ -88,7 +87,7 @@ def temper(
         state = emcee.State(position, log_prob=prior + heat * likelihood)
         for _ in range(max(1, (sweeps if heat > _WARM else sweeps // 3) // _BLOCK)):
             state = sampler.run_mcmc(state, _BLOCK, skip_initial_state_check=True, store=False)
-            moves += factor * _BLOCK
+            moves += _CROWD * _BLOCK
             if _memory(posterior, position, state.coords) <= _TRAVELLED:
                 break
         random = tuple(sampler.random_state)

@@ -160,11 +160,9 @@ class Weighted:
     def resampled(self, count: int, rng: np.random.Generator, *, part: slice = slice(None)) -> Index:
         """Positions of `count` draws with equal weights, in random order, by systematic resampling of a
         `part` of the draws."""
-        log_weights = self.log_weights[part]
-        share = np.cumsum(np.exp(log_weights - log_weights.max()))
-        at = (rng.random() + np.arange(count)) / count
-        chosen = np.minimum(np.searchsorted(share / share[-1], at), share.size - 1)
-        return np.asarray(rng.permutation(np.arange(self.log_weights.size)[part][chosen]))
+        return np.asarray(
+            np.arange(self.log_weights.size)[part][resampled(self.log_weights[part], count, rng)]
+        )
 
     def batches(self, count: int, rng: np.random.Generator) -> Index:
         """Positions of resampled draws, `count` of every part, (batches, count)."""
@@ -180,6 +178,13 @@ def tail_smoothed(log_weights: Vector) -> tuple[Vector, float]:
     if positive <= max(3 * np.sqrt(log_weights.size) + 1, log_weights.size // 5):
         return log_weights - (logsumexp(log_weights) if positive else 0.0), np.inf
     return smoothed(log_weights)
+
+
+def resampled(log_weights: Vector, count: int, rng: np.random.Generator) -> Index:
+    """Positions of `count` draws with equal weights, in random order, by systematic resampling."""
+    share = np.cumsum(np.exp(log_weights - log_weights.max()))
+    at = (rng.random() + np.arange(count)) / count
+    return np.asarray(rng.permutation(np.minimum(np.searchsorted(share / share[-1], at), share.size - 1)))
 
 
 def _worth(values: Vector, weights: Vector) -> float:

@@ -90,7 +90,7 @@ def test_tempering_begins_where_responses_are_bounded(problem):
     rng = np.random.default_rng(3)
     drawn = posterior.log_density(posterior.coordinates(posterior.table.draw(8, np.random.default_rng(3))))
     assert np.isneginf(drawn).any()
-    population, _ = temper(posterior, 4, 1, rng, state, 2)
+    population, _ = temper(posterior, 4, 1, rng, state)
     assert np.isfinite(population.log_density).all()
     assert population.position.shape == (4, posterior.dimension)
 

@@ -84,28 +84,6 @@ def test_the_volume_is_that_of_central_differences(name):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_chart_that_holds_a_term_keeps_its_time_and_has_its_own_volume(name):
-    _, chart = made(name)
-    elements = chart.terrain.elements
-    if not elements:
-        pytest.skip("no element to hold a term of")
-    holding = chart.holding([element.terms - 1 for element in elements])
-    z = drawn(name, 15, seed=4)
-    y, log_volume = holding.charted(z)
-    back, exists = holding.uncharted(y)
-    assert exists.all()
-    assert_allclose(back, z, rtol=1e-6, atol=1e-6)
-    for element in holding.terrain.elements:
-        k = int(element.times[-1])
-        share = (z[:, k] - chart.low[k]) / (chart.high[k] - chart.low[k])
-        held = logit(share) if np.isfinite(chart.high[k] - chart.low[k]) else z[:, k]
-        assert_allclose(y[:, k], held, rtol=1e-9)
-    steps = 1e-5 * np.eye(z.shape[1])
-    slopes = [(holding.charted(z + step)[0] - holding.charted(z - step)[0]) / 2e-5 for step in steps]
-    assert_allclose(log_volume, np.linalg.slogdet(np.stack(slopes, axis=2))[1], atol=2e-4)
-
-
-@pytest.mark.parametrize("name", CASES)
 def test_what_is_charted_as_stated(name):
     """Logits between two finite ends, ratios for times, gain over level; all else as it is."""
     posterior, chart = made(name)

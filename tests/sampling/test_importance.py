@@ -11,7 +11,7 @@ from scipy import stats
 from scipy.special import logsumexp
 from small import Toy, problem, record, same_quantiles
 
-from lcopa_bayes.inference.optimum import Optimum
+from lcopa_bayes.inference.optimum import Optimum, find_optima
 from lcopa_bayes.results.fit import plan_of
 from lcopa_bayes.sampling.draws import gather, weighted_draws
 from lcopa_bayes.sampling.evidence import evidence
@@ -19,7 +19,6 @@ from lcopa_bayes.sampling.importance import (
     Effort,
     Importance,
     ImportancePlan,
-    first_look,
     importance,
 )
 from lcopa_bayes.sampling.sampler import sample
@@ -32,6 +31,12 @@ def optimum(centre, sd) -> Optimum:
     """A start at a place of a toy, whose values are its coordinates."""
     centre = np.asarray(centre, dtype=float)
     return Optimum(centre, np.diag(np.square(np.broadcast_to(sd, centre.shape))), 0.0)
+
+
+def looked(posterior, seed: int) -> Importance:
+    """Importance sampling around the optima of a posterior."""
+    rng = np.random.default_rng(seed)
+    return importance(posterior, find_optima(posterior, rng, starts=6), rng)
 
 
 def moments(found: Importance) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -93,8 +98,7 @@ def test_a_bent_posterior_agrees_with_quadrature(rng):
 def test_it_agrees_with_the_ensembles_on_a_study():
     made = problem(record(camera=0.3), noise="ar1", sampler={"ensembles": 2, "walkers": 48})
     posterior = made.posterior
-    found = first_look(posterior, np.random.default_rng(3))
-    assert found is not None
+    found = looked(posterior, 3)
     assert found.good(400)
     look = weighted_draws(posterior, found.weighted, np.random.default_rng(4), target_ess=400)
     assert look.grade.level == "reliable"
@@ -197,7 +201,7 @@ def test_resampling_takes_each_draw_as_often_as_its_weight(rng):
 
 def test_the_same_randomness_gives_the_same_draws():
     posterior = problem(record(camera=0.6)).posterior
-    one, other = (first_look(posterior, np.random.default_rng(7)) for _ in range(2))
+    one, other = (looked(posterior, 7) for _ in range(2))
     assert one is not None
     assert other is not None
     assert_array_equal(one.weighted.coordinates, other.weighted.coordinates)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -340,3 +341,24 @@ def test_a_posterior_with_two_hills_no_walker_crosses_between_is_not_reliable():
     alone = qualities("ab", np.array([chains[0], chains[2]]))
     assert all(quality.grade(100).level == "unusable" for quality in together)
     assert all(quality.grade(100).level != "unusable" for quality in alone)
+
+
+FILLED = {  # share of a mode that few walkers were in at the start, over the run
+    "from the start": (lambda t: 0.3 + 0 * t, True),
+    "early": (lambda t: 0.3 * np.minimum(1.0, 8 * t), True),
+    "to the end": (lambda t: 0.3 * t, False),
+}
+
+
+@pytest.mark.parametrize("name", FILLED)
+def test_a_run_is_settled_once_a_mode_no_longer_fills(name):
+    """All ensembles alike, so that their agreement shows nothing."""
+    share, settled = FILLED[name]
+    toy = Toy(lambda z: np.zeros(len(z)), {"a": ("norm", {"loc": 0.0, "scale": 9.0})})
+    rng, ensembles = np.random.default_rng(8), []
+    for child in np.random.SeedSequence(5).spawn(4):
+        inside = rng.random((400, 64)) < share(np.linspace(0, 1, 400))[:, None]
+        chain = (np.where(inside, 8.0, 0.0) + rng.standard_normal((400, 64)))[..., None]
+        ensemble = ensemble_at(toy, chain[-1], child)
+        ensembles.append(replace(ensemble, chain=chain, log_density=np.zeros((400, 64))))
+    assert sampler._settled(toy, Run(tuple(ensembles), plan())) == settled

@@ -1,0 +1,123 @@
+"""Second-order expansions of the log likelihood about many parameter sets, linear ones integrated out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.inference.noise import GaussianNoise
+from lcopa_bayes.inference.posterior import Posterior
+
+_LOG_2PI = float(np.log(2 * np.pi))
+_PORTION = 32
+"""Parameter sets expanded at once."""
+
+
+class Expansion(NamedTuple):
+    """``log_likelihood + gradient x - x' information x / 2`` for small x, for a batch."""
+
+    log_likelihood: Vector
+    """(batch,) [nat]."""
+    gradient: Matrix
+    """(batch, columns)."""
+    information: Array
+    """(batch, columns, columns), positive semidefinite."""
+
+
+def expanded(posterior: Posterior, values: Matrix, columns: Sequence[int]) -> Expansion:
+    """Expansion about canonical table values (batch, rows) in table rows `columns`, times by their logarithm.
+
+    Times, delays, and gains and offsets that are sampled may be columns; what is integrated out follows. The
+    information is that of least squares (Gauss and Newton), for Student noise by its weights (Lange, Little
+    and Taylor 1989, J. Am. Stat. Assoc. 84); the slope of the normalisation of what is integrated out is
+    neglected. Of a plant without effects.
+    """
+    if len(values) > _PORTION:
+        portions = np.array_split(values, -(-len(values) // _PORTION))
+        parts = [expanded(posterior, part, columns) for part in portions]
+        return Expansion(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+    table, batch, size = posterior.table, len(values), len(columns)
+    slopes = posterior.model.unit_slopes(table.dynamics(values))
+    units = [unit for unit, _ in slopes]
+    total, gradient = np.zeros(batch), np.zeros((batch, size))
+    information = np.zeros((batch, size, size))
+    for axis in range(len(table.layout.responses)):
+        block = posterior.blocks[axis]
+        mean, sd = posterior.scaled[axis]
+        centre = values.copy()
+        centre[:, block] = mean
+        slots, place = _slots(posterior, axis, columns)
+        count = len(block) + slots + 1
+        normal = np.zeros((batch, count, count))
+        normal[:, range(len(block)), range(len(block))] = 1.0
+        noise = posterior.noise_parameters(values, axis)
+        for r, samples in enumerate(posterior.samples):
+            observed = samples.axes[axis]
+            if observed.values.size == 0:
+                continue
+            stacked = np.zeros((batch, count, observed.values.size))
+            for k in posterior.acting[axis]:
+                column = posterior.column(k, axis, r, observed, units[r])
+                if column is None:
+                    continue
+                if k in block:
+                    stacked[:, block.index(k)] = sd[block.index(k)] * column
+                elif k in columns:
+                    stacked[:, len(block) + place[k, -1]] = column
+            for drive, unit in enumerate(table.layout.unit_of[axis]):
+                if not posterior.model.experiments[r].drives[drive].moves:
+                    continue
+                element, delay, _ = table.layout.units[unit]
+                slope, terms = slopes[r][1][unit], table.layout.elements[element].terms
+                rows = [(table.at("time", element, i), i) for i in range(terms)]
+                for k, position in [*rows, (table.at("delay", delay), 2 * terms)]:
+                    if k in columns:
+                        stacked[:, len(block) + place[k, drive]] = slope[position][:, observed.chosen]
+            residual = posterior.residual(axis, r, observed, centre, units[r])
+            stacked[:, -1] = residual
+            if isinstance(posterior.noise, GaussianNoise):
+                white, scale = posterior.noise.whiten(stacked, noise, observed.gaps)
+                total -= scale + 0.5 * observed.values.size * _LOG_2PI
+            else:
+                total += posterior.noise.pointwise(residual, noise, observed.gaps).sum(axis=1)
+                sigma, nu = noise[:, 0, None, None], noise[:, 1, None]
+                weight = np.sqrt((nu + 1) / (nu + (residual / sigma[:, 0]) ** 2))
+                white = stacked / sigma * weight[:, None, :]
+            normal += white @ white.swapaxes(1, 2)
+        combine = np.zeros((batch, slots, size))
+        if block:
+            inner, rest = normal[:, : len(block), : len(block)], normal[:, : len(block), len(block) :]
+            solved = np.linalg.solve(inner, rest)
+            total -= np.log(np.diagonal(np.linalg.cholesky(inner), axis1=1, axis2=2)).sum(axis=1)
+            reduced = normal[:, len(block) :, len(block) :] - rest.swapaxes(1, 2) @ solved
+            centre[:, block] = mean + sd * solved[:, :, -1]
+        else:
+            reduced = normal
+        for (k, drive), slot in place.items():
+            factor = 1.0 if drive < 0 else centre[:, table.at("gain", axis, drive)]
+            combine[:, slot, columns.index(k)] = factor
+        if isinstance(posterior.noise, GaussianNoise):
+            total -= 0.5 * reduced[:, -1, -1]
+        gradient += (combine.swapaxes(1, 2) @ reduced[:, :-1, -1:])[..., 0]
+        information += combine.swapaxes(1, 2) @ reduced[:, :-1, :-1] @ combine
+    return Expansion(total, gradient, information)
+
+
+def _slots(posterior: Posterior, axis: int, columns: Sequence[int]) -> tuple[int, dict[tuple[int, int], int]]:
+    """Number of derivative series of a response axis, and the position of each by table row and drive (-1: a
+    gain or an offset, whose series no gain scales)."""
+    table = posterior.table
+    place: dict[tuple[int, int], int] = {}
+    for drive, unit in enumerate(table.layout.unit_of[axis]):
+        element, delay, _ = table.layout.units[unit]
+        terms = table.layout.elements[element].terms
+        for k in [*(table.at("time", element, i) for i in range(terms)), table.at("delay", delay)]:
+            if k in columns:
+                place[k, drive] = len(place)
+    for k in posterior.acting[axis]:
+        if k in columns:
+            place[k, -1] = len(place)
+    return len(place), place

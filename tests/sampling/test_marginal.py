@@ -1,0 +1,190 @@
+"""Draws given orders and noise, and the search over these: normalisation, known shares, quadrature."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy import stats
+from scipy.special import logsumexp
+from small import TRUTH, Toy, problem, record
+
+from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.inference.conditional import Conditional, Expanded
+from lcopa_bayes.sampling import marginal
+from lcopa_bayes.sampling.conditionaldraws import kept
+from lcopa_bayes.sampling.marginal import Search
+from lcopa_bayes.sampling.mixture import Mixture
+from lcopa_bayes.sampling.outer import Outer, PriorOrders, applies
+from lcopa_bayes.sampling.proposal import Seen, tempered
+
+GAIN = {"gain": ("loguniform", {"a": 0.5, "b": 5.0})}
+PLAIN_GAIN = {"gain": ("gamma", {"a": 4.0, "scale": 0.5})}
+TIMES = {f"time_{k}": ("loguniform", {"a": 0.05, "b": 50.0}) for k in (1, 2, 3)}
+
+
+@pytest.mark.parametrize("terms", [1, 2, 3])
+@pytest.mark.parametrize("name", ["gain out", "gain by its logarithm", "gain", "a time fixed"])
+def test_without_information_the_evidence_is_that_of_the_prior(terms, name):
+    """Else the density of the draws is not what they are drawn from, in some subset of the terms."""
+    own = {k: prior for k, prior in TIMES.items() if int(k[-1]) <= terms}
+    priors = {"gain out": {}, "gain by its logarithm": GAIN, "gain": PLAIN_GAIN, "a time fixed": GAIN}[name]
+    if name == "a time fixed":
+        own["time_1"] = 0.7
+    posterior = problem(record(camera=1.0), terms=terms, priors={**own, **priors, "sigma": 1.0}).posterior
+    if not Conditional(posterior).columns:
+        return
+    conditional, rng, tries = Conditional(posterior), np.random.default_rng(terms), 400
+    values = posterior.table.draw(25, rng)
+    x = conditional.x(values)
+    size = x.shape[1]
+    nothing = np.zeros(25), np.zeros((25, size)), np.zeros((25, size, size))
+    draw = kept(conditional, Expanded(values, x, *nothing), tries, rng)
+    exact = posterior.log_prior(posterior.coordinates(values))
+    for k in conditional.columns:
+        row = posterior.table.rows[k]
+        exact -= row.log_prior(values[:, k]) + (np.log(values[:, k]) if row.log_scale else 0.0)
+    ratio = np.exp(draw.log_evidence - exact)
+    error = np.sqrt(np.mean((1 / draw.efficiency - 1) / tries) / 25)
+    assert abs(ratio.mean() - 1) < 4 * error
+    assert error < 0.1
+
+
+def test_the_draw_kept_follows_the_conditional_posterior():
+    """One time given the order, by quadrature; and its evidence."""
+    fixed = {key: TRUTH[key] for key in ("gain", "delay", "offset")}
+    posterior = problem(
+        record(camera=1.0, noise_sd=0.5), priors=fixed | {"sigma": 0.5, "time_1": TIMES["time_1"]}
+    ).posterior
+    conditional, rng = Conditional(posterior), np.random.default_rng(5)
+    values = np.repeat(posterior.table.draw(1, rng), 3_000, axis=0)
+    values[:, posterior.table.at("order", 0)] = TRUTH["order_1"]
+    at, _ = conditional.descended(values[:1], 12)
+    many = Expanded(*(np.repeat(part, len(values), axis=0) for part in at))
+    draw = kept(conditional, many, 16, rng)
+    grid = np.linspace(np.log(0.05), np.log(50.0), 4_001)
+    points = values[:1].repeat(len(grid), axis=0)
+    points[:, posterior.table.at("time", 0)] = np.exp(grid)
+    apart = conditional.x(points) - at.x
+    surrogate = (
+        at.log_likelihood + apart[:, 0] * at.gradient[0] - 0.5 * apart[:, 0] ** 2 * at.information[0, 0]
+    )
+    density = posterior.log_prior(posterior.coordinates(points)) + surrogate
+    evidence = logsumexp(density) + np.log(grid[1] - grid[0])
+    ratio = np.exp(draw.log_evidence - evidence)
+    assert abs(ratio.mean() - 1) < 4 * ratio.std() / np.sqrt(ratio.size)
+    weights = ratio / ratio.sum()
+    times = draw.coordinates[:, posterior.sampled.index(posterior.table.at("time", 0))]
+    exact = np.exp(density - logsumexp(density))
+    mean, sd = exact @ grid, np.sqrt(exact @ (grid - exact @ grid) ** 2)
+    worth = 1 / (weights @ weights)
+    assert abs(weights @ times - mean) < 4 * sd / np.sqrt(worth)
+
+
+def test_a_proposal_of_orders_from_their_prior_has_their_density(rng):
+    posterior = problem(record(camera=1.0), terms=2).posterior
+    outer = Outer(posterior)
+    rest = Mixture(np.ones(1), np.zeros((1, np.sum(~outer.orders))), np.eye(np.sum(~outer.orders))[None])
+    proposal = PriorOrders(outer, rest)
+    y = proposal.draw(4_000, rng)
+    orders = y[:, outer.orders]
+    assert (np.diff(orders, axis=1) <= 0).all()
+    own = rest.log_density(y[:, ~outer.orders])
+    # the two orders are uniform over half of a square of area 4
+    assert_allclose(proposal.log_density(y) - own, -np.log(2.0), rtol=1e-12)
+    assert abs(np.mean(orders[:, 0] < 1.0) - 0.25) < 4 * np.sqrt(0.25 * 0.75 / 4_000)
+
+
+SHARE = 0.06
+FAR, SMALL = np.array([4.0, -1.5]), np.array([0.35, 0.2])
+WIDE = ("norm", {"loc": 0.0, "scale": 10.0})
+
+
+def valley(y):
+    """Log density of a curved valley and a narrow second mode beside it, normalised."""
+    curved = stats.norm.logpdf(y[:, 0]) + stats.norm(0.5 * y[:, 0] ** 2, 0.2).logpdf(y[:, 1])
+    narrow = stats.norm(FAR, SMALL).logpdf(y).sum(axis=1)
+    return np.logaddexp(np.log(1 - SHARE) + curved, np.log(SHARE) + narrow)
+
+
+def search_of(log_density, seed: int) -> Search:
+    """A search whose marginal density is known."""
+    toy = Toy(log_density, {"a": WIDE, "b": WIDE})
+    search = Search.__new__(Search)
+    search.posterior, search._rng = toy, np.random.default_rng(seed)
+    search._seen, search._points = Seen((), (), ()), []
+    every = lambda y: np.ones(len(y), dtype=bool)  # noqa: E731
+    search.outer = SimpleNamespace(values=lambda y: y, y=lambda y: y, inside=every)
+    search._evaluated = lambda y, values, starts: marginal._Point(
+        y, y, log_density(y), y, log_density(y), log_density(y), np.ones(len(y))
+    )
+    return search
+
+
+def test_a_narrow_mode_beside_a_curved_valley_has_its_share():
+    """Over seeds: no bias, and the scatter is the reported error."""
+    first = Mixture(np.ones(1), np.array([[0.0, 1.0]]), 4.0 * np.eye(2)[None])
+    found, errors, evidence = [], [], []
+    for seed in range(10):
+        weighted = search_of(valley, seed)._improved(first, np.empty((0, 2)), 500)
+        assert weighted is not None
+        weights, inside = np.exp(weighted.log_weights), weighted.coordinates[:, 1] < -0.8
+        share = float(weights @ inside)
+        found.append(share)
+        errors.append(float(np.sqrt(weights**2 @ (inside - share) ** 2)))
+        evidence.append(weighted.log_evidence / weighted.log_evidence_sd)
+    assert abs(np.mean(found) - SHARE) < 4 * np.mean(errors) / np.sqrt(10)
+    low, high = stats.chi2(9).ppf([1e-3, 1 - 1e-3]) / 9
+    assert low < np.var(found, ddof=1) / np.mean(np.square(errors)) < high
+    assert low < np.mean(np.square(evidence)) < high
+
+
+def test_a_search_gives_up_where_no_proposal_comes_near():
+    """Spikes a thousand times narrower than what a round can find."""
+
+    def spikes(y):
+        return -0.5 * ((np.sin(500 * y[:, 0]) / 1e-3) ** 2 + (np.sin(500 * y[:, 1]) / 1e-3) ** 2)
+
+    first = Mixture(np.ones(1), np.zeros((1, 2)), np.eye(2)[None])
+    assert search_of(spikes, 1)._improved(first, np.empty((0, 2)), 500) is None
+
+
+def test_tempered_weights_have_the_effective_draws_wanted(rng):
+    log_weights = 10 * rng.standard_normal(500)
+    weights = tempered(log_weights, 40)
+    assert 40 <= 1 / (weights @ weights) < 60
+    equal = tempered(np.zeros(500), 40)
+    assert_allclose(equal, 1 / 500)
+
+
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_search_agrees_with_quadrature(seed):
+    """An order, a time and a gain: the first two on a grid, the gain integrated out in closed form."""
+    fixed = {key: TRUTH[key] for key in ("delay", "offset")} | {"sigma": 0.1, "time_1": TIMES["time_1"]}
+    posterior = problem(record(camera=0.6, noise_sd=0.1), priors=fixed).posterior
+    with workers(posterior) as crew:
+        weighted = Search(posterior, seed, crew).run(800)
+    assert weighted is not None
+    place = posterior.sampled.index(posterior.table.at("order", 0))
+    times, orders = np.linspace(np.log(0.4), np.log(5.0), 120), np.linspace(0.3, 1.6, 120)
+    z = np.stack([axis.ravel() for axis in np.meshgrid(times, orders)], axis=1)
+    z = z if place == 1 else z[:, ::-1]
+    density = posterior.log_density(z)
+    cell = (times[1] - times[0]) * (orders[1] - orders[0])
+    assert abs(weighted.log_evidence - logsumexp(density) - np.log(cell)) < 4 * weighted.log_evidence_sd
+    exact, weights = np.exp(density - logsumexp(density)), np.exp(weighted.log_weights)
+    for column in range(2):
+        mean = exact @ z[:, column]
+        sd = np.sqrt(exact @ (z[:, column] - mean) ** 2)
+        own = weighted.coordinates[:, column]
+        assert abs(weights @ own - mean) < 4 * sd / np.sqrt(weighted.centre_ess[column])
+        assert abs(weights @ (own - mean) ** 2 / sd**2 - 1) < 8 / np.sqrt(weighted.ess)
+
+
+def test_what_a_search_cannot_divide_is_left_to_ensembles():
+    assert applies(problem(record(camera=1.0)).posterior)
+    nothing = {key: TRUTH[key] for key in ("order_1", "time_1", "delay", "sigma", "offset")}
+    fixed = problem(record(camera=1.0), priors=nothing | GAIN).posterior
+    assert not applies(fixed)

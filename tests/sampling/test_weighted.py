@@ -1,0 +1,83 @@
+"""Importance draws as a result: effective sizes, agreement with ensembles, resuming."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy import stats
+from small import Toy, problem, record
+
+from lcopa_bayes.sampling.draws import gather
+from lcopa_bayes.sampling.evidence import evidence_of
+from lcopa_bayes.sampling.sampler import Run, SamplePlan, sample
+from lcopa_bayes.sampling.weighted import BATCHES, Weighted
+
+WIDE = ("norm", {"loc": 0.0, "scale": 10.0})
+TOY = Toy(lambda z: stats.norm(0.0, 1.0).logpdf(z).sum(axis=1), {"a": WIDE, "b": WIDE})
+
+
+def test_an_error_that_hangs_on_few_draws_is_taken_larger(rng):
+    """Weights of so heavy a tail that hardly more than one of them makes the error."""
+    z = rng.standard_normal((5_000, 2))
+    raw = rng.exponential(1.2, 5_000)  # a tail of shape 1.2
+    weighted = Weighted.of(TOY, z, np.zeros(5_000), raw, 5_000, smooth=False)
+    by_weights = 1 / np.sum(np.exp(2 * weighted.log_weights))
+    assert weighted.smallest_ess(rng) < 0.5 * by_weights
+
+
+def test_effective_sizes_are_those_of_equal_weights():
+    rng = np.random.default_rng(2)
+    z = rng.standard_normal((4_000, 2))
+    weighted = Weighted.of(TOY, z, np.zeros(4_000), np.zeros(4_000), 4_000, smooth=False)
+    assert weighted.ess == pytest.approx(4_000)
+    assert_allclose(weighted.centre_ess, 4_000, rtol=0.1)
+    assert_allclose(weighted.tail_ess, 4_000, rtol=0.25)
+    assert weighted.log_evidence == pytest.approx(0.0)
+    assert np.isnan(weighted.pareto_k)
+
+
+@pytest.fixture(scope="module")
+def weighted_run(tmp_path_factory) -> tuple[Run, object]:
+    made = problem(record(camera=0.3))
+    plan = SamplePlan.of(made.posterior.dimension, seed=4, ensembles=2, walkers=32, method="auto")
+    path = tmp_path_factory.mktemp("run") / "chain.h5"
+    run = sample(made.posterior, plan, chain_file=path, fingerprint="it")
+    return run, (made.posterior, plan, path)
+
+
+def test_a_study_is_sampled_by_importance_draws_that_agree_with_its_ensembles(weighted_run):
+    run, (posterior, plan, _) = weighted_run
+    assert run.weighted is not None
+    assert run.ensembles == ()
+    draws = gather(posterior, run)
+    assert draws.sampling_grade.level == "reliable"
+    assert all(quality.ess >= plan.target_ess for quality in draws.qualities)
+    alone = sample(posterior, replace(plan, method="ensembles"))
+    assert alone.weighted is None
+    chains = gather(posterior, alone)
+    for name in (row.name for row in draws.table.rows if row.free):
+        ours, theirs = draws.column(name), chains.column(name)
+        error = ours.std() * np.hypot(*(one.ess**-0.5 for one in (draws, chains)))
+        assert abs(ours.mean() - theirs.mean()) < 4.5 * error
+        assert abs(np.log(ours.std() / theirs.std())) < 4.5 * error / ours.std()
+    weighed = [evidence_of(posterior, one, chains.ess) for one in (run, alone)]
+    assert abs(weighed[0].value - weighed[1].value) < 4.5 * np.hypot(weighed[0].sd, weighed[1].sd)
+    assert len(weighed[0].by_ensemble) == BATCHES
+
+
+def test_a_finished_run_resumes_to_the_same_importance_draws(weighted_run):
+    run, (posterior, plan, path) = weighted_run
+    again = sample(posterior, plan, chain_file=path, fingerprint="it", resume=True)
+    assert again.weighted is not None
+    assert_array_equal(again.weighted.coordinates, run.weighted.coordinates)
+    assert_array_equal(again.kept()[0], run.kept()[0])
+
+
+def test_importance_draws_do_not_depend_on_the_number_of_processes(weighted_run):
+    run, (posterior, plan, _) = weighted_run
+    again = sample(posterior, plan, jobs=2)
+    assert_array_equal(again.weighted.coordinates, run.weighted.coordinates)
+    assert_array_equal(again.weighted.log_weights, run.weighted.log_weights)
