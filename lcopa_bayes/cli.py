@@ -79,7 +79,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}; narrow the priors that allow these values", file=sys.stderr)
         return USAGE_ERROR
     except KeyboardInterrupt:
-        print("interrupted; the same command with --resume goes on where it stopped", file=sys.stderr)
+        resume = "; the same command with --resume goes on where it stopped" * hasattr(options, "resume")
+        print(f"interrupted{resume}", file=sys.stderr)
         return INTERRUPTED
     if options.json:
         print(json.dumps(outcome.values, allow_nan=False))

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import final
 
-from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.core.errors import InputError, nearest, refuse_if
 from lcopa_bayes.data.settings import CandidateSettings, ModelSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import table_of
@@ -138,8 +138,7 @@ def candidates_of(
             candidates.append(derived(study, own[name] if name in own else known_settings(name, study)))
         except InputError as error:
             problems += [f"candidate {name!r}: {p}" if name not in p else p for p in error.problems]
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     distinct: list[Candidate] = []
     for one in candidates:
         alike = [other for other in distinct if _same(one, other)]

@@ -13,7 +13,7 @@ from lcopa_bayes.comparison.candidatefit import Contender, contender
 from lcopa_bayes.comparison.candidates import Candidate
 from lcopa_bayes.comparison.containment import Check
 from lcopa_bayes.comparison.judgement import judged
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.files import writable_folder
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.inference.assembly import problem_of
@@ -39,8 +39,7 @@ def compare(
     nothing is fitted.
     """
     problems = _problems(candidates)
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     place = None if folder is None else writable_folder(folder) / "candidates"
     tasks = []
     for one in candidates:

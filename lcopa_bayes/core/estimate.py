@@ -8,7 +8,7 @@ from typing import Any, final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.arrays import Array, Vector
 
 LEVEL = 0.9
 """Probability inside the intervals that are reported [-]."""
@@ -48,7 +48,7 @@ class Estimate:
             raise ValueError(f"{name}: {np.isnan(draws).sum()} of {draws.size} draws are NaN")
         finite = bool(np.isfinite(draws).all())
         tail = (1 - LEVEL) / 2
-        lower, middle, upper = (_quantile(draws, q) for q in (tail, 0.5, 1 - tail))
+        lower, middle, upper = (float(quantile(draws, q)) for q in (tail, 0.5, 1 - tail))
         mean, sd = (float(draws.mean()), float(draws.std(ddof=1))) if finite else (np.nan, np.nan)
         return cls(name, middle, unit, lower, upper, ess, grade, mean, sd, note=note)
 
@@ -70,10 +70,10 @@ class Estimate:
         return plain(out | ({"note": self.note} if self.note else {}))
 
 
-def _quantile(draws: Vector, probability: float) -> float:
-    """Quantile that does not interpolate between a finite and an infinite draw."""
-    method = "linear" if np.isfinite(draws).all() else "higher"
-    return float(np.quantile(draws, probability, method=method))  # type: ignore[call-overload]
+def quantile(values: Array, probability: float) -> Array:
+    """Quantile along the first axis that does not interpolate between a finite and an infinite entry."""
+    method = "linear" if np.isfinite(values).all() else "higher"
+    return np.asarray(np.quantile(values, probability, axis=0, method=method))  # type: ignore[call-overload]
 
 
 def plain(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -19,7 +19,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from lcopa_bayes.core.arrays import Matrix, Vector, frozen
-from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.core.errors import InputError, nearest, refuse_if
 from lcopa_bayes.core.files import write_whole
 from lcopa_bayes.core.rules import rebuilt
 from lcopa_bayes.core.units import TIME_UNITS, in_time_unit
@@ -201,8 +201,7 @@ def _columns(table: CellTable, time_unit: str | None, *, responses: bool) -> Col
         table.problems.append(f"{table.path}: has {n_rows} row(s) of data; a record needs two or more")
     if responses and not table.problems and np.isnan(values["response"]).all():
         table.problems.append(f"{table.path}: no response column holds a sample; a record needs one or more")
-    if table.problems:
-        raise InputError(table.problems)
+    refuse_if(table.problems)
     wanted = time_unit or given
     time = in_time_unit(values["time"][0], given, wanted)
     drive, response = (
@@ -254,8 +253,7 @@ def records_of(
             out.append(_record_of_any(one, time_unit, f"{called}-{number}"))
         except InputError as error:
             problems += error.problems
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     return tuple(out)
 
 

@@ -10,11 +10,11 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Flags, Matrix, Vector
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.core.estimate import Estimate
+from lcopa_bayes.core.estimate import Estimate, quantile
 from lcopa_bayes.experiments.candidates import PLAIN, candidates
 from lcopa_bayes.experiments.information import Bench
 from lcopa_bayes.experiments.limits import Limits, bench_times, limits_of
-from lcopa_bayes.experiments.precision import Promise, median, promises, ratios, reached, within
+from lcopa_bayes.experiments.precision import Promise, promises, ratios, reached, within
 from lcopa_bayes.identifiability.contraction import prior_draws, prior_spread
 from lcopa_bayes.identifiability.symmetries import Structure, structure
 from lcopa_bayes.inference.assembly import Problem
@@ -80,7 +80,7 @@ class Design:
         the whole. Draws are compared one by one because bounds differ by decades between them."""
 
         def key(one: Promise) -> tuple[float, float]:
-            return -float(median(self.factors(one)[:, None])[0]), one.typical(self.determined)
+            return -float(quantile(self.factors(one), 0.5)), one.typical(self.determined)
 
         return min(self.here, key=key)
 

@@ -9,7 +9,7 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.observations import sampling_period
 from lcopa_bayes.model.literature import PAPER
@@ -81,8 +81,7 @@ def limits_of(problem: Problem, *, amplitude: float | None = None, refresh: floa
                 f"drive {axis.name!r} moves in no record and no other drive is in {axis.unit}: its range is "
                 "not known; add a record in which it moves"
             )
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     if amplitude is not None:
         factor = amplitude / np.maximum(-low, high)
         low, high = low * factor, high * factor

@@ -9,6 +9,7 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
+from lcopa_bayes.core.estimate import quantile
 from lcopa_bayes.experiments.candidates import Candidate
 from lcopa_bayes.experiments.information import Bench
 from lcopa_bayes.experiments.limits import Limits
@@ -39,7 +40,7 @@ class Promise:
     @property
     def expected(self) -> Vector:
         """Medians of `relative` over the draws, (parameters,) [-]; infinite when half the draws are."""
-        return median(self.relative)
+        return quantile(self.relative, 0.5)
 
     @property
     def excites(self) -> bool:
@@ -58,13 +59,7 @@ class Promise:
         bare = np.where(open_[:, None, None], np.eye(int(among.sum())), chosen)
         sign, logs = np.linalg.slogdet(bare)
         sizes = np.where(open_ | (sign <= 0), np.inf, np.exp(logs / (2 * among.sum())))
-        return float(median(sizes[:, None])[0])
-
-
-def median(columns: Matrix) -> Vector:
-    """Medians of columns that may hold infinite entries; between a finite and an infinite one, the latter."""
-    method = "linear" if np.isfinite(columns).all() else "higher"
-    return np.asarray(np.quantile(columns, 0.5, axis=0, method=method))  # type: ignore[call-overload]
+        return float(quantile(sizes, 0.5))
 
 
 def ratios(over: Vector, under: Vector) -> Vector:

@@ -9,9 +9,9 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.core.estimate import Estimate, plain
+from lcopa_bayes.core.estimate import Estimate, plain, quantile
 from lcopa_bayes.experiments.design import Design, design
-from lcopa_bayes.experiments.precision import Promise, median
+from lcopa_bayes.experiments.precision import Promise
 from lcopa_bayes.results.predictive import Predictive
 
 
@@ -61,7 +61,7 @@ def _row(result: Design, promise: Promise) -> dict[str, Any]:
         "changes": promise.candidate.command.times.size,
         "time": promise.time,
         "worst": result.worst_of(promise).as_json() if among.any() else None,
-        "factor_over_step": median(result.factors(promise)[:, None])[0] if among.any() else None,
+        "factor_over_step": quantile(result.factors(promise), 0.5) if among.any() else None,
         "typical": promise.typical(among) if among.any() else None,
         "relative_sd": [
             result.estimate(promise, name).as_json() if result.determined[k] else None

@@ -24,6 +24,10 @@ def sampled(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
     """Of verbs that sample."""
     study(parser, out)
     parser.add_argument("--resume", action="store_true", help="go on with an interrupted run")
+    _quick(parser)
+
+
+def _quick(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quick", action="store_true", help="a quarter of the steps")
 
 
@@ -53,7 +57,8 @@ def compare(parser: argparse.ArgumentParser) -> None:
 
 def loop(parser: argparse.ArgumentParser) -> None:
     """Of `loop`."""
-    sampled(parser)
+    study(parser)
+    _quick(parser)
     parser.add_argument(
         "--as-stated", action="store_true", help="keep the number of viscous terms the study states"
     )

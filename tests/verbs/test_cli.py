@@ -202,3 +202,11 @@ def test_a_bad_campaign_is_told(tmp_path, capsys, text, words):
     assert code == 2
     assert all(word in told for word in words)
     assert not (tmp_path / "demo").exists()
+
+
+def test_what_cannot_be_resumed_has_no_such_option(record, capsys):
+    """`loop` keeps nothing to go on from."""
+    with pytest.raises(SystemExit) as ended:
+        main(["loop", str(record), "--resume"])
+    assert ended.value.code == 2
+    assert "unrecognized arguments: --resume" in capsys.readouterr().err
