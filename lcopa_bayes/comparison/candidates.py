@@ -62,25 +62,25 @@ def known_settings(name: str, study: Study) -> CandidateSettings:
         base = result[1]
         variants.append(result[2])
     most = _most_terms(study.model)
-    entries: dict[str, object] = {}
+    settings: dict[str, object] = {}
     fractional = re.fullmatch(r"fractional-([1-6])", base)
     if fractional:
-        entries["terms"] = int(fractional[1])
+        settings["terms"] = int(fractional[1])
     elif base == "first-order":
-        entries["orders"] = (1.0,)
+        settings["orders"] = (1.0,)
     elif base == "second-order":
-        entries["orders"] = (2.0, 1.0)
+        settings["orders"] = (2.0, 1.0)
     elif base == "integer-kept":
-        entries["orders"] = (2.0, *[1.0] * (most - 1)) if most > 1 else (1.0,)
+        settings["orders"] = (2.0, *[1.0] * (most - 1)) if most > 1 else (1.0,)
     elif base != STUDY:
         raise InputError(
             f"no candidate {name!r}{nearest(base, KNOWN)}; any of them may end in "
             f"{', '.join('-' + key for key in VARIANTS)}; or describe it under [[candidates]]"
         )
-    entries |= {"share": "none"} if "separate" in variants else {}
-    entries |= {"delay": "path"} if "delays" in variants else {}
-    entries |= {"effects": ()} if "no-effects" in variants else {}
-    return CandidateSettings(name, cross="no-cross" not in variants, **entries)  # type: ignore[arg-type]
+    settings |= {"share": "none"} if "separate" in variants else {}
+    settings |= {"delay": "path"} if "delays" in variants else {}
+    settings |= {"effects": ()} if "no-effects" in variants else {}
+    return CandidateSettings(name, cross="no-cross" not in variants, **settings)  # type: ignore[arg-type]
 
 
 def derived(study: Study, settings: CandidateSettings) -> Candidate:

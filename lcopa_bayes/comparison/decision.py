@@ -28,7 +28,7 @@ def fractional(usable: Sequence[Row]) -> dict[str, Any]:
     gains = [gain, *others]
     least = min(gains, key=lambda one: one.nats - ERRORS * one.sd)
     most = max(gains, key=lambda one: one.nats + ERRORS * one.sd)
-    entries = {
+    values = {
         "fractional": free["name"],
         "integer": whole["name"],
         "log_bayes_factor": gain.nats,
@@ -46,14 +46,14 @@ def fractional(usable: Sequence[Row]) -> dict[str, Any]:
     denied = predicted is not None and -predicted.nats > max(TIE, ERRORS * predicted.sd)
     shown = predicted is None or predicted.nats > predicted.sd  # the evidence is strong by itself
     if strong and shown and not unknown:
-        return entries | {
+        return values | {
             "verdict": "warranted",
             "sentence": (
                 f"Fractional orders are warranted. {said}; least over priors half and twice as wide {least}."
             ),
         }
     if denied or most.nats + ERRORS * most.sd < 0:
-        return entries | {
+        return values | {
             "verdict": "not warranted",
             "sentence": f"Fractional orders are not warranted. {said}.",
         }
@@ -64,7 +64,7 @@ def fractional(usable: Sequence[Row]) -> dict[str, Any]:
         if not shown
         else f"whether the evidence hangs on the width of the priors is not known: {'; '.join(unknown)}"
     )
-    return entries | {
+    return values | {
         "verdict": "not shown",
         "sentence": f"No win of fractional orders is claimed: {lacking}. {said}.",
     }
@@ -117,10 +117,10 @@ def decided(rows: Sequence[Row]) -> dict[str, Any]:
     ]
     usable = [row for row in rows if row["usable"]]
     weighed = [row for row in usable if row["log_evidence"] is not None]
-    entries = {"unranked": unranked, "evidence_undefined": undefined, "flags": flags(rows)}
+    values = {"unranked": unranked, "evidence_undefined": undefined, "flags": flags(rows)}
     if len(usable) < 2:
         why = "fewer than two candidates have a usable posterior: nothing can be compared"
-        return entries | {
+        return values | {
             "preferred": None,
             "why": why,
             "agreement": {"agree": None, "sentence": why},
@@ -141,7 +141,7 @@ def decided(rows: Sequence[Row]) -> dict[str, Any]:
         for row in rows
         if not row["containment"]["met"]
     )
-    return entries | {
+    return values | {
         "preferred": None if preferred is None else preferred["name"],
         "why": why,
         "agreement": {"agree": agree, "sentence": sentence},
@@ -201,8 +201,8 @@ def _why(
 
 def _gains(rows: Sequence[Row], against: Row) -> list[tuple[Row, Gain]]:
     """Rows with what they gain over another, the best first; those without evidence are left out."""
-    entries = [(row, by_evidence(row, against)) for row in rows]
-    return sorted(((row, gain) for row, gain in entries if gain is not None), key=lambda pair: -pair[1].nats)
+    gains = [(row, by_evidence(row, against)) for row in rows]
+    return sorted(((row, gain) for row, gain in gains if gain is not None), key=lambda pair: -pair[1].nats)
 
 
 def flags(rows: Sequence[Row]) -> list[dict[str, str]]:

@@ -89,8 +89,8 @@ def _shapes(ticks: int, refresh: float, unit: str) -> Iterator[tuple[str, str, s
     yield PLAIN, "step", f"on at 0 and held for {whole}", _step
     holds = sorted({max(1, ticks // k) for k in (2, 8, 32, 128)} | {1} & {ticks // 2})
     for hold in reversed(holds):
-        values = f"{hold * refresh:.4g} {unit}"
-        yield f"on/off, {values}", "on/off", f"on for {values}, off for as long, repeated", _square(hold)
+        dwell = f"{hold * refresh:.4g} {unit}"
+        yield f"on/off, {dwell}", "on/off", f"on for {dwell}, off for as long, repeated", _square(hold)
     if ticks >= 2 * _LEVELS:
         words = f"steps to 1/{_LEVELS}, 2/{_LEVELS}, ... of the range, each followed by as long a rest"
         yield "amplitude series", "amplitude series", words, _series
@@ -98,9 +98,9 @@ def _shapes(ticks: int, refresh: float, unit: str) -> Iterator[tuple[str, str, s
         yield "staircase", "staircase", words, _staircase
     for hold in (1, 4, 16):
         if ticks >= 4 * hold:
-            values = f"{hold * refresh:.4g} {unit}"
-            name = "binary, every refresh" if hold == 1 else f"binary, {values}"
-            yield name, "pseudo-random binary", f"low or high, drawn anew every {values}", _binary(hold)
+            dwell = f"{hold * refresh:.4g} {unit}"
+            name = "binary, every refresh" if hold == 1 else f"binary, {dwell}"
+            yield name, "pseudo-random binary", f"low or high, drawn anew every {dwell}", _binary(hold)
     if ticks >= 16:
         words = f"low and high by turns, dwells log-uniform from {refresh:.4g} {unit} to a quarter of {whole}"
         yield "telegraph", "random telegraph", words, _telegraph

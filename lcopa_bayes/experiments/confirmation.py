@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from math import isfinite
+from operator import call
 from typing import Any, final
 
 import numpy as np
@@ -80,7 +80,7 @@ class Confirmation:
     def sentence(self) -> str:
         """Result of the simulation."""
         count = self.winner.errors.shape[0]
-        values = (
+        achieved = (
             f"{self.where}, {count} simulated records and fits each: the worst standard deviation achieved "
             f"is {self.factor:.3g} times ({100 * LEVEL:g} %: {self.lower:.3g} to {self.upper:.3g}) smaller "
             "than after the plain step"
@@ -93,7 +93,7 @@ class Confirmation:
             f"; {held} of {count} fits after the step lean on the end of a prior, so that its scatter is "
             "smaller than the data alone would leave it"
         ) * (held > 0)
-        return f"{'confirmed' if self.confirmed else 'not confirmed'}: {values} ({promised}){bound}"
+        return f"{'confirmed' if self.confirmed else 'not confirmed'}: {achieved} ({promised}){bound}"
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; infinite ones are None."""
@@ -160,7 +160,7 @@ def confirm(design: Design, *, replicas: int = REPLICAS, jobs: int = 1) -> tuple
         places[int(ranked[(small.size - 1) // 2])] = "where linear bounds can be believed"
     ranked = finite[np.argsort(worst[finite])]
     places.setdefault(int(ranked[(finite.size - 1) // 2]), "at the draw of median precision")
-    return tuple(_confirmed(design, k, values, replicas, jobs) for k, values in places.items())
+    return tuple(_confirmed(design, k, where, replicas, jobs) for k, where in places.items())
 
 
 def confirmed(design: Design, *, jobs: int = 1, replicas: int = REPLICAS) -> dict[str, Any]:
@@ -195,7 +195,8 @@ def _confirmed(design: Design, chosen: int, where: str, replicas: int, jobs: int
             Trial(bench, clean, design.draws[chosen], design.names, (problem.study.seed, 9, chosen, which, k))
             for k in range(replicas)
         ]
-    result = list(_performed(tasks, min(jobs, replicas)))
+    with workers(None, jobs=min(jobs, replicas)) as crew:
+        result = list(crew.map(call, tasks))
     winner, step = (
         Achieved(
             promise.candidate.name,
@@ -212,15 +213,6 @@ def _confirmed(design: Design, chosen: int, where: str, replicas: int, jobs: int
     return Confirmation(where, design.names, design.determined, at, winner, step, factor, low, high)
 
 
-def _performed(tasks: list[Trial], jobs: int) -> Iterator[tuple[Vector, Flags]]:
-    with workers(None, jobs=jobs) as crew:
-        yield from crew.map(_perform, tasks)
-
-
-def _perform(task: Trial) -> tuple[Vector, Flags]:
-    return task()
-
-
 def _factor(
     winner: Matrix, step: Matrix, among: Flags, rng: np.random.Generator
 ) -> tuple[float, float, float]:
@@ -233,6 +225,6 @@ def _factor(
         worst(errors[rng.integers(0, errors.shape[0], (_RESAMPLED, errors.shape[0]))])
         for errors in (step, winner)
     ]
-    values = (drawn[0] > 0) & (drawn[1] > 0)  # a resample of one record, over and over, has no spread
-    low, high = np.quantile(drawn[0][values] / drawn[1][values], (0.5 - LEVEL / 2, 0.5 + LEVEL / 2))
+    spread = (drawn[0] > 0) & (drawn[1] > 0)  # a resample of one record, over and over, has no spread
+    low, high = np.quantile(drawn[0][spread] / drawn[1][spread], (0.5 - LEVEL / 2, 0.5 + LEVEL / 2))
     return float(worst(step) / worst(winner)), float(low), float(high)

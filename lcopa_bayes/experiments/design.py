@@ -144,9 +144,9 @@ class Design:
         unit = self.fit.study.time_unit
         if not self.determined.any():
             return f"no drive tried determines any parameter within {self.time:g} {unit}"
-        entries = f"{self.winner.candidate.name} for {self.time:g} {unit}"
+        which = f"{self.winner.candidate.name} for {self.time:g} {unit}"
         if self.winner is self.step:
-            return f"{entries}: no drive tried is better for the worst parameter than the plain step"
+            return f"{which}: no drive tried is better for the worst parameter than the plain step"
         factor = self.factor.value
         gained = (
             f"{factor:.3g} times smaller than after the plain step of equal time"
@@ -157,7 +157,7 @@ class Design:
             f"; linear bounds can be believed at {100 * self.linear:.0f} % of the draws, elsewhere they say "
             "which drive is better but not how precise it will be"
         ) * (self.linear < 1)
-        return f"{entries}: the worst relative standard deviation (mostly {self.worst}) is {gained}{few}"
+        return f"{which}: the worst relative standard deviation (mostly {self.worst}) is {gained}{few}"
 
 
 def checked(

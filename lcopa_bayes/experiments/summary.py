@@ -76,9 +76,9 @@ def _parameter(result: Design, name: str, unit: str) -> dict[str, Any]:
     best = result.best(name, result.here)
     sizes = np.abs(result.draws[:, result.fit.draws.table.names.index(name)])
     spread: Vector = best.relative[:, at] * sizes
-    values = "not by any drive tried"
+    needed_words = "not by any drive tried"
     if needed is not None:
-        values = f"{'at most ' * needed[1]}{needed[0]:.3g} {result.fit.study.time_unit}"
+        needed_words = f"{'at most ' * needed[1]}{needed[0]:.3g} {result.fit.study.time_unit}"
     return {
         "name": name,
         "unit": unit,
@@ -94,7 +94,7 @@ def _parameter(result: Design, name: str, unit: str) -> dict[str, Any]:
         "relative_sd_winner": None if reason else result.estimate(result.winner, name).as_json(),
         "time_for_10_percent": None if needed is None else needed[0],
         "time_is_upper_bound": needed is not None and needed[1],
-        "time_words": values,
+        "time_words": needed_words,
     }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, final
 
@@ -182,8 +182,8 @@ def _flat(row: Parameter) -> bool:
 def _profiles(landscape: Landscape, peak: Peak, witnesses: Matrix, jobs: int) -> tuple[list[Profile], Peak]:
     """Profiles of all free parameters about one maximum, and that maximum."""
     for _ in range(_TRIES):
-        tasks = [_Task(k, peak, witnesses, _first_step(landscape, k, witnesses)) for k in landscape.free]
-        profiles = list(_performed(landscape, tasks, jobs))
+        with workers((landscape, peak, witnesses), jobs=min(jobs, len(landscape.free))) as crew:
+            profiles = list(crew.each(_profile, landscape.free))
         top = max(profiles, key=lambda profile: profile.best)
         better = top.best - peak.log_likelihood
         if better > 0:
@@ -200,25 +200,6 @@ def _first_step(landscape: Landscape, k: int, witnesses: Matrix) -> float:
     return 0.1 * spread if spread > 0 else 1e-3 * (high - low)
 
 
-@final
-@dataclass(frozen=True, eq=False)
-class _Task:
-    """One profile to calculate."""
-
-    k: int
-    peak: Peak
-    witnesses: Matrix
-    step: float
-
-    def __call__(self, landscape: Landscape) -> Profile:
-        return profile(landscape, self.k, self.peak, self.witnesses, self.step)
-
-
-def _performed(landscape: Landscape, tasks: Sequence[_Task], jobs: int) -> Iterator[Profile]:
-    """Profiles in the order of the tasks."""
-    with workers(landscape, jobs=min(jobs, len(tasks))) as crew:
-        yield from crew.each(_perform, tasks)
-
-
-def _perform(landscape: Landscape, task: _Task) -> Profile:
-    return task(landscape)
+def _profile(shared: tuple[Landscape, Peak, Matrix], k: int) -> Profile:
+    landscape, peak, witnesses = shared
+    return profile(landscape, k, peak, witnesses, _first_step(landscape, k, witnesses))

@@ -67,6 +67,8 @@ _SINGULAR = 1e-11
 """Eigenvalues below this share of the largest are rounding [-]."""
 _TOUCHED = 1e-6
 """Squared weight in a singular direction from which a parameter's variance is infinite [-]."""
+_PARTNERS = 0.8
+"""Correlation from which two parameters are named together [-]."""
 _SHOWN = 0.1
 """Weights of a direction that are named [-]."""
 
@@ -102,13 +104,13 @@ class Curvature:
         place = self.names.index(name)
         return float(self.sd[place]), float(self.relative_sd[place])
 
-    def partners(self, name: str, least: float = 0.8) -> tuple[str, ...]:
+    def partners(self, name: str) -> tuple[str, ...]:
         """Parameters whose linearised estimates are correlated with this one's, strongest first."""
         if name not in self.names:
             return ()
         row = np.abs(self.correlations[self.names.index(name)])
         order = np.argsort(-np.nan_to_num(row))
-        return tuple(self.names[p] for p in order if self.names[p] != name and row[p] >= least)
+        return tuple(self.names[p] for p in order if self.names[p] != name and row[p] >= _PARTNERS)
 
     def as_json(self) -> dict[str, Any]:
         """Plain values without the spectrum; infinite values are None."""

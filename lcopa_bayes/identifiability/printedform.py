@@ -10,7 +10,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.identifiability.curvature import Sensitivities
 from lcopa_bayes.identifiability.symmetries import Structure, structure
-from lcopa_bayes.model.literature import PAPER, Stated
+from lcopa_bayes.model.literature import PAPER
 from lcopa_bayes.model.path import Normalisation, TransferPath
 from lcopa_bayes.optics.array import paper_array
 from lcopa_bayes.optics.steering import linearised_angle
@@ -29,7 +29,7 @@ class PrintedForm(NamedTuple):
 
 
 def printed_form(
-    gain: float, times: Vector, orders: Vector, delay: float, rng: np.random.Generator, stated: Stated = PAPER
+    gain: float, times: Vector, orders: Vector, delay: float, rng: np.random.Generator
 ) -> PrintedForm:
     """One of the many printed forms of ``gain exp(-delay s) / (1 + sum_i (T_i s)^order_i)``.
 
@@ -37,7 +37,7 @@ def printed_form(
     ``b = asin(lambda / (2 pi d)) j q / (0.4019 x)`` (Ta et al. 2026, Eqs. 16, 21, 28); the springs are
     drawn with `rng`, the rest follows. Rows of `slopes`: gain, log T_i, order_i, delay; units as given.
     """
-    optics = stated.optics
+    optics = PAPER.optics
     springs = rng.uniform(0.5, 2.0, SPRINGS)
     k = float(springs.sum())
     path = TransferPath.of_times(gain, delay, times.tolist(), orders.tolist())

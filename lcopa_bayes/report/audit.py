@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from lcopa_bayes.report.formatting import NONE, ends, figures, percent
+from lcopa_bayes.report.formatting import NONE, ends, figures, percent, sentence
 from lcopa_bayes.report.page import write_graded
 from lcopa_bayes.report.savedrun import SavedRun, load_run
 from lcopa_bayes.report.section import Drawing, Section, Table, paged
@@ -97,7 +97,7 @@ def _next(results: Mapping[str, Any]) -> Section:
     limits = results["limitations"]
     if advice is None and limits:
         text = tuple(
-            f"{_sentence(limit['reason'])} Remedy: {limit['remedy'] or 'see the report'}." for limit in limits
+            f"{sentence(limit['reason'])} Remedy: {limit['remedy'] or 'see the report'}." for limit in limits
         )
         return Section(
             "What to measure next",
@@ -112,7 +112,7 @@ def _next(results: Mapping[str, Any]) -> Section:
             "What to measure next",
             ("Given this model every parameter is identified: its parameters need no further record.",),
         )
-    text = (_sentence(advice["reason"]),)
+    text = (sentence(advice["reason"]),)
     if not advice["parameters"]:
         return Section("What to measure next", text)
     caption = (
@@ -131,11 +131,6 @@ def _next(results: Mapping[str, Any]) -> Section:
         caption=caption,
     )
     return Section("What to measure next", text, tables=(table,))
-
-
-def _sentence(clause: str) -> str:
-    """A clause as a sentence."""
-    return f"{clause[0].upper()}{clause[1:]}."
 
 
 def _expected(row: Mapping[str, Any], which: str) -> str:
@@ -190,8 +185,7 @@ def _functions(results: Mapping[str, Any]) -> Section:
 
 def _delays(results: Mapping[str, Any]) -> Section:
     delays = results["delays"]
-    sentence = str(delays["sentence"])
-    text = (f"{sentence[0].upper()}{sentence[1:]}.",)
+    text = (sentence(str(delays["sentence"])),)
     rows: Sequence[Mapping[str, Any]] = delays["separations"]
     if not rows:
         return Section("Delays of the paths", text)

@@ -64,6 +64,16 @@ def probability(p: float) -> str:
     return f"p\u00a0=\u00a0{figures(p, 2)}" if p > 0 else "p below the smallest number a computer holds"
 
 
+def sentence(clause: str) -> str:
+    """A clause with a capital and a full stop."""
+    return stopped(f"{clause[0].upper()}{clause[1:]}")
+
+
+def stopped(clause: str) -> str:
+    """A clause that may begin with a name, with a full stop."""
+    return clause if clause.endswith((".", ":")) else f"{clause}."
+
+
 def _place(value: float) -> int:
     """Decimal places that show two significant digits."""
     return 1 - floor(log10(abs(float(f"{value:.1e}"))))

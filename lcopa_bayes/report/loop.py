@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from lcopa_bayes.report.formatting import NONE, figures, interval, percent
+from lcopa_bayes.report.formatting import NONE, figures, interval, percent, stopped
 from lcopa_bayes.report.page import Verdict, write_graded
 from lcopa_bayes.report.section import Drawing, Section, Table
 from lcopa_bayes.report.theme import BAND, HELD_OUT, NOISE, SEEN, blank, label, plain, svg_of
@@ -52,7 +52,7 @@ def _tables(results: Mapping[str, Any]) -> list[Section]:
 
 
 def _effects(results: Mapping[str, Any]) -> Section:
-    text = [str(results["sentence"]), *(f"Caution: {caution}" for caution in results["cautions"])]
+    text = [str(results["sentence"]), *(stopped(f"Caution: {caution}") for caution in results["cautions"])]
     if results.get("base_enlarged"):
         text.append(str(results["base_enlarged"]))
     for effect in results["effects"]:

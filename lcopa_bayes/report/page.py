@@ -13,6 +13,7 @@ from markupsafe import Markup
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.files import writable_folder, write_text
+from lcopa_bayes.report.formatting import stopped
 from lcopa_bayes.report.savedrun import load_run
 from lcopa_bayes.report.section import Drawing, Section
 from lcopa_bayes.report.sections import (
@@ -72,7 +73,7 @@ class Verdict:
     def of(cls, values: Mapping[str, Any]) -> Verdict:
         """Verdict of a result; the reason is not repeated."""
         sentence, reason = str(values["verdict"]), str(values["grade_reason"])
-        return cls(str(values["grade"]), sentence, "" if reason in sentence else reason)
+        return cls(str(values["grade"]), stopped(sentence), "" if reason in sentence else reason)
 
 
 def write_report(folder: Path) -> Path:

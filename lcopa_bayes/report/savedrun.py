@@ -50,7 +50,7 @@ _CHECK_TABLES: Mapping[str, tuple[str, ...]] = {
 _RESULTS = (
     *("study", "verdict", "grade", "grade_reason", "time_unit", "parameters", "fixed", "held_out"),
     *("fit_scores", "step_metrics", "residual_tests", "sampler"),
-    *("ridges", "sensitivity", "cross_check"),
+    *("modes", "sensitivity", "cross_check"),
 )
 _PROVENANCE = ("command", "seed", "inputs_sha256", "python", "versions")
 

@@ -38,8 +38,7 @@ class Table:
     def of(cls, rows: Iterable[Row], *columns: tuple[str, Kind, Cell], caption: str = "") -> Table:
         """One row per entry of `rows`, one column per title, kind and cell.
 
-        A cell is a key of the entry, whose value stands to three digits in columns of numbers and as it is in
-        others, or a function of the entry.
+        A cell is a key of the entry, printed to three digits in columns of numbers, or a function of it.
         """
         return cls(
             tuple(Column(title, kind) for title, kind, _ in columns),

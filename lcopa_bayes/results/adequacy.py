@@ -3,7 +3,7 @@
 A grade by the sampling says how well a posterior is known, not whether its model is right. Checks of the
 model against the records it was fitted to are limitations of every number: a residual that the noise model
 does not explain, bands that hold too many or too few samples, a residual far above the scatter at rest, noise
-whose parameters stand at the end of their priors, and a resonance that the samples do not resolve.
+whose parameters are at the end of their priors, and a resonance that the samples do not resolve.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ REST = 2.0
 default priors let noise in motion be twice that at rest."""
 MEMORY = 0.1
 """Share of the record over which noise may be correlated [-]: with less than ten independent stretches it
-cannot be told from a response that the plant lacks."""
+cannot be distinguished from a response that the plant lacks."""
 _END = 0.9
-"""Noise parameters with half of their draws beyond this share of a bounded prior stand at its end [-]."""
+"""Noise parameters with half of their draws beyond this share of a bounded prior are at its end [-]."""
 _REPLICAS = 400
 """Noise that is drawn to learn how coverage scatters."""
 _CELLS = 4_000_000
@@ -43,14 +43,15 @@ def limitations(
     problem: Problem,
     draws: Draws,
     shown: Sequence[Band],
-    left: Sequence[Residual],
+    remaining: Sequence[Residual],
     rng: np.random.Generator,
 ) -> tuple[Limitation, ...]:
     """Limitations of the numbers of a fit, from its bands and residuals of the records that were fitted."""
     fitted = [band for band in shown if not band.held_out]
     return (
         *_unexplained(
-            [one for one in left if not one.held_out], [_coverage(problem, draws, b, rng) for b in fitted]
+            [one for one in remaining if not one.held_out],
+            [_coverage(problem, draws, b, rng) for b in fitted],
         ),
         *_above_rest(problem, fitted),
         *_ends(problem, draws),
@@ -93,14 +94,14 @@ def _coverage(problem: Problem, draws: Draws, band: Band, rng: np.random.Generat
     return Coverage(band.record, band.axis, share, float(min(1.0, 2 * min(above, below))))
 
 
-def _unexplained(left: Sequence[Residual], covered: Sequence[Coverage]) -> Iterator[Limitation]:
+def _unexplained(remaining: Sequence[Residual], covered: Sequence[Coverage]) -> Iterator[Limitation]:
     """Residuals that are not white and bands that do not hold what is due, corrected for all that are
     tried."""
-    adjusted = holm([one.p_white for one in left] + [one.p for one in covered])
-    white, hold = adjusted[: len(left)], adjusted[len(left) :]
+    adjusted = holm([one.p_white for one in remaining] + [one.p for one in covered])
+    white, hold = adjusted[: len(remaining)], adjusted[len(remaining) :]
     count = f"corrected for {len(adjusted)} tests" if len(adjusted) > 1 else "one test"
     if white and min(white) < WHITE_P:
-        worst = left[int(np.argmin(white))]
+        worst = remaining[int(np.argmin(white))]
         yield Limitation(
             "tentative",
             "intervals hold only if what the noise model does not explain is harmless: the residual of "
@@ -127,7 +128,7 @@ def _p(p: float) -> str:
 def _above_rest(problem: Problem, fitted: Sequence[Band]) -> Iterator[Limitation]:
     """The axis whose residual is largest over the scatter at rest, where that is too large."""
     begins = {one.record.name: one.first_change for one in problem.posterior.samples}
-    worst, told = REST, None
+    worst, largest = REST, None
     for axis, declared in enumerate(problem.posterior.table.layout.responses):
         quiet = problem.scales.quiet(axis)
         if quiet is None:
@@ -139,9 +140,9 @@ def _above_rest(problem: Problem, fitted: Sequence[Band]) -> Iterator[Limitation
                 continue
             rms = sqrt(float(np.mean((band.observed - band.plant[2])[moving] ** 2)))
             if rms > worst * most:
-                worst, told = rms / most, (band, rms, most)
-    if told is not None:
-        band, rms, most = told
+                worst, largest = rms / most, (band, rms, most)
+    if largest is not None:
+        band, rms, most = largest
         yield Limitation(
             "tentative",
             "intervals hold only if noise grew with the first change of the drive: the residual of "
@@ -165,7 +166,7 @@ def _ends(problem: Problem, draws: Draws) -> Iterator[Limitation]:
                 yield Limitation(
                     "tentative",
                     f"intervals hold only if noise is correlated over {memory:.3g} samples of "
-                    f"{samples:.0f} ({row.name} = {np.median(column):.4g}): noise that slow stands for what "
+                    f"{samples:.0f} ({row.name} = {np.median(column):.4g}): noise that slow replaces what "
                     "the plant lacks",
                     _ADD,
                 )
@@ -173,6 +174,6 @@ def _ends(problem: Problem, draws: Draws) -> Iterator[Limitation]:
             yield Limitation(
                 "tentative",
                 f"intervals hold only if {row.name} may not exceed {high:.3g} {row.unit}, the end of its "
-                "prior where it stands",
+                "prior, near which it is",
                 _ADD,
             )

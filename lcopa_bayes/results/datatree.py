@@ -60,12 +60,12 @@ def posterior_tree(fit: Fit) -> DataTree:
     attributes; per response axis of a record, `<record>_<axis>` with both as attributes, there are
     `log_likelihood`, `posterior_predictive` and `prior_predictive` (plant with noise) and `observed_data`,
     and of held-out records `predictions` (with noise) and, beside the drives, `predictions_constant_data`.
-    Their dimension is `<record>_<axis>_time` with the times as coordinate. Drives stand in the constant data
+    Their dimension is `<record>_<axis>_time` with the times as coordinate. Drives are in the constant data
     by `<record>_drive_time` and `drive`, the axes' names; `record` lists the records.
 
     The priors of single parameters add up to that of all but for a constant, the attribute `joint_support` of
     `log_prior`: decreasing orders and resolved terms hold a part of the mass. A slash in a name, which netCDF
-    keeps for groups, is written as a vertical bar; names that would be the same are told apart by a number
+    keeps for groups, is written as a vertical bar; names that would be the same get a number
     (`variable_names`).
     """
     draws, problem = fit.draws, fit.problem
@@ -98,11 +98,11 @@ def posterior_tree(fit: Fit) -> DataTree:
     if study.held_out:
         samples, model = problem.simulated(study.held_out)
         apart, later = _Series.of(samples), _Drives.of(study.held_out)
-        found = record_draws(draws, model, samples, posterior.noise, held_out=True, seed=fit.run.plan.seed)
-        names = {pair: name for name, pair in apart.told.items()}
+        drawn = record_draws(draws, model, samples, posterior.noise, held_out=True, seed=fit.run.plan.seed)
+        names = {pair: name for name, pair in apart.origins.items()}
         groups["predictions"] = {
             names[record, axis.name]: (response + offset[0][:, None] + noises)[None].astype(np.float32)
-            for (record, axis, _), _, _, response, noises, offset in found
+            for (record, axis, _), _, _, response, noises, offset in drawn
         }
         groups["predictions_constant_data"] = apart.observed | later.values
         series, drives = [fitted, apart], [commanded, later]
@@ -136,7 +136,7 @@ def _describe(tree: DataTree, fit: Fit, variables: Mapping[int, str], series: Se
     units = {axis.name: axis.unit for axis in study.response_axes}
     for node in tree.children.values():
         for one in series:
-            for name, (record, axis) in one.told.items():
+            for name, (record, axis) in one.origins.items():
                 if name in node.data_vars:
                     more = {} if node.name == "log_likelihood" else {"units": units[axis]}
                     node[name].attrs |= {"record": record, "axis": axis, **more}
@@ -179,7 +179,7 @@ def variable_names(wanted: Sequence[str]) -> list[str]:
 class _Series:
     """What was seen of some records, by variable name."""
 
-    told: dict[str, tuple[str, str]]
+    origins: dict[str, tuple[str, str]]
     """Record and axis."""
     places: dict[str, tuple[int, int]]
     """Their positions."""
@@ -189,16 +189,16 @@ class _Series:
     @classmethod
     def of(cls, samples: Sequence[Samples]) -> _Series:
         """Of every axis of every record that has a sample."""
-        told = {
+        origins = {
             (r, axis): (record.record.name, record.record.response_axes[axis].name)
             for r, record in enumerate(samples)
             for axis, seen in enumerate(record.axes)
             if seen.values.size
         }
-        names = variable_names(["_".join(pair) for pair in told.values()])
-        places = dict(zip(names, told, strict=True))
+        names = variable_names(["_".join(pair) for pair in origins.values()])
+        places = dict(zip(names, origins, strict=True))
         return cls(
-            dict(zip(names, told.values(), strict=True)),
+            dict(zip(names, origins.values(), strict=True)),
             places,
             {name: samples[r].axes[axis].values for name, (r, axis) in places.items()},
             {name: samples[r].times[samples[r].axes[axis].index] for name, (r, axis) in places.items()},

@@ -32,7 +32,7 @@ _NOTHING = 0.02
 FACTORS = (2, 4)
 """How many times narrower the blocks are on which shifts are measured."""
 _REST = 16 / 15
-"""What is left from blocks four times narrower to none, by the second order of the scheme."""
+"""Shift to blocks without width over that to blocks four times narrower, at second order."""
 _FINEST = 16
 """Most by which blocks are narrowed [-]."""
 _MOST_CELLS = 1 << 15
@@ -55,7 +55,7 @@ class Discretisation:
     error: float
     """Standard error of `shift` from the number of draws [posterior sd]."""
     refinement: int
-    """How many times narrower than the study's settings ask the blocks already are."""
+    """How many times narrower the blocks already are than the study sets."""
 
     blocks: int
     """Blocks of all fit records together [-]."""
@@ -122,7 +122,7 @@ def resolved(problem: Problem, optima: Sequence[Optimum] | None = None) -> Probl
 def narrowed(problem: Problem, shift: Callable[[Problem], float]) -> Problem:
     """The problem on blocks halved while the `shift` measured on them is larger than `LARGEST` sd.
 
-    Not beyond `_FINEST` or `_MOST_CELLS`, where the measurement after sampling says what is left.
+    Not beyond `_FINEST` or `_MOST_CELLS`, where the measurement after sampling gives the remaining shift.
     """
     while shift(problem) > LARGEST and _may_refine(problem):
         problem = problem.refined(2)

@@ -54,7 +54,7 @@ class Fit(Predictive):
     problem: Problem
     """The study prepared for inference, with blocks as narrow as its records need."""
     run: Run
-    """Ensembles or weighted draws, as sampling left them."""
+    """Ensembles or weighted draws, as sampled."""
     draws: Draws
     """Posterior draws, (ensembles, draws, parameters) in the unit of each, with their grade."""
     bands: tuple[Band, ...]
@@ -175,8 +175,10 @@ def fit(
     if study.held_out:
         samples, model = problem.simulated(study.held_out)
         shown += bands(draws, model, samples, noise, held_out=True, seed=seed)
-    left = residuals(draws, shown, noise, problem.scales.period)
-    draws = draws.limited(limitations(problem, draws, shown, left, np.random.default_rng([plan.seed, 4])))
+    remaining = residuals(draws, shown, noise, problem.scales.period)
+    draws = draws.limited(
+        limitations(problem, draws, shown, remaining, np.random.default_rng([plan.seed, 4]))
+    )
     metrics = step_metrics(draws, curves, time_unit=study.time_unit)
     moved = sensitivity(draws, problem.posterior)
     response = frequency_response(
@@ -187,7 +189,7 @@ def fit(
         run,
         draws,
         tuple(shown),
-        tuple(left),
+        tuple(remaining),
         curves,
         tuple(metrics),
         moved,
@@ -199,7 +201,7 @@ def fit(
 
 
 def plan_of(problem: Problem, *, quick: bool) -> SamplePlan:
-    """How a study asks to be sampled."""
+    """The sampling plan of a study."""
     wanted, study = problem.study.sampler, problem.study
     plan = SamplePlan.of(
         problem.posterior.dimension,

@@ -1,4 +1,4 @@
-"""What a drive asks of a plant beyond what the fit records showed: in size, in duration and in frequency.
+"""What of a drive lies beyond what the fit records cover: in size, in duration and in frequency.
 
 A model predicts there too, but by its form alone. Nothing is refused for it: each thing outside becomes a
 sentence with the time from which it counts.

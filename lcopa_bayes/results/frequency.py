@@ -204,7 +204,7 @@ def frequency_response(
     outside = []
     if table.effects is not None:
         names = ", ".join(kind.card.name for kind in table.effects.kinds)
-        outside.append(f"It is that of the linear plant alone: its effects ({names}) are left out.")
+        outside.append(f"It is that of the linear plant alone: its effects ({names}) are not included.")
     if frequency[0] < lowest * (1 - 1e-9):
         outside.append(
             f"Below {lowest:.3g} 1/{time_unit} the fit records are shorter than one cycle: the "

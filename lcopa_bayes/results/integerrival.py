@@ -68,8 +68,8 @@ def integer_study(fitted: Fit) -> tuple[Study, dict[str, float]] | None:
 
 def integer_rival(fitted: Fit, *, jobs: int = 1, quick: bool = False, quiet: bool = True) -> Rival | None:
     """Fit the rival by the same procedure; None when no order is free or no record is held out."""
-    made = integer_study(fitted)
-    if made is None or not fitted.study.held_out:
+    rival = integer_study(fitted)
+    if rival is None or not fitted.study.held_out:
         return None
-    study, orders = made
+    study, orders = rival
     return Rival(orders, fit(study, jobs=jobs, quick=quick, quiet=quiet), fitted)

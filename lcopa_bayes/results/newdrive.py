@@ -37,7 +37,7 @@ from lcopa_bayes.sampling.draws import Draws
 Level = Literal["fitted", "zero"]
 """Offset of a response under a new drive: as in the fit records, or none."""
 NAME, BANDS, DRIVES = "predict.json", "predict_bands.csv", "predict_drives.csv"
-"""Files of a saved prediction; the tables stand in `tables/`."""
+"""Files of a saved prediction; the tables are in `tables/`."""
 _LEAD = 5
 """Sampling periods at rest before the first change of a drive that is given by its steps."""
 _MOST = 100_000

@@ -1,4 +1,4 @@
-"""What the posterior says a record or a drive looks like: credible bands, held-out scores."""
+"""Prediction of records and drives by a posterior: credible bands, held-out scores."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _FEWEST = 200
 _WITH_EFFECTS = 400
 """Draws behind a band at most where the plant has effects, which take a simulation each."""
 _SWEEPS = 20
-"""Sweeps after which a Gibbs chain of a level has forgotten its start [-]: 1e-6 of it is left at nu = 1."""
+"""Sweeps after which a Gibbs chain of a level has forgotten its start [-]: 1e-6 of it remains at nu = 1."""
 
 
 @final
@@ -135,7 +135,7 @@ def bands(
 
     `model` simulates the records of `samples` at their sample times. An offset per record is not
     known for a held-out record: it is taken from the samples before the drive can have acted, else
-    from the record itself (integrated out given its samples), and the band says which and from how many.
+    from the record itself (integrated out given its samples), and the band states which and from how many.
     Effects that differ from record to record count as noise on a held-out record, as large as on the others.
     What is drawn depends on `seed` and the record's name alone, not on the other records.
     """
@@ -152,7 +152,7 @@ def record_draws(
     held_out: bool,
     seed: int,
 ) -> Iterator[tuple[tuple[str, Axis, bool], Vector, Vector, Matrix, Matrix, tuple[Vector, str, int]]]:
-    """What `bands` are made of, axis by axis of every record: arguments of `band_of`."""
+    """The draws behind `bands`, axis by axis of every record: arguments of `band_of`."""
     for r, record in enumerate(samples):
         rng = named_rng(seed, record.record.name)
         alone = model.only(r)

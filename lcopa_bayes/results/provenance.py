@@ -31,7 +31,7 @@ _PACKAGES = (
     "xarray",
 )
 _COMMAND: ContextVar[tuple[str, ...]] = ContextVar("_COMMAND", default=())
-"""The command line that is being carried out; empty when a function was called from Python."""
+"""The command line being executed; empty when a function was called from Python."""
 
 
 def settings_of(study: Study) -> dict[str, Any]:
@@ -52,14 +52,14 @@ def settings_of(study: Study) -> dict[str, Any]:
 
 def fingerprint(study: Study, plan: SamplePlan) -> str:
     """Hash of everything the draws depend on: inputs, settings, plan and this package's version."""
-    told = {
+    basis = {
         "inputs": dict(study.inputs),
         "records": [digest(record) for record in study.fit],
         "settings": settings_of(study),
         "plan": asdict(plan),
         "version": version("lcopa-bayes"),
     }
-    return hashlib.sha256(json.dumps(told, sort_keys=True, default=str).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(basis, sort_keys=True, default=str).encode()).hexdigest()
 
 
 def digest(record: Record) -> str:

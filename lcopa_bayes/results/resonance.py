@@ -92,10 +92,10 @@ def peaks(times: Matrix, orders: Matrix) -> tuple[Vector, Vector]:
 
 def resonances(draws: Draws, period: float, time_unit: str) -> Iterator[Limitation]:
     """Limitations of every number by resonances that the sampling `period` [time unit] does not resolve."""
-    for found in unresolved(draws, period):
+    for one in unresolved(draws, period):
         yield Limitation(
-            "unusable" if found.share >= MOST else "tentative",
-            f"numbers describe a plant only if this does: {found.sentence(period, time_unit)}",
+            "unusable" if one.share >= MOST else "tentative",
+            f"numbers describe a plant only if this does: {one.sentence(period, time_unit)}",
             "sample faster, keep the priors of the times above the sampling period, or let `loop` trace the "
             "disturbance",
         )

@@ -88,7 +88,7 @@ def fit_to_json(problem: Problem, draws: Draws) -> dict[str, Any]:
         "target_ess": draws.target_ess,
         "qualities": [_texts(asdict(one)) for one in draws.qualities],
         "limitations": [one.as_json() for one in draws.limitations],
-        "ridges": [
+        "modes": [
             {
                 "parameter": one.parameter,
                 "unit": one.unit,
@@ -133,7 +133,7 @@ def load_fit(folder: Path | str) -> SavedFit:
         parts = (
             tuple(Quality(**_numbers(one)) for one in values["qualities"]),
             float(values["target_ess"]),
-            tuple(Modes(**one | {"boundaries": tuple(one["boundaries"])}) for one in values["ridges"]),
+            tuple(Modes(**one | {"boundaries": tuple(one["boundaries"])}) for one in values["modes"]),
             tuple(
                 Limitation(**one | {"parameters": tuple(one["parameters"])}) for one in values["limitations"]
             ),

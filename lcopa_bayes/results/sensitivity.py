@@ -65,8 +65,8 @@ class Sensitivity:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; what is not trusted is None."""
-        told: dict[str, Any] = plain(asdict(self) | {"threshold": THRESHOLD})
-        return told
+        values: dict[str, Any] = plain(asdict(self) | {"threshold": THRESHOLD})
+        return values
 
 
 def sensitivity(draws: Draws, posterior: Posterior) -> tuple[Sensitivity, ...]:
@@ -117,7 +117,7 @@ def power_scaled(
     """
     prior, likelihood = (_scale(values, density) for density in (log_prior, log_likelihood))
     limit = usable_k(log_prior.size)
-    found = []
+    out = []
     for k, (name, grade) in enumerate(zip(names, grades, strict=True)):
         (a, a_error), (b, b_error) = ((side.value[k], side.error[k]) for side in (prior, likelihood))
         bad = [
@@ -143,8 +143,8 @@ def power_scaled(
                 _diagnosis(a, b),
                 note,
             )
-        found.append(Sensitivity(name, *row))  # type: ignore[arg-type]
-    return tuple(sorted(found, key=lambda each: (_RANK[each.diagnosis], -np.nan_to_num(each.prior))))
+        out.append(Sensitivity(name, *row))  # type: ignore[arg-type]
+    return tuple(sorted(out, key=lambda each: (_RANK[each.diagnosis], -np.nan_to_num(each.prior))))
 
 
 def _diagnosis(prior: float, likelihood: float) -> Diagnosis:
@@ -164,7 +164,7 @@ def _note(prior: float, prior_error: float, likelihood: float, likelihood_error:
         if abs(value - THRESHOLD) < 2 * error
     ]
     if prior < THRESHOLD and likelihood < THRESHOLD:
-        words.append("neither prior density nor data move it: what is left are the bounds of the priors")
+        words.append("neither prior density nor data move it: only the bounds of the priors remain")
     elif flat:
         words.append("a flat prior has no power to scale: what its bounds do is not seen")
     return "; ".join(words)
@@ -200,12 +200,12 @@ def _scale(values: Array, log_density: Matrix) -> _Scale:
         for e in range(values.shape[0])
         for part in np.array_split(np.arange(values.shape[1]), _STRETCHES)
     ]
-    left = []
+    without = []
     for e, part in stretches:
         keep = np.ones(log_density.shape, dtype=bool)
         keep[e, part] = False
-        left.append(_distances(values[keep][None], *(w[keep][None] for w in weights)))
-    spread = np.var(left, axis=0) * (len(left) - 1)  # jackknife: (n - 1) / n times the sum of squares
+        without.append(_distances(values[keep][None], *(w[keep][None] for w in weights)))
+    spread = np.var(without, axis=0) * (len(without) - 1)  # jackknife: (n - 1) / n times the sum of squares
     finite = [one for one in k if np.isfinite(one)]
     return _Scale(whole, np.sqrt(spread), max(finite, default=np.nan), flat=False)
 

@@ -33,7 +33,7 @@ _SETTLED_SPANS = 200.0
 """Time after which what effects add has settled, in spans of the record [-]."""
 _LATER = 4.0
 """Time after the record over which a response must stay where it settled, in spans of the record [-]: a fast
-mode that crosses the steady value at the record's end has left it again long before."""
+mode that crosses the steady value at the record's end is outside it again long before."""
 _LATER_POINTS = 800
 """Samples of the response after the record."""
 _SETTLED = 0.02
@@ -100,15 +100,15 @@ def _with_effects(table: ParameterTable, values: Matrix, time: Vector) -> StepCu
 def _effect_steps(table: ParameterTable, values: Matrix, time: Vector) -> Array:
     """Responses to a step of each drive at time 0 over its height, (paths, draws, n) [response unit / drive
     unit]; NaN where there is no bounded one."""
-    told = table.effects
-    assert told is not None
-    heights, experiments = told.ranges.drive, []
+    effects = table.effects
+    assert effects is not None
+    heights, experiments = effects.ranges.drive, []
     for j, height in enumerate(heights):
         step = AxisDrive(np.zeros(1), np.array([float(height)]))
         drives = tuple(step if j == k else AxisDrive(np.empty(0), np.empty(0)) for k in range(heights.size))
         experiments.append(Experiment("step", Mesh.of_samples(time, 0.0), drives, np.zeros(heights.size)))
     count = len(experiments)
-    over = replace(told, epochs=np.zeros(count), times=(time,) * count, fitted=(None,) * count)
+    over = replace(effects, epochs=np.zeros(count), times=(time,) * count, fitted=(None,) * count)
     model = ForwardModel(table.layout, tuple(experiments), over)
     read = Simulation(table, model).responses(values)
     by_drive = [one / height for one, height in zip(read, heights, strict=True)]
@@ -206,8 +206,8 @@ def path_metrics(draws: Draws, *, span: float, time_unit: str, path: str | None 
     paths = [layout.path_name(i, j) or layout.responses[i].name for i, j in places]
     if path is not None and path not in paths:
         raise InputError(f"the plant has no path {path!r}{nearest(path, paths)}")
-    found = step_metrics(draws, step_curves(draws, span), time_unit=time_unit)
-    return [one for one in found if path is None or one.name.endswith(f"[{path}]")]
+    metrics = step_metrics(draws, step_curves(draws, span), time_unit=time_unit)
+    return [one for one in metrics if path is None or one.name.endswith(f"[{path}]")]
 
 
 def step_metrics(draws: Draws, curves: StepCurves, *, time_unit: str) -> list[Estimate]:

@@ -1,4 +1,4 @@
-"""What a fit says: its verdict in a sentence, and every number as plain JSON values."""
+"""The verdict of a fit in a few sentences, and every number as plain JSON values."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def verdict(fit: Fit) -> str:
     flags = [one.held_out for one in fit.residuals] + [one.held_out for one in fit.bands]
     tried = flags.count(False)  # as many tests as `adequacy` corrects for
     if worst is not None and tried * worst.p_white >= WHITE_P:  # what is not white is part of the grade
-        parts.append(f"What is left looks like the noise model (smallest p = {worst.p_white:.2g}).")
+        parts.append(f"The residual is compatible with the noise model (smallest p = {worst.p_white:.2g}).")
     parts.extend(_held_out_sentence(fit))
     slow = max(share_unsettled(curve) for curve in fit.curves.normalised)
     if slow > 0.05:
@@ -63,7 +63,7 @@ def results(fit: Fit) -> dict[str, Any]:
         | {"rhat": quality[estimate.name].rhat, "ess_between": quality[estimate.name].ess_between}
         for estimate in fit.draws.estimates()
     ]
-    told: dict[str, Any] = plain(
+    values: dict[str, Any] = plain(
         {
             "study": fit.study.name,
             "verdict": verdict(fit),
@@ -87,7 +87,7 @@ def results(fit: Fit) -> dict[str, Any]:
             "held_out": scores(fit, held_out=True),
             "rival": fit.rival.as_json() if fit.rival else None,
             "fit_scores": scores(fit, held_out=False),
-            "ridges": [
+            "modes": [
                 r.as_json() | {"grade": fit.draws.level(r.parameter, shares_grade(r))}
                 for r in fit.draws.modes
             ],
@@ -106,11 +106,11 @@ def results(fit: Fit) -> dict[str, Any]:
             "sampler": _sampler(fit),
         }
     )
-    return told
+    return values
 
 
 def _evidence_grade(fit: Fit) -> str | None:
-    """No better than the draws' grade: an evidence counts only the hills they have found."""
+    """No better than the draws' grade: an evidence counts only the modes they have visited."""
     return Grade.worst([fit.evidence.grade, fit.draws.grade]).level if fit.evidence else None
 
 

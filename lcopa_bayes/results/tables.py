@@ -22,14 +22,14 @@ _BINS = 30
 
 def tables(fit: Fit) -> dict[str, pd.DataFrame]:
     """Tables by file name."""
-    told = results(fit)
+    values = results(fit)
     return {
-        "parameters": pd.DataFrame(told["parameters"]),
-        "sensitivity": pd.DataFrame(told["sensitivity"]),
-        "step_metrics": pd.DataFrame(told["step_metrics"]),
+        "parameters": pd.DataFrame(values["parameters"]),
+        "sensitivity": pd.DataFrame(values["sensitivity"]),
+        "step_metrics": pd.DataFrame(values["step_metrics"]),
         "scores": pd.DataFrame(
-            [row | {"held_out": False} for row in told["fit_scores"]]
-            + [row | {"held_out": True} for row in told["held_out"]]
+            [row | {"held_out": False} for row in values["fit_scores"]]
+            + [row | {"held_out": True} for row in values["held_out"]]
         ),
         "bands": pd.concat([band.table() for band in fit.bands], ignore_index=True),
         "drives": _drives(fit),
@@ -145,10 +145,10 @@ def _cross_check(fit: Fit, check: CrossCheck) -> dict[str, pd.DataFrame]:
     draws of both."""
     rows, densities = [], []
     for one in check.parameters:
-        told = {"name": one.name, "unit": one.unit}
+        row = {"name": one.name, "unit": one.unit}
         for method, summary in (("ensembles", one.run), ("nested", one.nested)):
-            told |= {f"{method}_{key}": value for key, value in summary.as_json().items()}
-        rows.append(told | {"distance": one.distance, "p": one.p, "resolution": one.resolution})
+            row |= {f"{method}_{key}": value for key, value in summary.as_json().items()}
+        rows.append(row | {"distance": one.distance, "p": one.p, "resolution": one.resolution})
         k = fit.draws.table.names.index(one.name)
         log = fit.draws.table.rows[k].log_scale
         both = [draws[:, k] for draws in (fit.draws.flat, check.nested.values)]

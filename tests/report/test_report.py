@@ -20,7 +20,7 @@ from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.inference import defaultpriors
 from lcopa_bayes.report import write_page, write_report
 from lcopa_bayes.report.decimation import extremes
-from lcopa_bayes.report.formatting import NOT_REACHED, figures, interval, to_spread
+from lcopa_bayes.report.formatting import NOT_REACHED, figures, interval, sentence, stopped, to_spread
 from lcopa_bayes.report.savedrun import load_run
 from lcopa_bayes.report.section import Column, Drawing, Section, Table
 from lcopa_bayes.report.sections import pairs, parameters, records, residuals, sensitivity, steps
@@ -134,7 +134,7 @@ def results_of() -> dict:
             estimate("settling_5[x]", "ms", None, None, "reliable", lower=7.5),
             estimate("overshoot[x]", "-", 0.04, 0.002, "reliable"),
         ],
-        "ridges": [],
+        "modes": [],
         "rival": None,
         "log_evidence": -12.345,
         "log_evidence_sd": 0.0123,
@@ -445,16 +445,21 @@ def test_step_table_is_left_out_when_there_are_no_metrics(folder, tmp_path):
     assert steps.section(bare).tables == ()
 
 
+def test_a_clause_becomes_a_sentence_once():
+    assert sentence("the data bound it") == sentence("The data bound it.") == "The data bound it."
+    assert stopped("on/off, 14 ms is best") == "on/off, 14 ms is best."
+
+
 def with_results(folder: Path, **more: object):
     run = load_run(folder)
     return type(run)({**run.results, **more}, run.provenance, run.tables, run.draws)
 
 
-def test_several_ridges_are_shown_with_their_shares(folder):
+def test_several_modes_are_shown_with_their_shares(folder):
     assert len(parameters.section(load_run(folder)).tables) == 2
     found = Modes("time_1", "ms", (1.1,), np.array([[0.3, 0.7], [0.5, 0.5]]), np.full((2, 2), 0.02))
     row = found.as_json() | {"grade": "tentative"}
-    table = parameters.section(with_results(folder, ridges=[row])).tables[1]
+    table = parameters.section(with_results(folder, modes=[row])).tables[1]
     assert table.rows[0][:6] == (
         *("time_1", "1.10", "ms", "0.40 ± 0.10, 0.60 ± 0.10", "0.30 to 0.50, 0.50 to 0.70", "tentative"),
     )

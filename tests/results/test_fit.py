@@ -89,7 +89,7 @@ def test_results_have_the_keys_that_other_tools_rely_on(fitted):
 def test_the_verdict_names_grade_residual_and_held_out_record(fitted):
     said = verdict(fitted)
     assert said.startswith(f"Grade {fitted.draws.grade.level}: ")
-    assert "What is left looks like the noise model" in said
+    assert "The residual is compatible with the noise model" in said
     assert "Held out: held/y RMSE 0.0" in said
     assert "untested" in verdict(replace(fitted, bands=fitted.bands[:1]))
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from lcopa_bayes.report.formatting import NONE, figures, interval, to_spread
+from lcopa_bayes.report.formatting import NONE, figures, interval, sentence, to_spread
 from lcopa_bayes.report.savedrun import SavedRun
 from lcopa_bayes.report.section import Column, Section, Table, paged
 from lcopa_bayes.report.sections.priors import density_axis, marginals
@@ -34,7 +34,6 @@ def section(run: SavedRun) -> Section:
             _TITLE,
             ("Not run: `fit --cross-check` also samples by an independent method and compares the results.",),
         )
-    said = str(check["sentence"])
     density = run.tables["cross_check_density"]
     names = list(dict.fromkeys(density["name"]))
     caption = (
@@ -43,7 +42,7 @@ def section(run: SavedRun) -> Section:
     )
     return Section(
         _TITLE,
-        (f"{said[0].upper()}{said[1:]}.", _HOW.format(alarm=figures(check["alarm"], 1))),
+        (sentence(str(check["sentence"])), _HOW.format(alarm=figures(check["alarm"], 1))),
         paged("cross_check", names, _PER_FIGURE, lambda part: marginals(run, part, _panel), caption),
         (_marginals(check), _evidences(check)),
     )

@@ -35,8 +35,8 @@ def section(run: SavedRun) -> Section:
             "independent ensembles.",
         )
     ]
-    if run.results["ridges"]:
-        tables.append(_modes(run.results["ridges"]))
+    if run.results["modes"]:
+        tables.append(_modes(run.results["modes"]))
     if fixed:
         tables.append(
             Table.of(

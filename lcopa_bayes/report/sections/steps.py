@@ -89,7 +89,7 @@ def _kind(metric: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def _open(metric: Mapping[str, Any]) -> str:
-    """What an end says that no draw bounds."""
+    """Text of an end that no draw bounds."""
     return NOT_REACHED if _kind(metric)[0].startswith(_TIMES) else OPEN
 
 
