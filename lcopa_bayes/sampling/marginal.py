@@ -59,8 +59,8 @@ _ROUNDS, _LARGER = 20, 6
 """Most rounds, and most of them that are larger than for learning."""
 _HELPFUL, _GROWTH = 0.1, 4
 """Effective draws per draw from which the next round may be larger, and by how many times [-]."""
-_MOST = 12_000
-"""Most points of a round."""
+_MOST = 10.0
+"""Most points of a round over the effective draws wanted [-]."""
 _VISITED = 6_000
 """Most points that a first proposal is learned from."""
 _TEACHING, _WALKERS, _WALK = 3_000, 256, (20, 5)
@@ -212,7 +212,7 @@ class Search:
                 own = clustered(y, np.zeros(len(y)), int(self._rng.integers(2**31)))
                 proposal = proposal.blended(own, 0.5)
             # a larger round only where the proposal is close to the posterior
-            needed = int(min(_SPARE * count * wanted / max(worth, 1.0), _MOST))
+            needed = int(min(_SPARE * count / max(worth, 1.0), _MOST) * wanted)
             more = min(needed, _GROWTH * count) if weighted.ess >= _HELPFUL * count else 0
             count = max(_LEARNING, more)
         return None
