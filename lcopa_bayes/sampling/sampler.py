@@ -43,8 +43,9 @@ _TREND = 2.0
 [-]: there chance is the less likely reason, and to go on costs little."""
 _THIN = 5
 """Steps per kept draw unless the study says otherwise."""
-_CONFIRMED_AFTER = 4
-"""Rounds before importance draws around where the ensembles have been are tried."""
+_CONFIRMED_AFTER = 16
+"""Rounds before importance draws around where the ensembles have been are tried while these go on [-]: one
+trial costs as much as ten rounds."""
 _TRAIL = 1_500
 """Draws per ensemble that the first mixture is learned from, where a search gave them."""
 _DELIVERED = 500
@@ -156,9 +157,10 @@ def sample(
     starts: Matrix | None = None,
 ) -> Run:
     """Sample a posterior, as the plan allows by importance draws from a search over orders, delays and noise
-    (`marginal`). Where their weights do not converge, rounds of emcee go on from the points of the search,
-    and importance draws around where the walkers have been are tried again. Populations tempered from the
-    prior begin where no search is possible, or the plan asks for ensembles.
+    (`marginal`). Where their weights do not converge, rounds of emcee go on from the points of the search;
+    importance draws around where the walkers have been are tried again where the rounds are many, or a mode
+    filled during them. Populations tempered from the prior begin where no search is possible, or the plan
+    asks for ensembles.
 
     The draws depend on the arguments alone, not on `jobs` nor on interruptions: with `resume`, a run killed
     at any moment continues from the last complete round in `chain_file`. `starts`, table values (starts,
@@ -195,15 +197,15 @@ def sample(
         least = max(_LEAST, round(_AS_LONG * hardest / (_ROUND * plan.thin)))
         while True:
             last = done >= rounds or (done >= least and finished(posterior, Run(ensembles, plan), bar))
-            if searched and (last or (done >= _CONFIRMED_AFTER and due(done))):
+            filling = _filling(posterior, Run(ensembles, plan)) if searched and last else ()
+            if filling or (searched and not last and done >= _CONFIRMED_AFTER and due(done)):
                 visited = Run(ensembles, plan).visited
                 weighted = Search(posterior, plan.seed + done, crew).around(visited, wanted)
                 if weighted is not None:
                     _store(chain_file, Chain(ensembles, weighted), fingerprint)
                     return Run(ensembles, plan, weighted)
             if last:
-                run = Run(ensembles, plan)
-                return Run(ensembles, plan, None, _filling(posterior, run) if searched else ())
+                return Run(ensembles, plan, None, filling)
             if due(done):
                 mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
             ensembles = tuple(crew.each(_Round(plan.thin, mixture), ensembles))
