@@ -204,8 +204,11 @@ class Search:
             larger += count > _LEARNING
             if larger == _LARGER:
                 return None
+            log_weights = self._seen.log_weights()
+            if not np.isfinite(log_weights).any():
+                return None
             proposal = clustered(
-                np.concatenate(self._seen.points), self._seen.log_weights(), int(self._rng.integers(2**31))
+                np.concatenate(self._seen.points), log_weights, int(self._rng.integers(2**31))
             )
             if walked is not None:
                 y = spread_evenly(walked, _VISITED)

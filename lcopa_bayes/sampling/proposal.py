@@ -161,7 +161,7 @@ def clustered(y: Matrix, log_weights: Vector, seed: int) -> Mixture:
     with equal weights, so that a small mode is drawn from often enough, and in part wider."""
     weights = tempered(log_weights, min(_PER_CLUSTER * y.shape[1], 0.25 * log_weights.size))
     # the largest weights made equal: a cluster around one draw would cover nothing of what it stands for
-    equal = min(_EQUAL * y.shape[1], weights.size)
+    equal = min(_EQUAL * y.shape[1], np.count_nonzero(weights))
     weights = np.minimum(weights, np.partition(weights, -equal)[-equal])
     weights /= weights.sum()
     count = int(np.clip(1 / (weights @ weights) / (_PER_CLUSTER * y.shape[1]), 1, _CLUSTERS))

@@ -14,11 +14,11 @@ from small import TRUTH, Toy, problem, record
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.inference.conditional import Conditional, Expanded
 from lcopa_bayes.sampling import marginal
-from lcopa_bayes.sampling.conditionaldraws import kept
+from lcopa_bayes.sampling.conditionaldraws import Kept, kept
 from lcopa_bayes.sampling.marginal import Search
 from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.outer import Outer, PriorOrders, applies
-from lcopa_bayes.sampling.proposal import Seen, tempered
+from lcopa_bayes.sampling.proposal import Seen, clustered, tempered
 
 GAIN = {"gain": ("loguniform", {"a": 0.5, "b": 5.0})}
 PLAIN_GAIN = {"gain": ("gamma", {"a": 4.0, "scale": 0.5})}
@@ -188,3 +188,27 @@ def test_what_a_search_cannot_divide_is_left_to_ensembles():
     nothing = {key: TRUTH[key] for key in ("order_1", "time_1", "delay", "sigma", "offset")}
     fixed = problem(record(camera=1.0), priors=nothing | GAIN).posterior
     assert not applies(fixed)
+
+
+def test_a_proposal_is_learned_where_hardly_a_draw_has_any_weight(rng):
+    """As far from a narrow posterior: weights of all but a few draws are 0 to the last digit."""
+    y = rng.standard_normal((80, 10))
+    y[:25] *= 0.1
+    log_weights = np.where(np.arange(80) < 25, 0.0, -1e6)
+    proposal = clustered(y, log_weights, 1)
+    best, others = proposal.log_density(y[:25]), proposal.log_density(y[25:])
+    assert np.isfinite(best).all()
+    assert best.min() > others.max()
+
+
+def test_a_search_without_a_single_draw_gives_nothing(monkeypatch):
+    def none(conditional, at, tries, rng):
+        size, least = conditional.posterior.dimension, np.full(len(at.values), -np.inf)
+        return Kept(np.full((least.size, size), np.nan), least, least, np.zeros(least.size))
+
+    monkeypatch.setattr(marginal, "kept", none)
+    posterior = problem(record(camera=1.0), terms=1, priors={"sigma": 0.05}).posterior
+    with workers(posterior) as crew:
+        search = Search(posterior, 1, crew)
+        assert search.run(100.0) is None
+        assert search.population(4, 10) == []
