@@ -332,6 +332,15 @@ def test_verbs_in_one_folder_keep_their_own_provenance(folder, tmp_path, capsys)
     other.save(run)
     with pytest.raises(lb.InputError, match="rests on another fit"):
         lb.load_result(run, "audit")
+    # cut short, and published without its draws
+    (run / "fit.json").unlink()
+    with pytest.raises(lb.InputError, match=r"fit\.json: this file of the run folder is missing"):
+        lb.load_result(run, "audit")
+    (run / "posterior.nc").unlink()
+    published = lb.load_result(run, "audit")
+    assert published.fit is None
+    with pytest.raises(lb.InputError, match=r"posterior\.nc: this file of the run folder is missing"):
+        published.report(run)
 
 
 def test_a_folder_of_another_study_is_refused(folder, tmp_path):
@@ -504,5 +513,6 @@ def test_runs_leave_what_is_published_alone():
     ignored = (Path(__file__).parents[1] / ".gitignore").read_text().splitlines()
     assert f"{RUNS}/" in ignored
     published = Path(__file__).parents[1] / "reports"
-    assert lb.load_result(published / "paper-step").verb == "compare"
+    for verb in ("audit", "compare"):
+        assert lb.load_result(published / "paper-step", verb).verb == verb
     assert "coverage" in lb.load_result(published / "calibration" / "one-term").to_json()

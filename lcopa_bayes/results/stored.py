@@ -11,11 +11,12 @@ from typing import Any, ClassVar, TypeVar
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import save_json, writable_folder, write_text
+from lcopa_bayes.results.datatree import POSTERIOR
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.provenance import provenance
 from lcopa_bayes.results.result import Result
 from lcopa_bayes.results.runfolder import add_origin, opened, origins
-from lcopa_bayes.results.savedfit import load_fit
+from lcopa_bayes.results.savedfit import NAME, load_fit
 
 R = TypeVar("R", bound="StoredResult")
 
@@ -31,10 +32,11 @@ class StoredResult(Result):
     texts: Mapping[str, str] = field(default_factory=dict)
     """Further files of the result, by name inside the run folder."""
     fit: Predictive | None = None
-    """The fit that the result rests on; None for results that rest on none."""
+    """The fit that the result rests on; None for results that rest on none, or that were published without
+    its draws."""
 
     rests_on_fit: ClassVar[bool] = False
-    """Whether the folder must hold the fit too."""
+    """Whether the result is of one fit."""
     beside: ClassVar[tuple[str, ...]] = ()
     """Patterns of the further files."""
 
@@ -74,7 +76,7 @@ class StoredResult(Result):
     @classmethod
     def load(cls: type[R], folder: Path) -> R:
         """The result in a run folder; InputError when it is not there, cannot be read, or rests on another
-        fit than the one there."""
+        fit than the one there, or on one that is cut short."""
         path, origin = folder / cls.file, origins(folder).get(cls.verb)
         if origin is None:
             raise InputError(f"{folder}: holds no result of `{cls.verb}`; run it to write one")
@@ -84,7 +86,8 @@ class StoredResult(Result):
             texts = {str(one.relative_to(folder)): one.read_text(encoding="utf-8") for one in names}
         except (OSError, ValueError) as error:
             raise InputError(f"{path}: cannot be read ({error}); run `{cls.verb}` again") from None
-        fit = load_fit(folder) if cls.rests_on_fit else None
+        kept = any((folder / one).exists() for one in (NAME, POSTERIOR))
+        fit = load_fit(folder) if cls.rests_on_fit and kept else None
         if fit is not None and origin.get("draws_sha256") != fit.draws.sha256:
             raise InputError(f"{path}: rests on another fit than the one beside it; run `{cls.verb}` again")
         return cls(values, origin, texts, fit)
