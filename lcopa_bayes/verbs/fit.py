@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,7 +37,7 @@ def fit(
     written to, holds another study's results, or is being written by another run; then nothing is written.
     """
     wanted = study_of(study)
-    with nullcontext() if folder is None else opened(folder, provenance(wanted, "fit")) as place:
+    with opened(folder, provenance(wanted, "fit")) as place:
         fitted = sampled(
             wanted,
             jobs=jobs,
