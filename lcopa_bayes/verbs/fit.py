@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -40,7 +39,7 @@ def fit(
     written to, holds another study's results, or is being written by another run; then nothing is written.
     """
     wanted = study_of(study)
-    with nullcontext() if folder is None else opened(folder, provenance(wanted, "fit")) as place:
+    with opened(folder, provenance(wanted, "fit")) as place:
         if place is not None and not (quiet or resume or wanted.effects.use):
             page = look(wanted).report(place)
             print(f"first look: {page}", file=sys.stderr)
