@@ -181,12 +181,35 @@ def _truth(options: argparse.Namespace, study: Any) -> object:
     return stated_values(options.truth)
 
 
-def _look(options: argparse.Namespace) -> Outcome:
-    from lcopa_bayes.verbs.sources import study_of
+def _new(options: argparse.Namespace) -> Outcome:
+    result = lcopa_bayes.new(
+        options.folder,
+        options.files,
+        held_out=options.held_out,
+        time=options.time,
+        drives=options.drive,
+        responses=options.response,
+        time_unit=options.time_unit,
+        decimal=options.decimal,
+        time_format=options.time_format,
+        sheet=options.sheet,
+        overwrite=options.overwrite,
+    )
+    after = f"lcopa-bayes check {options.folder}"
+    return Outcome(result.to_json() | {"folder": str(options.folder)}, f"{result}\n\nnext: {after}")
 
-    study = study_of(_source(options))
-    folder = _folder(options, study)
-    return _reported(lcopa_bayes.look(study, folder=folder), folder)
+
+def _unsampled(verb: str) -> Callable[[argparse.Namespace], Outcome]:
+    """What runs a public function of a study that samples nothing."""
+
+    def perform(options: argparse.Namespace) -> Outcome:
+        from lcopa_bayes.verbs.sources import study_of
+
+        study = study_of(_source(options))
+        folder = _folder(options, study)
+        return _reported(getattr(lcopa_bayes, verb)(study, folder=folder), folder)
+
+    return perform
 
 
 def _predict(options: argparse.Namespace) -> Outcome:
@@ -270,7 +293,11 @@ def _scan(options: argparse.Namespace, study: Any) -> Scan:
 _SAMPLING = ("resume", "quick", "quiet")
 """Options of every verb that samples."""
 VERBS: Mapping[str, Verb] = {
-    "look": Verb("least squares and residual within seconds, before sampling", choices.study, _look),
+    "new": Verb("records and a study from spreadsheets and loggers' tables", choices.new, _new),
+    "check": Verb("what was understood of a study, without fitting it", choices.study, _unsampled("check")),
+    "look": Verb(
+        "least squares and residual within seconds, before sampling", choices.study, _unsampled("look")
+    ),
     "run": Verb(
         "all stages the study names, then the report",
         choices.fit,

@@ -69,6 +69,24 @@ def loop(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def new(parser: argparse.ArgumentParser) -> None:
+    """Of `new`."""
+    parser.add_argument("folder", type=Path, help="folder for the records and their study")
+    parser.add_argument("files", nargs="+", type=Path, help="tables: text of any separator, or workbooks")
+    parser.add_argument("--held-out", nargs="+", type=Path, default=[], help="tables not to fit")
+    column = "by header or number, perhaps with a new name: 'heater [%%]=Column B'"
+    parser.add_argument("--time", default="", metavar="COLUMN", help="the time column")
+    parser.add_argument("--drive", nargs="+", default=[], metavar="COLUMN", help=f"drives, {column}")
+    parser.add_argument("--response", nargs="+", default=[], metavar="COLUMN", help=f"responses, {column}")
+    parser.add_argument("--time-unit", default="", help="unit of a numeric time column")
+    parser.add_argument("--decimal", default="", help="decimal sign, . or ,")
+    parser.add_argument(
+        "--time-format", default="", help="format of time stamps, as '%%d.%%m.%%Y %%H:%%M:%%S'"
+    )
+    parser.add_argument("--sheet", help="sheet of a workbook")
+    parser.add_argument("--overwrite", action="store_true", help="replace files that are there")
+
+
 def claims(parser: argparse.ArgumentParser) -> None:
     """Of `claims`."""
     parser.add_argument("--out", type=Path, default=RUNS / "claims", help="folder for the page")
