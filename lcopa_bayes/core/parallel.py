@@ -42,8 +42,8 @@ class Workers(ABC, Generic[S]):
         inputs: Sequence[T],
         failed: Callable[[T, BaseException], R] | None = None,
     ) -> Iterator[R]:
-        """Results in the order in which they are finished. Where a task could not be done, `failed`
-        gives its result; without it the error is raised."""
+        """Results in the order in which they are finished. Where a task ends in an error, on a cluster also
+        where it is lost with its worker, `failed` gives its result; without it the error is raised."""
 
     def map(self, function: Callable[[T], R], inputs: Sequence[T]) -> Iterator[R]:
         """Results of a function that needs nothing shared, in the order of the inputs."""
@@ -100,7 +100,14 @@ class _Here(Workers[S]):
         inputs: Sequence[T],
         failed: Callable[[T, BaseException], R] | None = None,
     ) -> Iterator[R]:
-        return self.each(task, inputs)
+        for one in inputs:
+            try:
+                result = task(self._shared, one)
+            except Exception as error:
+                if failed is None:
+                    raise
+                result = failed(one, error)
+            yield result
 
 
 @final
@@ -119,8 +126,13 @@ class _Processes(Workers[S]):
         inputs: Sequence[T],
         failed: Callable[[T, BaseException], R] | None = None,
     ) -> Iterator[R]:
-        for future in as_completed([self._pool.submit(_perform, task, one) for one in inputs]):
-            yield future.result()
+        futures = {self._pool.submit(_perform, task, one): one for one in inputs}
+        for future in as_completed(futures):
+            error = future.exception()
+            if error is None or failed is None or isinstance(error, BrokenProcessPool):
+                yield future.result()
+            else:
+                yield failed(futures[future], error)
 
 
 @final
