@@ -83,7 +83,7 @@ class LeastSquares:
                 wall = (values[upper] + values[lower]) / 2 if all(free) else wall
                 for k, ends, choose in ((upper, low, max), (lower, high, min)):
                     if k in self.columns:
-                        limit = np.log(wall) if table.rows[k].log_scale else wall
+                        limit = float(table.rows[k].coordinate(wall))
                         position = self.columns.index(k)
                         ends[position] = choose(ends[position], limit)
         return low, high
@@ -91,14 +91,14 @@ class LeastSquares:
     def coordinates(self, values: Vector) -> Vector:
         """Search coordinates of table values."""
         rows = self.posterior.table.rows
-        return np.array([np.log(values[k]) if rows[k].log_scale else values[k] for k in self.columns])
+        return np.array([rows[k].coordinate(values[k]) for k in self.columns])
 
     def values(self, x: Vector, template: Vector) -> Vector:
         """Table values of search coordinates, the rest from `template`; not sorted."""
         out = template.copy()
         rows = self.posterior.table.rows
         for position, k in enumerate(self.columns):
-            out[k] = np.exp(x[position]) if rows[k].log_scale else x[position]
+            out[k] = rows[k].value_at(x[position])
         return out
 
     def misfit(self, x: Vector, template: Vector) -> Vector:
