@@ -14,12 +14,10 @@ import numpy as np
 
 from lcopa_bayes.comparison.folds import Part
 from lcopa_bayes.core.arrays import Array, Matrix
-from lcopa_bayes.inference.noise import GaussianNoise
+from lcopa_bayes.inference.noise import LOG_2PI, GaussianNoise
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.forward import ForwardModel
-
-_LOG_2PI = float(np.log(2 * np.pi))
 
 
 def applies(posterior: Posterior) -> bool:
@@ -58,7 +56,7 @@ def linear_densities(
         bent = np.einsum("bij,bj->bi", covariance, slope)
         variance = 1 + np.einsum("bi,bi->b", slope, bent)
         apart = white[:, -1, k] - np.einsum("bi,bi->b", slope, mean)
-        out[:, k] = -0.5 * (apart**2 / variance + np.log(variance) + _LOG_2PI) - scales[:, k]
+        out[:, k] = -0.5 * (apart**2 / variance + np.log(variance) + LOG_2PI) - scales[:, k]
         mean = mean + bent * (apart / variance)[:, None]
         covariance = covariance - bent[:, :, None] * (bent / variance[:, None])[:, None, :]
     return out[:, first:]

@@ -16,11 +16,10 @@ from scipy.special import logsumexp
 
 from lcopa_bayes.comparison.folds import Part
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.inference.noise import GaussianNoise, Noise
+from lcopa_bayes.inference.noise import LOG_2PI, GaussianNoise, Noise
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.parameters import ParameterTable
 
-_LOG_2PI = float(np.log(2 * np.pi))
 _NODES = 241
 """Levels at which a density that is not Gaussian is integrated, about each of two centres [-]."""
 _REACH = 11.0
@@ -111,7 +110,7 @@ def _followed(noise: GaussianNoise, residual: Matrix, parameters: Matrix, gaps: 
     variance = 1 + slope[:, 1:] ** 2 / precision[:, :-1]
     apart = seen[:, 1:] - slope[:, 1:] * mean[:, :-1]
     scales = np.broadcast_to(noise.log_scales(parameters, gaps), residual.shape)[:, 1:]
-    out[:, 1:] = -0.5 * (apart**2 / variance + np.log(variance) + _LOG_2PI) - scales
+    out[:, 1:] = -0.5 * (apart**2 / variance + np.log(variance) + LOG_2PI) - scales
     return out
 
 

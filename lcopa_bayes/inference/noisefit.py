@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from scipy.special import log_expit
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.inference.noisemodel import Noise
+from lcopa_bayes.inference.noise import Noise
 from lcopa_bayes.inference.parameter import Parameter
 
 _TAIL = 1e-9
