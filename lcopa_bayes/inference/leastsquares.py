@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.inference.effectslopes import effect_slopes
+from lcopa_bayes.inference.effects import effect_slopes
 from lcopa_bayes.inference.noise import GaussianNoise, White
 from lcopa_bayes.inference.noisefit import NoiseFit
 from lcopa_bayes.inference.observations import Observed
@@ -119,7 +119,7 @@ class LeastSquares:
         """Whitened residual (model minus data, then prior rows) and its exact Jacobian in `x`.
 
         `template` (rows,) gives fixed values and noise parameters. With effects slopes are those of
-        `effectslopes`; UnstableError where these leave no bounded response.
+        `effects.effect_slopes`; UnstableError where these leave no bounded response.
         """
         posterior, table = self.posterior, self.posterior.table
         raw = self.values(x, template)
