@@ -27,7 +27,7 @@ from lcopa_bayes.effectsearch.terms import fitted_base
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.defaultpriors import Scales
-from lcopa_bayes.inference.mixednoise import WhiteAR1
+from lcopa_bayes.inference.noise import WhiteAR1
 from lcopa_bayes.inference.observations import Observed
 from lcopa_bayes.model.effects import parallel
 from lcopa_bayes.model.effects.catalogue import catalogue
