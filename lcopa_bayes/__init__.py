@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from lcopa_bayes.verbs.compare import compare as compare
     from lcopa_bayes.verbs.design import DesignResult as DesignResult
     from lcopa_bayes.verbs.design import design as design
+    from lcopa_bayes.verbs.explain import explain as explain
     from lcopa_bayes.verbs.fit import fit as fit
     from lcopa_bayes.verbs.look import LookResult as LookResult
     from lcopa_bayes.verbs.look import look as look
@@ -59,6 +60,7 @@ _PLACES = {
     "verbs.check": ("CheckResult", "check"),
     "verbs.compare": ("Comparison", "compare"),
     "verbs.design": ("DesignResult", "design"),
+    "verbs.explain": ("explain",),
     "verbs.fit": ("fit",),
     "verbs.look": ("LookResult", "look"),
     "verbs.loop": ("LoopResult", "loop"),

@@ -4,24 +4,28 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, final
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol, final
 
 import lcopa_bayes
 
 # verbs are imported when they run, so that help and refusals come at once
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.verbs import choices
-from lcopa_bayes.verbs.choices import RUNS
+from lcopa_bayes.verbs.choices import EXAMPLES, RUNS
 
 if TYPE_CHECKING:
     from lcopa_bayes.paper.intervals import Scan
     from lcopa_bayes.verbs.sources import FitLike
 
+_PROGRAM = "lcopa-bayes"
+_CODES = "exit codes: 0 done, 2 the input cannot be used (nothing is written), 130 interrupted"
 USAGE_ERROR = 2
 """Exit code for input that cannot be used."""
 INTERRUPTED = 130
@@ -68,16 +72,13 @@ class Verb:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb; returns the exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    options = _parser(given[:1]).parse_args(given)
+    options = _parser(given).parse_args(given)
     try:
         outcome = _outcome(options, ["lcopa-bayes", *given])
     except InputError as error:
-        for problem in error.problems:
-            print(f"error: {problem}", file=sys.stderr)
-        return USAGE_ERROR
+        return _refused(error.problems, as_json=options.json)
     except FloatingPointError as error:  # a prior that reaches where the model cannot be computed
-        print(f"error: {error}; narrow the priors that allow these values", file=sys.stderr)
-        return USAGE_ERROR
+        return _refused([f"{error}; narrow the priors that allow these values"], as_json=options.json)
     except KeyboardInterrupt:
         resume = "; the same command with --resume goes on where it stopped" * hasattr(options, "resume")
         print(f"interrupted{resume}", file=sys.stderr)
@@ -89,6 +90,50 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
+def _refused(problems: Sequence[str], *, as_json: bool) -> int:
+    """Print what is wrong with the input; the exit code."""
+    if as_json:
+        print(json.dumps({"errors": list(problems)}))
+    else:
+        for problem in problems:
+            print(f"error: {problem}", file=sys.stderr)
+    return USAGE_ERROR
+
+
+@final
+class _Parser(argparse.ArgumentParser):
+    """A parser that names the nearest known word, and complains in JSON where JSON was asked for."""
+
+    given: Sequence[str] = ()
+    """The command line."""
+    verbs: Mapping[str, _Parser] = MappingProxyType({})
+    """Parsers of the verbs, where this one knows them."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print what is wrong with the command line and exit."""
+        verb = next((one for one in self.given if not one.startswith("-")), "")
+        unknown = re.search(r"unrecognized arguments: (--?\S+)", message)
+        if verb and verb not in VERBS:
+            message = f"{verb!r} is not a verb{nearest(verb, VERBS)}"
+        elif unknown and verb:
+            options = re.findall(r"--[\w-]+", self.verbs[verb].format_help())
+            message = f"{unknown[1]} is not an option of {verb}{nearest(unknown[1], options)}"
+        elif "--json" not in self.given:
+            self.print_usage(sys.stderr)
+        raise SystemExit(_refused([message], as_json="--json" in self.given))
+
+
+@final
+class _Version(argparse.Action):
+    """Prints the version, which is looked up when it is asked for."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from importlib.metadata import version
+
+        print(f"{_PROGRAM} {version(_PROGRAM)}")
+        parser.exit()
+
+
 def _outcome(options: argparse.Namespace, command: Sequence[str]) -> Outcome:
     from lcopa_bayes.results.provenance import commanded
 
@@ -96,15 +141,28 @@ def _outcome(options: argparse.Namespace, command: Sequence[str]) -> Outcome:
         return VERBS[options.verb].perform(options)
 
 
-def _parser(wanted: Sequence[str]) -> argparse.ArgumentParser:
-    """All verbs, with the options of the one that is wanted."""
-    parser = argparse.ArgumentParser(prog="lcopa-bayes", description=lcopa_bayes.__doc__)
-    verbs = parser.add_subparsers(required=True, metavar="VERB", dest="verb")
+def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
+    """All verbs, with the options of the one that is given first."""
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = _Parser(prog=_PROGRAM, description=lcopa_bayes.__doc__, epilog=_CODES, formatter_class=raw)
+    parser.given = given
+    completed = given[:1] == ["--print-completion"]
+    if completed:
+        import shtab
+
+        shtab.add_argument_to(parser, ["--print-completion"])
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
+    verbs = parser.add_subparsers(required=True, metavar="VERB", dest="verb", parser_class=_Parser)
     for name, verb in VERBS.items():
-        own = verbs.add_parser(name, help=verb.text, description=verb.text)
+        example = f"example: {_PROGRAM} {name} {EXAMPLES[name]}"
+        own = verbs.add_parser(
+            name, help=verb.text, description=verb.text, epilog=f"{example}\n\n{_CODES}", formatter_class=raw
+        )
+        own.given = given
+        parser.verbs = {**parser.verbs, name: own}
         own.add_argument("--quiet", action="store_true", help="no progress, no closing words")
         own.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-        if name in wanted:
+        if completed or name in given[:1]:
             verb.options(own)
     return parser
 
@@ -197,6 +255,12 @@ def _new(options: argparse.Namespace) -> Outcome:
     )
     after = f"lcopa-bayes check {options.folder}"
     return Outcome(result.to_json() | {"folder": str(options.folder)}, f"{result}\n\nnext: {after}")
+
+
+def _explain(options: argparse.Namespace) -> Outcome:
+    term = " ".join(options.term)
+    text = lcopa_bayes.explain(term, runs=RUNS)
+    return Outcome({"term": term, "text": text}, text)
 
 
 def _unsampled(verb: str) -> Callable[[argparse.Namespace], Outcome]:
@@ -346,6 +410,7 @@ VERBS: Mapping[str, Verb] = {
     ),
     "optics": Verb("far field, director, chain from volts to angle, with figures", choices.optics, _optics),
     "claims": Verb("the paper's claims, each with a computed verdict", choices.claims, _claims),
+    "explain": Verb("what a term means, with an example from the last fit", choices.explain, _explain),
     "report": Verb("render the pages of a run folder again", choices.report, _report),
     "simulate": Verb("measure a campaign file on the virtual bench", choices.simulate, _simulate),
 }

@@ -3,10 +3,31 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
 
 RUNS = Path("runs")
 """Where run folders go unless `--out` names another."""
+EXAMPLES: Mapping[str, str] = {
+    "new": "oven step1.xlsx step2.csv --drive 'Heater [%]'",
+    "check": "oven",
+    "look": "oven",
+    "run": "studies/paper-step",
+    "fit": "on.csv off.csv --held-out both.csv",
+    "audit": "runs/paper-step",
+    "design": "runs/paper-step --time 1000",
+    "compare": "studies/paper-step --pick fractional-2 second-order",
+    "loop": "studies/undeclared --quick",
+    "calibrate": "studies/paper-step-x --replicas 20 --quick",
+    "predict": "runs/paper-step drive.csv",
+    "identify": "studies/paper-step-x",
+    "optics": "--targets 1 2 3",
+    "claims": "--out runs/claims",
+    "explain": "R-hat",
+    "report": "runs/paper-step",
+    "simulate": "studies/paper-step/campaign.toml --out bench",
+}
+"""A command line of every verb, without the verb."""
 
 
 def study(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
@@ -33,7 +54,9 @@ def sampled(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
 
 
 def _quick(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--quick", action="store_true", help="a quarter of the steps")
+    parser.add_argument(
+        "--quick", action="store_true", help="a quarter of the steps or replicas: to see that it runs"
+    )
 
 
 def fit(parser: argparse.ArgumentParser) -> None:
@@ -85,6 +108,11 @@ def new(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--sheet", help="sheet of a workbook")
     parser.add_argument("--overwrite", action="store_true", help="replace files that are there")
+
+
+def explain(parser: argparse.ArgumentParser) -> None:
+    """Of `explain`."""
+    parser.add_argument("term", nargs="+", help="a word of a page or a message")
 
 
 def claims(parser: argparse.ArgumentParser) -> None:
