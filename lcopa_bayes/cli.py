@@ -4,30 +4,26 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NoReturn, Protocol, final
+from typing import TYPE_CHECKING, Any, Protocol, final
 
 import lcopa_bayes
 
 # verbs are imported when they run, so that help and refusals come at once
-from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.verbs import choices
 from lcopa_bayes.verbs.choices import EXAMPLES, RUNS
+from lcopa_bayes.verbs.commandline import PROGRAM, CommandParser, Version, refused
 
 if TYPE_CHECKING:
     from lcopa_bayes.paper.intervals import Scan
     from lcopa_bayes.verbs.sources import FitLike
 
-_PROGRAM = "lcopa-bayes"
 _CODES = "exit codes: 0 done, 2 the input cannot be used (nothing is written), 130 interrupted"
-USAGE_ERROR = 2
-"""Exit code for input that cannot be used."""
 INTERRUPTED = 130
 """Exit code after an interrupt from the keyboard."""
 PUBLISHED = Path("reports")
@@ -76,9 +72,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         outcome = _outcome(options, ["lcopa-bayes", *given])
     except InputError as error:
-        return _refused(error.problems, as_json=options.json)
+        return refused(error.problems, as_json=options.json)
     except FloatingPointError as error:  # a prior that reaches where the model cannot be computed
-        return _refused([f"{error}; narrow the priors that allow these values"], as_json=options.json)
+        return refused([f"{error}; narrow the priors that allow these values"], as_json=options.json)
     except KeyboardInterrupt:
         resume = "; the same command with --resume goes on where it stopped" * hasattr(options, "resume")
         print(f"interrupted{resume}", file=sys.stderr)
@@ -88,50 +84,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     elif not options.quiet:
         print(outcome.text)
     return 0
-
-
-def _refused(problems: Sequence[str], *, as_json: bool) -> int:
-    """Print what is wrong with the input; the exit code."""
-    if as_json:
-        print(json.dumps({"errors": list(problems)}))
-    else:
-        for problem in problems:
-            print(f"error: {problem}", file=sys.stderr)
-    return USAGE_ERROR
-
-
-@final
-class _Parser(argparse.ArgumentParser):
-    """A parser that names the nearest known word, and complains in JSON where JSON was asked for."""
-
-    given: Sequence[str] = ()
-    """The command line."""
-    verbs: Mapping[str, _Parser] = MappingProxyType({})
-    """Parsers of the verbs, where this one knows them."""
-
-    def error(self, message: str) -> NoReturn:
-        """Print what is wrong with the command line and exit."""
-        verb = next((one for one in self.given if not one.startswith("-")), "")
-        unknown = re.search(r"unrecognized arguments: (--?\S+)", message)
-        if verb and verb not in VERBS:
-            message = f"{verb!r} is not a verb{nearest(verb, VERBS)}"
-        elif unknown and verb:
-            options = re.findall(r"--[\w-]+", self.verbs[verb].format_help())
-            message = f"{unknown[1]} is not an option of {verb}{nearest(unknown[1], options)}"
-        elif "--json" not in self.given:
-            self.print_usage(sys.stderr)
-        raise SystemExit(_refused([message], as_json="--json" in self.given))
-
-
-@final
-class _Version(argparse.Action):
-    """Prints the version, which is looked up when it is asked for."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        from importlib.metadata import version
-
-        print(f"{_PROGRAM} {version(_PROGRAM)}")
-        parser.exit()
 
 
 def _outcome(options: argparse.Namespace, command: Sequence[str]) -> Outcome:
@@ -144,17 +96,17 @@ def _outcome(options: argparse.Namespace, command: Sequence[str]) -> Outcome:
 def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     """All verbs, with the options of the one that is given first."""
     raw = argparse.RawDescriptionHelpFormatter
-    parser = _Parser(prog=_PROGRAM, description=lcopa_bayes.__doc__, epilog=_CODES, formatter_class=raw)
+    parser = CommandParser(prog=PROGRAM, description=lcopa_bayes.__doc__, epilog=_CODES, formatter_class=raw)
     parser.given = given
     completed = given[:1] == ["--print-completion"]
     if completed:
         import shtab
 
         shtab.add_argument_to(parser, ["--print-completion"])
-    parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
-    verbs = parser.add_subparsers(required=True, metavar="VERB", dest="verb", parser_class=_Parser)
+    parser.add_argument("--version", action=Version, nargs=0, help="print the version")
+    verbs = parser.add_subparsers(required=True, metavar="VERB", dest="verb", parser_class=CommandParser)
     for name, verb in VERBS.items():
-        example = f"example: {_PROGRAM} {name} {EXAMPLES[name]}"
+        example = f"example: {PROGRAM} {name} {EXAMPLES[name]}"
         own = verbs.add_parser(
             name, help=verb.text, description=verb.text, epilog=f"{example}\n\n{_CODES}", formatter_class=raw
         )
