@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import sys
@@ -23,6 +24,9 @@ from lcopa_bayes.core.errors import InputError
 S = TypeVar("S")
 T = TypeVar("T")
 R = TypeVar("R")
+_MMAP_THRESHOLD, _TRIM_THRESHOLD = (-3, 32 << 20), (-1, 256 << 20)
+"""Options of the allocator of the GNU C library with their values: arrays below 32 MB, the most it takes,
+come from the heap, and up to 256 MB at its end are kept when they are freed [byte]."""
 CONNECT = 5.0
 """Time a Dask scheduler has to answer [s]."""
 _ADVICE = "what was finished is stored; go on with --resume"
@@ -58,6 +62,7 @@ def workers(shared: S, *, jobs: int = 1, dask: str | None = None) -> Iterator[Wo
     Processes end with this one, however it ends, and do not run the main script again, so that a script needs
     no main guard. InputError when there is no such cluster, and when a worker or the cluster is lost.
     """
+    keep_freed_memory()
     if dask is not None:
         with _cluster(shared, dask) as cluster:
             yield cluster
@@ -75,6 +80,20 @@ def workers(shared: S, *, jobs: int = 1, dask: str | None = None) -> Iterator[Wo
             ) from None
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+def keep_freed_memory() -> None:
+    """Keep memory that arrays leave for the next ones.
+
+    By default the allocator of the GNU C library hands the temporaries of a batch back to the operating
+    system and takes them anew as page faults, 3.7 million in a fit of a thousand samples: a quarter of its
+    time. With another library this does nothing.
+    """
+    if sys.platform == "linux":
+        mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+        if mallopt is not None:
+            for option, value in (_MMAP_THRESHOLD, _TRIM_THRESHOLD):
+                mallopt(option, value)
 
 
 def cores() -> int:
@@ -226,6 +245,7 @@ def _take_up(shared: object) -> None:
     import numpy  # noqa: F401 - its threads can only be limited once they are there
     import scipy.linalg  # noqa: F401
 
+    keep_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # an interrupt ends a worker without a word
     threadpool_limits(1)
     _shared = shared

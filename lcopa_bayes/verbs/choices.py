@@ -17,12 +17,17 @@ def study(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
     parser.add_argument("--held-out", nargs="+", type=Path, default=[], help="records not to fit")
     parser.add_argument("--out", type=Path, help=f"run folder (default: {out})")
     parser.add_argument("--seed", type=int, help="seed in place of the study's")
+
+
+def parallel(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
+    """Of verbs about a study that use several processes."""
+    study(parser, out)
     parser.add_argument("--jobs", type=int, default=None, help="processes (default: all cores)")
 
 
 def sampled(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
     """Of verbs that sample."""
-    study(parser, out)
+    parallel(parser, out)
     parser.add_argument("--resume", action="store_true", help="go on with an interrupted run")
     _quick(parser)
 
@@ -57,7 +62,7 @@ def compare(parser: argparse.ArgumentParser) -> None:
 
 def loop(parser: argparse.ArgumentParser) -> None:
     """Of `loop`."""
-    study(parser)
+    parallel(parser)
     _quick(parser)
     parser.add_argument(
         "--as-stated", action="store_true", help="keep the number of viscous terms the study states"
@@ -160,7 +165,7 @@ def identify(parser: argparse.ArgumentParser) -> None:
     from lcopa_bayes.paper.intervals import Scan
 
     plan = Scan()
-    study(parser)
+    parallel(parser)
     for name, which in (("alpha", "largest"), ("beta", "second"), ("gamma", "third")):
         parser.add_argument(
             f"--{name}",
