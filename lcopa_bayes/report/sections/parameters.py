@@ -55,7 +55,7 @@ _SENSITIVITY = (
 
 def estimates(run: SavedRun) -> Section:
     """Free parameters with intervals and grades, parameters with several modes, and fixed parameters."""
-    free, fixed = run.results["parameters"], run.results["fixed"]
+    free = run.results["parameters"]
     kind = ", ".join(dict.fromkeys(f"{percent(row['level'])} {row['interval']}" for row in free))
     tables = [
         Table.of(
@@ -80,17 +80,20 @@ def estimates(run: SavedRun) -> Section:
     ]
     if run.results["modes"]:
         tables.append(_modes(run.results["modes"]))
-    if fixed:
-        tables.append(
-            Table.of(
-                fixed,
-                ("fixed parameter", "code", "name"),
-                ("value", "number", lambda row: figures(row["value"], 6)),
-                ("unit", "text", "unit"),
-            )
-        )
-    text = () if fixed else ("No parameter was fixed.",)
+    if run.results["fixed"]:
+        tables.append(fixed(run.results["fixed"]))
+    text = () if run.results["fixed"] else ("No parameter was fixed.",)
     return Section("Parameters", text, tables=tuple(tables))
+
+
+def fixed(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Values of fixed parameters."""
+    return Table.of(
+        rows,
+        ("fixed parameter", "code", "name"),
+        ("value", "number", lambda row: figures(row["value"], 6)),
+        ("unit", "text", "unit"),
+    )
 
 
 def _modes(rows: list[Mapping[str, Any]]) -> Table:
