@@ -40,17 +40,13 @@ def write_audit(folder: Path) -> Path:
 
     InputError when the folder holds no audit or it cannot be used.
     """
-    return write_graded(
-        folder,
-        "audit",
-        "identifiability",
-        lambda values: [*_tables(values), *_figures(values, load_run(folder))],
-    )
 
+    def sections(values: Mapping[str, Any]) -> list[Section]:
+        run = load_run(folder)
+        texts = [part(values) for part in (_verdicts, _next, _symmetries, _functions, _delays)]
+        return [*texts, _profiles(values, run), _spectrum(values), _pairs(values, run)]
 
-def _tables(results: Mapping[str, Any]) -> list[Section]:
-    """The sections of an audit that hold text and tables."""
-    return [_verdicts(results), _next(results), _symmetries(results), _functions(results), _delays(results)]
+    return write_graded(folder, "audit", "identifiability", sections)
 
 
 def _verdicts(results: Mapping[str, Any]) -> Section:
@@ -201,11 +197,6 @@ def _delays(results: Mapping[str, Any]) -> Section:
         caption="Smallest difference whose 90 % interval excludes 0, linearised; a dash: none.",
     )
     return Section("Delays of the paths", text, tables=(table,))
-
-
-def _figures(results: Mapping[str, Any], run: SavedRun) -> list[Section]:
-    """Every figure of an audit."""
-    return [_profiles(results, run), _spectrum(results), _pairs(results, run)]
 
 
 def _profiles(results: Mapping[str, Any], run: SavedRun) -> Section:

@@ -28,9 +28,12 @@ def write_comparison(folder: Path) -> Path:
 
     InputError when the folder holds no comparison or it cannot be used.
     """
-    return write_graded(
-        folder, "compare", "comparison", lambda values: _sections(values, folder), box=_verdict
-    )
+
+    def sections(values: Mapping[str, Any]) -> list[Section]:
+        texts = [part(values) for part in (_priors, _predicted, _orders, _warnings)]
+        return [_scores(values), _figures(values, _curves(folder, values)), *texts]
+
+    return write_graded(folder, "compare", "comparison", sections, box=_verdict)
 
 
 def _verdict(results: Mapping[str, Any]) -> Verdict:
@@ -52,12 +55,6 @@ def _curves(folder: Path, results: Mapping[str, Any]) -> dict[str, pd.DataFrame]
     if problems:
         raise InputError(problems)
     return out
-
-
-def _sections(results: Mapping[str, Any], folder: Path) -> list[Section]:
-    """Every part of the page."""
-    parts = (_priors, _predicted, _orders, _warnings)
-    return [_scores(results), _figures(results, _curves(folder, results)), *(part(results) for part in parts)]
 
 
 def _scores(results: Mapping[str, Any]) -> Section:

@@ -30,25 +30,17 @@ def write_loop(folder: Path) -> Path:
         folder,
         "loop",
         "what the model lacks",
-        lambda values: [*_tables(values), *_figures(values, shown)],
+        lambda values: [
+            *(part(values) for part in (_effects, _errors, _noise, _evidence, _rounds, _moved, _bars)),
+            _residuals(values, shown["curves"]),
+            _views(shown["views"]),
+        ],
         box=lambda values: Verdict(
             str(values["grade"]),
             f"{values['verdict']} ({values['confidence']}): {values['sentence']}",
             str(values["grade_reason"]),
         ),
     )
-
-
-def _tables(results: Mapping[str, Any]) -> list[Section]:
-    """The sections of a loop that hold text and tables."""
-    return [
-        _effects(results),
-        _errors(results),
-        _noise(results),
-        _evidence(results),
-        _rounds(results),
-        _moved(results),
-    ]
 
 
 def _effects(results: Mapping[str, Any]) -> Section:
@@ -194,11 +186,6 @@ def _moved(results: Mapping[str, Any]) -> Section:
     )
     text = "Without the effect these parameters were biased by more than 2 sd of the fit with it."
     return Section("Bias of the parameters without the effect", (text,), tables=(table,))
-
-
-def _figures(results: Mapping[str, Any], shown: Mapping[str, Any]) -> list[Section]:
-    """Every figure of a loop."""
-    return [_bars(results), _residuals(results, shown["curves"]), _views(shown["views"])]
 
 
 def _bars(results: Mapping[str, Any]) -> Section:

@@ -27,67 +27,50 @@ _SHOWN = 100.0
 
 def sections(stated: Stated = PAPER) -> list[Section]:
     """One section for each family of claims."""
-    rival = integer_rival(stated)
-    costs = delay_costs(stated)
-    return [
-        Section(
+    rival, costs = integer_rival(stated), delay_costs(stated)
+    shown = (
+        (
             "M2, M3: steady state and settling",
-            drawings=(
-                Drawing(
-                    "claim_steady",
-                    _steady(stated),
-                    "The step of Fig. 13 through Eq. 65, over a record and beyond it, with 2 and 5 % bands "
-                    "about the value it tends to; the integer-order model closest to it over the record "
-                    f"(RMSE {figures(rival.rmse)} rad); the measured steady value.",
-                ),
-            ),
+            "steady",
+            _steady,
+            "The step of Fig. 13 through Eq. 65, over a record and beyond it, with 2 and 5 % bands "
+            "about the value it tends to; the integer-order model closest to it over the record "
+            f"(RMSE {figures(rival.rmse)} rad); the measured steady value.",
         ),
-        Section(
+        (
             "X1 to X3: crosstalk and two axes",
-            drawings=(
-                Drawing(
-                    "claim_crosstalk",
-                    _crosstalk(stated),
-                    "Left: b / k of the coupling paths against the printed crosstalk gains. Middle: y over x "
-                    "with x driven, at rest and at the end of the record, against the measured ratio. Right: "
-                    "steady values of both axes driven together.",
-                ),
-            ),
+            "crosstalk",
+            _crosstalk,
+            "Left: b / k of the coupling paths against the printed crosstalk gains. Middle: y over x "
+            "with x driven, at rest and at the end of the record, against the measured ratio. Right: "
+            "steady values of both axes driven together.",
         ),
-        Section(
+        (
             "N2: delays in whole blocks",
-            drawings=(
-                Drawing(
-                    "claim_delay",
-                    _delays(stated),
-                    "Shift of the other parameters when the delay is held at the nearest camera period, for "
-                    f"the printed delay of {figures(costs[0].delay, 4)} ms and for the worst delay, "
-                    f"{figures(costs[1].delay, 4)} ms.",
-                ),
-            ),
+            "delay",
+            _delays,
+            "Shift of the other parameters when the delay is held at the nearest camera period, for "
+            f"the printed delay of {figures(costs[0].delay, 4)} ms and for the worst delay, "
+            f"{figures(costs[1].delay, 4)} ms.",
         ),
-        Section(
+        (
             "S1: tilt law",
-            drawings=(
-                Drawing(
-                    "claim_tilt",
-                    _tilt(stated),
-                    "Mean tilt in a uniform and a self-consistent field, and Eq. 24; right: about the knee.",
-                ),
-            ),
+            "tilt",
+            _tilt,
+            "Mean tilt in a uniform and a self-consistent field, and Eq. 24; right: about the knee.",
         ),
-        Section(
+        (
             "S2 to S4: lobes, linearised steering, geometry",
-            drawings=(
-                Drawing(
-                    "claim_steering",
-                    _steering(stated),
-                    "Left: strongest grating lobe over the main lobe. Middle: size of the error of Eq. 26, "
-                    "and the steady-state error the paper claims. Right: angle by Eq. 5 for the pitch of "
-                    "Section 2 and for the pitch that the measured step implies.",
-                ),
-            ),
+            "steering",
+            _steering,
+            "Left: strongest grating lobe over the main lobe. Middle: size of the error of Eq. 26, "
+            "and the steady-state error the paper claims. Right: angle by Eq. 5 for the pitch of "
+            "Section 2 and for the pitch that the measured step implies.",
         ),
+    )
+    return [
+        Section(title, drawings=(Drawing(f"claim_{stem}", draw(stated), caption),))
+        for title, stem, draw, caption in shown
     ]
 
 
