@@ -134,7 +134,7 @@ class Effected:
             made = np.zeros((*next(iter(slope.values())).shape, len(table.rows)))
             for k, row in enumerate(table.rows):
                 first, second = row.place
-                if row.kind in ("gain", "time", "order", "delay"):
+                if (row.kind, first, second) in slope:
                     made[..., k] = slope[row.kind, first, second]
                 elif row.kind == "offset" and self.offsets is not None and second in (-1, self.offsets[r]):
                     made[:, first, k] = 1.0

@@ -195,13 +195,9 @@ class LeastSquares:
                         block[:, k] = column[0]
                 for drive, unit in enumerate(table.layout.unit_of[axis]):
                     gain = values[0, table.at("gain", axis, drive)]
-                    element, delay, _ = table.layout.units[unit]
-                    slope = gain * unit_slopes[unit][:, 0, observed.index]
-                    terms = table.layout.elements[element].terms
-                    for i in range(terms):
-                        block[:, table.at("time", element, i)] += slope[i]
-                        block[:, table.at("order", element, i)] += slope[terms + i]
-                    block[:, table.at("delay", delay)] += slope[2 * terms]
+                    slopes_here = gain * unit_slopes[unit][:, 0, observed.index]
+                    for k, slope in zip(table.shaping(unit), slopes_here, strict=True):
+                        block[:, k] += slope
                 yield axis, observed, block, misfit
 
     def _effected(self, values: Matrix) -> Iterator[tuple[int, Observed, Matrix, Vector]]:
