@@ -70,7 +70,7 @@ def _csv_cells(path: Path) -> CellTable:
     if not names:
         refuse(path, f"is empty; expected a header of columns {FORM}")
     if len(names) == 1 and any(separator in names[0] for separator in ";\t"):
-        refuse(path, "line 1: the columns are not separated by commas; separate them by commas")
+        raise InputError(f"{path}, line 1: the columns are not separated by commas; separate them by commas")
     table = CellTable(path, names, rows, [*zip(*cells, strict=True)] if cells else [()] * len(names), [])
     table.add(ragged, str(path))
     return table

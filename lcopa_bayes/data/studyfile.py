@@ -45,6 +45,9 @@ def _hashes(paths: Iterable[Path]) -> dict[str, str]:
 
 
 def _document(path: Path) -> dict[str, Any]:
+    if not path.exists():
+        beside = (one.name for one in path.parent.glob("*.toml"))
+        raise InputError(f"{path}: no such file{nearest(path.name, beside)}")
     try:
         text = path.read_text(encoding="utf-8-sig")
         return tomllib.loads(text)
@@ -120,7 +123,13 @@ def load_study(source: Path | Sequence[Path], *, held_out: Sequence[Path] = ()) 
     sources = [Path(source)] if isinstance(source, (str, Path)) else [Path(path) for path in source]
     apart = [Path(path) for path in held_out]
     if len(sources) == 1 and (sources[0].is_dir() or sources[0].suffix.lower() == ".toml"):
-        return _from_file(sources[0] / "study.toml" if sources[0].is_dir() else sources[0], apart)
+        path = sources[0] / "study.toml" if sources[0].is_dir() else sources[0]
+        if sources[0].is_dir() and not path.exists():
+            raise InputError(
+                f"{sources[0]}: this folder holds neither a study.toml nor a finished fit; name a study, "
+                "record files, or the run folder of a fit"
+            )
+        return _from_file(path, apart)
     if not sources:
         raise InputError("no study: name a folder with a study.toml, or one or more record files")
     problems: list[str] = []

@@ -3,10 +3,22 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 
 RUNS = Path("runs")
 """Where run folders go unless `--out` names another."""
+
+
+def _whole(least: int) -> Callable[[str], int]:
+    """Reads a whole number of at least `least`."""
+
+    def read(text: str) -> int:
+        if not (text.removeprefix("-").isdecimal() and int(text) >= least):
+            raise argparse.ArgumentTypeError(f"must be a whole number of at least {least}; got {text!r}")
+        return int(text)
+
+    return read
 
 
 def study(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
@@ -16,8 +28,8 @@ def study(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
     )
     parser.add_argument("--held-out", nargs="+", type=Path, default=[], help="records not to fit")
     parser.add_argument("--out", type=Path, help=f"run folder (default: {out})")
-    parser.add_argument("--seed", type=int, help="seed in place of the study's")
-    parser.add_argument("--jobs", type=int, default=None, help="processes (default: all cores)")
+    parser.add_argument("--seed", type=_whole(0), help="seed in place of the study's")
+    parser.add_argument("--jobs", type=_whole(1), help="processes (default: all cores)")
 
 
 def sampled(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
@@ -106,7 +118,7 @@ def simulate(parser: argparse.ArgumentParser) -> None:
     """Of `simulate`."""
     parser.add_argument("campaign", type=Path, help="campaign file (TOML)")
     parser.add_argument("--out", type=Path, required=True, help="folder for the records and their study")
-    parser.add_argument("--seed", type=int, help="seed in place of the campaign's")
+    parser.add_argument("--seed", type=_whole(0), help="seed in place of the campaign's")
     parser.add_argument("--overwrite", action="store_true", help="replace records that are there")
 
 
