@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from lcopa_bayes.verbs.design import DesignResult as DesignResult
     from lcopa_bayes.verbs.design import design as design
     from lcopa_bayes.verbs.fit import fit as fit
+    from lcopa_bayes.verbs.look import LookResult as LookResult
+    from lcopa_bayes.verbs.look import look as look
     from lcopa_bayes.verbs.loop import LoopResult as LoopResult
     from lcopa_bayes.verbs.loop import loop as loop
     from lcopa_bayes.verbs.simulate import Simulation as Simulation
@@ -53,6 +55,7 @@ _PLACES = {
     "verbs.compare": ("Comparison", "compare"),
     "verbs.design": ("DesignResult", "design"),
     "verbs.fit": ("fit",),
+    "verbs.look": ("LookResult", "look"),
     "verbs.loop": ("LoopResult", "loop"),
     "verbs.simulate": ("Simulation", "simulate"),
     "verbs.stored": ("load_result",),

@@ -181,6 +181,14 @@ def _truth(options: argparse.Namespace, study: Any) -> object:
     return stated_values(options.truth)
 
 
+def _look(options: argparse.Namespace) -> Outcome:
+    from lcopa_bayes.verbs.sources import study_of
+
+    study = study_of(_source(options))
+    folder = _folder(options, study)
+    return _reported(lcopa_bayes.look(study, folder=folder), folder)
+
+
 def _predict(options: argparse.Namespace) -> Outcome:
     from lcopa_bayes.results.savedfit import load_fit
 
@@ -262,6 +270,7 @@ def _scan(options: argparse.Namespace, study: Any) -> Scan:
 _SAMPLING = ("resume", "quick", "quiet")
 """Options of every verb that samples."""
 VERBS: Mapping[str, Verb] = {
+    "look": Verb("least squares and residual within seconds, before sampling", choices.study, _look),
     "run": Verb(
         "all stages the study names, then the report",
         choices.fit,

@@ -59,6 +59,11 @@ class AxisDrive:
         return cls(at, np.cumsum(np.bincount(where, weights=jumps, minlength=at.size)))
 
     @property
+    def jumps(self) -> Vector:
+        """Change of the drive at each instant [drive unit], (changes,)."""
+        return np.diff(self.values, prepend=0.0)
+
+    @property
     def moves(self) -> bool:
         """Whether the drive ever leaves its resting value."""
         return self.times.size > 0

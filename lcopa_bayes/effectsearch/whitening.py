@@ -11,7 +11,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.effectsearch.noise import Law
-from lcopa_bayes.inference.mixednoise import WhiteAR1
+from lcopa_bayes.inference.noise import WhiteAR1
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.restnoise import PlausibleNoise
 

@@ -14,7 +14,7 @@ from lcopa_bayes.bench.command import Command
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.inference.assembly import Problem
-from lcopa_bayes.inference.effectslopes import effect_slopes
+from lcopa_bayes.inference.effects import effect_slopes
 from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.noise import GaussianNoise, Student
 from lcopa_bayes.inference.simulation import Simulation
@@ -120,7 +120,7 @@ class Bench:
     def slopes(self, values: Vector, elements: Sequence[Prepared], command: Command) -> list[Matrix]:
         """White derivatives of every response axis, each (parameters, samples).
 
-        With effects by `inference.effectslopes`; what differs from record to record is left out.
+        With effects by `inference.effects`; what differs from record to record is left out.
         UnstableError where there is no bounded response.
         """
         table = self.problem.posterior.table

@@ -58,6 +58,8 @@ class Expanded(NamedTuple):
     """In the coordinates, (batch, size)."""
     information: Array
     """(batch, size, size)."""
+    steepness: Array
+    """Derivatives of the natural coordinates in the coordinates, (batch, size, size)."""
 
 
 @final
@@ -142,18 +144,23 @@ class Conditional:
         """``s_0^order`` of the terms of an element, (batch, terms)."""
         return np.asarray(self.frequency ** values[:, element.orders])
 
+    @staticmethod
+    def strengths(element: Element, values: Matrix) -> Matrix:
+        """``c_i`` of the terms of an element, (batch, terms)."""
+        return np.asarray(values[:, element.times] ** values[:, element.orders])
+
     def rest(self, element: Element, values: Matrix) -> Vector:
         """D(s_0) without the terms whose times are sampled, (batch,)."""
         fixed = [i for i in range(len(element.times)) if i not in element.free]
-        strength = values[:, element.times] ** values[:, element.orders]
-        return np.asarray(1.0 + (self.powers(element, values) * strength)[:, fixed].sum(axis=1))
+        terms = self.powers(element, values) * self.strengths(element, values)
+        return np.asarray(1.0 + terms[:, fixed].sum(axis=1))
 
     def x(self, values: Matrix) -> Matrix:
         """Coordinates of table values, (batch, size)."""
         out = values[:, self.columns].copy()
         levels = []
         for element in self.elements:
-            strength = values[:, element.times] ** values[:, element.orders]
+            strength = self.strengths(element, values)
             level = 1.0 + (self.powers(element, values) * strength).sum(axis=1)
             out[:, element.part] = strength[:, element.free] / level[:, None]
             levels.append(level)
@@ -219,13 +226,14 @@ class Conditional:
             found.log_likelihood,
             (steep.swapaxes(1, 2) @ found.gradient[..., None])[..., 0],
             steep.swapaxes(1, 2) @ found.information @ steep,
+            steep,
         )
 
     def _objective(self, at: Expanded) -> tuple[Vector, Matrix, Array]:
         """Log likelihood with normal priors of the widths of the priors; gradient and information."""
         middle, width = self._priors
         apart = (self.natural(at.values) - middle) / width
-        steep = self.steepness(at.values) / width[:, None]
+        steep = at.steepness / width[:, None]
         return (
             at.log_likelihood - 0.5 * (apart**2).sum(axis=1),
             at.gradient - (steep.swapaxes(1, 2) @ apart[..., None])[..., 0],
@@ -253,8 +261,7 @@ class Conditional:
     def uncertainty(self, at: Expanded) -> Matrix:
         """Standard deviations of the natural coordinates about optima, at most those of the priors, (batch,
         size)."""
-        steep = self.steepness(at.values)
-        information = self._objective(at)[2]
+        steep, information = at.steepness, self._objective(at)[2]
         covariance = steep @ np.linalg.pinv(information, hermitian=True) @ steep.swapaxes(1, 2)
         sd = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
         return np.asarray(np.minimum(sd, self.widths))

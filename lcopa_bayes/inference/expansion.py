@@ -8,10 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
-from lcopa_bayes.inference.noise import GaussianNoise
+from lcopa_bayes.inference.noise import LOG_2PI, GaussianNoise
 from lcopa_bayes.inference.posterior import Posterior
 
-_LOG_2PI = float(np.log(2 * np.pi))
 _PORTION = 32
 """Parameter sets expanded at once."""
 
@@ -49,8 +48,8 @@ def expanded(posterior: Posterior, values: Matrix, columns: Sequence[int]) -> Ex
         mean, sd = posterior.scaled[axis]
         centre = values.copy()
         centre[:, block] = mean
-        slots, place = _slots(posterior, axis, columns)
-        count = len(block) + slots + 1
+        series = _series(posterior, axis, columns)
+        count = len(block) + len(series) + 1
         normal = np.zeros((batch, count, count))
         normal[:, range(len(block)), range(len(block))] = 1.0
         noise = posterior.noise_parameters(values, axis)
@@ -59,35 +58,31 @@ def expanded(posterior: Posterior, values: Matrix, columns: Sequence[int]) -> Ex
             if observed.values.size == 0:
                 continue
             stacked = np.zeros((batch, count, observed.values.size))
-            for k in posterior.acting[axis]:
+            for position, k in enumerate(block):
                 column = posterior.column(k, axis, r, observed, units[r])
-                if column is None:
-                    continue
-                if k in block:
-                    stacked[:, block.index(k)] = sd[block.index(k)] * column
-                elif k in columns:
-                    stacked[:, len(block) + place[k, -1]] = column
-            for drive, unit in enumerate(table.layout.unit_of[axis]):
-                if not posterior.model.experiments[r].drives[drive].moves:
-                    continue
-                element, delay, _ = table.layout.units[unit]
-                slope, terms = slopes[r][1][unit], table.layout.elements[element].terms
-                rows = [(table.at("time", element, i), i) for i in range(terms)]
-                for k, position in [*rows, (table.at("delay", delay), 2 * terms)]:
-                    if k in columns:
-                        stacked[:, len(block) + place[k, drive]] = slope[position][:, observed.chosen]
+                if column is not None:
+                    stacked[:, position] = sd[position] * column
+            for position, one in enumerate(series, start=len(block)):
+                if one.drive < 0:
+                    column = posterior.column(one.row, axis, r, observed, units[r])
+                elif posterior.model.experiments[r].drives[one.drive].moves:
+                    column = slopes[r][1][one.unit][one.position][:, observed.chosen]
+                else:
+                    column = None
+                if column is not None:
+                    stacked[:, position] = column
             residual = posterior.residual(axis, r, observed, centre, units[r])
             stacked[:, -1] = residual
             if isinstance(posterior.noise, GaussianNoise):
                 white, scale = posterior.noise.whiten(stacked, noise, observed.gaps)
-                total -= scale + 0.5 * observed.values.size * _LOG_2PI
+                total -= scale + 0.5 * observed.values.size * LOG_2PI
             else:
                 total += posterior.noise.pointwise(residual, noise, observed.gaps).sum(axis=1)
                 sigma, nu = noise[:, 0, None, None], noise[:, 1, None]
                 weight = np.sqrt((nu + 1) / (nu + (residual / sigma[:, 0]) ** 2))
                 white = stacked / sigma * weight[:, None, :]
             normal += white @ white.swapaxes(1, 2)
-        combine = np.zeros((batch, slots, size))
+        combine = np.zeros((batch, len(series), size))
         if block:
             inner, rest = normal[:, : len(block), : len(block)], normal[:, : len(block), len(block) :]
             solved = np.linalg.solve(inner, rest)
@@ -96,9 +91,9 @@ def expanded(posterior: Posterior, values: Matrix, columns: Sequence[int]) -> Ex
             centre[:, block] = mean + sd * solved[:, :, -1]
         else:
             reduced = normal
-        for (k, drive), slot in place.items():
-            factor = 1.0 if drive < 0 else centre[:, table.at("gain", axis, drive)]
-            combine[:, slot, columns.index(k)] = factor
+        for slot, one in enumerate(series):
+            factor = 1.0 if one.drive < 0 else centre[:, table.at("gain", axis, one.drive)]
+            combine[:, slot, columns.index(one.row)] = factor
         if isinstance(posterior.noise, GaussianNoise):
             total -= 0.5 * reduced[:, -1, -1]
         gradient += (combine.swapaxes(1, 2) @ reduced[:, :-1, -1:])[..., 0]
@@ -106,18 +101,27 @@ def expanded(posterior: Posterior, values: Matrix, columns: Sequence[int]) -> Ex
     return Expansion(total, gradient, information)
 
 
-def _slots(posterior: Posterior, axis: int, columns: Sequence[int]) -> tuple[int, dict[tuple[int, int], int]]:
-    """Number of derivative series of a response axis, and the position of each by table row and drive (-1: a
-    gain or an offset, whose series no gain scales)."""
+class _Series(NamedTuple):
+    """A derivative of a response axis, or what a unit of a gain or an offset adds to it."""
+
+    row: int
+    """Table row."""
+    drive: int = -1
+    """Drive whose gain scales the derivative; -1: a gain or an offset, whose series no gain scales."""
+    unit: int = -1
+    """Unit response of the derivative."""
+    position: int = -1
+    """Place of the derivative among those of the unit response."""
+
+
+def _series(posterior: Posterior, axis: int, columns: Sequence[int]) -> list[_Series]:
+    """What `columns` change of a response axis."""
     table = posterior.table
-    place: dict[tuple[int, int], int] = {}
+    out = []
     for drive, unit in enumerate(table.layout.unit_of[axis]):
         element, delay, _ = table.layout.units[unit]
         terms = table.layout.elements[element].terms
-        for k in [*(table.at("time", element, i) for i in range(terms)), table.at("delay", delay)]:
-            if k in columns:
-                place[k, drive] = len(place)
-    for k in posterior.acting[axis]:
-        if k in columns:
-            place[k, -1] = len(place)
-    return len(place), place
+        out += [_Series(table.at("time", element, i), drive, unit, i) for i in range(terms)]
+        out.append(_Series(table.at("delay", delay), drive, unit, 2 * terms))
+    out += [_Series(k) for k in posterior.acting[axis]]
+    return [one for one in out if one.row in columns]

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.inference.effectslopes import effect_slopes
+from lcopa_bayes.inference.effects import effect_slopes
 from lcopa_bayes.inference.noise import GaussianNoise, White
 from lcopa_bayes.inference.noisefit import NoiseFit
 from lcopa_bayes.inference.observations import Observed
@@ -83,7 +83,7 @@ class LeastSquares:
                 wall = (values[upper] + values[lower]) / 2 if all(free) else wall
                 for k, ends, choose in ((upper, low, max), (lower, high, min)):
                     if k in self.columns:
-                        limit = np.log(wall) if table.rows[k].log_scale else wall
+                        limit = float(table.rows[k].coordinate(wall))
                         position = self.columns.index(k)
                         ends[position] = choose(ends[position], limit)
         return low, high
@@ -91,14 +91,14 @@ class LeastSquares:
     def coordinates(self, values: Vector) -> Vector:
         """Search coordinates of table values."""
         rows = self.posterior.table.rows
-        return np.array([np.log(values[k]) if rows[k].log_scale else values[k] for k in self.columns])
+        return np.array([rows[k].coordinate(values[k]) for k in self.columns])
 
     def values(self, x: Vector, template: Vector) -> Vector:
         """Table values of search coordinates, the rest from `template`; not sorted."""
         out = template.copy()
         rows = self.posterior.table.rows
         for position, k in enumerate(self.columns):
-            out[k] = np.exp(x[position]) if rows[k].log_scale else x[position]
+            out[k] = rows[k].value_at(x[position])
         return out
 
     def misfit(self, x: Vector, template: Vector) -> Vector:
@@ -119,7 +119,7 @@ class LeastSquares:
         """Whitened residual (model minus data, then prior rows) and its exact Jacobian in `x`.
 
         `template` (rows,) gives fixed values and noise parameters. With effects slopes are those of
-        `effectslopes`; UnstableError where these leave no bounded response.
+        `effects.effect_slopes`; UnstableError where these leave no bounded response.
         """
         posterior, table = self.posterior, self.posterior.table
         raw = self.values(x, template)

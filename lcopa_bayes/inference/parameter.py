@@ -8,9 +8,9 @@ from math import inf, log
 from typing import NamedTuple, final
 
 import numpy as np
-from scipy.special import logit
+from scipy.special import expit, logit
 
-from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.arrays import Array, Vector
 from lcopa_bayes.inference.kinds import KINDS, Kind
 from lcopa_bayes.inference.priors import Prior
 
@@ -77,6 +77,15 @@ class Parameter:
     def logit_scale(self) -> bool:
         """Whether it is sampled by its logit."""
         return self.declared.scale == "logit"
+
+    def coordinate(self, values: Array | float) -> Array:
+        """Values on the scale the parameter is sampled on, same shape."""
+        return np.asarray(np.log(values) if self.log_scale else logit(values) if self.logit_scale else values)
+
+    def value_at(self, coordinate: Array | float) -> Array:
+        """Values at places on the scale the parameter is sampled on, same shape [unit]."""
+        x = coordinate
+        return np.asarray(np.exp(x) if self.log_scale else expit(x) if self.logit_scale else x)
 
     @property
     def domain(self) -> tuple[float, float]:

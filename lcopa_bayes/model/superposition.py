@@ -44,7 +44,7 @@ class Phase:
 
 def phases(drive: AxisDrive, step: float) -> tuple[Phase, ...]:
     """The changes of a drive by phase on blocks of width `step` [time unit]."""
-    jumps = np.diff(drive.values, prepend=0.0)
+    jumps = drive.jumps
     place = (drive.times - drive.times[0]) / step
     for tolerance in (_SAME_PHASE, _ROUNDED):
         groups = _alike(place, tolerance)

@@ -9,12 +9,14 @@ from lcopa_bayes.report.audit import write_audit
 from lcopa_bayes.report.calibrate import write_calibration
 from lcopa_bayes.report.compare import write_comparison
 from lcopa_bayes.report.design import write_design
+from lcopa_bayes.report.look import write_look
 from lcopa_bayes.report.loop import write_loop
 from lcopa_bayes.report.page import write_report
 from lcopa_bayes.report.paperpages import write_claims, write_identification, write_optics
 from lcopa_bayes.report.predict import write_prediction
 
 _PAGES: Mapping[str, Callable[[Path], Path]] = {
+    "look": write_look,
     "fit": write_report,
     "audit": write_audit,
     "design": write_design,

@@ -20,7 +20,7 @@ from lcopa_bayes.results.runfolder import ORIGINS
 
 _WORDS = ("record", "axis", "unit", "name", "path", "prior", "from")
 _FLAGS = ("held_out", "log_scale", "integrated_out")
-_TABLES: Mapping[str, tuple[str, ...]] = {
+TABLES: Mapping[str, tuple[str, ...]] = {
     "bands": (
         *("record", "axis", "unit", "held_out", "time", "observed"),
         *(f"{kind}_{POINTWISE}_{q}" for kind in ("plant", "noisy") for q in QUANTILE_NAMES),
@@ -113,9 +113,9 @@ def load_run(folder: Path) -> SavedRun:
         for key in _PROVENANCE
         if origin and key not in origin
     ]
-    wanted = {**_TABLES, **(_CHECK_TABLES if results.get("cross_check") else {})}
+    wanted = {**TABLES, **(_CHECK_TABLES if results.get("cross_check") else {})}
     tables = {
-        name: _table(folder / "tables" / f"{name}.csv", needs, problems) for name, needs in wanted.items()
+        name: read_table(folder / "tables" / f"{name}.csv", needs, problems) for name, needs in wanted.items()
     }
     draws = _draws(folder / "posterior.nc", problems)
     if not problems:
@@ -130,8 +130,8 @@ def load_run(folder: Path) -> SavedRun:
     return SavedRun(results, origin, tables, draws)
 
 
-def _missing(path: Path) -> str:
-    return f"{path}: this file of the run folder is missing; run `fit` again to write it"
+def _missing(path: Path, verb: str = "fit") -> str:
+    return f"{path}: this file of the run folder is missing; run `{verb}` again to write it"
 
 
 def _json(path: Path, needs: tuple[str, ...], problems: list[str]) -> dict[str, Any]:
@@ -154,8 +154,9 @@ def _json(path: Path, needs: tuple[str, ...], problems: list[str]) -> dict[str, 
     return content
 
 
-def _table(path: Path, needs: tuple[str, ...], problems: list[str]) -> pd.DataFrame:
-    """A CSV table whose names stay names even when they look like numbers; empty when it has no rows."""
+def read_table(path: Path, needs: tuple[str, ...], problems: list[str], *, verb: str = "fit") -> pd.DataFrame:
+    """A CSV table of `verb` whose names stay names even when they look like numbers; empty when it has no
+    rows. What is missing or cannot be used is added to `problems`."""
     empty = pd.DataFrame(columns=list(needs))
     try:
         text = path.read_text(encoding="utf-8")
@@ -165,13 +166,13 @@ def _table(path: Path, needs: tuple[str, ...], problems: list[str]) -> pd.DataFr
         absent = {name: ["", "nan"] for name in needs if name not in (*_WORDS, *_FLAGS)}
         table = pd.read_csv(io.StringIO(text), dtype=words, keep_default_na=False, na_values=absent)
     except FileNotFoundError:
-        problems.append(_missing(path))
+        problems.append(_missing(path, verb))
         return empty
     except (OSError, ValueError) as error:
-        problems.append(f"{path}: cannot be read as a table ({error}); run `fit` again to write it")
+        problems.append(f"{path}: cannot be read as a table ({error}); run `{verb}` again to write it")
         return empty
     problems += [
-        f"{path}: the column {name!r} is missing; run `fit` again with this version of lcopa-bayes"
+        f"{path}: the column {name!r} is missing; run `{verb}` again with this version of lcopa-bayes"
         for name in needs
         if name not in table
     ]

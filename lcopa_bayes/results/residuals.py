@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 import numpy as np
 from scipy import signal, stats
@@ -55,6 +55,16 @@ class Residual:
     def rms(self) -> float:
         """Root mean square [response unit]."""
         return float(np.sqrt(np.mean(self.values**2)))
+
+    def test(self) -> dict[str, Any]:
+        """Size and test of whiteness as plain values."""
+        return {
+            "record": self.record,
+            "axis": self.axis,
+            "held_out": self.held_out,
+            "p_white": self.p_white,
+            "rms": self.rms,
+        }
 
 
 def residuals(draws: Draws, bands: Sequence[Band], noise: Noise, period: float) -> list[Residual]:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, overload
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.files import save_json, writable_folder, writing
@@ -26,14 +26,21 @@ _held: dict[Path, int] = {}
 """Folders this process has locked, and how many times."""
 
 
+@overload
+def opened(folder: Path | str, origin: Mapping[str, Any]) -> AbstractContextManager[Path]: ...
+@overload
+def opened(folder: Path | str | None, origin: Mapping[str, Any]) -> AbstractContextManager[Path | None]: ...
 @contextmanager
-def opened(folder: Path | str, origin: Mapping[str, Any]) -> Iterator[Path]:
+def opened(folder: Path | str | None, origin: Mapping[str, Any]) -> Iterator[Any]:
     """A run folder, made if need be, that no other run writes into meanwhile; `origin` is the provenance of
-    what is to be written.
+    what is to be written. None stands for none: nothing is opened.
 
     InputError when it cannot be written to, another run is writing there, or it holds results of other
     records.
     """
+    if folder is None:
+        yield None
+        return
     path = Path(folder)
     refuse_other(path, origin)  # before anything is made
     made = [one for one in (path, *path.parents) if not one.exists()]

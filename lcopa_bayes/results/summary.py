@@ -93,16 +93,7 @@ def results(fit: Fit) -> dict[str, Any]:
             ],
             "sensitivity": [moved.as_json() for moved in fit.sensitivity],
             "step_metrics": [metric.as_json() for metric in fit.metrics],
-            "residual_tests": [
-                {
-                    "record": r.record,
-                    "axis": r.axis,
-                    "held_out": r.held_out,
-                    "p_white": r.p_white,
-                    "rms": r.rms,
-                }
-                for r in fit.residuals
-            ],
+            "residual_tests": [one.test() for one in fit.residuals],
             "sampler": _sampler(fit),
         }
     )

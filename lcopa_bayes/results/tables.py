@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.results.bands import QUANTILE_NAMES, QUANTILES
+from lcopa_bayes.results.prediction import Band
+from lcopa_bayes.results.residuals import Residual
 from lcopa_bayes.results.summary import results
 from lcopa_bayes.sampling.crosscheck import CrossCheck
 
 if TYPE_CHECKING:
     from lcopa_bayes.results.fit import Fit
-    from lcopa_bayes.results.residuals import Residual
 
 _PRIOR_POINTS = 200
 _BINS = 30
@@ -31,10 +33,23 @@ def tables(fit: Fit) -> dict[str, pd.DataFrame]:
             [row | {"held_out": False} for row in values["fit_scores"]]
             + [row | {"held_out": True} for row in values["held_out"]]
         ),
-        "bands": pd.concat([band.table() for band in fit.bands], ignore_index=True),
-        "drives": _drives(fit),
+        **data_tables(fit.study, fit.bands, fit.residuals),
+        "step_response": _step_response(fit),
+        "frequency_response": fit.frequency.table(),
+        "priors": _priors(fit),
+        "prior_density": _prior_density(fit),
+    } | ({} if fit.cross_check is None else _cross_check(fit, fit.cross_check))
+
+
+def data_tables(
+    study: Study, bands: Sequence[Band], residuals: Sequence[Residual]
+) -> dict[str, pd.DataFrame]:
+    """Records with their bands, drives and residuals, by file name."""
+    return {
+        "bands": pd.concat([band.table() for band in bands], ignore_index=True),
+        "drives": _drives(study),
         "residuals": _of_residuals(
-            fit,
+            residuals,
             lambda one: {
                 "unit": one.unit,
                 "time": one.time,
@@ -43,7 +58,7 @@ def tables(fit: Fit) -> dict[str, pd.DataFrame]:
             },
         ),
         "autocorrelation": _of_residuals(
-            fit,
+            residuals,
             lambda one: {
                 "lag": np.arange(1, one.autocorrelation.size + 1),
                 "autocorrelation": one.autocorrelation,
@@ -51,16 +66,12 @@ def tables(fit: Fit) -> dict[str, pd.DataFrame]:
             },
         ),
         "spectrum": _of_residuals(
-            fit, lambda one: {"frequency": one.frequency, "power_over_white": one.spectrum}
+            residuals, lambda one: {"frequency": one.frequency, "power_over_white": one.spectrum}
         ),
-        "step_response": _step_response(fit),
-        "frequency_response": fit.frequency.table(),
-        "priors": _priors(fit),
-        "prior_density": _prior_density(fit),
-    } | ({} if fit.cross_check is None else _cross_check(fit, fit.cross_check))
+    }
 
 
-def _drives(fit: Fit) -> pd.DataFrame:
+def _drives(study: Study) -> pd.DataFrame:
     frames = [
         pd.DataFrame(
             {
@@ -71,17 +82,19 @@ def _drives(fit: Fit) -> pd.DataFrame:
                 "drive": record.drive[:, j],
             }
         )
-        for record in (*fit.study.fit, *fit.study.held_out)
+        for record in (*study.fit, *study.held_out)
         for j, axis in enumerate(record.drive_axes)
     ]
     return pd.concat(frames, ignore_index=True)
 
 
-def _of_residuals(fit: Fit, columns: Callable[[Residual], dict[str, Any]]) -> pd.DataFrame:
+def _of_residuals(
+    residuals: Sequence[Residual], columns: Callable[[Residual], dict[str, Any]]
+) -> pd.DataFrame:
     """Columns of every residual below each other; empty when every record is too short for one."""
     frames = [
         pd.DataFrame({"record": one.record, "axis": one.axis, "held_out": one.held_out, **columns(one)})
-        for one in fit.residuals
+        for one in residuals
     ]
     return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
 

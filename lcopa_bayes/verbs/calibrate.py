@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import final
@@ -62,7 +61,7 @@ def calibrate(
     """
     wanted = study_of(study)
     origin = plain(provenance(wanted, "calibrate"))
-    with nullcontext() if folder is None else opened(folder, origin) as place:
+    with opened(folder, origin) as place:
         calibration = calibrated(
             wanted,
             replicas=replicas,

@@ -29,12 +29,17 @@ def study(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
     parser.add_argument("--held-out", nargs="+", type=Path, default=[], help="records not to fit")
     parser.add_argument("--out", type=Path, help=f"run folder (default: {out})")
     parser.add_argument("--seed", type=_whole(0), help="seed in place of the study's")
+
+
+def parallel(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
+    """Of verbs about a study that use several processes."""
+    study(parser, out)
     parser.add_argument("--jobs", type=_whole(1), help="processes (default: all cores)")
 
 
 def sampled(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
     """Of verbs that sample."""
-    study(parser, out)
+    parallel(parser, out)
     parser.add_argument("--resume", action="store_true", help="go on with an interrupted run")
     _quick(parser)
 
@@ -69,7 +74,7 @@ def compare(parser: argparse.ArgumentParser) -> None:
 
 def loop(parser: argparse.ArgumentParser) -> None:
     """Of `loop`."""
-    study(parser)
+    parallel(parser)
     _quick(parser)
     parser.add_argument(
         "--as-stated", action="store_true", help="keep the number of viscous terms the study states"
@@ -172,7 +177,7 @@ def identify(parser: argparse.ArgumentParser) -> None:
     from lcopa_bayes.paper.intervals import Scan
 
     plan = Scan()
-    study(parser)
+    parallel(parser)
     for name, which in (("alpha", "largest"), ("beta", "second"), ("gamma", "third")):
         parser.add_argument(
             f"--{name}",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from lcopa_bayes.results.integerrival import integer_rival
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.provenance import provenance
 from lcopa_bayes.results.runfolder import opened
+from lcopa_bayes.verbs.look import look
 from lcopa_bayes.verbs.sources import FitLike, StudyLike, finished, study_of
 
 
@@ -32,13 +33,16 @@ def fit(
     a run folder in which draws are kept while they are made, so that `resume` goes on from them, and the
     result afterwards; `quick`, a quarter of the steps; `cross_check`, sample by nested sampling too; `rival`,
     fit the study with integer orders too and compare what both predict of the held-out records; `quiet`, no
-    progress bar.
+    progress bar, and no first look (`look`) in the folder meanwhile.
 
     The same study gives the same draws. InputError when the study cannot be used, or the folder cannot be
     written to, holds another study's results, or is being written by another run; then nothing is written.
     """
     wanted = study_of(study)
-    with nullcontext() if folder is None else opened(folder, provenance(wanted, "fit")) as place:
+    with opened(folder, provenance(wanted, "fit")) as place:
+        if place is not None and not (quiet or resume or wanted.effects.use):
+            page = look(wanted).report(place)
+            print(f"first look: {page}", file=sys.stderr)
         fitted = sampled(
             wanted,
             jobs=jobs,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import final
@@ -95,7 +94,7 @@ def loop(
     wanted = study_of(study)
     problem_of(wanted)  # what is wrong with the study is said before anything is written
     origin = plain(provenance(wanted, "loop"))
-    with nullcontext() if folder is None else opened(folder, origin):
+    with opened(folder, origin):
         outcome = searched(wanted, jobs=jobs, quick=quick, as_stated=as_stated)
         curves = json.dumps(plain(drawn(outcome)), indent=1, allow_nan=False) + "\n"
         values = results(outcome) | {"explained": EXPLAINED}

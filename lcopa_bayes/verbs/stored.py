@@ -19,6 +19,7 @@ from lcopa_bayes.verbs.audit import AuditResult
 from lcopa_bayes.verbs.calibrate import CalibrationResult
 from lcopa_bayes.verbs.compare import Comparison
 from lcopa_bayes.verbs.design import DesignResult
+from lcopa_bayes.verbs.look import LookResult
 from lcopa_bayes.verbs.loop import LoopResult
 from lcopa_bayes.verbs.papers import ClaimsResult, IdentifyResult, OpticsResult
 
@@ -38,6 +39,7 @@ class SavedPrediction(StoredResult):
 _KINDS: Mapping[str, type[StoredResult]] = {
     kind.verb: kind
     for kind in (
+        LookResult,
         *(AuditResult, DesignResult, Comparison, LoopResult, CalibrationResult, SavedPrediction),
         *(OpticsResult, IdentifyResult, ClaimsResult),
     )

@@ -27,7 +27,7 @@ from lcopa_bayes.effectsearch.terms import fitted_base
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.defaultpriors import Scales
-from lcopa_bayes.inference.mixednoise import WhiteAR1
+from lcopa_bayes.inference.noise import WhiteAR1
 from lcopa_bayes.inference.observations import Observed
 from lcopa_bayes.model.effects import parallel
 from lcopa_bayes.model.effects.catalogue import catalogue
@@ -77,7 +77,7 @@ def resonant(seed=2, n=1500):
 def test_many_even_changes_are_one_convolution(delay, monkeypatch):
     rng, times = np.random.default_rng(0), np.arange(400) * 0.1 + 0.3
     drive = AxisDrive(times[1:], rng.normal(size=399))
-    jumps, shape = parallel.jumps_of(drive), relaxing
+    jumps, shape = drive.jumps, relaxing
     fast = parallel.summed(times, drive, delay, jumps, shape)
     monkeypatch.setattr(parallel, "_MANY", 10**9)
     slow = parallel.summed(times, drive, delay, jumps, shape)
@@ -92,10 +92,9 @@ def test_changes_between_samples_are_shared_to_second_order():
         at = times[1:] + 0.4 * period
         drive = AxisDrive(at, np.sin(at))
         exact = sum(
-            jump * -np.expm1(-np.maximum(times - t, 0) / 2.0)
-            for t, jump in zip(at, parallel.jumps_of(drive), strict=True)
+            jump * -np.expm1(-np.maximum(times - t, 0) / 2.0) for t, jump in zip(at, drive.jumps, strict=True)
         )
-        got = parallel.summed(times, drive, 0.0, parallel.jumps_of(drive), relaxing)
+        got = parallel.summed(times, drive, 0.0, drive.jumps, relaxing)
         errors.append(np.abs(got - exact)[5:].max())
     slope = np.diff(np.log(errors)) / np.log(0.5)
     assert np.all((slope > 1.7) & (slope < 2.3))

@@ -15,7 +15,7 @@ from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.inference.effects import Effected, carried, effected
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.model.effects.catalogue import bundled
-from lcopa_bayes.model.effects.parallel import jumps_of, relaxing, summed
+from lcopa_bayes.model.effects.parallel import relaxing, summed
 from lcopa_bayes.model.effects.response import CrossFade
 from lcopa_bayes.model.forward import forward_model
 
@@ -118,7 +118,7 @@ def test_many_changes_under_few_samples(samples: int):
     rng = np.random.default_rng(3)
     drive = AxisDrive(0.05 + 0.11 * np.arange(80), rng.normal(size=80))
     times = np.linspace(0.0, 10.0, samples) if samples > 1 else np.array([9.0])
-    total = summed(times, drive, 0.3, jumps_of(drive), relaxing(0.4))
+    total = summed(times, drive, 0.3, drive.jumps, relaxing(0.4))
     late = np.maximum(times[:, None] - drive.times - 0.3, 0.0)
-    exact = (-np.expm1(-late / 0.4)) @ jumps_of(drive)
+    exact = (-np.expm1(-late / 0.4)) @ drive.jumps
     assert np.abs(total - exact).max() < (1e-12 if samples < 80 else 1e-2)

@@ -25,6 +25,7 @@ from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.report.savedrun import load_run
 from lcopa_bayes.results.datatree import save_tree, variable_names
 from lcopa_bayes.results.fit import Fit, fit
+from lcopa_bayes.results.runfolder import opened
 from lcopa_bayes.results.tables import tables
 
 TINY = {"ensembles": 2, "walkers": 16, "steps": 60, "thin": 1, "target_ess": 100}
@@ -240,6 +241,13 @@ def test_names_and_their_times_never_collide(wanted):
     for name, want in zip(names, wanted, strict=True):
         assert name.startswith(want.replace("/", "|"))
     assert variable_names(wanted) == names
+
+
+def test_no_folder_is_opened_as_none(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with opened(None, {"study": "any"}) as place:
+        assert place is None
+    assert not any(tmp_path.iterdir())
 
 
 def test_records_and_axes_with_the_same_joint_name_are_kept_apart(tmp_path):

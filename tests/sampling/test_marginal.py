@@ -41,7 +41,7 @@ def test_without_information_the_evidence_is_that_of_the_prior(terms, name):
     x = conditional.x(values)
     size = x.shape[1]
     nothing = np.zeros(25), np.zeros((25, size)), np.zeros((25, size, size))
-    draw = kept(conditional, Expanded(values, x, *nothing), tries, rng)
+    draw = kept(conditional, Expanded(values, x, *nothing, conditional.steepness(values)), tries, rng)
     exact = posterior.log_prior(posterior.coordinates(values))
     for k in conditional.columns:
         row = posterior.table.rows[k]

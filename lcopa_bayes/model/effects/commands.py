@@ -50,7 +50,7 @@ class OverdrivePulse(DriveEffect):
         self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
     ) -> tuple[AxisDrive, float]:
         """One more pair of changes per change."""
-        jumps = np.diff(drive.values, prepend=0.0)
+        jumps = drive.jumps
         times = np.concatenate((drive.times, drive.times + self.frame))
         return AxisDrive.of_jumps(times, np.concatenate(((1 + psi[0]) * jumps, -psi[0] * jumps))), rest
 
@@ -95,11 +95,15 @@ class RefreshHold(DriveEffect):
     ) -> tuple[AxisDrive, float]:
         """Of several changes that fall to one refresh the sum acts."""
         ticks = np.ceil(drive.times / self.refresh - self.phase - 1e-9) + self.phase
-        times = drive.times + psi[0] * (self.refresh * ticks - drive.times)
-        return AxisDrive.of_jumps(times, np.diff(drive.values, prepend=0.0)), rest
+        return _shifted(drive, psi[0] * (self.refresh * ticks - drive.times)), rest
 
 
-def _mapped(drive: AxisDrive, rest: float, levels: Vector) -> tuple[AxisDrive, float]:
+def _shifted(drive: AxisDrive, by: Vector | float) -> AxisDrive:
+    """The drive with every change later by a time [time unit], one or (changes,); any order."""
+    return AxisDrive.of_jumps(drive.times + by, drive.jumps)
+
+
+def _mapped(drive: AxisDrive, levels: Vector) -> tuple[AxisDrive, float]:
     """The drive with other levels: that at rest, then one per change."""
     return AxisDrive.of_jumps(drive.times, np.diff(levels)), float(levels[0])
 
@@ -143,7 +147,7 @@ class GreyQuantisation(DriveEffect):
     ) -> tuple[AxisDrive, float]:
         """Level by level."""
         step, levels = scene.ranges.drive[axis] / self.levels, _levels(drive, rest)
-        return _mapped(drive, rest, levels + psi[0] * (step * np.round(levels / step) - levels))
+        return _mapped(drive, levels + psi[0] * (step * np.round(levels / step) - levels))
 
 
 @final
@@ -178,7 +182,7 @@ class Hysteresis(DriveEffect):
         played = levels.copy()
         for k in range(1, levels.size):
             played[k] = max(levels[k] - radius, min(levels[k] + radius, played[k - 1]))
-        return _mapped(drive, rest, levels + psi[0] * (played - levels))
+        return _mapped(drive, levels + psi[0] * (played - levels))
 
 
 @final
@@ -201,7 +205,7 @@ class VoltageKnee(DriveEffect):
     ) -> tuple[AxisDrive, float]:
         """Level by level."""
         levels = _levels(drive, rest)
-        return _mapped(drive, rest, levels * (1 + psi[0] * (1 - np.abs(levels) / scene.ranges.drive[axis])))
+        return _mapped(drive, levels * (1 + psi[0] * (1 - np.abs(levels) / scene.ranges.drive[axis])))
 
 
 @final
@@ -225,8 +229,7 @@ class FieldDependentDelay(DriveEffect):
         own = np.flatnonzero(scene.ranges.direct == axis)
         delay = float(scene.delays[own[0] if own.size else 0, axis])
         levels = np.abs(_levels(drive, rest)[1:]) / scene.ranges.drive[axis]
-        times = drive.times + psi[0] * delay * (0.5 - levels)
-        return AxisDrive.of_jumps(times, np.diff(drive.values, prepend=0.0)), rest
+        return _shifted(drive, psi[0] * delay * (0.5 - levels)), rest
 
 
 @final
@@ -247,5 +250,4 @@ class SampledDrive(DriveEffect):
         self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
     ) -> tuple[AxisDrive, float]:
         """All changes by the same time."""
-        times = drive.times - 0.5 * psi[0] * scene.ranges.period
-        return AxisDrive.of_jumps(times, np.diff(drive.values, prepend=0.0)), rest
+        return _shifted(drive, float(-0.5 * psi[0] * scene.ranges.period)), rest

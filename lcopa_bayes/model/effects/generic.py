@@ -8,7 +8,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.model.effects.effect import Card, Coefficient, ParallelEffect, Ranges, Scene, per_axis
-from lcopa_bayes.model.effects.parallel import falling, jumps_of, relaxing, summed
+from lcopa_bayes.model.effects.parallel import falling, relaxing, summed
 
 _LAGS = 6
 _WAVES = 8
@@ -46,7 +46,7 @@ class UnmodelledLinear(ParallelEffect):
             drive, rest, gain, delay = scene.direct(axis)
             for c, lag in zip(mine, lags, strict=True):
                 if c != 0.0:
-                    moved = summed(scene.times, drive, delay, jumps_of(drive), relaxing(float(lag)))
+                    moved = summed(scene.times, drive, delay, drive.jumps, relaxing(float(lag)))
                     out[:, axis] += c * gain * (rest + moved)
         return out
 

@@ -63,11 +63,6 @@ def _convolved(
     return np.asarray(fftconvolve(kernel, dense)[-begin : times.size - begin])
 
 
-def jumps_of(drive: AxisDrive) -> Vector:
-    """Change of the drive at each instant [drive unit]."""
-    return np.diff(drive.values, prepend=0.0)
-
-
 def relaxing(time: float) -> Callable[[Array], Array]:
     """``1 - exp(-t / time)``."""
     return lambda t: np.asarray(-np.expm1(-t / time))
@@ -87,7 +82,7 @@ def own_responses(scene: Scene, size: float, shape: Callable[[Array], Array]) ->
     columns = []
     for axis in range(scene.ranges.axes):
         drive, rest, gain, delay = scene.direct(axis)
-        moved = summed(scene.times, drive, delay, jumps_of(drive), shape)
+        moved = summed(scene.times, drive, delay, drive.jumps, shape)
         columns.append(size * gain * (rest + moved))
     return np.stack(columns, axis=1)
 
@@ -153,7 +148,7 @@ class Backflow(ParallelEffect):
         columns = []
         for axis in range(scene.ranges.axes):
             drive, rest, gain, delay = scene.direct(axis)
-            chosen = np.where(falling(drive, rest) != self.rising, jumps_of(drive), 0.0)
+            chosen = np.where(falling(drive, rest) != self.rising, drive.jumps, 0.0)
             kick = summed(scene.times, drive, delay, chosen, self.kick)
             columns.append(psi[0] * gain * kick)
         return np.stack(columns, axis=1)
@@ -251,8 +246,6 @@ class MissingCrossPath(ParallelEffect):
         other = ((i, j) for i, j in pairs if j != scene.ranges.direct[i])
         for k, (i, j) in zip(psi, other, strict=True):
             drive, unit = scene.drives[j], scene.ranges.response[i] / scene.ranges.drive[j]
-            moved = summed(
-                scene.times, drive, float(scene.delays[i, j]), jumps_of(drive), relaxing(self.time)
-            )
+            moved = summed(scene.times, drive, float(scene.delays[i, j]), drive.jumps, relaxing(self.time))
             out[:, i] += k * unit * (scene.rest[j] + moved)
         return out

@@ -1,0 +1,198 @@
+"""The first look: least squares and draws about the best optimum, within seconds and before any sampling.
+
+It shows whether the model can follow the records at all, what the best of a few searches leaves of them, and
+roughly how wide intervals will be. Draws are of a Gaussian about that optimum, weighted by the posterior; how
+far the Gaussian is from it is measured by the weights. Other modes are not searched for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+import pandas as pd
+from scipy.special import logsumexp
+
+from lcopa_bayes.core.errors import InputError, refuse_if
+from lcopa_bayes.core.estimate import Estimate, plain
+from lcopa_bayes.data.requirements import unmet
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.inference.optimum import Optimum, find_optima
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.results.prediction import Band, bands
+from lcopa_bayes.results.residuals import WHITE_P, Residual, residuals
+from lcopa_bayes.results.tables import data_tables
+from lcopa_bayes.sampling.draws import Draws
+from lcopa_bayes.sampling.importanceweights import effective, smoothed
+
+TABLES = ("bands", "drives", "residuals", "autocorrelation", "spectrum")
+"""Tables of a first look."""
+GRADE = "tentative"
+"""No first look has a better grade."""
+_STARTS = 2
+"""Starts of the search for optima [-]."""
+_DRAWS = 2_000
+"""Draws of the Gaussian ..."""
+_SIMULATED = 200
+"""... where each takes a simulation with effects."""
+_SHOWN = 400
+"""Draws of equal weight behind bands and intervals."""
+_FEWEST = 20.0
+"""Effective draws below which the Gaussian is shown as it is."""
+_STREAM = 13
+"""Marks the randomness of a first look."""
+_CLOSE = 0.3
+"""Effective share of the draws from which the Gaussian is close to the posterior near the optimum [-]."""
+_TRIED = 20
+"""Batches after which draws outside the prior are replaced no further."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class FirstLook:
+    """Least squares of a study with a Gaussian about the best optimum."""
+
+    problem: Problem
+    optimum: Optimum
+    draws: Draws
+    """Of the Gaussian, cut to the support of the priors and weighted by the posterior where enough of them
+    count, (1, draws, rows)."""
+    share: float
+    """Effective share of draws of the Gaussian as importance draws of the posterior near the optimum [-]."""
+    bands: tuple[Band, ...]
+    """50 and 90 % bands of every response axis of every record, fitted ones first [response unit]."""
+    residuals: tuple[Residual, ...]
+    """What the optimum leaves of each of these [response unit], tested for whiteness."""
+
+    @property
+    def reason(self) -> str:
+        """What the numbers rest on."""
+        near = "close to" if self.share >= _CLOSE else "far from"
+        return (
+            "a first look shows the best of a few least-squares searches, and draws about it of a Gaussian "
+            f"that is {near} the posterior there ({100 * self.share:.0f} % effective); other modes are not "
+            "searched for"
+        )
+
+    @property
+    def verdict(self) -> str:
+        """How well the best optimum follows the records, and what the numbers rest on."""
+        parts = []
+        for held, name in ((False, "Fitted"), (True, "Held out")):
+            shown = [band for band in self.bands if band.held_out == held]
+            if shown:
+                said = ", ".join(
+                    f"{band.record}/{band.axis} RMSE {band.rmse:.3g} {band.unit}" for band in shown
+                )
+                parts.append(f"{name}: {said}.")
+        tested = [one for one in self.residuals if not one.held_out]
+        if tested:
+            smallest = min(one.p_white for one in tested)
+            white = smallest * len(tested) >= WHITE_P
+            parts.append(
+                "The residual is compatible with the noise model"
+                if white
+                else "The noise model does not explain the residual"
+            )
+            parts[-1] += f" (smallest p = {smallest:.2g})."
+        return " ".join([f"Grade {GRADE}: {self.reason}.", *parts, "`fit` samples the posterior."])
+
+    def to_json(self) -> dict[str, Any]:
+        """Every number as plain values."""
+        table = self.problem.posterior.table
+        return plain(
+            {
+                "study": self.problem.study.name,
+                "verdict": self.verdict,
+                "grade": GRADE,
+                "grade_reason": self.reason,
+                "time_unit": self.problem.study.time_unit,
+                "log_density": self.optimum.log_density,
+                "effective_share": self.share,
+                "parameters": [one.as_json() for one in self._estimates()],
+                "fixed": [
+                    {"name": row.name, "value": row.value, "unit": row.unit}
+                    for row in table.rows
+                    if not row.free
+                ],
+                "fit_scores": [band.score() for band in self.bands if not band.held_out],
+                "held_out": [band.score() for band in self.bands if band.held_out],
+                "residual_tests": [one.test() for one in self.residuals],
+            }
+        )
+
+    def tables(self) -> Mapping[str, pd.DataFrame]:
+        """`TABLES` by name."""
+        return data_tables(self.problem.study, self.bands, self.residuals)
+
+    def _estimates(self) -> list[Estimate]:
+        flat = self.draws.flat
+        worth = min(_DRAWS * self.share, float(len(flat)))
+        return [
+            Estimate.of(row.name, row.unit, flat[:, k], ess=worth, grade=GRADE)
+            for k, row in enumerate(self.problem.posterior.table.rows)
+            if row.free
+        ]
+
+
+def first_look(study: Study) -> FirstLook:
+    """Look at a study before it is sampled.
+
+    InputError when the study does not fit its records, these do not meet the requirements of a fit, or no
+    search leads to a plant inside the priors. With effects a look costs many simulations.
+    """
+    refuse_if(unmet(study))
+    problem = problem_of(study)
+    rng = np.random.default_rng([study.seed, _STREAM])
+    optima = find_optima(problem.posterior, rng, starts=_STARTS)
+    if not optima:
+        raise InputError(
+            f"{study.name}: no least-squares search leads to a plant inside the priors; widen them or "
+            "check the units of the records"
+        )
+    posterior = problem.posterior
+    draws, share = _near(posterior, optima[0], rng)
+    shown = _bands(problem, draws)
+    same = np.tile(optima[0].values, (1, 4, 1))  # a simultaneous band needs four draws
+    best = Draws(posterior.table, same, np.zeros((1, 4)), (), 1.0)
+    remaining = residuals(best, _bands(problem, best), posterior.noise, problem.scales.period)
+    return FirstLook(problem, optima[0], draws, share, tuple(shown), tuple(remaining))
+
+
+def _bands(problem: Problem, draws: Draws) -> list[Band]:
+    """Of all records of a study, held-out ones last."""
+    posterior, study = problem.posterior, problem.study
+    noise, seed = posterior.noise, study.seed
+    shown = bands(draws, posterior.model, posterior.samples, noise, held_out=False, seed=seed)
+    if study.held_out:
+        samples, model = problem.simulated(study.held_out)
+        shown += bands(draws, model, samples, noise, held_out=True, seed=seed)
+    return shown
+
+
+def _near(posterior: Posterior, optimum: Optimum, rng: np.random.Generator) -> tuple[Draws, float]:
+    """Draws of the posterior near an optimum inside the priors, by importance weights of a Gaussian about it
+    where enough of its draws count, else draws of the Gaussian; and the effective share of these [-]."""
+    count = _DRAWS if posterior.simulation is None else _SIMULATED
+    centre = posterior.coordinates(optimum.values[None])[0]
+    values, vectors = np.linalg.eigh(optimum.covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    kept = [np.zeros((1, centre.size))]
+    for _ in range(_TRIED):
+        standard = rng.standard_normal((count, centre.size))
+        kept.append(standard[np.isfinite(posterior.log_prior(centre + standard @ root.T))])
+        if sum(map(len, kept)) >= count:
+            break
+    standard = np.concatenate(kept)[:count]
+    z = centre + standard @ root.T
+    density = posterior.log_density(z)
+    log_weights, _ = smoothed(density + 0.5 * (standard**2).sum(axis=1))
+    worth, chosen = effective(log_weights), np.arange(len(z))
+    if worth >= _FEWEST:
+        chosen = rng.choice(len(z), min(_SHOWN, len(z)), p=np.exp(log_weights - logsumexp(log_weights)))
+    chosen = chosen[:_SHOWN]
+    completed = posterior.complete(z[chosen], rng)
+    return Draws(posterior.table, completed[None], density[None, chosen], (), 1.0), worth / len(z)
