@@ -11,10 +11,12 @@ from lcopa_bayes.report.section import Section, Table
 
 _TITLE = "Evidence"
 _HOW = (
-    "Log evidence {value:.2f} ± {sd:.2f} nat (standard error; grade {grade}), by bridge sampling between the "
-    "draws of each ensemble and a mixture fitted to the others. It compares models of the same records only, "
-    "and depends on the width of their priors."
+    "Log evidence {value:.2f} ± {sd:.2f} nat (standard error; grade {grade}), {method}. It compares models "
+    "of the same records only, and depends on the width of their priors."
 )
+
+_WEIGHTED = "the mean weight of the importance draws"
+_BRIDGED = "by bridge sampling between the draws of each ensemble and a mixture fitted to the others"
 
 
 def section(run: SavedRun) -> Section:
@@ -24,7 +26,10 @@ def section(run: SavedRun) -> Section:
         said = "The error of an evidence needs several ensembles; with a single one none is given."
     else:
         said = _HOW.format(
-            value=results["log_evidence"], sd=results["log_evidence_sd"], grade=results["log_evidence_grade"]
+            value=results["log_evidence"],
+            sd=results["log_evidence_sd"],
+            grade=results["log_evidence_grade"],
+            method=_WEIGHTED if run.weighted else _BRIDGED,
         )
     rival = results["rival"]
     if rival is None:

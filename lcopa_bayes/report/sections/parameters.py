@@ -32,7 +32,7 @@ def section(run: SavedRun) -> Section:
             ("grade", "grade", "grade"),
             caption=f"Intervals are {kind}. Digits end at the second significant digit of the standard "
             "deviation. ESS is the smaller of the effective sample sizes of bulk and tails; R-hat compares "
-            "independent ensembles.",
+            "independent sets of draws.",
         )
     ]
     if run.results["modes"]:
@@ -59,7 +59,7 @@ def _modes(rows: list[Mapping[str, Any]]) -> Table:
         ("unit", "text", "unit"),
         ("shares of all draws", "interval", _shares),
         (
-            "range over ensembles",
+            "range over sets of draws",
             "interval",
             lambda row: ", ".join(f"{min(s):.2f} to {max(s):.2f}" for s in zip(*row["shares"], strict=True)),
         ),

@@ -77,12 +77,23 @@ def _panel(panel: Axes, run: SavedRun, name: str) -> None:
 
 
 def _table(run: SavedRun) -> Table:
+    fixed = {row["name"] for row in run.results["fixed"]}
     return Table.of(
         run.tables["priors"].to_dict("records"),  # type: ignore[arg-type]
         ("name", "code", "name"),
         ("unit", "text", "unit"),
         ("prior", "code", "prior"),
         ("from", "text", "from"),
-        ("treated", "text", lambda row: "integrated out exactly" if row["integrated_out"] else "sampled"),
+        (
+            "treated",
+            "text",
+            lambda row: (
+                "fixed"
+                if row["name"] in fixed
+                else "integrated out exactly"
+                if row["integrated_out"]
+                else "sampled"
+            ),
+        ),
         caption="Where a prior is a default, the rule below derived it from the fit records.",
     )

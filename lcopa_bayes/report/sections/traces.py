@@ -16,19 +16,19 @@ _PER_FIGURE = 12
 
 
 def section(run: SavedRun) -> Section:
-    """Traces with the ensembles in colours and R-hat in the titles."""
+    """Traces with ensembles, or batches, in colours and R-hat in the titles."""
     names = list(run.units)
-    ensembles, draws = run.draws[names[0]].shape
+    sets, draws = run.draws[names[0]].shape
     caption = (
-        f"{draws} draws of each of {ensembles} ensembles, thinned evenly from the kept part of the run, "
+        f"{draws} draws of each of {sets} batches, in random order."
+        if run.weighted
+        else f"{draws} draws of each of {sets} ensembles, thinned evenly from the kept part of the run, "
         "walkers side by side within a step."
     )
+    kind = "batch of importance draws" if run.weighted else "ensemble"
     return Section(
         "Traces",
-        (
-            "Each colour is an independent ensemble. Draws whose colours separate or drift have not "
-            "converged.",
-        ),
+        (f"Each colour is an independent {kind}. Draws whose colours separate or drift have not converged.",),
         paged("trace", names, _PER_FIGURE, lambda part: _drawn(run, part), caption),
     )
 
