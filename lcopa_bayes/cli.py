@@ -98,7 +98,8 @@ def _outcome(options: argparse.Namespace, command: Sequence[str]) -> Outcome:
 
 def _parser(wanted: Sequence[str]) -> argparse.ArgumentParser:
     """All verbs, with the options of the one that is wanted."""
-    parser = argparse.ArgumentParser(prog="lcopa-bayes", description=lcopa_bayes.__doc__)
+    purpose = (lcopa_bayes.__doc__ or "").partition("\n")[0]
+    parser = argparse.ArgumentParser(prog="lcopa-bayes", description=purpose)
     verbs = parser.add_subparsers(required=True, metavar="VERB", dest="verb")
     for name, verb in VERBS.items():
         own = verbs.add_parser(name, help=verb.text, description=verb.text)

@@ -3,6 +3,7 @@
 import inspect
 import json
 import re
+from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
@@ -23,7 +24,18 @@ from lcopa_bayes.report.decimation import extremes
 from lcopa_bayes.report.formatting import NOT_REACHED, figures, interval, sentence, stopped, to_spread
 from lcopa_bayes.report.savedrun import load_run
 from lcopa_bayes.report.section import Column, Drawing, Section, Table
-from lcopa_bayes.report.sections import pairs, parameters, records, residuals, sensitivity, steps
+from lcopa_bayes.report.sections import (
+    evidence,
+    pairs,
+    parameters,
+    priors,
+    provenance,
+    records,
+    residuals,
+    sensitivity,
+    steps,
+    traces,
+)
 from lcopa_bayes.report.theme import inlined
 from lcopa_bayes.sampling.modes import Modes
 
@@ -488,3 +500,24 @@ def test_the_most_prior_sensitive_parameters_are_shown_and_the_rest_counted(fold
     assert any("20 most affected of 30" in text for text in many.text)
     assert any("No parameter depends noticeably" in text for text in many.text)
     assert sensitivity.section(with_results(folder, sensitivity=[])).tables == ()
+
+
+def test_a_page_of_importance_draws_speaks_of_no_ensembles(folder):
+    """Batches of weighted draws are no ensembles of walkers, and their evidence is no bridge."""
+    of_ensembles, sampler = with_results(folder), {"method": "importance draws", "batches": 2, "seed": 1}
+    for name, words in ((evidence, "by bridge sampling"), (traces, "Each colour is an independent ensemble")):
+        assert words in str(name.section(of_ensembles))
+    weighted = with_results(folder, sampler=sampler)
+    assert "the mean weight of the importance draws" in str(evidence.section(weighted))
+    page = "".join(str(one.section(weighted).text) for one in (evidence, traces, provenance))
+    assert "ensemble" not in page
+
+
+def test_a_fixed_parameter_is_not_called_sampled(folder):
+    run = with_results(folder)
+    row = {"unit": "-", "prior": "x", "from": "study", "integrated_out": False}
+    rows = [{"name": name, **row} for name in ("a", "b")]
+    fixed = [{"name": "a", "value": 1.0, "unit": "-"}]
+    tables = {**run.tables, "priors": pd.DataFrame(rows)}
+    run = replace(run, results={**run.results, "fixed": fixed}, tables=tables)
+    assert [cells[-1] for cells in priors._table(run).rows] == ["fixed", "sampled"]

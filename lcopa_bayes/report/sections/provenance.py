@@ -11,6 +11,7 @@ from lcopa_bayes.report.savedrun import SavedRun
 from lcopa_bayes.report.section import Column, Section, Table
 
 _WORDS = {
+    "batches": "independent batches of draws",
     "draws": "draws of the proposal",
     "pareto_k": "Pareto k of the weights [-]",
     "weights_ess": "effective sample size of the weights [draws]",
