@@ -259,7 +259,7 @@ def test_bad_toml_is_named_by_line(tmp_path, text, line):
 
 
 def test_study_files_that_cannot_be_read(tmp_path):
-    assert "holds neither a study.toml nor a finished fit" in problems_of(tmp_path)[0]
+    assert "holds neither a study.toml nor a record" in problems_of(tmp_path)[0]
     (tmp_path / "camera.toml").write_text("")
     assert problems_of(tmp_path / "camra.toml")[0].endswith("no such file; did you mean 'camera.toml'?")
     folder_of(tmp_path, "")
