@@ -411,6 +411,15 @@ def test_intervals_and_significant_digits():
     assert [figures(x) for x in (0.0, 0.99996, 123456.0, float("inf"))] == ["0", "1.00", "123000", "–"]  # noqa: RUF001
 
 
+def test_axes_of_pairs_span_most_draws_and_have_round_ticks():
+    scale = pairs._Scale.of(np.linspace(-1.0, 1.0, 20_001), log=False)
+    assert scale.share(np.array([-0.995, 0.0, 0.995])) == pytest.approx([0.0, 0.5, 1.0])
+    assert [text for at, text in scale.ticks(5) if abs(at - 0.5) < 1e-9] == ["0"]
+    decades = pairs._Scale(1e-3, 1e1, log=True)
+    assert decades.share(np.array([1e-3, 1e-1, 1e1])) == pytest.approx([0.0, 0.5, 1.0])
+    assert [text for _, text in decades.ticks(5)] == ["0.001", "0.1", "10"]
+
+
 def test_interesting_parameters_come_first_and_the_rest_is_named(tmp_path):
     names = ["sigma", "gain_a", "offset", "delay", "gate_1", "order_1", "time_2", "time_1"]
     assert pairs.ranked(names) == [
