@@ -9,8 +9,14 @@ import numpy as np
 from scipy.special import logsumexp
 
 from lcopa_bayes.comparison.folds import Part, parts_of, predicted, without
-from lcopa_bayes.comparison.lineardensity import applies, linear_densities
-from lcopa_bayes.comparison.sequentialdensity import LevelFrom, known_before, level_of, log_densities
+from lcopa_bayes.comparison.sequentialdensity import (
+    LevelFrom,
+    applies,
+    known_before,
+    level_of,
+    linear_densities,
+    log_densities,
+)
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.inference.observations import Observed, Samples

@@ -46,7 +46,7 @@ def refitted(state: State, seen: Trace) -> tuple[list[Refit], list[str], dict[st
             effect, reached_at = signature.effect, None
             if far and movable(seen.of(name)):
                 effect, reached_at = descended(state, seen, seen.of(name), signature)
-                amplitude = reached_at[state.optimum.x.size :]
+                amplitude = reached_at[-amplitude.size :] / state.model.having(effect).scale
             done.append(
                 refit(
                     state.model,

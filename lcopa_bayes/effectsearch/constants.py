@@ -11,63 +11,48 @@ from scipy.optimize import minimize_scalar
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
-from lcopa_bayes.effectsearch.gaussnewton import Optimum, Regression
+from lcopa_bayes.effectsearch.regression import Optimum, Regression
 from lcopa_bayes.effectsearch.signature import Projection, Signature, signature_of
 from lcopa_bayes.effectsearch.trace import LEVEL, Trace, Traced
 from lcopa_bayes.effectsearch.whitening import Whitening
+from lcopa_bayes.inference.kinds import CONSTANTS
 from lcopa_bayes.model.effects.effect import Effect
 
-_ROUNDS = 6
-_STEPS = 4
-"""Steps after which a constant that moved back to its grid is judged [-]."""
+_EVALUATIONS = 15
+"""Most responses of a descent with constants [-]."""
+_STEPS = 6
+"""Responses after which a constant that moved back to its grid is judged [-]."""
 _HOPELESS = 1000.0
-"""Cost beyond which these steps would not mend it [nat]."""
-_STEP = 1e-3
-"""Step of a constant's logarithm for its slope [-]."""
-_FAR = 0.2
-"""Largest move of a constant's logarithm in one round, and the spread that holds it back [-]."""
+"""Cost beyond which these would not mend it [nat]."""
 _GAIN = 0.05
-"""A round that gains less is the last [nat]."""
+"""A step that gains less is the last [nat]."""
 
 
-def polished(
+def freed(
     model: ExtendedModel, x: Vector, whitening: Whitening, names: Sequence[str]
 ) -> tuple[ExtendedModel, Vector]:
     """The model with the constants of its effects `names` where the residual is smallest, and coordinates.
 
-    Gauss-Newton over coordinates and logarithms of the positive constants together, with step halving and the
-    plant's own tangents. Constants without a slope, as a number of grey levels, stay; so does one whose move
-    off the grid the records do not ask for.
+    They are parameters like any other of the descent, which uses the plant's own tangents; those that a fit
+    holds by default stay.
     """
-    fit = Regression(replace(model, exact=False), whitening)
-    for _ in range(_ROUNDS):
-        here = fit.at(x)
-        columns, moves = [], []
-        for k, effect in enumerate(model.effects):
-            for name in constants_of(effect) if effect.name in names else ():
-                column = _slope(model, x, whitening, k, name)
-                if column is not None and column @ column > 1.0:
-                    columns.append(column)
-                    moves.append((k, name))
-        if not moves:
-            break
-        jacobian = np.column_stack([here.jacobian, *columns])
-        held = np.concatenate([1 / model.spread**2, np.full(len(moves), 1 / _FAR**2)])
-        step = np.linalg.solve(jacobian.T @ jacobian + np.diag(held), jacobian.T @ here.white)
-        step *= min(1.0, _FAR / max(float(np.abs(step[x.size :]).max()), 1e-12))
-        for share in (1.0, 0.5, 0.25, 0.1):
-            other = _moved(model, moves, share * step[x.size :])
-            # a step ends where the support does
-            new = np.clip(x + share * step[: x.size], *model.bounds_about(x))
-            cost = Regression(replace(other, exact=False), whitening).cost(new)
-            if cost < here.cost:
-                break
-        else:
-            break
-        model, x = other, new
-        fit = Regression(replace(model, exact=False), whitening)
-        if here.cost - cost < _GAIN:
-            break
+    rows = model.posterior.table.rows
+    loose = frozenset(
+        row.name for row in rows if row.kind == "constant" and row.name.partition(".")[0] in names
+    )
+    wide = replace(model, exact=False, loose=loose)
+    if not any(rows[k].kind in CONSTANTS for k in wide.columns):
+        return model, x
+    best = Regression(replace(model, exact=False), whitening).cost(x)
+    try:
+        reached, _ = Regression(wide, whitening).reached(
+            wide.coordinates(model.values(x)), most=_EVALUATIONS, gain=_GAIN
+        )
+    except ArithmeticError:
+        return model, x
+    moved, other = wide.held(reached)
+    if Regression(moved, whitening).cost(other) < best:
+        model, x = replace(moved, exact=model.exact), other
     return _likely(model, x, whitening, names)
 
 
@@ -92,9 +77,9 @@ def _likely(
             fit = Regression(back, whitening)
             if near == here or not fit.cost(x) < cost + _HOPELESS:
                 continue
-            found = fit.descend(x, most=_STEPS, gain=_GAIN)
-            if found.cost < cost + LEVEL:
-                model, x = back, found.x
+            there, _ = fit.reached(x, most=_STEPS, gain=_GAIN)
+            if fit.cost(there) < cost + LEVEL:
+                model, x = back, there
     return model, x
 
 
@@ -103,28 +88,6 @@ def _replaced(model: ExtendedModel, effect: int, name: str, value: float) -> Ext
     effects: list[Any] = list(model.effects)
     effects[effect] = replace(effects[effect], **{name: value})
     return model.having(*effects)
-
-
-def _moved(model: ExtendedModel, moves: Sequence[tuple[int, str]], logs: Vector) -> ExtendedModel:
-    """The model with the logarithms of these constants moved."""
-    for (k, name), change in zip(moves, logs, strict=True):
-        value = getattr(model.effects[k], name) * float(np.exp(change))
-        model = _replaced(model, k, name, value)
-    return model
-
-
-def _slope(model: ExtendedModel, x: Vector, whitening: Whitening, effect: int, name: str) -> Vector | None:
-    """Whitened slope of the response in a constant's logarithm, (n,) [-]; None where there is none."""
-    if not getattr(model.effects[effect], name) > 0:
-        return None
-    try:
-        up, down = (
-            _moved(model, [(effect, name)], np.array([side * _STEP])).predict(x) for side in (1.0, -1.0)
-        )
-    except ArithmeticError:
-        return None
-    slope = (up - down) / (2 * _STEP)
-    return whitening(slope) if np.isfinite(slope).all() else None
 
 
 def tuned(

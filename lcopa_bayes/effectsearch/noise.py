@@ -1,7 +1,7 @@
 """Noise of the loop: its law, and samples that hold no signal to measure it by.
 
 Such samples are those before the drive moves and inside the delay, and differences of repeats. The law is
-that of a fit, white noise plus a correlated part (`inference.mixednoise`).
+that of a fit, white noise plus a correlated part (`inference.noise`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from scipy.stats import chi2
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.defaultpriors import Scales
-from lcopa_bayes.inference.mixednoise import WhiteAR1
+from lcopa_bayes.inference.noise import WhiteAR1
 from lcopa_bayes.inference.observations import Observed, Samples
 from lcopa_bayes.inference.restnoise import PlausibleNoise, mixed_shapes
 

@@ -43,17 +43,19 @@ def predicted(
     own = model.effected
     places = campaign_places(problem.study)
     there = own.over(forward, samples, np.array([places[record.name] for record in records]))
-    values, psi = model.split(x)
+    values, psi = model.values(x)[: len(model.plant.table.rows)], x[model.plant_size :]
     moved = carried(psi, own, there)
     mean = stacked(samples, there.responses(values, moved))
     slopes = stacked(samples, [np.moveaxis(one, 2, 0) for one in there.jacobian(values, moved)])
     mean, slopes = _with_shared_offset(problem, model, samples, mean, slopes, values)
-    plant = model._in_coordinates(slopes, x[: model.plant_size], values)
+    rows = model.plant.table.rows
+    columns = model.columns[: model.plant_size]
+    plant = np.array([slopes[k] * (values[k] if rows[k].log_scale else 1.0) for k in columns])
     tangents, extra = plant, np.zeros_like(mean)
     if own.effects:
         by_psi = stacked(samples, [np.moveaxis(one, 2, 0) for one in there.signature(values, moved)])
         shared, extra = _shared(own, there, by_psi, psi)
-        tangents = np.vstack([plant, shared * model.scale[:, None]])
+        tangents = np.vstack([plant, shared])
     variance = np.einsum("kn,kl,ln->n", tangents, covariance, tangents, optimize=True)
     return Prediction(samples, mean, np.asarray(variance + extra))
 

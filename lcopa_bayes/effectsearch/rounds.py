@@ -10,8 +10,8 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.effectsearch.candidates import refitted
-from lcopa_bayes.effectsearch.gaussnewton import Regression
 from lcopa_bayes.effectsearch.refits import SIGNIFICANT, Refit, log_bayes_factor, refit, under_one_noise
+from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.signature import Signature, expected_margin, pair_evidence
 from lcopa_bayes.effectsearch.trace import Trace, Traced, trace
@@ -212,7 +212,8 @@ def group(
     """
     name = chosen.added[0]
     own = signatures[name]
-    amplitude = chosen.optimum.x[chosen.places(name)]
+    where = chosen.places(name)
+    amplitude = chosen.optimum.x[where] / chosen.model.spread[where]
     out = [name]
     fitted = {one.added[0]: one for one in refits}
     for one in seen.traced:

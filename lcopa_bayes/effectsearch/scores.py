@@ -13,8 +13,8 @@ from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.crossvalidation import groups, shifts
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
-from lcopa_bayes.effectsearch.gaussnewton import Optimum
 from lcopa_bayes.effectsearch.prediction import level_of, predicted
+from lcopa_bayes.effectsearch.regression import Optimum
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import Problem
 
@@ -136,7 +136,7 @@ def held_out_scores(state: State, problem: Problem) -> list[Score]:
 
 def _own_levels(state: State) -> bool:
     """Whether every record has an offset of its own."""
-    table = state.model.base.posterior.table
+    table = state.model.plant.table
     return any(row.kind == "offset" and row.place.second >= 0 for row in table.rows)
 
 

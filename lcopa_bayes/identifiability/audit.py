@@ -23,8 +23,7 @@ from lcopa_bayes.identifiability.contraction import (
 from lcopa_bayes.identifiability.curvature import Curvature, Sensitivities, curvature, sensitivities
 from lcopa_bayes.identifiability.delays import Delays, delays
 from lcopa_bayes.identifiability.printedform import printed_structure
-from lcopa_bayes.identifiability.profile import Profile
-from lcopa_bayes.identifiability.profilepath import profile
+from lcopa_bayes.identifiability.profile import Profile, profile
 from lcopa_bayes.identifiability.radial import Radial, radial
 from lcopa_bayes.identifiability.symmetries import DIFFERENCED, TOLERANCES, Structure, exchanges, structure
 from lcopa_bayes.identifiability.verdict import Finding, judged

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import combinations
 from typing import Any, Literal, final
 
@@ -47,14 +47,7 @@ class Symmetry:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        return plain(
-            {
-                "kind": self.kind,
-                "parameters": self.parameters,
-                "powers": self.powers,
-                "sentence": self.sentence,
-            }
-        )
+        return plain(asdict(self))
 
 
 @final

@@ -14,6 +14,7 @@ Samples an axis misses are filled too: choose with ``samples[r].axes[a].index``.
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -21,16 +22,20 @@ from typing import final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.simulation import Simulation
 from lcopa_bayes.model.effects.effect import Coefficient, Effect, Ranges
 from lcopa_bayes.model.effects.jacobian import coefficient_slopes, plant_slopes
 from lcopa_bayes.model.effects.passage import Plant
 from lcopa_bayes.model.effects.scales import ranges_of
 from lcopa_bayes.model.effects.simulator import Simulator
 from lcopa_bayes.model.forward import ForwardModel
+
+_STEP = 1e-4
+"""Step of a constant, over its value or, where it lies between 0 and 1, over 1 [-]."""
 
 
 @final
@@ -96,7 +101,7 @@ class Effected:
     def over(self, model: ForwardModel, samples: Sequence[Samples], epochs: Vector) -> Effected:
         """The same plant and effects over records held out; their offsets are left out."""
         times = tuple(one.times for one in samples)
-        simulator = replace(self.simulator, model=model, times=times, epochs=epochs)
+        simulator = replace(self.simulator, model=model, times=times, epochs=epochs, still=OrderedDict())
         return replace(
             self, simulator=simulator, records=tuple(one.record.name for one in samples), offsets=None
         )
@@ -129,7 +134,7 @@ class Effected:
             made = np.zeros((*next(iter(slope.values())).shape, len(table.rows)))
             for k, row in enumerate(table.rows):
                 first, second = row.place
-                if row.kind in ("gain", "time", "order", "delay"):
+                if (row.kind, first, second) in slope:
                     made[..., k] = slope[row.kind, first, second]
                 elif row.kind == "offset" and self.offsets is not None and second in (-1, self.offsets[r]):
                     made[:, first, k] = 1.0
@@ -168,3 +173,54 @@ def carried(psi: Vector, source: Effected, target: Effected) -> Vector:
     """psi for the same effects over other records; coefficients of one record vanish."""
     shared = {one.name: value for one, value in zip(source.coefficients, psi, strict=True)}
     return np.array([shared.get(one.name, 0.0) if one.record is None else 0.0 for one in target.coefficients])
+
+
+def effect_slopes(
+    simulation: Simulation, values: Vector, *, exact: bool = True, model: Effected | None = None
+) -> list[Array]:
+    """Per record (samples, axes, rows), in the table's units, at canonical values (rows,).
+
+    `model` is that of `effected_at`, where it is there already.
+
+    Coefficients by differences through the simulator (`model.effects.jacobian`), constants by central ones
+    over 1e-4. The plant's rows as there; unless `exact` those of the plant alone, fifty times cheaper and
+    good enough to descend with. Raises UnstableError where there is no bounded response.
+    """
+    model, psi = model or effected_at(simulation, values), simulation.psi(values)
+    plant = model if exact else model.with_effects(())
+    out = plant.jacobian(values, psi if exact else plant.vanishing)
+    rows = [k for each in simulation.coefficients for k in each]
+    if rows:
+        for whole, slope in zip(out, model.signature(values, psi), strict=True):
+            whole[..., rows] = slope
+    for e, constants in enumerate(simulation.constants):
+        for position, k in enumerate(constants):
+            if simulation.table.rows[k].free:
+                for whole, slope in zip(out, _by_constant(model, values, psi, (e, position, k)), strict=True):
+                    whole[..., k] = slope
+    return out
+
+
+def effected_at(simulation: Simulation, values: Vector) -> Effected:
+    """The plant with the internal constants of table values, (rows,), and offsets."""
+    declared = simulation.declared
+    names = tuple(one.name for one in simulation.model.experiments)
+    offsets = tuple(-2 if place is None else place for place in declared.fitted)
+    return Effected(simulation.table, simulation.simulator(simulation.effects(values)), names, offsets)
+
+
+def _by_constant(model: Effected, values: Vector, psi: Vector, at: tuple[int, int, int]) -> list[Matrix]:
+    """Derivative in one internal constant: effect, its position there, row of the table."""
+    effect, position, k = at
+    row = model.table.rows[k]
+    step = _STEP * (1.0 if row.kind == "fraction" else float(values[k]))
+    ends = [values[k] - step, values[k] + step]
+    if row.kind == "fraction":
+        ends = [max(ends[0], 0.0), min(ends[1], 1.0)]
+    name = list(model.effects[effect].constants)[position]
+    sides = []
+    for end in ends:
+        effects = list(model.effects)
+        effects[effect] = replace(effects[effect], **{name: end})
+        sides.append(model.with_effects(effects).responses(values, psi))
+    return [(b - a) / (ends[1] - ends[0]) for a, b in zip(*sides, strict=True)]

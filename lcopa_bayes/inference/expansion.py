@@ -8,10 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
-from lcopa_bayes.inference.noise import GaussianNoise
+from lcopa_bayes.inference.noise import LOG_2PI, GaussianNoise
 from lcopa_bayes.inference.posterior import Posterior
 
-_LOG_2PI = float(np.log(2 * np.pi))
 _PORTION = 32
 """Parameter sets expanded at once."""
 
@@ -76,7 +75,7 @@ def expanded(posterior: Posterior, values: Matrix, columns: Sequence[int]) -> Ex
             stacked[:, -1] = residual
             if isinstance(posterior.noise, GaussianNoise):
                 white, scale = posterior.noise.whiten(stacked, noise, observed.gaps)
-                total -= scale + 0.5 * observed.values.size * _LOG_2PI
+                total -= scale + 0.5 * observed.values.size * LOG_2PI
             else:
                 total += posterior.noise.pointwise(residual, noise, observed.gaps).sum(axis=1)
                 sigma, nu = noise[:, 0, None, None], noise[:, 1, None]
@@ -120,9 +119,6 @@ def _series(posterior: Posterior, axis: int, columns: Sequence[int]) -> list[_Se
     table = posterior.table
     out = []
     for drive, unit in enumerate(table.layout.unit_of[axis]):
-        element, delay, _ = table.layout.units[unit]
-        terms = table.layout.elements[element].terms
-        out += [_Series(table.at("time", element, i), drive, unit, i) for i in range(terms)]
-        out.append(_Series(table.at("delay", delay), drive, unit, 2 * terms))
+        out += [_Series(k, drive, unit, position) for position, k in enumerate(table.shaping(unit))]
     out += [_Series(k) for k in posterior.acting[axis]]
     return [one for one in out if one.row in columns]

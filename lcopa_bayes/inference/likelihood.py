@@ -10,7 +10,6 @@ from typing import final
 
 import numpy as np
 from scipy.optimize import least_squares, minimize
-from scipy.special import expit, logit
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.inference.leastsquares import LeastSquares, apart
@@ -66,20 +65,15 @@ class Landscape:
 
     def coordinate(self, k: int, value: float) -> float:
         """Coordinate of one parameter's value."""
-        row = self.posterior.table.rows[k]
-        return float(np.log(value) if row.log_scale else logit(value) if row.logit_scale else value)
+        return float(self.posterior.table.rows[k].coordinate(value))
 
     def value(self, k: int, coordinate: float) -> float:
         """Value of one parameter's coordinate."""
-        row = self.posterior.table.rows[k]
-        return float(
-            np.exp(coordinate) if row.log_scale else expit(coordinate) if row.logit_scale else coordinate
-        )
+        return float(self.posterior.table.rows[k].value_at(coordinate))
 
     def column(self, k: int, values: Matrix) -> Vector:
         """Coordinates of one parameter of many table values, (batch,)."""
-        row, x = self.posterior.table.rows[k], values[:, k]
-        return np.asarray(np.log(x) if row.log_scale else logit(x) if row.logit_scale else x)
+        return self.posterior.table.rows[k].coordinate(values[:, k])
 
     def search(self, k: int) -> tuple[float, float]:
         """Ends of the search of one parameter in its coordinate: its domain, or for a prior without ends of

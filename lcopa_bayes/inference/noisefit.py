@@ -9,10 +9,10 @@ from typing import final
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.special import expit, log_expit, logit
+from scipy.special import log_expit
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.inference.noisemodel import Noise
+from lcopa_bayes.inference.noise import Noise
 from lcopa_bayes.inference.parameter import Parameter
 
 _TAIL = 1e-9
@@ -55,24 +55,17 @@ class NoiseFit:
             assert row.prior is not None
             tails = row.prior.frozen.ppf((_TAIL, 1 - _TAIL))
             a, b = row.domain
-            at = self.coordinates(np.array([max(a, tails[0]), min(b, tails[1])]), row)
+            at = row.coordinate(np.array([max(a, tails[0]), min(b, tails[1])]))
             edge = _EDGE * (at[1] - at[0])
             low.append(at[0] + edge)
             high.append(at[1] - edge)
         return np.array(low), np.array(high)
 
-    @staticmethod
-    def coordinates(values: Vector, row: Parameter) -> Vector:
-        """Sampled coordinates of values of one parameter."""
-        return np.asarray(np.log(values) if row.log_scale else logit(values) if row.logit_scale else values)
-
     def values(self, x: Matrix, template: Vector) -> Matrix:
         """Noise parameters at coordinates, (batch, names), fixed ones from `template`."""
         out = np.tile(template, (len(x), 1))
         for column, k in enumerate(self.free):
-            row = self.rows[k]
-            at = x[:, column]
-            out[:, k] = np.exp(at) if row.log_scale else expit(at) if row.logit_scale else at
+            out[:, k] = self.rows[k].value_at(x[:, column])
         return out
 
     def log_density(self, x: Matrix, template: Vector) -> Vector:
@@ -115,7 +108,7 @@ class NoiseFit:
         """Inverse curvature of the log density at values (names,) in the coordinates of the free parameters;
         no direction is wider than a uniform density over the search."""
         low, high = self.ends
-        x = np.array([self.coordinates(values[k : k + 1], self.rows[k])[0] for k in self.free])
+        x = np.array([self.rows[k].coordinate(values[k : k + 1])[0] for k in self.free])
         step = np.minimum(_STEP, (high - low) / 8)
         x = np.clip(x, low + 2 * step, high - 2 * step)  # the curvature beside a bound stands for that at it
         steps = np.concatenate([np.diag(step), -np.diag(step)])
@@ -134,7 +127,7 @@ class NoiseFit:
             row, ends = self.rows[k], [end[column] for end in self.ends]
             value = np.array([told[self.noise.names[k]]])
             inside = row.domain[0] < value[0] < row.domain[1]
-            at = self.coordinates(value, row)[0] if inside else ends[int(value[0] >= row.domain[1])]
+            at = row.coordinate(value)[0] if inside else ends[int(value[0] >= row.domain[1])]
             out.append(float(np.clip(at, *ends)))
         return np.array(out)
 

@@ -69,6 +69,13 @@ class ParameterTable:
             for e, slot in enumerate(self.layout.elements)
         ]
 
+    def shaping(self, unit: int) -> list[int]:
+        """Positions of what shapes a unit response, in the order of its slopes (`ForwardModel.unit_slopes`):
+        times and orders of its element, and its delay."""
+        element, delay, _ = self.layout.units[unit]
+        times, orders = self._columns[element]
+        return [*times, *orders, self.at("delay", delay)]
+
     @cached_property
     def exchangeable(self) -> tuple[bool, ...]:
         """Per element: whether its terms have equal priors, so that they are sampled in any order."""

@@ -12,14 +12,13 @@ from scipy.special import expit, log_expit, logit
 
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
-from lcopa_bayes.inference.noise import GaussianNoise, Noise
+from lcopa_bayes.inference.noise import LOG_2PI, GaussianNoise, Noise
 from lcopa_bayes.inference.observations import Observed, Samples
 from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.simulation import Simulated, Simulation
 from lcopa_bayes.model.forward import ForwardModel
 
-_LOG_2PI = float(np.log(2 * np.pi))
 Units: TypeAlias = "Array | Simulated"
 """Responses of one record that linear parameters scale."""
 _PORTION = 64
@@ -146,7 +145,7 @@ class Posterior:
         for axis in range(len(self.table.layout.responses)):
             if isinstance(self.noise, GaussianNoise):
                 equations, log_scale, count = self.equations(axis, values, units)
-                total += equations.log_marginal() - log_scale - 0.5 * count * _LOG_2PI
+                total += equations.log_marginal() - log_scale - 0.5 * count * LOG_2PI
             else:
                 for r, samples in enumerate(self.samples):
                     residual = self.residual(axis, r, samples.axes[axis], values, units[r])

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import expit
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.inference.mixednoise import WhiteAR1
+from lcopa_bayes.inference.noise import WhiteAR1
 from lcopa_bayes.inference.observations import Observed
 
 FEWEST = 8

@@ -67,11 +67,9 @@ def _curve(results: Mapping[str, Any]) -> Section:
             spread = np.array([row[key][name] for row in curve], dtype=float)
             panel.plot(times, spread, color=colour, marker=".", markersize=4, label=told_as)
         panel.axhline(0.1, color=INK, linewidth=0.7, linestyle=":")
-        panel.set_xscale("log")
-        panel.set_yscale("log")
-        panel.set_title(plain(name), fontsize=7.5, loc="left")
-        panel.set_xlabel(label("bench time", results["time_unit"]))
-        panel.set_ylabel("relative sd [-]")
+        panel.set(xscale="log", yscale="log")
+        panel.set_title(plain(name), fontsize=7.5)
+        panel.set(xlabel=label("bench time", results["time_unit"]), ylabel="relative sd [-]")
     panels[0].legend()
     caption = (
         "Expected relative standard deviation (median over draws) after the best drive and after the plain "

@@ -30,25 +30,17 @@ def write_loop(folder: Path) -> Path:
         folder,
         "loop",
         "what the model lacks",
-        lambda values: [*_tables(values), *_figures(values, shown)],
+        lambda values: [
+            *(part(values) for part in (_effects, _errors, _noise, _evidence, _rounds, _moved, _bars)),
+            _residuals(values, shown["curves"]),
+            _views(shown["views"]),
+        ],
         box=lambda values: Verdict(
             str(values["grade"]),
             f"{values['verdict']} ({values['confidence']}): {values['sentence']}",
             str(values["grade_reason"]),
         ),
     )
-
-
-def _tables(results: Mapping[str, Any]) -> list[Section]:
-    """The sections of a loop that hold text and tables."""
-    return [
-        _effects(results),
-        _errors(results),
-        _noise(results),
-        _evidence(results),
-        _rounds(results),
-        _moved(results),
-    ]
 
 
 def _effects(results: Mapping[str, Any]) -> Section:
@@ -196,11 +188,6 @@ def _moved(results: Mapping[str, Any]) -> Section:
     return Section("Bias of the parameters without the effect", (text,), tables=(table,))
 
 
-def _figures(results: Mapping[str, Any], shown: Mapping[str, Any]) -> list[Section]:
-    """Every figure of a loop."""
-    return [_bars(results), _residuals(results, shown["curves"]), _views(shown["views"])]
-
-
 def _bars(results: Mapping[str, Any]) -> Section:
     evidence = results["evidence"]
     listed = [
@@ -269,8 +256,7 @@ def _residual(axes: Axes, curve: Mapping[str, Any], when: str, colour: str, unit
     axes.fill_between(time, -width, width, color=NOISE, alpha=0.25, lw=0)
     axes.plot(time, curve[when], ".", ms=1.6, mew=0, color=colour)
     axes.axhline(0.0, color=NOISE, lw=0.6)
-    axes.set_title(plain(f"{curve['record']}, {curve['axis']}: {when}"), loc="left")
-    axes.set_xlabel(label("time", unit))
+    axes.set(title=plain(f"{curve['record']}, {curve['axis']}: {when}"), xlabel=label("time", unit))
 
 
 def _views(views: Mapping[str, Sequence[Mapping[str, Any]]]) -> Section:
@@ -287,10 +273,10 @@ def _views(views: Mapping[str, Sequence[Mapping[str, Any]]]) -> Section:
             axes.axhline(level, color=NOISE, lw=0.7)
             axes.errorbar(x, y, yerr=1.645 * error, fmt=".-", ms=3, lw=0.8, elinewidth=0.6, color=BAND)
             if view["name"] == "spectrum" and x.size:
-                axes.set_xscale("log")
-                axes.set_yscale("log")
-            axes.set_title(plain(f"{view['axis']}, {view['name']}: {when}"), loc="left")
-            axes.set_xlabel(plain(str(view["across"]))[:70])
+                axes.set(xscale="log", yscale="log")
+            axes.set(
+                title=plain(f"{view['axis']}, {view['name']}: {when}"), xlabel=plain(str(view["across"]))[:70]
+            )
         panels[0].set_ylabel(plain(str(before["along"])))
         caption = (
             f"Before: {before['sentence']}. After: {after['sentence']}. Bars: 90 % intervals of pure noise."

@@ -11,11 +11,11 @@ from typing import Any, final
 
 import numpy as np
 import pandas as pd
-import xarray as xr
 
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.results.bands import POINTWISE, QUANTILE_NAMES, SIMULTANEOUS
+from lcopa_bayes.results.datatree import posterior_draws
 from lcopa_bayes.results.runfolder import ORIGINS
 
 _WORDS = ("record", "axis", "unit", "name", "path", "prior", "from")
@@ -184,12 +184,7 @@ def _draws(path: Path, problems: list[str]) -> dict[str, Matrix]:
         problems.append(_missing(path))
         return {}
     try:
-        with xr.open_dataset(path, group="posterior", engine="h5netcdf") as posterior:
-            return {
-                str(values.attrs.get("parameter", name)): values.transpose("chain", "draw").to_numpy()
-                for name, values in posterior.data_vars.items()
-                if values.dims in (("chain", "draw"), ("draw", "chain"))
-            }
+        return posterior_draws(path)
     except (OSError, ValueError, KeyError) as error:
         problems.append(f"{path}: cannot be read as draws ({error}); run `fit` again to write it")
         return {}

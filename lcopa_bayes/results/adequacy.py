@@ -3,7 +3,8 @@
 A grade by the sampling says how well a posterior is known, not whether its model is right. Checks of the
 model against the records it was fitted to are limitations of every number: a residual that the noise model
 does not explain, bands that hold too many or too few samples, a residual far above the scatter at rest, noise
-whose parameters are at the end of their priors, and a resonance that the samples do not resolve.
+whose parameters are at the end of their priors, a resonance that the samples do not resolve, and priors in
+conflict with the data (`priorconflict`).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from scipy.stats import binom
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.results.bands import LEVELS
 from lcopa_bayes.results.prediction import Band
+from lcopa_bayes.results.priorconflict import conflicts
 from lcopa_bayes.results.residuals import WHITE_P, Residual
 from lcopa_bayes.results.resonance import resonances
 from lcopa_bayes.sampling.convergence import Limitation
@@ -56,6 +58,7 @@ def limitations(
         *_above_rest(problem, fitted),
         *_ends(problem, draws),
         *resonances(draws, problem.scales.period, problem.study.time_unit),
+        *conflicts(draws),
     )
 
 

@@ -53,6 +53,17 @@ def load_tree(path: Path) -> DataTree:
         raise InputError(f"{path}: cannot be read as draws ({error}); run `fit` again to write it") from None
 
 
+def posterior_draws(path: Path) -> dict[str, Matrix]:
+    """Draws of every free parameter by its name, (chains, draws), in the netCDF file of a fit; what xarray
+    raises for another file passes through."""
+    with xr.open_dataset(path, group="posterior", engine="h5netcdf") as group:
+        return {
+            str(one.attrs.get("parameter", name)): one.transpose("chain", "draw").to_numpy()
+            for name, one in group.data_vars.items()
+            if set(one.dims) == {"chain", "draw"}
+        }
+
+
 def posterior_tree(fit: Fit) -> DataTree:
     """Draws of a fit with its data and prior in the ArviZ groups.
 

@@ -8,11 +8,9 @@ from typing import Any, Literal, final
 
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]
-from scipy.special import logit
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.core.estimate import plain
-from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.convergence import Level
 from lcopa_bayes.sampling.draws import Draws
@@ -25,8 +23,6 @@ THRESHOLD = 0.05
 shift of the mean by about a quarter of a standard deviation per doubling of the power."""
 ALPHAS = (0.99, 1.01)
 """Powers at which the posterior is compared with itself [-]."""
-_PORTION = 64
-"""Draws whose likelihood is evaluated at once."""
 _STRETCHES = 5
 """Parts of an ensemble that are left out in turn for the Monte Carlo error."""
 _FEWEST = 50
@@ -79,14 +75,9 @@ def sensitivity(draws: Draws, posterior: Posterior) -> tuple[Sensitivity, ...]:
     """
     rows = [(k, row) for k, row in enumerate(posterior.table.rows) if row.free]
     shape, flat = draws.values.shape[:2], draws.flat
-    log_prior = np.sum([row.log_prior(flat[:, k]) + _log_stretch(row, flat[:, k]) for k, row in rows], axis=0)
-    log_likelihood = np.concatenate(
-        [_log_likelihood(posterior, flat[k : k + _PORTION]) for k in range(0, flat.shape[0], _PORTION)]
-    )
-    scaled = []
-    for k, row in rows:
-        x = draws.values[..., k]
-        scaled.append(np.log(x) if row.log_scale else logit(x) if row.logit_scale else x)
+    log_prior = np.sum([row.log_density(row.coordinate(flat[:, k])) for k, row in rows], axis=0)
+    log_likelihood = posterior.joint_log_likelihood(flat)
+    scaled = [row.coordinate(draws.values[..., k]) for k, row in rows]
     grades = {estimate.name: estimate.grade for estimate in draws.estimates()}
     names = [row.name for _, row in rows]
     return power_scaled(
@@ -96,13 +87,6 @@ def sensitivity(draws: Draws, posterior: Posterior) -> tuple[Sensitivity, ...]:
         log_likelihood.reshape(shape),
         [grades[name] for name in names],  # type: ignore[misc]
     )
-
-
-def _log_stretch(row: Parameter, x: Vector) -> Vector:
-    """Log of the derivative of a parameter in its sampled coordinate, (draws,)."""
-    if row.log_scale:
-        return np.asarray(np.log(x))
-    return np.asarray(np.log(x) + np.log1p(-x)) if row.logit_scale else np.zeros(x.size)
 
 
 def power_scaled(
@@ -232,9 +216,3 @@ def _distances(values: Array, lower: Matrix, upper: Matrix) -> Vector:
             for k in range(values.shape[-1])
         ]
     )
-
-
-def _log_likelihood(posterior: Posterior, values: Matrix) -> Vector:
-    """Log likelihood of all samples given all parameters, (batch,) [nat]."""
-    parts = [part.sum(axis=1) for record in posterior.pointwise(values) for part in record]
-    return np.asarray(np.sum(parts, axis=0))

@@ -144,16 +144,10 @@ def fitted(core: Mixture, y: Matrix, log_weights: Vector) -> tuple[Mixture, Mixt
     Miguez 2015, Statistics and Computing 25): the proposal nears the posterior without collapsing before.
     """
     weights = tempered(log_weights, min(_PER_DIMENSION * y.shape[1], 0.25 * log_weights.size))
-    kept = weights > _NO_WEIGHT / weights.size
-    y, weights = y[kept], weights[kept] / weights[kept].sum()
-    centre = weights @ y
-    whole = (weights[:, None] * (y - centre)).T @ (y - centre)
-    floor = np.diag(_LEAST_VARIANCE * np.diag(whole))
-    for _ in range(_STEPS):
-        core = _maximised(core, y, weights, floor)
-    around_all = Mixture(np.ones(1), centre[None], _WIDER * np.linalg.cholesky(whole + floor)[None])
+    cloud = _Cloud.of(y, weights, _LEAST_VARIANCE)
+    core = cloud.maximised(core, _STEPS)
     wider = Mixture(core.weights, core.means, _WIDER * core.factors)
-    return core, core.blended(wider.blended(around_all, 0.5), _DEFENSIVE)
+    return core, core.blended(wider.blended(cloud.around_all, 0.5), _DEFENSIVE)
 
 
 def clustered(y: Matrix, log_weights: Vector, seed: int) -> Mixture:
@@ -165,26 +159,76 @@ def clustered(y: Matrix, log_weights: Vector, seed: int) -> Mixture:
     weights = np.minimum(weights, np.partition(weights, -equal)[-equal])
     weights /= weights.sum()
     count = int(np.clip(1 / (weights @ weights) / (_PER_CLUSTER * y.shape[1]), 1, _CLUSTERS))
-    kept = weights > _NO_WEIGHT / weights.size
-    y, weights = y[kept], weights[kept] / weights[kept].sum()
-    centre = weights @ y
-    whole = (weights[:, None] * (y - centre)).T @ (y - centre)
-    floor = np.diag(_LEAST_SIZE * np.diag(whole) + 1e-300)
-    found = KMeans(count, n_init=3, random_state=seed).fit(y / np.sqrt(np.diag(floor)), sample_weight=weights)
-    masses, means, factors = [], [], []
-    for cluster in range(count):
-        own = weights * (found.labels_ == cluster)
-        if own.sum() > _NO_MASS:
-            mean = own @ y / own.sum()
-            masses.append(own.sum())
-            means.append(mean)
-            factors.append(np.linalg.cholesky((own[:, None] * (y - mean)).T @ (y - mean) / own.sum() + floor))
-    core = Mixture(np.array(masses) / np.sum(masses), np.array(means), np.array(factors))
-    for _ in range(_CLUSTER_STEPS):
-        core = _maximised(core, y, weights, floor)
-    around_all = Mixture(np.ones(1), centre[None], _WIDER * np.linalg.cholesky(whole + floor)[None])
-    wider = replace(core.levelled(), factors=_WIDER * core.factors).blended(around_all, 0.3)
+    cloud = _Cloud.of(y, weights, _LEAST_SIZE)
+    core = cloud.maximised(cloud.clusters(count, seed), _CLUSTER_STEPS)
+    wider = replace(core.levelled(), factors=_WIDER * core.factors).blended(cloud.around_all, 0.3)
     return core.blended(core.levelled(), _LEVELLED).blended(wider, _WIDE)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Cloud:
+    """Weighted draws that components are fitted to."""
+
+    y: Matrix
+    """(n, dimension)."""
+    weights: Vector
+    """Normalised, (n,) [-]."""
+    centre: Vector
+    whole: Matrix
+    """Covariance."""
+    floor: Matrix
+    """Least covariance of a component."""
+
+    @classmethod
+    def of(cls, y: Matrix, weights: Vector, least: float) -> _Cloud:
+        """Of normalised weights, without the draws of hardly any; `least` variance over that of all [-]."""
+        kept = weights > _NO_WEIGHT / weights.size
+        y, weights = y[kept], weights[kept] / weights[kept].sum()
+        centre = weights @ y
+        whole = (weights[:, None] * (y - centre)).T @ (y - centre)
+        return cls(y, weights, centre, whole, np.diag(least * np.diag(whole) + 1e-300))
+
+    @property
+    def around_all(self) -> Mixture:
+        """One component for all draws, wider than they are."""
+        factor = np.asarray(_WIDER * np.linalg.cholesky(self.whole + self.floor), dtype=float)
+        return Mixture(np.ones(1), self.centre[None], factor[None])
+
+    def clusters(self, count: int, seed: int) -> Mixture:
+        """A component for each of `count` clusters of the draws."""
+        y, masses, means, factors = self.y, [], [], []
+        scaled = y / np.sqrt(np.diag(self.floor))
+        labels = KMeans(count, n_init=3, random_state=seed).fit(scaled, sample_weight=self.weights).labels_
+        for cluster in range(count):
+            own = self.weights * (labels == cluster)
+            if own.sum() > _NO_MASS:
+                mean = own @ y / own.sum()
+                covariance = (own[:, None] * (y - mean)).T @ (y - mean) / own.sum()
+                masses.append(own.sum())
+                means.append(mean)
+                factors.append(np.linalg.cholesky(covariance + self.floor))
+        return Mixture(np.array(masses) / np.sum(masses), np.array(means), np.array(factors))
+
+    def maximised(self, core: Mixture, steps: int) -> Mixture:
+        """Student components after steps of expectation maximisation."""
+        y = self.y
+        for _ in range(steps):
+            shares, distances = np.exp(core.log_shares(y)), core.distances(y)
+            means, factors, masses = [], [], []
+            for share, distance in zip(shares, distances, strict=True):
+                own = self.weights * share
+                mass = own.sum()
+                if mass < _NO_MASS:
+                    continue
+                heavy = own * (FREEDOM + y.shape[1]) / (FREEDOM + distance)
+                mean = heavy @ y / heavy.sum()
+                covariance = ((heavy[:, None] * (y - mean)).T @ (y - mean)) / mass
+                means.append(mean)
+                factors.append(np.linalg.cholesky(covariance + self.floor))
+                masses.append(mass)
+            core = Mixture(np.array(masses) / np.sum(masses), np.array(means), np.array(factors))
+        return core
 
 
 def tempered(log_weights: Vector, wanted: float) -> Vector:
@@ -195,20 +239,3 @@ def tempered(log_weights: Vector, wanted: float) -> Vector:
     while effective(power * log_weights - logsumexp(power * log_weights)) < wanted:
         power *= 0.9
     return np.asarray(np.exp(power * log_weights - logsumexp(power * log_weights)))
-
-
-def _maximised(proposal: Mixture, y: Matrix, weights: Vector, floor: Matrix) -> Mixture:
-    """One step of expectation maximisation for Student components on weighted points."""
-    shares, distances = np.exp(proposal.log_shares(y)), proposal.distances(y)
-    means, factors, masses = [], [], []
-    for share, distance in zip(shares, distances, strict=True):
-        own = weights * share
-        mass = own.sum()
-        if mass < _NO_MASS:
-            continue
-        heavy = own * (FREEDOM + y.shape[1]) / (FREEDOM + distance)
-        mean = heavy @ y / heavy.sum()
-        means.append(mean)
-        factors.append(np.linalg.cholesky(((heavy[:, None] * (y - mean)).T @ (y - mean)) / mass + floor))
-        masses.append(mass)
-    return Mixture(np.array(masses) / np.sum(masses), np.array(means), np.array(factors))

@@ -3,10 +3,31 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
 
 RUNS = Path("runs")
 """Where run folders go unless `--out` names another."""
+EXAMPLES: Mapping[str, str] = {
+    "new": "oven step1.xlsx step2.csv --drive 'Heater [%]'",
+    "check": "oven",
+    "look": "oven",
+    "run": "studies/paper-step",
+    "fit": "on.csv off.csv --held-out both.csv",
+    "audit": "runs/paper-step",
+    "design": "runs/paper-step --time 1000",
+    "compare": "studies/paper-step --pick fractional-2 second-order",
+    "loop": "studies/undeclared --quick",
+    "calibrate": "studies/paper-step-x --replicas 20 --quick",
+    "predict": "runs/paper-step drive.csv",
+    "identify": "studies/paper-step-x",
+    "optics": "--targets 1 2 3",
+    "claims": "--out runs/claims",
+    "explain": "R-hat",
+    "report": "runs/paper-step",
+    "simulate": "studies/paper-step/campaign.toml --out bench",
+}
+"""A command line of every verb, without the verb."""
 
 
 def study(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
@@ -33,7 +54,9 @@ def sampled(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
 
 
 def _quick(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--quick", action="store_true", help="a quarter of the steps")
+    parser.add_argument(
+        "--quick", action="store_true", help="a quarter of the steps or replicas: to see that it runs"
+    )
 
 
 def fit(parser: argparse.ArgumentParser) -> None:
@@ -67,6 +90,29 @@ def loop(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--as-stated", action="store_true", help="keep the number of viscous terms the study states"
     )
+
+
+def new(parser: argparse.ArgumentParser) -> None:
+    """Of `new`."""
+    parser.add_argument("folder", type=Path, help="folder for the records and their study")
+    parser.add_argument("files", nargs="+", type=Path, help="tables: text of any separator, or workbooks")
+    parser.add_argument("--held-out", nargs="+", type=Path, default=[], help="tables not to fit")
+    column = "by header or number, perhaps with a new name: 'heater [%%]=Column B'"
+    parser.add_argument("--time", default="", metavar="COLUMN", help="the time column")
+    parser.add_argument("--drive", nargs="+", default=[], metavar="COLUMN", help=f"drives, {column}")
+    parser.add_argument("--response", nargs="+", default=[], metavar="COLUMN", help=f"responses, {column}")
+    parser.add_argument("--time-unit", default="", help="unit of a numeric time column")
+    parser.add_argument("--decimal", default="", help="decimal sign, . or ,")
+    parser.add_argument(
+        "--time-format", default="", help="format of time stamps, as '%%d.%%m.%%Y %%H:%%M:%%S'"
+    )
+    parser.add_argument("--sheet", help="sheet of a workbook")
+    parser.add_argument("--overwrite", action="store_true", help="replace files that are there")
+
+
+def explain(parser: argparse.ArgumentParser) -> None:
+    """Of `explain`."""
+    parser.add_argument("term", nargs="+", help="a word of a page or a message")
 
 
 def claims(parser: argparse.ArgumentParser) -> None:

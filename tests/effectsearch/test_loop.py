@@ -15,13 +15,12 @@ from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.basefit import base_fit
-from lcopa_bayes.effectsearch.basemodel import BaseModel
 from lcopa_bayes.effectsearch.crossvalidation import Group, log_scores
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
-from lcopa_bayes.effectsearch.gaussnewton import Regression
 from lcopa_bayes.effectsearch.heldouteffects import unseen_share
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.noise import axis_noise, repeat_pieces
+from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.summary import drawn, results, words
 from lcopa_bayes.effectsearch.verdict import Findings, decide
 from lcopa_bayes.effectsearch.whitening import Whitening
@@ -207,7 +206,7 @@ def test_repeats_measure_the_noise():
 
 def test_descent_reaches_the_least_squares_optimum():
     problem = problem_of(study(7))
-    base = base_fit(BaseModel(problem.posterior), np.random.default_rng(0))
+    base = base_fit(ExtendedModel(problem.posterior), np.random.default_rng(0))
     slope = base.optimum.jacobian.T @ base.optimum.white
     step = np.linalg.solve(base.optimum.information, slope)
     assert slope @ step < 0.1
@@ -218,9 +217,10 @@ def test_descent_reaches_the_least_squares_optimum():
 
 def test_a_plant_with_effects_at_zero_is_the_plant():
     problem = problem_of(study(7))
-    model = BaseModel(problem.posterior)
+    model = ExtendedModel(problem.posterior)
     x = model.coordinates(problem.posterior.table.draw(1, np.random.default_rng(3))[0])
-    extended = ExtendedModel.of(model, x, (next(iter(LIBRARY[0].grid(None))),))
+    places = {one.record.name: 0.0 for one in problem.posterior.samples}
+    extended = model.at_scales(x, places).having(next(iter(LIBRARY[0].grid(None))))
     np.testing.assert_allclose(extended.predict(np.append(x, 0.0)), model.predict(x), atol=1e-10)
 
 

@@ -22,7 +22,7 @@ from lcopa_bayes.effectsearch.noise import FEWEST, Law
 from lcopa_bayes.effectsearch.refits import SIGNIFICANT, Refit
 from lcopa_bayes.effectsearch.trace import threshold_of
 from lcopa_bayes.effectsearch.whitening import Whitening
-from lcopa_bayes.inference.mixednoise import WhiteAR1
+from lcopa_bayes.inference.noise import WhiteAR1
 from lcopa_bayes.inference.observations import Observed, Samples
 from lcopa_bayes.inference.restnoise import PlausibleNoise
 from lcopa_bayes.model.effects.catalogue import catalogue

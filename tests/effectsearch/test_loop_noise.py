@@ -10,7 +10,7 @@ from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.effectsearch.noise import Law, laws, plausible, scatter_evidence
 from lcopa_bayes.effectsearch.signature import Projection, Scale, Signature, log_bayes_factors, survival
 from lcopa_bayes.inference.defaultpriors import Scales
-from lcopa_bayes.inference.mixednoise import WhiteAR1
+from lcopa_bayes.inference.noise import WhiteAR1
 from lcopa_bayes.inference.observations import Observed
 from lcopa_bayes.model.effects.catalogue import catalogue
 

@@ -17,8 +17,7 @@ from lcopa_bayes.identifiability.audit import _flat
 from lcopa_bayes.identifiability.contraction import Tolerance, beliefs, prior_draws, prior_spread
 from lcopa_bayes.identifiability.curvature import curvature, sensitivities
 from lcopa_bayes.identifiability.printedform import printed_form, printed_structure
-from lcopa_bayes.identifiability.profile import Freedom, Profile
-from lcopa_bayes.identifiability.profilepath import _Path, profile
+from lcopa_bayes.identifiability.profile import Freedom, Profile, _Path, profile
 from lcopa_bayes.identifiability.radial import radial
 from lcopa_bayes.identifiability.symmetries import Structure, structure
 from lcopa_bayes.identifiability.verdict import Finding, judged

@@ -11,8 +11,7 @@ from small import problem, record
 from lcopa_bayes.bench.command import step
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.inference.leastsquares import LeastSquares
-from lcopa_bayes.inference.mixednoise import WhiteAR1
-from lcopa_bayes.inference.noise import NOISES
+from lcopa_bayes.inference.noise import NOISES, WhiteAR1
 from lcopa_bayes.inference.noisefit import NoiseFit
 from lcopa_bayes.inference.observations import Observed
 from lcopa_bayes.inference.optimum import find_optima

@@ -23,7 +23,7 @@ from lcopa_bayes.report.decimation import extremes
 from lcopa_bayes.report.formatting import NOT_REACHED, figures, interval, sentence, stopped, to_spread
 from lcopa_bayes.report.savedrun import load_run
 from lcopa_bayes.report.section import Column, Drawing, Section, Table
-from lcopa_bayes.report.sections import pairs, parameters, records, residuals, sensitivity, steps
+from lcopa_bayes.report.sections import parameters, records, responses
 from lcopa_bayes.report.theme import inlined
 from lcopa_bayes.sampling.modes import Modes
 
@@ -335,7 +335,7 @@ def test_records_too_short_for_residuals_leave_a_sentence(tmp_path):
     folder = run_folder(tmp_path / "run")
     for name in ("residuals", "autocorrelation", "spectrum"):
         (folder / "tables" / f"{name}.csv").write_text("\n", encoding="utf-8")
-    section = residuals.section(load_run(folder))
+    section = records.residuals(load_run(folder))
     assert section.drawings == ()
     assert "too short" in section.text[0]
 
@@ -351,7 +351,7 @@ def test_names_that_look_like_numbers_or_nothing_stay_names(tmp_path):
 
 def test_long_records_make_small_figures_and_say_so(tmp_path):
     run = load_run(run_folder(tmp_path / "run", size=40_000))
-    drawings = (*records.section(run).drawings, *residuals.section(run).drawings)
+    drawings = (*records.data(run).drawings, *records.residuals(run).drawings)
     assert max(len(drawing.svg) for drawing in drawings) < 300_000
     assert all("the record has 40000 samples" in drawing.caption for drawing in drawings)
 
@@ -422,7 +422,7 @@ def test_axes_of_pairs_span_most_draws_and_have_round_ticks():
 
 def test_interesting_parameters_come_first_and_the_rest_is_named(tmp_path):
     names = ["sigma", "gain_a", "offset", "delay", "gate_1", "order_1", "time_2", "time_1"]
-    assert pairs.ranked(names) == [
+    assert parameters.ranked(names) == [
         "time_2",
         "time_1",
         "order_1",
@@ -451,7 +451,7 @@ def test_a_page_of_any_sections_can_be_written(tmp_path):
 def test_step_table_is_left_out_when_there_are_no_metrics(folder, tmp_path):
     run = load_run(folder)
     bare = type(run)({**run.results, "step_metrics": []}, run.provenance, run.tables, run.draws)
-    assert steps.section(bare).tables == ()
+    assert responses.steps(bare).tables == ()
 
 
 def test_a_clause_becomes_a_sentence_once():
@@ -465,10 +465,10 @@ def with_results(folder: Path, **more: object):
 
 
 def test_several_modes_are_shown_with_their_shares(folder):
-    assert len(parameters.section(load_run(folder)).tables) == 2
+    assert len(parameters.estimates(load_run(folder)).tables) == 2
     found = Modes("time_1", "ms", (1.1,), np.array([[0.3, 0.7], [0.5, 0.5]]), np.full((2, 2), 0.02))
     row = found.as_json() | {"grade": "tentative"}
-    table = parameters.section(with_results(folder, modes=[row])).tables[1]
+    table = parameters.estimates(with_results(folder, modes=[row])).tables[1]
     assert table.rows[0][:6] == (
         *("time_1", "1.10", "ms", "0.40 ± 0.10, 0.60 ± 0.10", "0.30 to 0.50, 0.50 to 0.70", "tentative"),
     )
@@ -476,17 +476,17 @@ def test_several_modes_are_shown_with_their_shares(folder):
 
 
 def test_the_most_prior_sensitive_parameters_are_shown_and_the_rest_counted(folder):
-    shown = sensitivity.section(load_run(folder))
+    shown = parameters.sensitivity(load_run(folder))
     assert shown.tables[0].rows[0] == (
         *("time_1", "0.210 ± 0.012", "0.210 ± 0.012", "prior-data conflict", "0.31", "tentative", ""),
     )
     assert shown.tables[0].rows[1][1:4] == ("–", "–", "not trusted")  # noqa: RUF001
     assert any("matters for 1 of 2 parameters: time_1" in text for text in shown.text)
     assert any("Not trusted for 1 parameter(s), gain" in text for text in shown.text)
-    many = sensitivity.section(
+    many = parameters.sensitivity(
         with_results(folder, sensitivity=[moved(f"p{k}", 0.01, "-") for k in range(30)])
     )
     assert len(many.tables[0].rows) == 20
     assert any("20 most affected of 30" in text for text in many.text)
     assert any("No parameter depends noticeably" in text for text in many.text)
-    assert sensitivity.section(with_results(folder, sensitivity=[])).tables == ()
+    assert parameters.sensitivity(with_results(folder, sensitivity=[])).tables == ()

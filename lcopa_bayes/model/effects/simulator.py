@@ -49,6 +49,8 @@ class Simulator:
     step_responses: OrderedDict[bytes, StepResponses] = field(default_factory=OrderedDict)
     """Step responses of the latest plants; shared with simulators of other effects, for most
     simulations differ in the commands alone."""
+    still: OrderedDict[bytes, list[Moved]] = field(default_factory=OrderedDict)
+    """The latest plants up to their reading where nothing acts before it; shared likewise."""
 
     @cached_property
     def _kept(self) -> OrderedDict[bytes, list[Moved]]:
@@ -111,9 +113,12 @@ class Simulator:
         the forward model itself.
         """
         parts = [psi[self._slices[e]] for e, f in enumerate(self.effects) if isinstance(f, UPSTREAM)]
-        key = plant.key + b"".join(part.tobytes() for part in parts)
-        if key in self._kept:
-            self._kept.move_to_end(key)
+        acts = any(part.any() for part in parts)
+        kept = self._kept if acts else self.still
+        own = b"".join(part.tobytes() for part in parts) if acts else id(self.ranges).to_bytes(8)
+        key = plant.key + own  # what is kept holds its ranges, so that no others have their identity
+        if key in kept:
+            kept.move_to_end(key)
         else:
             acting = self._bending(psi)
             scenes = self.scenes(plant, psi)
@@ -123,10 +128,10 @@ class Simulator:
                 if any(acting)
                 else linear(model, scenes, plant, self._known(plant))
             )
-            self._kept[key] = moved
-            while len(self._kept) > _KEPT:
-                self._kept.popitem(last=False)
-        return self._kept[key]
+            kept[key] = moved
+            while len(kept) > _KEPT:
+                kept.popitem(last=False)
+        return kept[key]
 
     def _known(self, plant: Plant) -> StepResponses:
         """Step responses of a plant's elements."""
