@@ -75,8 +75,8 @@ def _csv_cells(path: Path) -> CellTable:
     if not names:
         refuse(path, f"is empty; expected a header of columns {FORM}")
     if len(names) == 1 and any(separator in names[0] for separator in ";\t"):
-        refuse(
-            path, "line 1: the columns are not separated by commas; `lcopa-bayes new` converts such a table"
+        raise InputError(
+            f"{path}, line 1: the columns are not separated by commas; `lcopa-bayes new` reads such tables"
         )
     table = CellTable(path, names, rows, [*zip(*cells, strict=True)] if cells else [()] * len(names), [])
     table.add(ragged, str(path))

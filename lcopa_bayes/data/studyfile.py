@@ -45,6 +45,9 @@ def _hashes(paths: Iterable[Path]) -> dict[str, str]:
 
 
 def _document(path: Path) -> dict[str, Any]:
+    if not path.exists():
+        beside = (one.name for one in path.parent.glob("*.toml"))
+        raise InputError(f"{path}: no such file{nearest(path.name, beside)}")
     try:
         text = path.read_text(encoding="utf-8-sig")
         return tomllib.loads(text)
@@ -136,8 +139,8 @@ def load_study(source: Path | Sequence[Path], *, held_out: Sequence[Path] = ()) 
         name = folder.resolve().name
         if not sources:
             raise InputError(
-                f"{folder}: holds neither a study.toml nor a record ({' or '.join(SUFFIXES)}); `lcopa-bayes "
-                "new` makes both from other tables"
+                f"{folder}: this folder holds neither a study.toml nor a record nor a finished fit; name a "
+                "study, record files, or the run folder of a fit; `lcopa-bayes new` reads other tables"
             )
     if not sources:
         raise InputError("no study: name a folder, a study.toml, or one or more record files")

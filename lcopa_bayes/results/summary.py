@@ -15,6 +15,9 @@ from lcopa_bayes.sampling.convergence import Grade, shares_grade
 if TYPE_CHECKING:
     from lcopa_bayes.results.fit import Fit
 
+IMPORTANCE = "importance draws"
+"""Method of a fit whose draws are not those of ensembles."""
+
 
 def verdict(fit: Fit) -> str:
     """One sentence: what was learned, how far it can be trusted, what is wrong with it."""
@@ -122,7 +125,7 @@ def scores(fit: Fit, *, held_out: bool) -> list[dict[str, Any]]:
 def _sampler(fit: Fit) -> Mapping[str, Any]:
     plan, ensembles, weighted = fit.run.plan, fit.run.ensembles, fit.run.weighted
     common = {
-        "method": "ensembles" if weighted is None else "importance draws",
+        "method": "ensembles" if weighted is None else IMPORTANCE,
         "ensembles": plan.ensembles,
         "walkers": plan.walkers,
         "steps": ensembles[0].steps if ensembles else 0,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 RUNS = Path("runs")
@@ -30,6 +30,17 @@ EXAMPLES: Mapping[str, str] = {
 """A command line of every verb, without the verb."""
 
 
+def _whole(least: int) -> Callable[[str], int]:
+    """Reads a whole number of at least `least`."""
+
+    def read(text: str) -> int:
+        if not (text.removeprefix("-").isdecimal() and int(text) >= least):
+            raise argparse.ArgumentTypeError(f"must be a whole number of at least {least}; got {text!r}")
+        return int(text)
+
+    return read
+
+
 def study(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
     """Of verbs about a study."""
     parser.add_argument(
@@ -37,13 +48,13 @@ def study(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
     )
     parser.add_argument("--held-out", nargs="+", type=Path, default=[], help="records not to fit")
     parser.add_argument("--out", type=Path, help=f"run folder (default: {out})")
-    parser.add_argument("--seed", type=int, help="seed in place of the study's")
+    parser.add_argument("--seed", type=_whole(0), help="seed in place of the study's")
 
 
 def parallel(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
     """Of verbs about a study that use several processes."""
     study(parser, out)
-    parser.add_argument("--jobs", type=int, default=None, help="processes (default: all cores)")
+    parser.add_argument("--jobs", type=_whole(1), help="processes (default: all cores)")
 
 
 def sampled(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
@@ -157,7 +168,7 @@ def simulate(parser: argparse.ArgumentParser) -> None:
     """Of `simulate`."""
     parser.add_argument("campaign", type=Path, help="campaign file (TOML)")
     parser.add_argument("--out", type=Path, required=True, help="folder for the records and their study")
-    parser.add_argument("--seed", type=int, help="seed in place of the campaign's")
+    parser.add_argument("--seed", type=_whole(0), help="seed in place of the campaign's")
     parser.add_argument("--overwrite", action="store_true", help="replace records that are there")
 
 

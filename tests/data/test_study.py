@@ -259,8 +259,9 @@ def test_bad_toml_is_named_by_line(tmp_path, text, line):
 
 
 def test_study_files_that_cannot_be_read(tmp_path):
-    (problem,) = problems_of(tmp_path)
-    assert "study.toml" in problem
+    assert "holds neither a study.toml nor a record" in problems_of(tmp_path)[0]
+    (tmp_path / "camera.toml").write_text("")
+    assert problems_of(tmp_path / "camra.toml")[0].endswith("no such file; did you mean 'camera.toml'?")
     folder_of(tmp_path, "")
     (tmp_path / "bench" / "study.toml").write_bytes("[study]\nname = 'ä'".encode("latin-1"))
     assert "cannot be read as UTF-8" in problems_of(tmp_path / "bench")[0]

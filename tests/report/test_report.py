@@ -145,7 +145,14 @@ def results_of() -> dict:
             {"record": record, "axis": "x", "held_out": held, "p_white": 3.2e-7, "rms": 1e-4}
             for record, held in RECORDS
         ],
-        "sampler": {"ensembles": 2, "steps": 400, "thin": 4, "acceptance": 0.31234, "largest_rhat": 1.0041},
+        "sampler": {
+            "method": "ensembles",
+            "ensembles": 2,
+            "steps": 400,
+            "thin": 4,
+            "acceptance": 0.31234,
+            "largest_rhat": 1.0041,
+        },
     }
 
 

@@ -39,11 +39,15 @@ def evidence(run: SavedRun) -> Section:
     if results["log_evidence"] is None:
         said = "The error of an evidence needs several ensembles; with a single one none is given."
     else:
+        method = (
+            "the mean weight of the importance draws"
+            if run.weighted
+            else "by bridge sampling between the draws of each ensemble and a mixture fitted to the others"
+        )
         said = (
             f"Log evidence {with_error(results['log_evidence'], results['log_evidence_sd'])} nat (standard "
-            f"error; grade {results['log_evidence_grade']}), by bridge sampling between the draws of each "
-            "ensemble and a mixture fitted to the others. It compares models of the same records only, and "
-            "depends on the width of their priors."
+            f"error; grade {results['log_evidence_grade']}), {method}. It compares models of the same "
+            "records only, and depends on the width of their priors."
         )
     rival = results["rival"]
     if rival is None:
