@@ -38,6 +38,8 @@ REPLICAS = {True: "2", False: "20"}
 SAMPLES = 1000
 """Bench time of `design` [sampling periods]."""
 WITHOUT_STUDY = ("optics", "claims")
+APART = ("run", "new", "explain")
+"""Verbs that are not measured: `fit` with what a study adds to it, and two that calculate nothing."""
 ON_FIT = ("report", "predict", "audit", "design")
 """Verbs that take the run folder of a fit."""
 
@@ -90,7 +92,18 @@ def cells(sources: Sequence[Source]) -> list[Cell]:
     """Every verb on every study in an order in which each has what it needs: first all that is simulated, all
     verbs of the easiest study, the fits of all, and then the rest from easy to hard."""
     simulated = [Cell("simulate", each) for each in sources if each.folder is None]
-    rest = ("look", "report", "predict", "loop", "identify", "audit", "design", "calibrate", "compare")
+    rest = (
+        "check",
+        "look",
+        "report",
+        "predict",
+        "loop",
+        "identify",
+        "audit",
+        "design",
+        "calibrate",
+        "compare",
+    )
     first, *harder = sources
     easy = [Cell(verb, first) for verb in ("fit", *rest)]
     alone = [Cell(verb, None) for verb in WITHOUT_STUDY]
@@ -203,7 +216,7 @@ class Workshop:
                 file.write(cell.source.model)
         counts = json.loads(place.read_text()) if place.is_file() else {}
         results = fit_results(said) if cell.verb == "fit" and outcome == "done" else {}
-        message = "" if outcome == "done" else problem.strip().rpartition("\n")[2][:200]
+        message = "" if outcome == "done" else (problem or said).strip().rpartition("\n")[2][:200]
         return Measurement(*spent, around, outcome, message, counts, results)
 
 

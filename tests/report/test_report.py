@@ -23,7 +23,7 @@ from lcopa_bayes.report.decimation import extremes
 from lcopa_bayes.report.formatting import NOT_REACHED, figures, interval, sentence, stopped, to_spread
 from lcopa_bayes.report.savedrun import load_run
 from lcopa_bayes.report.section import Column, Drawing, Section, Table
-from lcopa_bayes.report.sections import parameters, records, responses
+from lcopa_bayes.report.sections import pairs, parameters, records, responses
 from lcopa_bayes.report.theme import inlined
 from lcopa_bayes.sampling.modes import Modes
 

@@ -1,7 +1,8 @@
-"""How parameters go together: the corner plot."""
+"""The corner plot: how parameters go together."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from typing import Any, final
@@ -15,51 +16,22 @@ from scipy.ndimage import gaussian_filter
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.report.savedrun import SavedRun
-from lcopa_bayes.report.section import Drawing, Section
 from lcopa_bayes.report.theme import BAND, INK, log_locator, plain, svg_of
 
-_MOST = 10
-"""Parameters on one corner plot."""
-_KINDS = ("time", "order", "delay", "gain")
-"""Kinds of parameters that are shown first; of the rest, noise and offsets come last."""
-_LAST = ("offset", "sigma", "rho", "nu")
+MIDDLE = 0.995
+"""Share of the draws that each axis spans [-]."""
 _PITCH = 1.06
 """Distance of panels in widths of one [-]."""
 _BINS = 24
 _QUANTILES, _CONTOURS = (0.05, 0.5, 0.95), (0.5, 0.9)
-_MIDDLE = 0.995
-"""Share of the draws that each axis spans [-]."""
 
 
-def ranked(names: list[str]) -> list[str]:
-    """Names by interest: times, orders, delays, gains, anything else, offsets, noise; ties in their order."""
+def corner(run: SavedRun, names: Sequence[str]) -> str:
+    """Histograms of parameters, and contours of the draws of every pair, as SVG.
 
-    def rank(name: str) -> int:
-        kind = name.split("_")[0]
-        if kind in _KINDS:
-            return _KINDS.index(kind)
-        return len(_KINDS) + (1 + _LAST.index(kind) if kind in _LAST else 0)
-
-    return sorted(names, key=rank)
-
-
-def section(run: SavedRun) -> Section:
-    """Corner plot of the most interesting free parameters."""
-    moving = [name for name in run.units if np.ptp(run.draws[name]) > 0]
-    shown, left_out = ranked(moving)[:_MOST], ranked(moving)[_MOST:]
-    if not shown:
-        return Section("Pairs of parameters", ("No free parameter has draws that vary.",))
-    caption = (
-        "Contours, smoothed, hold about 50 and 90 % of the draws of a pair; dashed "
-        f"lines mark the 5, 50 and 95 % quantiles; each axis spans {100 * _MIDDLE:g} % of the draws."
-    )
-    rest = f" Not shown for lack of space: {', '.join(left_out)}." if left_out else ""
-    return Section("Pairs of parameters", drawings=(Drawing("corner", _drawn(run, shown), caption + rest),))
-
-
-def _drawn(run: SavedRun, names: list[str]) -> str:
-    """All panels in one system of axes, each of them a unit square: as axes of their own they took a third of
-    the time of a page."""
+    All panels are unit squares in one system of axes: as axes of their own they took a third of the time of a
+    page.
+    """
     count = len(names)
     side = min(9.6, max(3.4, 1.15 * count + 0.9))
     room, small = 0.95 / side, count > 5
@@ -131,8 +103,8 @@ class _Scale:
 
     @classmethod
     def of(cls, draws: Vector, *, log: bool) -> _Scale:
-        """An axis that spans `_MIDDLE` of the draws."""
-        low, high = np.quantile(draws, (0.5 - _MIDDLE / 2, 0.5 + _MIDDLE / 2)).tolist()
+        """An axis that spans `MIDDLE` of the draws."""
+        low, high = np.quantile(draws, (0.5 - MIDDLE / 2, 0.5 + MIDDLE / 2)).tolist()
         return cls(low, high, log)
 
     def share(self, values: Vector) -> Vector:
