@@ -11,6 +11,8 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import resource
+import signal
 import subprocess
 import sys
 import tempfile
@@ -122,7 +124,7 @@ class Measurement:
     yardstick: float
     """CPU time of the yardstick around the run [s]."""
     outcome: str
-    """``done``, ``refused``, ``failed`` or ``stopped`` when the time for it was up."""
+    """``done``, ``refused``, ``failed`` or ``stopped`` when its time was up."""
     message: str = ""
     """What the verb said when it was refused or failed."""
     probe: Mapping[str, Any] = field(default_factory=dict)
@@ -197,8 +199,8 @@ class Workshop:
             return (self.run(cell.source) / "results.json").is_file()
         return (self.study(cell.source) / "study.toml").is_file()
 
-    def measured(self, cell: Cell, limit: float) -> Measurement:
-        """One run, stopped after `limit` seconds."""
+    def measured(self, cell: Cell, limit: float, remaining: float) -> Measurement:
+        """One run, stopped after `limit` seconds of CPU time and `remaining` seconds in all."""
         if cell.verb == "fit" and cell.source is not None:  # a fit that is stopped leaves nothing behind
             (self.run(cell.source) / "results.json").unlink(missing_ok=True)
         place = self.folder / "probe.json"
@@ -208,7 +210,7 @@ class Workshop:
         threads = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}
         environment = os.environ | threads | {"PYTHONPATH": str(self.root)}
         before = yardstick()
-        spent, code, said, problem = observed(command, environment, self.root, limit)
+        spent, code, said, problem = observed(command, environment, self.root, limit, remaining)
         around = (before + yardstick()) / 2
         outcome = {0: "done", 2: "refused", None: "stopped"}.get(code, "failed")
         if outcome == "done" and cell.verb == "simulate" and cell.source is not None:
@@ -229,19 +231,26 @@ def options_of(verb: str) -> str:
 
 
 def observed(
-    command: Sequence[str], environment: Mapping[str, str], folder: Path, limit: float
+    command: Sequence[str], environment: Mapping[str, str], folder: Path, limit: float, remaining: float
 ) -> tuple[tuple[float, float], int | None, str, str]:
-    """Wall and CPU seconds of a command with what it started, its exit code (None: it was stopped after
-    `limit` seconds), and what it wrote."""
-    begin = time.perf_counter()
+    """Wall and CPU seconds of a command with what it started, its exit code (None: it was stopped, after
+    `limit` seconds of CPU time or `remaining` seconds), and what it wrote."""
+    begin, most = time.perf_counter(), int(np.ceil(min(limit, 1e6)))
     with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as problems:
-        process = subprocess.Popen(command, env=dict(environment), cwd=folder, stdout=out, stderr=problems)
+        process = subprocess.Popen(
+            command,
+            env=dict(environment),
+            cwd=folder,
+            stdout=out,
+            stderr=problems,
+            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (most, most)),
+        )
         stopped = False
         while True:
             ended, status, used = os.wait4(process.pid, 0 if stopped else os.WNOHANG)
             if ended:
                 break
-            if time.perf_counter() - begin > limit:
+            if time.perf_counter() - begin > remaining:
                 process.terminate()  # its workers end with it
                 stopped = True
             else:
@@ -251,6 +260,7 @@ def observed(
         for file in (out, problems):
             file.seek(0)
         spent = wall, used.ru_utime + used.ru_stime
+        stopped = stopped or code in (-signal.SIGXCPU, -signal.SIGKILL)
         return spent, None if stopped else code, out.read(), problems.read()
 
 
@@ -329,10 +339,10 @@ def measured(
                 remaining = end - time.perf_counter()
                 if not shop.ready(cell):
                     left_out[cell.place] = "its fit was not finished" if cell.verb in ON_FIT else "no study"
-                elif remaining < min(3.0, limit):
+                elif remaining < 3.0:
                     left_out[cell.place] = "no time in a quick run"
                 else:
-                    one = shop.measured(cell, min(limit, remaining))
+                    one = shop.measured(cell, limit, remaining)
                     own.setdefault(cell.place, []).append(one)
                     print(f"{' '.join(cell.place)}: {one.cpu:.1f} CPU s, {one.outcome}", file=sys.stderr)
     rows = []

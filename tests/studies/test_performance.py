@@ -244,7 +244,7 @@ def test_measured_records_are_added_where_there_are_any(tmp_path, monkeypatch):
 def test_a_cell_is_run_measured_and_its_study_completed(tmp_path):
     source = verbs.SOURCES[1]
     shop = verbs.Workshop(tmp_path, quick=True)
-    one = shop.measured(verbs.Cell("simulate", source), limit=120.0)
+    one = shop.measured(verbs.Cell("simulate", source), 120.0, np.inf)
     assert (one.outcome, one.message) == ("done", "")
     assert one.wall > 0 < one.cpu
     assert one.probe["peak_MB"] > 20
@@ -266,11 +266,13 @@ def test_a_verb_that_is_refused_or_stopped_says_so(tmp_path):
     shop = verbs.Workshop(tmp_path)
     (tmp_path / "studies" / "correlated").mkdir(parents=True)
     (tmp_path / "studies" / "correlated" / "study.toml").write_text("[nothing]\n")
-    refused = shop.measured(verbs.Cell("look", verbs.SOURCES[1]), limit=60.0)
+    refused = shop.measured(verbs.Cell("look", verbs.SOURCES[1]), 60.0, np.inf)
     assert refused.outcome == "refused"
     assert "nothing" in refused.message
-    stopped = shop.measured(verbs.Cell("optics", None), limit=0.05)
-    assert (stopped.outcome, stopped.probe) == ("stopped", {})
+    late = shop.measured(verbs.Cell("optics", None), 60.0, 0.05)
+    stopped = shop.measured(verbs.Cell("optics", None), 1.0, np.inf)
+    assert (late.outcome, stopped.outcome, stopped.probe) == ("stopped", "stopped", {})
+    assert late.cpu < 0.5 < stopped.cpu < 2.0
     row = verbs.row_of(verbs.Cell("optics", None), [stopped], [])
     assert (row["runs"], row["cpu_s_at_least"]) == (0, stopped.cpu)
 
