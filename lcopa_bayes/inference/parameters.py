@@ -199,12 +199,23 @@ class ParameterTable:
             for i, row in enumerate(layout.element_of)
         )
 
+    def offsets(self, response: int) -> Mapping[int, int]:
+        """Positions of the offsets of a response axis by fit record; -1 is that of all records."""
+        return self._offsets[response]
+
+    @cached_property
+    def _offsets(self) -> list[dict[int, int]]:
+        rows = [(k, self.rows[k].place) for k in self.of_kind("offset")]
+        return [
+            {place.second: k for k, place in rows if place.first == i}
+            for i in range(len(self.layout.responses))
+        ]
+
     def offset(self, values: Matrix, response: int, record: int) -> Vector:
         """Offset of a response axis on a fit record, (batch,) [response unit]; 0 when the model has none."""
-        for second in (-1, record):
-            if ("offset", response, second) in self._positions:
-                return values[:, self.at("offset", response, second)]
-        return np.zeros(values.shape[0])
+        known = self.offsets(response)
+        place = known.get(-1, known.get(record))
+        return np.zeros(values.shape[0]) if place is None else values[:, place]
 
     def supported(self, values: Matrix) -> Flags:
         """Whether the orders of every element decrease and its terms are resolved, (batch,)."""

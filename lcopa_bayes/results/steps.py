@@ -201,9 +201,7 @@ def path_metrics(draws: Draws, *, span: float, time_unit: str, path: str | None 
     """
     if not 0 < span < np.inf:
         raise InputError(f"`span` must be a positive time [{time_unit}]; got {span!r}")
-    layout = draws.table.layout
-    places = np.ndindex(len(layout.responses), len(layout.drives))
-    paths = [layout.path_name(i, j) or layout.responses[i].name for i, j in places]
+    paths = [one.name for one in draws.table.layout.paths]
     if path is not None and path not in paths:
         raise InputError(f"the plant has no path {path!r}{nearest(path, paths)}")
     metrics = step_metrics(draws, step_curves(draws, span), time_unit=time_unit)
@@ -226,28 +224,26 @@ def step_metrics(draws: Draws, curves: StepCurves, *, time_unit: str) -> list[Es
     def add(name: str, unit: str, values: Vector, note: str = "") -> None:
         out.append(Estimate.of(name, unit, values, ess=ess, grade=grade, note=note))
 
-    for i, response in enumerate(layout.responses):
-        for j, drive in enumerate(layout.drives):
-            k = curves.curve_of[i][j]
-            curve, whole = curves.normalised[k], np.concatenate((curves.normalised[k], later[k]), axis=1)
-            gain, unit = curves.gains[:, i, j], f"{response.unit}/{drive.unit}"
-            path = layout.path_name(i, j) or response.name
-            low, high = crossing(curves.time, curve, 0.1), crossing(curves.time, curve, 0.9)
-            settled = settling(time, whole, _SETTLED, until=end)
-            unsettled = float(np.mean(np.isinf(settled)))
-            note = (
-                f"{100 * unsettled:.0f} % of draws have not settled to {100 * _SETTLED:.0f} % of steady "
-                "state by the end of the record"
-                if unsettled > 0.05
-                else ""
-            )
-            add(f"rise_10_90[{path}]", time_unit, _difference(high, low), note)
-            add(f"delay[{path}]", time_unit, curves.delays[:, layout.delay_of[i][j]])
-            add(f"settling_2[{path}]", time_unit, settled, note)
-            add(f"settling_5[{path}]", time_unit, settling(time, whole, 0.05, until=end), note)
-            add(f"overshoot[{path}]", "-", np.maximum(whole.max(axis=1) - 1.0, 0.0))
-            add(f"value_at_end[{path}]", unit, gain * curve[:, -1])
-            add(f"steady_state[{path}]", unit, gain, note)
+    for i, j, path, unit in layout.paths:
+        k = curves.curve_of[i][j]
+        curve, whole = curves.normalised[k], np.concatenate((curves.normalised[k], later[k]), axis=1)
+        gain = curves.gains[:, i, j]
+        low, high = crossing(curves.time, curve, 0.1), crossing(curves.time, curve, 0.9)
+        settled = settling(time, whole, _SETTLED, until=end)
+        unsettled = float(np.mean(np.isinf(settled)))
+        note = (
+            f"{100 * unsettled:.0f} % of draws have not settled to {100 * _SETTLED:.0f} % of steady "
+            "state by the end of the record"
+            if unsettled > 0.05
+            else ""
+        )
+        add(f"rise_10_90[{path}]", time_unit, _difference(high, low), note)
+        add(f"delay[{path}]", time_unit, curves.delays[:, layout.delay_of[i][j]])
+        add(f"settling_2[{path}]", time_unit, settled, note)
+        add(f"settling_5[{path}]", time_unit, settling(time, whole, 0.05, until=end), note)
+        add(f"overshoot[{path}]", "-", np.maximum(whole.max(axis=1) - 1.0, 0.0))
+        add(f"value_at_end[{path}]", unit, gain * curve[:, -1])
+        add(f"steady_state[{path}]", unit, gain, note)
     out.extend(_crosstalk(layout, curves, ess=ess, grade=grade))
     return out
 
