@@ -128,7 +128,9 @@ def _roles(table: CellTable, needed: Sequence[str] = _ROLES) -> tuple[str, dict[
         table.problems.append(f"{table.place(index)} (column {index + 1} of {len(table.names)}): {problem}")
     for role in needed:
         if not any(name.partition("_")[0] == role for name in table.names):
-            table.problems.append(f"{table.path}: has no {role} column; columns are {FORM}")
+            table.problems.append(
+                f"{table.path}: has no {role} column; columns are {FORM}; `lcopa-bayes new` converts others"
+            )
     return next((axis.unit for axis in result["time"].values()), "s"), result
 
 

@@ -45,6 +45,9 @@ def _hashes(paths: Iterable[Path]) -> dict[str, str]:
 
 
 def _document(path: Path) -> dict[str, Any]:
+    if not path.exists():
+        beside = (one.name for one in path.parent.glob("*.toml"))
+        raise InputError(f"{path}: no such file{nearest(path.name, beside)}")
     try:
         text = path.read_text(encoding="utf-8-sig")
         return tomllib.loads(text)
@@ -79,8 +82,8 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
     if named:
         apart = [*(folder / name for name in named.held_out), *held_out]
         kept = {file.resolve() for file in apart}
-        beside = [file for file in sorted(folder.glob("[!.]*")) if file.suffix.lower() in SUFFIXES]
-        fit = [folder / k for k in named.fit or ()] or [file for file in beside if file.resolve() not in kept]
+        beside = [file for file in tables_in(folder) if file.resolve() not in kept]
+        fit = [folder / k for k in named.fit or ()] or beside
         if not fit:
             problems.append(
                 f"{where('records')}: no record to fit; name one, or put one beside the study file"
@@ -105,6 +108,11 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
     return study
 
 
+def tables_in(folder: Path) -> list[Path]:
+    """Record files in a folder, by name."""
+    return [file for file in sorted(folder.glob("[!.]*")) if file.suffix.lower() in SUFFIXES]
+
+
 def _unknown_tables(document: Mapping[str, object], path: Path, known: Sequence[str]) -> list[str]:
     return [f"{path}: unknown table [{key}]{nearest(key, known)}" for key in document if key not in known]
 
@@ -113,21 +121,34 @@ def load_study(source: Path | Sequence[Path], *, held_out: Sequence[Path] = ()) 
     """The study in the folder or study file `source`, or one of default settings made from record files.
 
     The time unit is the one the study file states, else that of the first fit record; records in other units
-    are converted. From record files the name is the first stems joined by ``-`` and the seed 0. `held_out`
-    adds records to hold out. Raises InputError with everything wrong in the study file and all its records
-    together; nothing is written.
+    are converted. A folder without a study file is a study of all records in it. From record files the name
+    is the first stems joined by ``-`` and the seed 0. `held_out` adds records to hold out. Raises InputError
+    with everything wrong in the study file and all its records together; nothing is written.
     """
     sources = [Path(source)] if isinstance(source, (str, Path)) else [Path(path) for path in source]
     apart = [Path(path) for path in held_out]
-    if len(sources) == 1 and (sources[0].is_dir() or sources[0].suffix.lower() == ".toml"):
-        return _from_file(sources[0] / "study.toml" if sources[0].is_dir() else sources[0], apart)
+    if len(sources) == 1 and sources[0].suffix.lower() == ".toml":
+        return _from_file(sources[0], apart)
+    name = None
+    if len(sources) == 1 and sources[0].is_dir():
+        folder = sources[0]
+        if (folder / "study.toml").exists():
+            return _from_file(folder / "study.toml", apart)
+        own = {path.resolve() for path in apart}
+        sources = [path for path in tables_in(folder) if path.resolve() not in own]
+        name = folder.resolve().name
+        if not sources:
+            raise InputError(
+                f"{folder}: this folder holds neither a study.toml nor a record nor a finished fit; name a "
+                "study, record files, or the run folder of a fit; `lcopa-bayes new` reads other tables"
+            )
     if not sources:
-        raise InputError("no study: name a folder with a study.toml, or one or more record files")
+        raise InputError("no study: name a folder, a study.toml, or one or more record files")
     problems: list[str] = []
     records = _read(sources, apart, None, problems)
     refuse_if(problems)
     fit, kept = tuple(records["fit"]), tuple(records["held_out"])
-    return Study(fit=fit, held_out=kept, inputs=_hashes([*sources, *apart]))
+    return Study(name, fit=fit, held_out=kept, inputs=_hashes([*sources, *apart]))
 
 
 def load_candidates(path: Path) -> tuple[tuple[str, ...] | None, tuple[CandidateSettings, ...]]:

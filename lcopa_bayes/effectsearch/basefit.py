@@ -9,9 +9,9 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
-from lcopa_bayes.effectsearch.basemodel import BaseModel
-from lcopa_bayes.effectsearch.gaussnewton import Optimum, Regression
+from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.noise import AxisNoise, Law, axis_noise, joint_noise, quiet_pieces
+from lcopa_bayes.effectsearch.regression import Optimum, Regression
 from lcopa_bayes.effectsearch.starts import screened
 from lcopa_bayes.effectsearch.whitening import Whitening, parts
 from lcopa_bayes.inference.defaultpriors import Scales
@@ -35,7 +35,7 @@ _MOVED = 0.05
 class BaseFit:
     """The plant alone at its optimum under the measured noise."""
 
-    model: BaseModel
+    model: ExtendedModel
     noise: tuple[AxisNoise, ...]
     regression: Regression
     optimum: Optimum
@@ -56,18 +56,19 @@ class BaseFit:
 
 
 def base_fit(
-    model: BaseModel, rng: np.random.Generator, *, starts: int = _STARTS, near: Sequence[Vector] = ()
+    model: ExtendedModel, rng: np.random.Generator, *, starts: int = _STARTS, near: Sequence[Vector] = ()
 ) -> BaseFit:
-    """Noise, then damped Gauss-Newton from several starts and delays; `near` are further coordinates to start
+    """Noise, then least squares from several starts and delays; `near` are further coordinates to start
     from.
 
     Where an axis has too few quiet samples its noise is fitted to the residual in turn with the plant.
     """
-    posterior = model.posterior
+    posterior = model.plant
     seeds = [model.coordinates(values) for values in screened(posterior, rng, count=starts)]
     white = Whitening(posterior.samples, _guessed(posterior))
-    optimum = Regression(model, white).best([*near, *seeds])
-    optimum = Regression(model, white).best([optimum.x, *_other_delays(model, optimum.x)])
+    first = Regression(model, white)
+    x, _ = first.lowest([*near, *seeds])
+    optimum = first.best([x, *_other_delays(model, x)])
     noise: tuple[AxisNoise, ...] = ()
     for _ in range(_ROUNDS):
         delay = model.dead_time(optimum.x)
@@ -82,7 +83,7 @@ def base_fit(
     for _ in range(_ROUNDS):
         if optimum.converged:
             break
-        optimum = regression.descend(optimum.x)  # damped to a standstill: start again undamped
+        optimum = regression.descend(optimum.x)  # out of evaluations: go on
     return BaseFit(model, noise, regression, optimum, _failure(model, optimum), _cautions(noise, optimum))
 
 
@@ -106,20 +107,20 @@ def measured(posterior: Posterior, residual: Vector, delay: float) -> tuple[Axis
     return tuple(out)
 
 
-def whitening(model: BaseModel, noise: Sequence[AxisNoise]) -> Whitening:
+def whitening(model: ExtendedModel, noise: Sequence[AxisNoise]) -> Whitening:
     """The whitening operator of the fit records."""
     laws = tuple(one.law for one in noise)
     known = tuple(one.posterior for one in noise)
     dependence = () if all(one.known for one in noise) else tuple(one.dependence for one in noise)
-    return Whitening(model.posterior.samples, laws, dependence, known)
+    return Whitening(model.plant.samples, laws, dependence, known)
 
 
-def renewed(model: BaseModel, optimum: Optimum, known: Whitening) -> Whitening:
+def renewed(model: ExtendedModel, optimum: Optimum, known: Whitening) -> Whitening:
     """The noise as the residual of another optimum gives it, where it had to be fitted jointly."""
     if not known.dependence:
         return known
-    delay = model.dead_time(optimum.x[: len(model.names)])
-    return whitening(model, measured(model.posterior, optimum.residual, delay))
+    delay = model.dead_time(optimum.x)
+    return whitening(model, measured(model.plant, optimum.residual, delay))
 
 
 def axis_pieces(posterior: Posterior, stacked: Vector, axis: int) -> list[Observed]:
@@ -131,9 +132,9 @@ def axis_pieces(posterior: Posterior, stacked: Vector, axis: int) -> list[Observ
     ]
 
 
-def _other_delays(model: BaseModel, x: Vector) -> list[Vector]:
+def _other_delays(model: ExtendedModel, x: Vector) -> list[Vector]:
     """The same coordinates with every free delay scaled."""
-    rows = [model.posterior.table.rows[k] for k in model.least.columns]
+    rows = [model.plant.table.rows[k] for k in model.columns]
     where = [k for k, row in enumerate(rows) if row.kind == "delay"]
     out = []
     for factor in _DELAYS if where else ():
@@ -148,7 +149,7 @@ def _alike(one: AxisNoise, other: AxisNoise) -> bool:
     return one.samples == other.samples and abs(one.law.sd / other.law.sd - 1) < 0.01
 
 
-def _failure(model: BaseModel, optimum: Optimum) -> str:
+def _failure(model: ExtendedModel, optimum: Optimum) -> str:
     if not optimum.converged:
         return "the base fit did not converge within its steps"
     if optimum.effective < optimum.x.size + _SPARE:
@@ -156,9 +157,9 @@ def _failure(model: BaseModel, optimum: Optimum) -> str:
             f"the residual of the base fit is so smooth that its samples count as {optimum.effective:.0f} "
             f"independent ones, too few beside {optimum.x.size} parameters"
         )
-    responses = model.posterior.table.layout.responses
+    responses = model.plant.table.layout.responses
     for axis, response in enumerate(responses):
-        own = [part.rows for part in parts(model.posterior.samples) if part.axis == axis]
+        own = [part.rows for part in parts(model.plant.samples) if part.axis == axis]
         seen = [model.observed[rows] for rows in own if rows.stop > rows.start]
         spread = sum(float(((values - values.mean()) ** 2).sum()) for values in seen)
         missed = sum(float((optimum.residual[rows] ** 2).sum()) for rows in own)

@@ -17,6 +17,7 @@ from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.results.bands import POINTWISE, QUANTILE_NAMES, SIMULTANEOUS
 from lcopa_bayes.results.datatree import posterior_draws
 from lcopa_bayes.results.runfolder import ORIGINS
+from lcopa_bayes.results.summary import IMPORTANCE
 
 _WORDS = ("record", "axis", "unit", "name", "path", "prior", "from")
 _FLAGS = ("held_out", "log_scale", "integrated_out")
@@ -71,6 +72,11 @@ class SavedRun:
     def time_unit(self) -> str:
         """Unit of all times."""
         return str(self.results["time_unit"])
+
+    @property
+    def weighted(self) -> bool:
+        """Whether the draws are importance draws, else those of ensembles."""
+        return bool(self.results["sampler"]["method"] == IMPORTANCE)
 
     @property
     def units(self) -> dict[str, str]:

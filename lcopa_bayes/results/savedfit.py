@@ -34,7 +34,7 @@ from lcopa_bayes.sampling.modes import Modes
 
 NAME = "fit.json"
 """The file beside `posterior.nc`."""
-_AGAIN = "run `fit` again with this version of lcopa-bayes"
+_AGAIN = "run `fit` on the study again with this version of lcopa-bayes"
 _CUT = "the run was cut short, or files of two runs are mixed; run `fit` again"
 
 

@@ -17,8 +17,8 @@ from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.effectsearch.basefit import base_fit
-from lcopa_bayes.effectsearch.basemodel import BaseModel
 from lcopa_bayes.effectsearch.crossvalidation import PARTS, groups
+from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.noise import Law, joint_noise
 from lcopa_bayes.effectsearch.signature import Scale
@@ -113,7 +113,7 @@ def test_a_regression_gives_the_poles_of_a_resonance():
 
 def test_a_base_fit_finds_a_resonance():
     study, _, _ = resonant()
-    fit = base_fit(BaseModel(problem_of(study).posterior), np.random.default_rng(0))
+    fit = base_fit(ExtendedModel(problem_of(study).posterior), np.random.default_rng(0))
     explained = 1 - fit.optimum.residual.var() / fit.model.observed.var()
     assert not fit.failed
     assert explained > 0.9

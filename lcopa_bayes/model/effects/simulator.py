@@ -64,6 +64,8 @@ class Simulator:
     step_responses: Latest[StepResponses] = field(default_factory=Latest)
     """Step responses of the latest plants; shared with simulators of other effects, for most
     simulations differ in the commands alone."""
+    still: Latest[list[Moved]] = field(default_factory=Latest)
+    """The latest plants up to their reading where nothing acts before it; shared likewise."""
 
     @cached_property
     def _kept(self) -> Latest[list[Moved]]:
@@ -126,8 +128,10 @@ class Simulator:
         the forward model itself.
         """
         parts = [psi[self._slices[e]] for e, f in enumerate(self.effects) if isinstance(f, UPSTREAM)]
-        key = plant.key + b"".join(part.tobytes() for part in parts)
-        return self._kept.get_or(key, lambda: self._simulated(plant, psi))
+        acts = any(part.any() for part in parts)
+        own = b"".join(part.tobytes() for part in parts) if acts else id(self.ranges).to_bytes(8)
+        key = plant.key + own  # what is kept holds its ranges, so that no others have their identity
+        return (self._kept if acts else self.still).get_or(key, lambda: self._simulated(plant, psi))
 
     def _simulated(self, plant: Plant, psi: Vector) -> list[Moved]:
         acting = self._bending(psi)

@@ -75,7 +75,7 @@ def estimates(run: SavedRun) -> Section:
             ("grade", "grade", "grade"),
             caption=f"Intervals are {kind}. Digits end at the second significant digit of the standard "
             "deviation. ESS is the smaller of the effective sample sizes of bulk and tails; R-hat compares "
-            "independent ensembles.",
+            "independent sets of draws.",
         )
     ]
     if run.results["modes"]:
@@ -105,7 +105,7 @@ def _modes(rows: list[Mapping[str, Any]]) -> Table:
         ("unit", "text", "unit"),
         ("shares of all draws", "interval", _shares),
         (
-            "range over ensembles",
+            "range over sets of draws",
             "interval",
             lambda row: ", ".join(f"{min(s):.2f} to {max(s):.2f}" for s in zip(*row["shares"], strict=True)),
         ),
@@ -193,14 +193,17 @@ def _corner(run: SavedRun, names: list[str]) -> str:
 
 
 def traces(run: SavedRun) -> Section:
-    """Draws in their order, with the ensembles in colours and R-hat in the titles."""
+    """Draws in their order, with ensembles, or batches, in colours and R-hat in the titles."""
     names = list(run.units)
-    ensembles, draws = run.draws[names[0]].shape
+    sets, draws = run.draws[names[0]].shape
     caption = (
-        f"{draws} draws of each of {ensembles} ensembles, thinned evenly from the kept part of the run, "
+        f"{draws} draws of each of {sets} batches, in random order."
+        if run.weighted
+        else f"{draws} draws of each of {sets} ensembles, thinned evenly from the kept part of the run, "
         "walkers side by side within a step."
     )
-    text = "Each colour is an independent ensemble. Draws whose colours separate or drift have not converged."
+    kind = "batch of importance draws" if run.weighted else "ensemble"
+    text = f"Each colour is an independent {kind}. Draws whose colours separate or drift have not converged."
     return Section(
         "Traces", (text,), paged("trace", names, _PER_FIGURE, lambda part: _traces(run, part), caption)
     )
@@ -231,13 +234,14 @@ def priors(run: SavedRun) -> Section:
         "Histogram: draws. Line: prior density, which may reach far beyond the axis. Where the axis is "
         "logarithmic, both are densities per natural logarithm of the parameter."
     )
+    held = {row["name"] for row in run.results["fixed"]}
     table = Table.of(
         run.tables["priors"].to_dict("records"),  # type: ignore[arg-type]
         ("name", "code", "name"),
         ("unit", "text", "unit"),
         ("prior", "code", "prior"),
         ("from", "text", "from"),
-        ("treated", "text", lambda row: "integrated out exactly" if row["integrated_out"] else "sampled"),
+        ("treated", "text", lambda row: _treated(row, held)),
         caption="Where a prior is a default, the rule below derived it from the fit records.",
     )
     return Section(
@@ -251,6 +255,12 @@ def priors(run: SavedRun) -> Section:
         (table,),
         inspect.cleandoc(defaultpriors.__doc__ or ""),
     )
+
+
+def _treated(row: Mapping[str, Any], held: set[str]) -> str:
+    if row["name"] in held:
+        return "fixed"
+    return "integrated out exactly" if row["integrated_out"] else "sampled"
 
 
 def marginals(run: SavedRun, names: Sequence[str], draw: Callable[[Axes, SavedRun, str], None]) -> str:

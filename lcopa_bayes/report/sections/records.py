@@ -104,7 +104,7 @@ def above_drives(
     ).ravel()
     first, last = float(rows["time"].min()), float(rows["time"].max())
     for panel, unit in zip(below, units, strict=True):
-        _drives(panel, drives[drives["unit"] == unit], unit, until=last)
+        draw_drives(panel, drives[drives["unit"] == unit], unit, until=last)
     margin = 0.02 * (last - first)
     top.set(
         ylabel=label(str(rows["axis"].iloc[0]), str(rows["unit"].iloc[0])),
@@ -115,7 +115,7 @@ def above_drives(
     return figure, top, below
 
 
-def _drives(panel: Axes, drives: pd.DataFrame, unit: str, *, until: float) -> None:
+def draw_drives(panel: Axes, drives: pd.DataFrame, unit: str, *, until: float) -> None:
     """Drives of one unit; the last row of each holds on to the time `until`."""
     names = list(dict.fromkeys(drives["axis"]))
     for name, colour in zip(names, CYCLE * len(names), strict=False):

@@ -20,6 +20,7 @@ _PER_FIGURE = 12
 _WIDE = 1.645 * 2
 """Width of a normal distribution's 90 % interval in standard deviations [-]."""
 _WORDS = {
+    "batches": "independent batches of draws",
     "draws": "draws of the proposal",
     "pareto_k": "Pareto k of the weights [-]",
     "weights_ess": "effective sample size of the weights [draws]",
@@ -39,11 +40,15 @@ def evidence(run: SavedRun) -> Section:
     if results["log_evidence"] is None:
         said = "The error of an evidence needs several ensembles; with a single one none is given."
     else:
+        method = (
+            "the mean weight of the importance draws"
+            if run.weighted
+            else "by bridge sampling between the draws of each ensemble and a mixture fitted to the others"
+        )
         said = (
             f"Log evidence {with_error(results['log_evidence'], results['log_evidence_sd'])} nat (standard "
-            f"error; grade {results['log_evidence_grade']}), by bridge sampling between the draws of each "
-            "ensemble and a mixture fitted to the others. It compares models of the same records only, and "
-            "depends on the width of their priors."
+            f"error; grade {results['log_evidence_grade']}), {method}. It compares models of the same "
+            "records only, and depends on the width of their priors."
         )
     rival = results["rival"]
     if rival is None:
