@@ -137,11 +137,8 @@ def too_fast(draws: Draws, curves: StepCurves, period: float) -> list[Limitation
         k = _curve_of(table.layout, curves, unit)
         reached = curves.normalised[k] / curves.normalised[k][:, -1:]
         rise = _difference(crossing(curves.time, reached, 0.9), crossing(curves.time, reached, 0.1))
-        names = tuple(
-            row.name
-            for row in table.rows
-            if row.free and row.kind in ("time", "order") and row.place.first == unit.element
-        )
+        terms = table.terms[unit.element]
+        names = tuple(table.names[k] for k in terms.every if table.rows[k].free)
         if names and float(np.mean(rise < period)) >= _HALF and all(names != one.parameters for one in out):
             out.append(
                 Limitation(
