@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 from threadpoolctl import threadpool_limits
 
+from lcopa_bayes.comparison.averaging import quantiles
 from lcopa_bayes.comparison.candidates import Candidate
 from lcopa_bayes.comparison.integerorder import integer_orders
 from lcopa_bayes.comparison.predictivedensity import Predicted, predictions
@@ -96,7 +97,7 @@ WALKERS = 32
 [-]. Ensembles and effective draws are those of a fit, so that a grade means the same."""
 _STARTS = 64
 """Draws kept as starts of richer models [-]."""
-_VERSION = 3
+_VERSION = 4
 """Raised when what a card holds changes."""
 
 
@@ -168,6 +169,7 @@ class Contender:
             "fingerprint": self.fingerprint,
             "pointwise": _pointwise(predicted),
             "curves": _curves(fitted),
+            "quantiles": quantiles(fitted) if entries["usable"] else {},
         }
 
     def store(self, entries: Mapping[str, Any]) -> None:

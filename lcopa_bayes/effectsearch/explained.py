@@ -14,6 +14,7 @@ from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.outliers import NAME, Outlying
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.declared import coefficient_prior
+from lcopa_bayes.inference.noise import Noise
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.effect import Effect
 from lcopa_bayes.model.effects.records import Outliers
@@ -59,12 +60,12 @@ def declarable(study: Study, effects: Sequence[Effect]) -> bool:
     return all(known.get(effect.name) is type(effect) for effect in effects)
 
 
-def explained_draws(study: Study, *, jobs: int = 1, quick: bool = False) -> Draws | None:
-    """Draws of an explained study, the same that a fit of it gives; None where importance sampling does not
-    hold, and a fit takes ensembles from the prior."""
+def explained_draws(study: Study, *, jobs: int = 1, quick: bool = False) -> tuple[Draws, Noise] | None:
+    """Draws of an explained study, the same that a fit of it gives, and its noise; None where importance
+    sampling does not hold, and a fit takes ensembles from the prior."""
     problem = problem_of(study)
     _, result = weighted_fit(problem, plan_of(problem, quick=False), jobs=jobs, quick=quick)
-    return None if result is None else result[1]
+    return None if result is None else (result[1], problem.posterior.noise)
 
 
 def coordinates_of(model: ExtendedModel, draws: Draws) -> Matrix:

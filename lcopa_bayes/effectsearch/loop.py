@@ -220,8 +220,8 @@ def _looped(
         explained = explained_study(problem.study, last_state.model, outliers)
         sampled = explained_draws(explained, jobs=jobs, quick=quick)
     if sampled is not None:
-        covariance = np.cov(coordinates_of(last_state.model, sampled).T)
-        last_state = replace(last_state, covariance=np.asarray(covariance))
+        covariance = np.cov(coordinates_of(last_state.model, sampled[0]).T)
+        last_state = replace(last_state, covariance=np.asarray(covariance), sampled=sampled)
     return Loop(
         problem,
         base,
@@ -234,7 +234,7 @@ def _looped(
         reached if last_state is searched.state else _side(problem, last_state),
         not study.held_out,
         cautions,
-        sampled,
+        sampled[0] if sampled is not None else None,
         outliers,
     )
 

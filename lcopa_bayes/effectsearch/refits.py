@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import final
+from typing import Any, final
 
 import numpy as np
 from scipy.stats import chi2
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.effectsearch.basefit import renewed
-from lcopa_bayes.effectsearch.constants import freed
 from lcopa_bayes.effectsearch.crossvalidation import groups, log_scores
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.noise import quiet_samples
 from lcopa_bayes.effectsearch.regression import Optimum, Regression
 from lcopa_bayes.effectsearch.signature import Scale
+from lcopa_bayes.effectsearch.trace import LEVEL
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.effects import Placed
+from lcopa_bayes.inference.kinds import CONSTANTS
 from lcopa_bayes.model.effects.effect import Effect
 
 SIGNIFICANT = 2.7e-3
@@ -36,6 +37,14 @@ _PROCESSES = 400
 """Plausible noise processes over which a p-value is averaged [-]."""
 _NEAR = 0.5
 """Expected gain of a step with which a descent by the plant's own tangents ends [nat]."""
+_EVALUATIONS = 15
+"""Most responses of a descent with constants [-]."""
+_BACK = 6
+"""Responses after which a constant that moved back to its grid is judged [-]."""
+_HOPELESS = 1000.0
+"""Cost beyond which these would not mend it [nat]."""
+_SLIGHT = 0.05
+"""A step that gains less is the last [nat]."""
 _DELAYS = (-0.25, -0.1)
 """Shares of a delay by which it is also started earlier, for effects that act on the drive [-]."""
 
@@ -187,6 +196,74 @@ def refit(
     tried = sum(np.log(len(effect.grid(extended.effected.ranges))) for effect, _ in added)
     paid = sides * float(np.log(2.0)) - float(tried) - rare
     return Refit(extended, optimum, before, whitening, names, quiet, paid)
+
+
+def freed(
+    model: ExtendedModel, x: Vector, whitening: Whitening, names: Sequence[str]
+) -> tuple[ExtendedModel, Vector]:
+    """The model with the constants of its effects `names` where the residual is smallest, and coordinates.
+
+    They are parameters like any other of the descent, which uses the plant's own tangents; those that a fit
+    holds by default stay.
+    """
+    rows = model.posterior.table.rows
+    loose = frozenset(
+        row.name for row in rows if row.kind == "constant" and row.name.partition(".")[0] in names
+    )
+    wide = replace(model, exact=False, loose=loose)
+    if not any(rows[k].kind in CONSTANTS for k in wide.columns):
+        return model, x
+    best = Regression(replace(model, exact=False), whitening).cost(x)
+    try:
+        reached, _ = Regression(wide, whitening).reached(
+            wide.coordinates(model.values(x)), most=_EVALUATIONS, gain=_SLIGHT
+        )
+    except ArithmeticError:
+        return model, x
+    moved, other = wide.held(reached)
+    if Regression(moved, whitening).cost(other) < best:
+        model, x = replace(moved, exact=model.exact), other
+    return _likely(model, x, whitening, names)
+
+
+def _likely(
+    model: ExtendedModel, x: Vector, whitening: Whitening, names: Sequence[str]
+) -> tuple[ExtendedModel, Vector]:
+    """The model with constants back on the grid, of likely values, where the fit does not separate them.
+
+    A phase and a delay move together until a command falls to another refresh, which other records may show.
+    A noise that still holds what the effect takes away separates too little.
+    """
+    if whitening.dependence:
+        return model, x
+    cost = Regression(model, whitening).cost(x)
+    for k, effect in enumerate(model.effects):
+        listed = effect.grid(model.effected.ranges)
+        for name in _constants_of(effect) if effect.name in names else ():
+            here = getattr(effect, name)
+            values = np.array([getattr(one, name) for one in listed])
+            near = float(values[np.argmin(np.abs(values - here))])
+            back = _replaced(model, k, name, near)
+            fit = Regression(back, whitening)
+            if near == here or not fit.cost(x) < cost + _HOPELESS:
+                continue
+            there, _ = fit.reached(x, most=_BACK, gain=_SLIGHT)
+            if fit.cost(there) < cost + LEVEL:
+                model, x = back, there
+    return model, x
+
+
+def _replaced(model: ExtendedModel, effect: int, name: str, value: float) -> ExtendedModel:
+    """The model with one constant of one effect at another value."""
+    effects: list[Any] = list(model.effects)
+    effects[effect] = replace(effects[effect], **{name: value})
+    return model.having(*effects)
+
+
+def _constants_of(effect: Effect) -> list[str]:
+    """Names of the internal constants that are real numbers."""
+    listed = [field.name for field in fields(effect)]
+    return [name for name in listed if isinstance(getattr(effect, name), float)]
 
 
 def _with_room(

@@ -11,6 +11,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.inference.observations import Samples
+from lcopa_bayes.inference.optimum import distinct
 from lcopa_bayes.inference.posterior import Posterior
 
 _LAGS = 4
@@ -22,8 +23,6 @@ _FEWEST = 30
 
 _SCREENED = 512
 """Prior draws whose misfit is looked at [-]."""
-_DISTINCT = 0.5
-"""Starts closer than this in every sampled coordinate count as one [natural log or parameter unit]."""
 _SCREEN_NOISE = 0.05
 """Noise scale of the screening over the spread of a response [-]: coarse, so that no draw is hopeless."""
 
@@ -42,7 +41,8 @@ def screened(posterior: Posterior, rng: np.random.Generator, *, count: int) -> l
             drawn[:, table.at(name, axis)] = value
     density = posterior.log_likelihood(drawn)
     ranked = drawn[np.argsort(-np.where(np.isnan(density), -np.inf, density), kind="stable")]
-    return [_completed(posterior, values) for values in _distinct(posterior, ranked, count)]
+    chosen = [posterior.coordinates(values[None]) for values in distinct(posterior, ranked, count)]
+    return [posterior.complete(each, None)[0] for each in chosen]
 
 
 def _classical(posterior: Posterior, drawn: Matrix, rng: np.random.Generator) -> Matrix:
@@ -65,23 +65,6 @@ def _classical(posterior: Posterior, drawn: Matrix, rng: np.random.Generator) ->
     legal = table.supported(out)
     out[~legal] = drawn[~legal]
     return table.canonical(out)
-
-
-def _completed(posterior: Posterior, values: Vector) -> Vector:
-    return np.asarray(posterior.complete(posterior.coordinates(values[None]), None)[0])
-
-
-def _distinct(posterior: Posterior, ranked: Matrix, count: int) -> list[Vector]:
-    kept: list[Vector] = []
-    places: list[Vector] = []
-    for values in ranked:
-        here = posterior.coordinates(values[None])[0]
-        if all(np.abs(here - other).max() > _DISTINCT for other in places):
-            kept.append(values)
-            places.append(here)
-        if len(kept) == count:
-            break
-    return kept
 
 
 def regressed(posterior: Posterior, drawn: Matrix) -> Matrix:

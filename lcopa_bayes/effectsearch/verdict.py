@@ -165,7 +165,8 @@ def beside(verdict: Verdict, said: str) -> Verdict:
 def widened(verdict: Verdict, wider: Mapping[str, float]) -> Verdict:
     """The verdict on effects whose default priors were made `wider` by factors [-]."""
     said = "".join(
-        f" The default prior of {name} is too narrow for these records and was made {factor:.0f} times wider."
+        f" The default prior of {name} is too narrow for these records and was made {factor:.0f} times as "
+        "wide."
         for name, factor in wider.items()
     )
     return Verdict(verdict.kind, verdict.confidence, verdict.sentence + said)

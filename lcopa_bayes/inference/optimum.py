@@ -65,7 +65,7 @@ def find_optima(posterior: Posterior, rng: np.random.Generator, *, starts: int =
     if np.isnan(likelihood).any():
         posterior.log_density(posterior.coordinates(drawn[np.isnan(likelihood)]))  # raises and says where
     chosen = drawn[np.argsort(-likelihood, kind="stable")]
-    return _kept(posterior, _descended(posterior, _distinct(posterior, chosen, starts)))
+    return _kept(posterior, _descended(posterior, distinct(posterior, chosen, starts)))
 
 
 def again(posterior: Posterior, optima: Sequence[Optimum]) -> tuple[Optimum, ...]:
@@ -134,7 +134,7 @@ def _spread(posterior: Posterior) -> list[float]:
     return [float(values.std()) or 1.0 for values in pooled]
 
 
-def _distinct(posterior: Posterior, ranked: Matrix, count: int) -> list[Vector]:
+def distinct(posterior: Posterior, ranked: Matrix, count: int) -> list[Vector]:
     """The first `count` rows that differ from each other."""
     kept: list[Vector] = []
     for values in ranked:

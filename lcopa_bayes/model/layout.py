@@ -51,9 +51,10 @@ class Layout:
         `share = "paper"`: direct paths (same axis, or same position when no axis name is both drive
         and response) have one element, cross paths another (Ta et al. 2026, Eq. 65).
         """
-        by_share = _slots(drives, responses, model.share)
-        kinds = {"shared": "all", "element": model.share, "path": "none"}
-        by_delay = _slots(drives, responses, kinds[model.delay])
+        model = model.for_plant(len(drives), len(responses))
+        share, delay = str(model.share), str(model.delay)
+        by_share = _slots(drives, responses, share)
+        by_delay = _slots(drives, responses, {"shared": "all", "element": share, "path": "none"}[delay])
         names = _distinct(by_share)
         terms = _terms(names, model)
         delay_names = _distinct(by_delay)

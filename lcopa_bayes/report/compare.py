@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import hypot
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ def write_comparison(folder: Path) -> Path:
 
     def sections(values: Mapping[str, Any]) -> list[Section]:
         texts = [part(values) for part in (_priors, _predicted, _orders, _warnings)]
-        return [_scores(values), _figures(values, _curves(folder, values)), *texts]
+        return [_scores(values), _averaged(values), _figures(values, _curves(folder, values)), *texts]
 
     return write_graded(folder, "compare", "comparison", sections, box=_verdict)
 
@@ -101,6 +102,41 @@ def _scores(results: Mapping[str, Any]) -> Section:
         caption=caption,
     )
     return Section("Scores", tuple(text), tables=(scores, others))
+
+
+def _averaged(results: Mapping[str, Any]) -> Section:
+    """Numbers that every candidate has, and the part of their uncertainty that the choice of a model adds."""
+    rows = results["averaged"]
+    if not rows:
+        return Section("Numbers over all models", ("Fewer than two usable candidates have an evidence.",))
+    table = Table.of(
+        rows,
+        ("number", "code", "name"),
+        ("median", "number", lambda row: to_spread(row["value"], _both(row))),
+        ("unit", "text", "unit"),
+        ("90 % interval", "interval", lambda row: interval(row["lower"], row["upper"], _both(row))),
+        ("sd by noise", "number", lambda row: figures(row["sd_noise"], 2)),
+        ("sd by structure", "number", lambda row: figures(row["sd_structure"], 2)),
+        ("weights", "prose", _weights),
+        ("grade", "grade", "grade"),
+        caption="Equal-tailed credible intervals of the mixture of all models. Weights are posterior "
+        "probabilities; a richer model that is not rejected and moves a number by more than half of its "
+        "standard deviation (*) weighs as much as the most probable one, and its interval is held. Standard "
+        "deviations are of draws within the models and of means between them; open where a number is not "
+        "reached.",
+    )
+    return Section("Numbers over all models", (), tables=(table,))
+
+
+def _both(row: Mapping[str, Any]) -> float | None:
+    parts = row["sd_noise"], row["sd_structure"]
+    return None if None in parts else float(hypot(*parts))
+
+
+def _weights(row: Mapping[str, Any]) -> str:
+    return ", ".join(
+        f"{name}{'*' * (name in row['raised'])} {weight:.2f}" for name, weight in row["weights"].items()
+    )
 
 
 def _priors(results: Mapping[str, Any]) -> Section:

@@ -12,7 +12,7 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, Locator, LogLocator, MaxNLocator, NullFormatter, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 INK = "#1a1a1a"
 SEEN = "#1a1a1a"
@@ -78,20 +78,15 @@ def grid(count: int, *, columns: int, height: float) -> tuple[Figure, Sequence[A
     return figure, list(panels[:count])
 
 
-def log_locator(low: float, high: float) -> Locator:
-    """Ticks of a logarithmic axis: round numbers when it spans few decades, else powers of ten."""
-    if high >= 200.0 * low:
-        return LogLocator(numticks=4)
-    return LogLocator(subs=(1, 2, 5)) if high > 5.0 * low else MaxNLocator(4, steps=[1, 2, 5, 10])
-
-
 def log_ticks(axis: Axis, low: float, high: float) -> None:
-    """Set the ticks of a logarithmic axis."""
-    axis.set_major_locator(log_locator(low, high))
+    """Ticks of a logarithmic axis: round numbers when it spans few decades, else powers of ten."""
     if high < 200.0 * low:
+        wide = high > 5.0 * low
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)) if wide else MaxNLocator(4, steps=[1, 2, 5, 10]))
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axis.set_minor_locator(NullLocator())
     else:
+        axis.set_major_locator(LogLocator(numticks=4))
         axis.set_minor_formatter(NullFormatter())
 
 

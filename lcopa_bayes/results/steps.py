@@ -210,21 +210,42 @@ def path_metrics(draws: Draws, *, span: float, time_unit: str, path: str | None 
     return [one for one in metrics if path is None or one.name.endswith(f"[{path}]")]
 
 
+@final
+@dataclass(frozen=True, eq=False)
+class Metric:
+    """One figure of a step response at every draw."""
+
+    name: str
+    unit: str
+    values: Vector
+    """(draws,) [unit]; infinite where it is not reached."""
+    note: str = ""
+
+
 def step_metrics(draws: Draws, curves: StepCurves, *, time_unit: str) -> list[Estimate]:
+    """Intervals of `metrics_of`, under the grade of the draws."""
+    grade, ess = draws.grade.level, draws.ess
+    return [
+        Estimate.of(one.name, one.unit, one.values, ess=ess, grade=grade, note=one.note)
+        for one in metrics_of(draws.table, curves, time_unit=time_unit)
+    ]
+
+
+def metrics_of(table: ParameterTable, curves: StepCurves, *, time_unit: str) -> list[Metric]:
     """Metrics of every path: rise 10-90 %, delay, settling, overshoot, value at the end, steady state.
 
     Times are counted from the step. What is not reached within the record is open above; a response has
     settled when it stays within the band after the record too, to which the overshoot refers as well.
     """
-    layout, grade, ess = draws.table.layout, draws.grade.level, draws.ess
-    out: list[Estimate] = []
+    layout = table.layout
+    out: list[Metric] = []
     end = float(curves.time[-1])
     after = end * (1 + _LATER * np.arange(1, _LATER_POINTS + 1) / _LATER_POINTS)
-    later = _later(draws.table, curves, after)
+    later = _later(table, curves, after)
     time = np.concatenate((curves.time, after))
 
     def add(name: str, unit: str, values: Vector, note: str = "") -> None:
-        out.append(Estimate.of(name, unit, values, ess=ess, grade=grade, note=note))
+        out.append(Metric(name, unit, values, note))
 
     for i, response in enumerate(layout.responses):
         for j, drive in enumerate(layout.drives):
@@ -248,7 +269,7 @@ def step_metrics(draws: Draws, curves: StepCurves, *, time_unit: str) -> list[Es
             add(f"overshoot[{path}]", "-", np.maximum(whole.max(axis=1) - 1.0, 0.0))
             add(f"value_at_end[{path}]", unit, gain * curve[:, -1])
             add(f"steady_state[{path}]", unit, gain, note)
-    out.extend(_crosstalk(layout, curves, ess=ess, grade=grade))
+    out.extend(_crosstalk(layout, curves))
     return out
 
 
@@ -273,7 +294,7 @@ def _difference(high: Vector, low: Vector) -> Vector:
     return np.where(reached, np.where(reached, high, 0.0) - np.where(reached, low, 0.0), np.inf)
 
 
-def _crosstalk(layout: Layout, curves: StepCurves, *, ess: float, grade: str) -> list[Estimate]:
+def _crosstalk(layout: Layout, curves: StepCurves) -> list[Metric]:
     """Steady response of the other axes over that of the driven one, where two axes respond."""
     out = []
     for j, drive in enumerate(layout.drives):
@@ -285,5 +306,5 @@ def _crosstalk(layout: Layout, curves: StepCurves, *, ess: float, grade: str) ->
                 ratio = np.where(direct != 0, other / np.where(direct != 0, direct, 1), np.inf)
                 name = f"crosstalk[{response.name}/{layout.responses[own].name} by {drive.name}]"
                 unit = f"{response.unit}/{layout.responses[own].unit}"
-                out.append(Estimate.of(name, unit, ratio, ess=ess, grade=grade))
+                out.append(Metric(name, unit, ratio))
     return out

@@ -125,20 +125,27 @@ def scores(fit: Fit, *, held_out: bool) -> list[dict[str, Any]]:
 def _sampler(fit: Fit) -> Mapping[str, Any]:
     plan, ensembles, weighted = fit.run.plan, fit.run.ensembles, fit.run.weighted
     common = {
-        "method": "ensembles" if weighted is None else IMPORTANCE,
-        "ensembles": plan.ensembles,
-        "walkers": plan.walkers,
-        "steps": ensembles[0].steps if ensembles else 0,
-        "most_steps": plan.steps,
-        "thin": plan.thin,
-        "acceptance": float(np.mean([ensemble.acceptance for ensemble in ensembles])) if ensembles else None,
         "smallest_ess": fit.draws.ess,
         "largest_rhat": max(q.rhat for q in fit.draws.qualities),
         "target_ess": plan.target_ess,
         "seed": plan.seed,
     }
-    if weighted is None:
-        return common
-    for key in ("steps", "most_steps", "thin", "acceptance"):
-        common.pop(key)
-    return {**common, "draws": weighted.count, "pareto_k": weighted.pareto_k, "weights_ess": weighted.ess}
+    if weighted is not None:
+        return {
+            "method": IMPORTANCE,
+            "batches": len(weighted.parts),
+            "draws": weighted.count,
+            "pareto_k": weighted.pareto_k,
+            "weights_ess": weighted.ess,
+            **common,
+        }
+    return {
+        "method": "ensembles",
+        "ensembles": plan.ensembles,
+        "walkers": plan.walkers,
+        "steps": ensembles[0].steps,
+        "most_steps": plan.steps,
+        "thin": plan.thin,
+        "acceptance": float(np.mean([ensemble.acceptance for ensemble in ensembles])),
+        **common,
+    }

@@ -21,7 +21,8 @@ from lcopa_bayes.data.study import Study
 _SETTINGS = """\
 [model]
 # terms = 1  # viscous terms of every element; `loop` and `compare` say whether more are needed
-# delay = "shared"  # "path" where paths may have delays of their own
+# share = "none"  # every path has an element of its own; "all": one for all
+# delay = "path"  # every path has a delay of its own; "shared": one for all
 # offset = "record"  # "shared" where all records rest at the same level
 
 [priors]

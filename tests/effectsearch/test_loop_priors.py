@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from test_loop import LIBRARY, study
 
+from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch import refits
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
@@ -17,6 +19,9 @@ from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.model.effects.catalogue import catalogue
 
+AXIS = (Axis("x", "rad"),)
+CUBE = 0.2
+"""Cubic part of the reading of the lags, per deflection squared [1/rad^2]."""
 NOISE = 0.02
 CURVATURE = 0.29
 """Cubic part of the response at a deflection of 1 [-]: ten standard deviations of the default prior."""
@@ -61,6 +66,40 @@ def test_a_large_effect_is_estimated_without_bias(monkeypatch):
     for one in found:
         assert one.after.state.model.wider == {"odd_curvature": 4.0}
         assert "prior of odd_curvature is too narrow" in one.verdict.sentence
+
+
+def lag(name: str, height: float, rng: np.random.Generator) -> Record:
+    """A first-order lag of 2 ms under a step, read by a sensor that adds a fifth of the cube."""
+    t = np.arange(-15.0, 12.0, 0.25)
+    y = height * -np.expm1(-np.maximum(t, 0) / 2)
+    y = y + CUBE * y**3 + 0.01 * rng.normal(size=t.size)
+    return Record(name, t, (height * (t >= 0))[:, None], y[:, None], AXIS, AXIS, "ms")
+
+
+@pytest.mark.parametrize("seed", [0])
+def test_what_a_narrow_prior_takes_away_is_no_further_effect(seed, monkeypatch):
+    """Held to the default prior the same search names hysteresis beside the curvature."""
+    rng = np.random.default_rng(seed)
+    fit = tuple(lag(f"step{k}", height, rng) for k, height in enumerate((0.4, 0.8, 1.2)))
+    made = Study(
+        "lags",
+        None,
+        "ms",
+        seed,
+        fit,
+        (lag("held", 1.0, rng),),
+        ModelSettings(orders=(1.0,), offset="none"),
+        priors={"delay": PriorSettings("delay", fixed=0.0)},
+    )
+    found = loop(made, sample=False, quick=True, as_stated=True)
+    assert found.names == ("odd_curvature",)
+    state = found.after.state
+    k = state.model.plant_size
+    truth = CUBE * state.model.effected.ranges.response[0] ** 2
+    assert abs(state.optimum.x[k] - truth) < 3.5 * state.optimum.sd[k]
+    monkeypatch.setattr(refits, "_FAR", np.inf)
+    held = loop(made, sample=False, quick=True, as_stated=True)
+    assert held.names == ("odd_curvature", "hysteresis")
 
 
 def test_the_explained_study_has_the_wider_prior():

@@ -3,6 +3,7 @@
 import inspect
 import json
 import re
+from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
@@ -23,7 +24,7 @@ from lcopa_bayes.report.decimation import extremes
 from lcopa_bayes.report.formatting import NOT_REACHED, figures, interval, sentence, stopped, to_spread
 from lcopa_bayes.report.savedrun import load_run
 from lcopa_bayes.report.section import Column, Drawing, Section, Table
-from lcopa_bayes.report.sections import pairs, parameters, records, responses
+from lcopa_bayes.report.sections import parameters, records, responses, sampling
 from lcopa_bayes.report.theme import inlined
 from lcopa_bayes.sampling.modes import Modes
 
@@ -418,15 +419,6 @@ def test_intervals_and_significant_digits():
     assert [figures(x) for x in (0.0, 0.99996, 123456.0, float("inf"))] == ["0", "1.00", "123000", "–"]  # noqa: RUF001
 
 
-def test_axes_of_pairs_span_most_draws_and_have_round_ticks():
-    scale = pairs._Scale.of(np.linspace(-1.0, 1.0, 20_001), log=False)
-    assert scale.share(np.array([-0.995, 0.0, 0.995])) == pytest.approx([0.0, 0.5, 1.0])
-    assert [text for at, text in scale.ticks(5) if abs(at - 0.5) < 1e-9] == ["0"]
-    decades = pairs._Scale(1e-3, 1e1, log=True)
-    assert decades.share(np.array([1e-3, 1e-1, 1e1])) == pytest.approx([0.0, 0.5, 1.0])
-    assert [text for _, text in decades.ticks(5)] == ["0.001", "0.1", "10"]
-
-
 def test_interesting_parameters_come_first_and_the_rest_is_named(tmp_path):
     names = ["sigma", "gain_a", "offset", "delay", "gate_1", "order_1", "time_2", "time_1"]
     assert parameters.ranked(names) == [
@@ -497,3 +489,24 @@ def test_the_most_prior_sensitive_parameters_are_shown_and_the_rest_counted(fold
     assert any("20 most affected of 30" in text for text in many.text)
     assert any("No parameter depends noticeably" in text for text in many.text)
     assert parameters.sensitivity(with_results(folder, sensitivity=[])).tables == ()
+
+
+def test_a_page_of_importance_draws_speaks_of_no_ensembles(folder):
+    """Batches of weighted draws are no ensembles of walkers, and their evidence is no bridge."""
+    of_ensembles, settings = with_results(folder), {"method": "importance draws", "batches": 2, "seed": 1}
+    assert "by bridge sampling" in str(sampling.evidence(of_ensembles))
+    assert "Each colour is an independent ensemble" in str(parameters.traces(of_ensembles))
+    weighted = with_results(folder, sampler=settings)
+    shown = [sampling.evidence(weighted), parameters.traces(weighted), sampling.provenance(weighted)]
+    assert "the mean weight of the importance draws" in shown[0].text[0]
+    assert "ensemble" not in "".join(str(one.text) for one in shown)
+
+
+def test_a_fixed_parameter_is_not_called_sampled(folder):
+    run = with_results(folder)
+    row = {"unit": "-", "prior": "x", "from": "study", "integrated_out": False}
+    rows = pd.DataFrame([{"name": name, **row} for name in ("a", "b")])
+    results = {**run.results, "fixed": [{"name": "a", "value": 1.0, "unit": "-"}]}
+    run = replace(run, results=results, tables={**run.tables, "priors": rows})
+    (table,) = parameters.priors(run).tables
+    assert [cells[-1] for cells in table.rows] == ["fixed", "sampled"]

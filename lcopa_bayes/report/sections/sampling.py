@@ -20,6 +20,7 @@ _PER_FIGURE = 12
 _WIDE = 1.645 * 2
 """Width of a normal distribution's 90 % interval in standard deviations [-]."""
 _WORDS = {
+    "batches": "independent batches of draws",
     "draws": "draws of the proposal",
     "pareto_k": "Pareto k of the weights [-]",
     "weights_ess": "effective sample size of the weights [draws]",
