@@ -16,7 +16,7 @@ from lcopa_bayes.model.effects.effect import Card, Coefficient, ParallelEffect, 
 from lcopa_bayes.model.layout import Layout
 
 _MANY = 64
-"""Changes above which a convolution is worth while [-]."""
+"""Changes and samples above which a convolution is worth while [-]."""
 _ROUNDING = 1e-4
 """How far printed times may lie from an even grid [periods]."""
 
@@ -31,7 +31,7 @@ def summed(
     follow each other faster than the samples are summed one at a time: for them the samples are too coarse.
     Changes may begin long before the first sample, as where a transient was not read.
     """
-    if drive.times.size > _MANY and _even(times) and _slower(drive.times, times):
+    if min(drive.times.size, times.size) > _MANY and _even(times) and _slower(drive.times, times):
         return _convolved(times, drive.times, delay, jumps, shape)
     out = np.zeros(times.size)
     for at, jump in zip(drive.times + delay, jumps, strict=True):
