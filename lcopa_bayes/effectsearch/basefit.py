@@ -12,13 +12,16 @@ from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.noise import AxisNoise, Law, axis_noise, joint_noise, quiet_pieces
 from lcopa_bayes.effectsearch.regression import Optimum, Regression
-from lcopa_bayes.effectsearch.starts import screened
+from lcopa_bayes.effectsearch.starts import LAGS, regressed
 from lcopa_bayes.effectsearch.whitening import Whitening, parts
 from lcopa_bayes.inference.defaultpriors import Scales
+from lcopa_bayes.inference.noise import White
 from lcopa_bayes.inference.observations import Observed
+from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.posterior import Posterior
 
-_STARTS = 8
+_STARTS = 2
+"""Starts of the search for the optimum [-]."""
 _DELAYS = (0.7, 0.85, 1.15, 1.3)
 """Factors on the fitted delays from which the descent is started again: delays can jump [-]."""
 _EXPLAINED = 0.5
@@ -58,17 +61,22 @@ class BaseFit:
 def base_fit(
     model: ExtendedModel, rng: np.random.Generator, *, starts: int = _STARTS, near: Sequence[Vector] = ()
 ) -> BaseFit:
-    """Noise, then least squares from several starts and delays; `near` are further coordinates to start
-    from.
+    """The optimum of a fit's own search, then noise, and the optimum under it; `near` are further coordinates
+    to start from.
 
     Where an axis has too few quiet samples its noise is fitted to the residual in turn with the plant.
+    ArithmeticError when the search finds none.
     """
     posterior = model.plant
-    seeds = [model.coordinates(values) for values in screened(posterior, rng, count=starts)]
-    white = Whitening(posterior.samples, _guessed(posterior))
-    first = Regression(model, white)
-    x, _ = first.lowest([*near, *seeds])
-    optimum = first.best([x, *_other_delays(model, x)])
+    told = regressed(posterior, posterior.table.draw(LAGS, rng))
+    seeds = [*(model.values(x) for x in near), *told]
+    optima = find_optima(replace(posterior, noise=White()), rng, starts=starts, near=seeds)
+    if not optima:
+        raise FloatingPointError("no least-squares search leads to a plant inside the priors")
+    x = model.coordinates(optima[0].values)
+    optimum = Regression(model, Whitening(posterior.samples, _guessed(posterior))).best(
+        [x, *_other_delays(model, x)]
+    )
     noise: tuple[AxisNoise, ...] = ()
     for _ in range(_ROUNDS):
         delay = model.dead_time(optimum.x)
