@@ -27,15 +27,20 @@ if TYPE_CHECKING:
     from lcopa_bayes.verbs.audit import audit as audit
     from lcopa_bayes.verbs.calibrate import CalibrationResult as CalibrationResult
     from lcopa_bayes.verbs.calibrate import calibrate as calibrate
+    from lcopa_bayes.verbs.check import CheckResult as CheckResult
+    from lcopa_bayes.verbs.check import check as check
     from lcopa_bayes.verbs.compare import Comparison as Comparison
     from lcopa_bayes.verbs.compare import compare as compare
     from lcopa_bayes.verbs.design import DesignResult as DesignResult
     from lcopa_bayes.verbs.design import design as design
+    from lcopa_bayes.verbs.explain import explain as explain
     from lcopa_bayes.verbs.fit import fit as fit
     from lcopa_bayes.verbs.look import LookResult as LookResult
     from lcopa_bayes.verbs.look import look as look
     from lcopa_bayes.verbs.loop import LoopResult as LoopResult
     from lcopa_bayes.verbs.loop import loop as loop
+    from lcopa_bayes.verbs.new import NewStudy as NewStudy
+    from lcopa_bayes.verbs.new import new as new
     from lcopa_bayes.verbs.simulate import Simulation as Simulation
     from lcopa_bayes.verbs.simulate import simulate as simulate
     from lcopa_bayes.verbs.stored import load_result as load_result
@@ -52,11 +57,14 @@ _PLACES = {
     "results.savedfit": ("SavedFit",),
     "verbs.audit": ("AuditResult", "audit"),
     "verbs.calibrate": ("CalibrationResult", "calibrate"),
+    "verbs.check": ("CheckResult", "check"),
     "verbs.compare": ("Comparison", "compare"),
     "verbs.design": ("DesignResult", "design"),
+    "verbs.explain": ("explain",),
     "verbs.fit": ("fit",),
     "verbs.look": ("LookResult", "look"),
     "verbs.loop": ("LoopResult", "loop"),
+    "verbs.new": ("NewStudy", "new"),
     "verbs.simulate": ("Simulation", "simulate"),
     "verbs.stored": ("load_result",),
 }

@@ -16,14 +16,14 @@ import lcopa_bayes
 # verbs are imported when they run, so that help and refusals come at once
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.verbs import choices
-from lcopa_bayes.verbs.choices import RUNS
+from lcopa_bayes.verbs.choices import EXAMPLES, RUNS
+from lcopa_bayes.verbs.commandline import PROGRAM, CommandParser, Version, refused
 
 if TYPE_CHECKING:
     from lcopa_bayes.paper.intervals import Scan
     from lcopa_bayes.verbs.sources import FitLike
 
-USAGE_ERROR = 2
-"""Exit code for input that cannot be used."""
+_CODES = "exit codes: 0 done, 2 the input cannot be used (nothing is written), 130 interrupted"
 INTERRUPTED = 130
 """Exit code after an interrupt from the keyboard."""
 PUBLISHED = Path("reports")
@@ -68,16 +68,13 @@ class Verb:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb; returns the exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    options = _parser(given[:1]).parse_args(given)
+    options = _parser(given).parse_args(given)
     try:
         outcome = _outcome(options, ["lcopa-bayes", *given])
     except InputError as error:
-        for problem in error.problems:
-            print(f"error: {problem}", file=sys.stderr)
-        return USAGE_ERROR
+        return refused(error.problems, as_json=options.json)
     except FloatingPointError as error:  # a prior that reaches where the model cannot be computed
-        print(f"error: {error}; narrow the priors that allow these values", file=sys.stderr)
-        return USAGE_ERROR
+        return refused([f"{error}; narrow the priors that allow these values"], as_json=options.json)
     except KeyboardInterrupt:
         resume = "; the same command with --resume goes on where it stopped" * hasattr(options, "resume")
         print(f"interrupted{resume}", file=sys.stderr)
@@ -96,15 +93,28 @@ def _outcome(options: argparse.Namespace, command: Sequence[str]) -> Outcome:
         return VERBS[options.verb].perform(options)
 
 
-def _parser(wanted: Sequence[str]) -> argparse.ArgumentParser:
-    """All verbs, with the options of the one that is wanted."""
-    parser = argparse.ArgumentParser(prog="lcopa-bayes", description=lcopa_bayes.__doc__)
-    verbs = parser.add_subparsers(required=True, metavar="VERB", dest="verb")
+def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
+    """All verbs, with the options of the one that is given first."""
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = CommandParser(prog=PROGRAM, description=lcopa_bayes.__doc__, epilog=_CODES, formatter_class=raw)
+    parser.given = given
+    completed = given[:1] == ["--print-completion"]
+    if completed:
+        import shtab
+
+        shtab.add_argument_to(parser, ["--print-completion"])
+    parser.add_argument("--version", action=Version, nargs=0, help="print the version")
+    verbs = parser.add_subparsers(required=True, metavar="VERB", dest="verb", parser_class=CommandParser)
     for name, verb in VERBS.items():
-        own = verbs.add_parser(name, help=verb.text, description=verb.text)
+        example = f"example: {PROGRAM} {name} {EXAMPLES[name]}"
+        own = verbs.add_parser(
+            name, help=verb.text, description=verb.text, epilog=f"{example}\n\n{_CODES}", formatter_class=raw
+        )
+        own.given = given
+        parser.verbs = {**parser.verbs, name: own}
         own.add_argument("--quiet", action="store_true", help="no progress, no closing words")
         own.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-        if name in wanted:
+        if completed or name in given[:1]:
             verb.options(own)
     return parser
 
@@ -181,12 +191,41 @@ def _truth(options: argparse.Namespace, study: Any) -> object:
     return stated_values(options.truth)
 
 
-def _look(options: argparse.Namespace) -> Outcome:
-    from lcopa_bayes.verbs.sources import study_of
+def _new(options: argparse.Namespace) -> Outcome:
+    result = lcopa_bayes.new(
+        options.folder,
+        options.files,
+        held_out=options.held_out,
+        time=options.time,
+        drives=options.drive,
+        responses=options.response,
+        time_unit=options.time_unit,
+        decimal=options.decimal,
+        time_format=options.time_format,
+        sheet=options.sheet,
+        overwrite=options.overwrite,
+    )
+    after = f"lcopa-bayes check {options.folder}"
+    return Outcome(result.to_json() | {"folder": str(options.folder)}, f"{result}\n\nnext: {after}")
 
-    study = study_of(_source(options))
-    folder = _folder(options, study)
-    return _reported(lcopa_bayes.look(study, folder=folder), folder)
+
+def _explain(options: argparse.Namespace) -> Outcome:
+    term = " ".join(options.term)
+    text = lcopa_bayes.explain(term, runs=RUNS)
+    return Outcome({"term": term, "text": text}, text)
+
+
+def _unsampled(verb: str) -> Callable[[argparse.Namespace], Outcome]:
+    """What runs a public function of a study that samples nothing."""
+
+    def perform(options: argparse.Namespace) -> Outcome:
+        from lcopa_bayes.verbs.sources import study_of
+
+        study = study_of(_source(options))
+        folder = _folder(options, study)
+        return _reported(getattr(lcopa_bayes, verb)(study, folder=folder), folder)
+
+    return perform
 
 
 def _predict(options: argparse.Namespace) -> Outcome:
@@ -270,7 +309,11 @@ def _scan(options: argparse.Namespace, study: Any) -> Scan:
 _SAMPLING = ("resume", "quick", "quiet")
 """Options of every verb that samples."""
 VERBS: Mapping[str, Verb] = {
-    "look": Verb("least squares and residual within seconds, before sampling", choices.study, _look),
+    "new": Verb("records and a study from spreadsheets and loggers' tables", choices.new, _new),
+    "check": Verb("what was understood of a study, without fitting it", choices.study, _unsampled("check")),
+    "look": Verb(
+        "least squares and residual within seconds, before sampling", choices.study, _unsampled("look")
+    ),
     "run": Verb(
         "all stages the study names, then the report",
         choices.fit,
@@ -319,6 +362,7 @@ VERBS: Mapping[str, Verb] = {
     ),
     "optics": Verb("far field, director, chain from volts to angle, with figures", choices.optics, _optics),
     "claims": Verb("the paper's claims, each with a computed verdict", choices.claims, _claims),
+    "explain": Verb("what a term means, with an example from the last fit", choices.explain, _explain),
     "report": Verb("render the pages of a run folder again", choices.report, _report),
     "simulate": Verb("measure a campaign file on the virtual bench", choices.simulate, _simulate),
 }

@@ -118,6 +118,13 @@ def draws_of(table: ParameterTable, values: Matrix) -> Draws:
     return Draws(table, stacked, np.zeros((2, half)), found, 400.0)
 
 
+ON_OFF_TABLE = "Messung 3;;;\n\nZeit [min];Heater [%];T1 (°C);Notiz\n" + "".join(
+    f"{k / 5:.1f};{40 * (k > 9)};{21 + 14 * max(0.0, 1 - 0.9 ** (k - 12)) + 0.01 * (k * k % 5):.2f};\n"
+    for k in range(80)
+).replace(".", ",")
+"""What a spreadsheet saves: semicolons, decimal commas, remarks above the header, an empty column."""
+
+
 class Toy:
     """A known density in place of a posterior without elements: what sampling asks of a posterior.
 

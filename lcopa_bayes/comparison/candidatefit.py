@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 from threadpoolctl import threadpool_limits
 
+from lcopa_bayes.comparison.averaging import quantiles
 from lcopa_bayes.comparison.candidates import Candidate
 from lcopa_bayes.comparison.integerorder import integer_orders
 from lcopa_bayes.comparison.predictivedensity import Predicted, predictions
@@ -27,6 +28,7 @@ from lcopa_bayes.data.settings import SamplerSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.likelihood import Landscape, Peak
+from lcopa_bayes.results.bands import POINTWISE
 from lcopa_bayes.results.fit import Fit, fit, plan_of
 from lcopa_bayes.results.provenance import digest, fingerprint, settings_of
 from lcopa_bayes.results.summary import residual_rms, scores
@@ -95,7 +97,7 @@ WALKERS = 32
 [-]. Ensembles and effective draws are those of a fit, so that a grade means the same."""
 _STARTS = 64
 """Draws kept as starts of richer models [-]."""
-_VERSION = 3
+_VERSION = 4
 """Raised when what a card holds changes."""
 
 
@@ -167,6 +169,7 @@ class Contender:
             "fingerprint": self.fingerprint,
             "pointwise": _pointwise(predicted),
             "curves": _curves(fitted),
+            "quantiles": quantiles(fitted) if entries["usable"] else {},
         }
 
     def store(self, entries: Mapping[str, Any]) -> None:
@@ -233,14 +236,7 @@ def card(
             "estimates": [one.as_json() for one in fitted.draws.estimates()],
             "step_metrics": [one.as_json() for one in fitted.metrics],
             "residual_tests": [
-                {
-                    "record": one.record,
-                    "axis": one.axis,
-                    "held_out": one.held_out,
-                    "p_white": one.p_white,
-                    "rms": one.rms,
-                    "lag_1": float(one.autocorrelation[0]) if one.autocorrelation.size else None,
-                }
+                one.test() | {"lag_1": float(one.autocorrelation[0]) if one.autocorrelation.size else None}
                 for one in fitted.residuals
             ],
             "ess": fitted.draws.ess,
@@ -251,34 +247,22 @@ def card(
 
 def _pointwise(parts: tuple[Predicted, ...]) -> dict[str, list[Any]]:
     """Log predictive density of every sample predicted, one list per column."""
-    entries: dict[str, list[Any]] = {"part": [], "kind": [], "axis": [], "time": [], "log_density": []}
-    for one in parts:
-        entries["part"] += [one.part.name] * one.time.size
-        entries["kind"] += [one.part.kind] * one.time.size
-        entries["axis"] += list(one.axis)
-        entries["time"] += one.time.tolist()
-        entries["log_density"] += one.log_density.tolist()
-    return entries
+    columns = ("part", "kind", "axis", "time", "log_density")
+    rows = [
+        (one.part.name, one.part.kind, *sample)
+        for one in parts
+        for sample in zip(one.axis, one.time.tolist(), one.log_density.tolist(), strict=True)
+    ]
+    return {name: [row[k] for row in rows] for k, name in enumerate(columns)}
 
 
 def _curves(fitted: Fit) -> dict[str, list[Any]]:
     """Observed, median and 90 % band of every record, one list per column."""
-    entries: dict[str, list[Any]] = {
-        name: []
-        for name in ("record", "axis", "unit", "held_out", "time", "observed", "middle", "low", "high")
+    ends = {
+        f"plant_{POINTWISE}_50": "middle",
+        f"noisy_{POINTWISE}_05": "low",
+        f"noisy_{POINTWISE}_95": "high",
     }
-    for band in fitted.bands:
-        size = band.time.size
-        entries["record"] += [band.record] * size
-        entries["axis"] += [band.axis] * size
-        entries["unit"] += [band.unit] * size
-        entries["held_out"] += [band.held_out] * size
-        for name, values in (
-            ("time", band.time),
-            ("observed", band.observed),
-            ("middle", band.plant[2]),
-            ("low", band.noisy[0]),
-            ("high", band.noisy[4]),
-        ):
-            entries[name] += np.asarray(values).tolist()
-    return entries
+    table = pd.concat([band.table() for band in fitted.bands]).rename(columns=ends)
+    kept = ["record", "axis", "unit", "held_out", "time", "observed", *ends.values()]
+    return {str(name): values for name, values in table[kept].to_dict("list").items()}

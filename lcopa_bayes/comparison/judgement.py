@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp
 
+from lcopa_bayes.comparison.averaging import averaged
 from lcopa_bayes.comparison.decision import decided
 from lcopa_bayes.comparison.gains import stretches, total_sd
 from lcopa_bayes.core.arrays import Matrix, Vector
@@ -17,6 +18,9 @@ from lcopa_bayes.data.study import Study
 _ROUNDS = 2_000
 _SETTLED = 1e-10
 _SIMULATED = 4_000
+
+_KEPT_APART = ("pointwise", "curves", "starts", "quantiles")
+"""Entries of a card that stay in the folder of their candidate."""
 
 Card = Mapping[str, Any]
 
@@ -39,13 +43,11 @@ def judged(cards: Sequence[Card], study: Study) -> dict[str, Any]:
             "fit": [record.name for record in study.fit],
             "held_out": [record.name for record in study.held_out],
             **result,
+            "averaged": averaged(rows),
             "order_is_integer": [
                 {"model": row["name"]} | dict(one) for row in fractional for one in row["order_is_integer"]
             ],
-            "models": [
-                {key: value for key, value in row.items() if key not in ("pointwise", "curves", "starts")}
-                for row in rows
-            ],
+            "models": [{key: value for key, value in row.items() if key not in _KEPT_APART} for row in rows],
         }
     )
 

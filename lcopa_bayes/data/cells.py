@@ -15,6 +15,8 @@ from lcopa_bayes.core.errors import InputError, nearest
 
 SUFFIXES = (".csv", ".parquet")
 """Kinds of record files."""
+TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc")
+"""Suffixes of text files that are tables."""
 FORM = "time_<unit>, drive_<axis>_<unit> or response_<axis>_<unit>"
 """How columns are named."""
 _MOST = 5
@@ -24,7 +26,7 @@ _MOST = 5
 @final
 @dataclass(frozen=True)
 class CellTable:
-    """A file as text, so that every bad cell can be quoted; `rows` are line (CSV) or row numbers."""
+    """A file as text, so that every bad cell can be quoted; `rows` are numbers of lines, or of rows."""
 
     path: Path
     names: list[str]
@@ -34,7 +36,7 @@ class CellTable:
 
     def place(self, column: int, row: int | None = None) -> str:
         """Place of a column or of one of its cells in the user's file."""
-        count = "line" if self.path.suffix.lower() == ".csv" else "row"
+        count = "line" if self.path.suffix.lower() in TEXTS else "row"
         middle = "" if row is None else f", {count} {self.rows[row]}"
         return f"{self.path}{middle}, column {self.names[column]!r}"
 
@@ -64,13 +66,18 @@ def _csv_cells(path: Path) -> CellTable:
                     what = f"has {len(row)} cell(s) where the header has {len(names)}"
                     ragged.append(f"{path}, line {reader.line_num}: {what}; write every cell, even if empty")
         except UnicodeDecodeError:
-            refuse(path, "is not UTF-8 text; save it as comma-separated UTF-8")
+            refuse(
+                path,
+                "is not UTF-8 text; save it as comma-separated UTF-8, or convert it with `lcopa-bayes new`",
+            )
         except csv.Error as error:
             refuse(path, f"line {reader.line_num} is not comma-separated text ({error})")
     if not names:
         refuse(path, f"is empty; expected a header of columns {FORM}")
     if len(names) == 1 and any(separator in names[0] for separator in ";\t"):
-        refuse(path, "line 1: the columns are not separated by commas; separate them by commas")
+        raise InputError(
+            f"{path}, line 1: the columns are not separated by commas; `lcopa-bayes new` reads such tables"
+        )
     table = CellTable(path, names, rows, [*zip(*cells, strict=True)] if cells else [()] * len(names), [])
     table.add(ragged, str(path))
     return table

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, final
+from typing import final
 
-from lcopa_bayes.core.errors import InputError, nearest, refuse_if
+from lcopa_bayes.core.errors import InputError, refuse_if
+from lcopa_bayes.core.files import read_tables
 from lcopa_bayes.data.cells import SUFFIXES
 from lcopa_bayes.data.record import Record, load_record
 from lcopa_bayes.data.settings import CandidateSettings, CompareSettings, HeadingSettings, RecordsSettings
@@ -44,18 +44,6 @@ def _hashes(paths: Iterable[Path]) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
 
 
-def _document(path: Path) -> dict[str, Any]:
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        end = f"at line {text.count(chr(10)) + 1}, the end of the file"
-        why = str(error).replace("at end of document", end)
-        raise InputError(f"{path}: is not valid TOML: {why}") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as UTF-8 text ({error})") from error
-
-
 @final
 class BrokenStudyError(InputError):
     """A study file with problems whose plant and records can be used: more may be wrong with these."""
@@ -66,8 +54,7 @@ class BrokenStudyError(InputError):
 
 
 def _from_file(path: Path, held_out: list[Path]) -> Study:
-    document, folder = _document(path), path.parent
-    problems = _unknown_tables(document, path, _TABLES)
+    (document, problems), folder = read_tables(path, _TABLES), path.parent
 
     def where(name: str) -> str:
         return f"{path}, [{name}]"
@@ -79,8 +66,8 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
     if named:
         apart = [*(folder / name for name in named.held_out), *held_out]
         kept = {file.resolve() for file in apart}
-        beside = [file for file in sorted(folder.glob("[!.]*")) if file.suffix.lower() in SUFFIXES]
-        fit = [folder / k for k in named.fit or ()] or [file for file in beside if file.resolve() not in kept]
+        beside = [file for file in tables_in(folder) if file.resolve() not in kept]
+        fit = [folder / k for k in named.fit or ()] or beside
         if not fit:
             problems.append(
                 f"{where('records')}: no record to fit; name one, or put one beside the study file"
@@ -105,29 +92,43 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
     return study
 
 
-def _unknown_tables(document: Mapping[str, object], path: Path, known: Sequence[str]) -> list[str]:
-    return [f"{path}: unknown table [{key}]{nearest(key, known)}" for key in document if key not in known]
+def tables_in(folder: Path) -> list[Path]:
+    """Record files in a folder, by name."""
+    return [file for file in sorted(folder.glob("[!.]*")) if file.suffix.lower() in SUFFIXES]
 
 
 def load_study(source: Path | Sequence[Path], *, held_out: Sequence[Path] = ()) -> Study:
     """The study in the folder or study file `source`, or one of default settings made from record files.
 
     The time unit is the one the study file states, else that of the first fit record; records in other units
-    are converted. From record files the name is the first stems joined by ``-`` and the seed 0. `held_out`
-    adds records to hold out. Raises InputError with everything wrong in the study file and all its records
-    together; nothing is written.
+    are converted. A folder without a study file is a study of all records in it. From record files the name
+    is the first stems joined by ``-`` and the seed 0. `held_out` adds records to hold out. Raises InputError
+    with everything wrong in the study file and all its records together; nothing is written.
     """
     sources = [Path(source)] if isinstance(source, (str, Path)) else [Path(path) for path in source]
     apart = [Path(path) for path in held_out]
-    if len(sources) == 1 and (sources[0].is_dir() or sources[0].suffix.lower() == ".toml"):
-        return _from_file(sources[0] / "study.toml" if sources[0].is_dir() else sources[0], apart)
+    if len(sources) == 1 and sources[0].suffix.lower() == ".toml":
+        return _from_file(sources[0], apart)
+    name = None
+    if len(sources) == 1 and sources[0].is_dir():
+        folder = sources[0]
+        if (folder / "study.toml").exists():
+            return _from_file(folder / "study.toml", apart)
+        own = {path.resolve() for path in apart}
+        sources = [path for path in tables_in(folder) if path.resolve() not in own]
+        name = folder.resolve().name
+        if not sources:
+            raise InputError(
+                f"{folder}: this folder holds neither a study.toml nor a record nor a finished fit; name a "
+                "study, record files, or the run folder of a fit; `lcopa-bayes new` reads other tables"
+            )
     if not sources:
-        raise InputError("no study: name a folder with a study.toml, or one or more record files")
+        raise InputError("no study: name a folder, a study.toml, or one or more record files")
     problems: list[str] = []
     records = _read(sources, apart, None, problems)
     refuse_if(problems)
     fit, kept = tuple(records["fit"]), tuple(records["held_out"])
-    return Study(fit=fit, held_out=kept, inputs=_hashes([*sources, *apart]))
+    return Study(name, fit=fit, held_out=kept, inputs=_hashes([*sources, *apart]))
 
 
 def load_candidates(path: Path) -> tuple[tuple[str, ...] | None, tuple[CandidateSettings, ...]]:
@@ -135,8 +136,7 @@ def load_candidates(path: Path) -> tuple[tuple[str, ...] | None, tuple[Candidate
 
     InputError with all that is wrong.
     """
-    document = _document(path)
-    problems = _unknown_tables(document, path, ("compare", "candidates"))
+    document, problems = read_tables(path, ("compare", "candidates"))
     chosen = settings_from(CompareSettings, document.get("compare", {}), f"{path}, [compare]", problems)
     described = candidate_settings(document.get("candidates", []), f"{path}, [[candidates]]", problems)
     if not document:

@@ -1,65 +1,75 @@
-"""Candidates of a round: named effects within reach of the best, refitted with everything free."""
+"""Candidates of a round: named effects within reach of the best, refitted with everything free.
+
+Far from the base fit the plant bends to imitate what is missing (an order above 1 imitates overdrive), and
+the best frame, level or frequency beside that bent plant is not the best beside the plant as it is: there
+instances are chosen by descents of the whole model.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from lcopa_bayes.effectsearch.constants import tuned
-from lcopa_bayes.effectsearch.descents import descended, movable, rough
+from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.effectsearch.refits import Refit, refit, under_one_noise
+from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.signature import Signature
 from lcopa_bayes.effectsearch.trace import SEEN, Trace, Traced
+from lcopa_bayes.model.effects.effect import Effect, ForceEffect
 
 _CANDIDATES = 4
-_TUNED = 8
-"""Named effects whose internal constants are moved off their grid before they are ranked [-]."""
+_NAMED = 8
+"""Named effects that are ranked [-]."""
 NEAR = 0.7
 """Candidates reach this share of the best log Bayes factor [-]."""
+ROUGH = 5.0
+"""Residual over noise beyond which the linear evidence is too rough to choose by [-]."""
+_INSTANCES = 16
+"""Instances descended from, those of largest evidence [-]."""
+_FORCED = 3
+"""The same beside a force that is already there [-]."""
+_STEPS = 12
+_SIZES = (1.0, -1.0)
+"""Coefficients from which a single one is also started, with fitted and with integer orders [prior sd]."""
 
 
-def refitted(state: State, seen: Trace) -> tuple[list[Refit], list[str], dict[str, Signature]]:
-    """Refits of what may be named, by falling evidence; what could not be refitted and why; best instances.
+def refitted(state: State, seen: Trace) -> tuple[list[Refit], list[str]]:
+    """Refits of what may be named, by falling evidence; what could not be refitted and why.
 
-    Candidates come near the best of all with their internal constants moved off the grid. Effects that the
-    base model imitates to first order are tried too, from the size of their prior.
+    Candidates come near the best of all. Effects that the base model imitates to first order are tried too,
+    from the size of their prior.
     """
-    named = [one for one in seen.traced if one.card.place != "generic" and one.signatures][:_TUNED]
-    worth = [one for one in named if one.log_bayes_factor > 0]
-    done, failures, signatures = [], [], {}
-    for one in worth:
-        signatures[one.name] = tuned(state.model, state.optimum, state.whitening, one, seen)
-    reached = {name: seen.alone(signature) for name, signature in signatures.items()}
+    named = [one for one in seen.traced if one.card.place != "generic" and one.signatures][:_NAMED]
+    worth = {one.name: one.signatures[one.best] for one in named if one.log_bayes_factor > 0}
+    reached = {name: seen.alone(signature) for name, signature in worth.items()}
     ranked = sorted(reached, key=lambda name: -reached[name])
     # noise fitted jointly holds the misfit too: only a refit shows what an effect is worth
     least = -np.inf if not seen.alarmed else NEAR * max(reached.values(), default=0.0)
     near = [name for name in ranked if reached[name] > least][:_CANDIDATES]
     far = rough(seen)
     near = ranked if far else near
-    blind = [one for one in _blind(seen) if one.name not in near] if seen.alarmed and near else []
-    signatures |= {one.name: one.signatures[one.best] for one in blind}
-    sizes = {name: signatures[name].amplitude(seen.residual) for name in near}
-    sizes |= {one.name: np.ones(signatures[one.name].columns.shape[1]) for one in blind}
+    sizes = {name: worth[name].amplitude(seen.residual) for name in near}
+    if seen.alarmed and near:
+        blind = [one for one in _blind(seen) if one.name not in near]
+        worth |= {one.name: one.signatures[one.best] for one in blind}
+        sizes |= {one.name: np.ones(worth[one.name].columns.shape[1]) for one in blind}
+    done: list[Refit] = []
+    failures: list[str] = []
     for name, amplitude in sizes.items():
-        signature = signatures[name]
+        effect, reached_at = worth[name].effect, None
         try:
-            effect, reached_at = signature.effect, None
             if far and movable(seen.of(name)):
-                effect, reached_at = descended(state, seen, seen.of(name), signature)
-                amplitude = reached_at[state.optimum.x.size :]
+                effect, reached_at = descended(state, seen, seen.of(name))
+                amplitude = reached_at[-amplitude.size :] / state.model.having(effect).scale
+            added = [(effect, amplitude)]
             done.append(
-                refit(
-                    state.model,
-                    state.optimum,
-                    state.whitening,
-                    [(effect, amplitude)],
-                    seen.scale.quiet,
-                    reached_at,
-                )
+                refit(state.model, state.optimum, state.whitening, added, seen.scale.quiet, near=reached_at)
             )
         except ArithmeticError as error:
             failures.append(f"{name}: {error}")
-    return under_one_noise(done), failures, signatures
+    return under_one_noise(done), failures
 
 
 def _blind(seen: Trace) -> list[Traced]:
@@ -69,3 +79,56 @@ def _blind(seen: Trace) -> list[Traced]:
         for one in seen.traced
         if one.card.place == "output" and 0 < one.survival < SEEN and len(one.signatures) == 1
     ]
+
+
+def rough(seen: Trace) -> bool:
+    """Whether a residual is far above the noise."""
+    return float(np.mean(seen.residual**2)) > ROUGH**2
+
+
+def movable(traced: Traced) -> bool:
+    """Whether there are instances to choose from that take no iteration to simulate: a refit has several
+    starts of its own."""
+    return len(traced.signatures) > 1 and not isinstance(traced.signatures[0].effect, ForceEffect)
+
+
+def descended(state: State, seen: Trace, traced: Traced) -> tuple[Effect, Vector]:
+    """The instance with the lowest cost after a short descent, and the coordinates it reached; its constants
+    are freed in the refit.
+
+    ArithmeticError when no instance has a bounded response.
+    """
+    forced = any(isinstance(effect, ForceEffect) for effect in state.model.effects)
+    listed = sorted(traced.signatures, key=lambda one: -seen.alone(one))
+    best: tuple[float, Effect, Vector] | None = None
+    for signature in listed[: _FORCED if forced else _INSTANCES]:
+        model = replace(state.model.having(*state.model.effects, signature.effect), exact=not forced)
+        fit = Regression(model, state.whitening)
+        for start in _starts(state, signature, seen, forced=forced):
+            try:
+                x, _ = fit.reached(np.clip(start, *model.bounds), most=_STEPS, gain=1.0)  # a start only
+            except ArithmeticError:
+                continue
+            cost = fit.cost(x)
+            if best is None or cost < best[0]:
+                best = cost, signature.effect, x
+    if best is None:
+        raise FloatingPointError(f"{traced.name}: no instance has a bounded response")
+    return best[1], best[2]
+
+
+def _starts(state: State, signature: Signature, seen: Trace, *, forced: bool) -> list[Vector]:
+    """Coordinates to descend from: the linear estimate, and a prior sd to either side of none, there also
+    with every order at the nearest integer."""
+    model = state.model.having(*state.model.effects, signature.effect)
+    linear = signature.amplitude(seen.residual)
+    unit = model.scale[-linear.size :]
+    starts = [np.concatenate([state.optimum.x, size * unit]) for size in (linear, 0.3 * linear)]
+    if linear.size == 1 and not forced:
+        rows = model.posterior.table.rows
+        straight = state.optimum.x.copy()
+        for position, k in enumerate(state.model.columns):
+            if rows[k].kind == "order":
+                straight[position] = max(np.round(straight[position]), 1.0)
+        starts += [np.append(x, size * unit) for x in (state.optimum.x, straight) for size in _SIZES]
+    return starts

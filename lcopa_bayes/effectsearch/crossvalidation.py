@@ -14,7 +14,7 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
-from lcopa_bayes.effectsearch.gaussnewton import Optimum
+from lcopa_bayes.effectsearch.regression import Optimum
 from lcopa_bayes.effectsearch.whitening import Whitening
 
 PARTS = 5

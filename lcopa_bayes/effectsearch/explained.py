@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +14,7 @@ from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.outliers import NAME, Outlying
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.declared import coefficient_prior
+from lcopa_bayes.inference.noise import Noise
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.effect import Effect
 from lcopa_bayes.model.effects.records import Outliers
@@ -32,7 +33,8 @@ def explained_study(study: Study, model: ExtendedModel, outliers: Outlying | Non
     priors: dict[str, PriorSettings] = {}
     for effect in effects:
         for one in effect.coefficients(ranges):
-            prior, name = coefficient_prior(one), f"{effect.name}.{one.name}"
+            wide = replace(one, scale=one.scale * model.wider.get(effect.name, 1.0))
+            prior, name = coefficient_prior(wide), f"{effect.name}.{one.name}"
             priors[name] = PriorSettings(name, dist=prior.dist, parameters=prior.parameters)
         for key, value in effect.constants.items():
             name = f"{effect.name}.{key}"
@@ -58,44 +60,22 @@ def declarable(study: Study, effects: Sequence[Effect]) -> bool:
     return all(known.get(effect.name) is type(effect) for effect in effects)
 
 
-def explained_draws(study: Study, *, jobs: int = 1, quick: bool = False) -> Draws | None:
-    """Draws of an explained study, the same that a fit of it gives; None where importance sampling does not
-    hold, and a fit takes ensembles from the prior."""
+def explained_draws(study: Study, *, jobs: int = 1, quick: bool = False) -> tuple[Draws, Noise] | None:
+    """Draws of an explained study, the same that a fit of it gives, and its noise; None where importance
+    sampling does not hold, and a fit takes ensembles from the prior."""
     problem = problem_of(study)
     _, result = weighted_fit(problem, plan_of(problem, quick=False), jobs=jobs, quick=quick)
-    return None if result is None else result[1]
+    return None if result is None else (result[1], problem.posterior.noise)
 
 
 def coordinates_of(model: ExtendedModel, draws: Draws) -> Matrix:
-    """Draws in the coordinates of a model, (draws, coordinates): logarithms as there, coefficients over their
-    prior sd."""
-    rows, base = model.base.posterior.table.rows, model.base
-    columns = []
-    for name, k in zip(base.names, base.least.columns, strict=True):
-        column = draws.column(name)
-        columns.append(np.log(column) if rows[k].log_scale else column)
-    for one, scale in zip(model.effected.coefficients, model.scale, strict=True):
-        columns.append(draws.column(_named(one.name, draws)) / scale)
-    return np.stack(columns, axis=1)
+    """Draws in the coordinates of a model, (draws, coordinates)."""
+    rows = model.posterior.table.rows
+    columns = [(draws.column(rows[k].name), rows[k].log_scale) for k in model.columns]
+    return np.stack([np.log(column) if log else column for column, log in columns], axis=1)
 
 
-def _named(name: str, draws: Draws) -> str:
-    """Name of a coefficient among draws: with one record it goes without the record's."""
-    return name if name in draws.table.names else name.partition("[")[0]
-
-
-def unit_of(model: ExtendedModel, k: int) -> tuple[str, str, float]:
-    """Name and unit of a coordinate, and the factor from the coordinate to it (before any logarithm)."""
-    if k < model.plant_size:
-        row = model.base.posterior.table.rows[model.base.least.columns[k]]
-        return row.name, row.unit, 1.0
-    placed = model.effected.coefficients[k - model.plant_size]
-    layout = model.base.posterior.table.layout
-    units: Mapping[str, str] = {"time": model.base.time_unit, "response": layout.responses[0].unit}
-    unit = units.get(placed.coefficient.unit, placed.coefficient.unit)
-    return placed.name, unit, placed.coefficient.scale
-
-
-def estimate_name(model: ExtendedModel, draws: Draws, k: int) -> str:
-    """Name of a coordinate among draws."""
-    return _named(unit_of(model, k)[0], draws)
+def unit_of(model: ExtendedModel, k: int) -> tuple[str, str]:
+    """Name and unit of a coordinate (before any logarithm)."""
+    row = model.posterior.table.rows[model.columns[k]]
+    return row.name, row.unit

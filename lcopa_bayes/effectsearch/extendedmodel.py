@@ -1,128 +1,237 @@
-"""The plant with effects as a curve through all samples."""
+"""The plant of a study with effects as a curve through all samples: predictions, tangents and descents."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.effectsearch.basemodel import BaseModel
+from lcopa_bayes.core.arrays import Flags, Matrix, Vector
 from lcopa_bayes.effectsearch.whitening import stacked
+from lcopa_bayes.inference.declared import with_effects
 from lcopa_bayes.inference.effects import Effected, Placed, effected
+from lcopa_bayes.inference.kinds import CONSTANTS
+from lcopa_bayes.inference.leastsquares import LeastSquares
+from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.effects.effect import Effect, ForceEffect
+
+_MERGED = 1e-6
+"""Orders closer than this are at the end of their support [-]."""
+_NORMAL = ("norm", "halfnorm")
+_UNIT = np.array([1.0, 0.0, 0.0])
+"""Noise of unit scale, as `WhiteAR1` takes it."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class ExtendedModel:
-    """Coordinates are those of the base model, then every effect's coefficients over their prior sd."""
+    """A posterior with effects at the scales of a base fit, in the search coordinates of `LeastSquares`:
+    logarithms of time constants, plain orders, delays, gains, offsets and coefficients."""
 
-    base: BaseModel
-    effected: Effected
+    plant: Posterior
+    """The plant alone."""
+    scaled: Effected | None = None
+    """The effects at scales of a base fit; None before there is one."""
     exact: bool = True
     """Whether the plant's tangents are those with the effects in place; otherwise those of the plant alone,
     fifty times cheaper and good enough to descend with."""
+    loose: frozenset[str] = frozenset()
+    """Internal constants that are coordinates too, ``<effect>.<constant>``; the others are held."""
 
-    @classmethod
-    def of(
-        cls,
-        base: BaseModel,
-        x: Vector,
-        effects: tuple[Effect, ...] = (),
-        *,
-        taken: Mapping[str, float] | None = None,
-    ) -> ExtendedModel:
-        """With the effects' scales taken from the base fit at `x`; `taken` gives each record's place in the
-        campaign
-        [-], by default evenly from -1/2 to 1/2."""
-        names = [one.record.name for one in base.posterior.samples]
-        epochs = np.array([taken[name] for name in names]) if taken else None
-        return cls(base, effected(base.posterior, base.values(x), effects, epochs))
+    def at_scales(self, x: Vector, taken: Mapping[str, float]) -> ExtendedModel:
+        """With the scales of effects taken from the base fit at `x`; `taken` gives each record's place in the
+        campaign [-]."""
+        epochs = np.array([taken[one.record.name] for one in self.plant.samples])
+        return replace(self, scaled=effected(self.plant, self.values(x), (), epochs))
+
+    wider: Mapping[str, float] = field(default_factory=dict)
+    """Factor on the default prior sd of the coefficients of an effect, by its name, where it is not 1 [-]."""
+
+    @property
+    def effected(self) -> Effected:
+        """The effects at scales of the base fit."""
+        assert self.scaled is not None
+        return self.scaled
+
+    @cached_property
+    def posterior(self) -> Posterior:
+        """The plant with the effects, their scales those of the base fit."""
+        if not self.effects:
+            return self.plant
+        simulator = self.effected.simulator
+        return with_effects(
+            self.plant,
+            self.effects,
+            simulator.ranges,
+            simulator.epochs,
+            free=self.loose,
+            wider=self.wider,
+        )
+
+    def least(self, held: tuple[Vector, ...] = ()) -> LeastSquares:
+        """Residuals, derivatives and descents under noise of each axis as `WhiteAR1` takes it, by default
+        white of unit scale."""
+        axes = len(self.plant.table.layout.responses)
+        return LeastSquares(self.posterior, exact=self.exact, held=held or (_UNIT,) * axes)
+
+    @cached_property
+    def _least(self) -> LeastSquares:
+        return self.least()
+
+    @cached_property
+    def template(self) -> Vector:
+        """Fixed values, (rows,); those of the noise do not count."""
+        return _template(self.posterior)
 
     def having(self, *effects: Effect) -> ExtendedModel:
         """The same plant and scales with these effects."""
-        return replace(self, effected=self.effected.with_effects(effects))
+        return replace(self, scaled=self.effected.with_effects(effects))
 
     @property
     def effects(self) -> tuple[Effect, ...]:
         """The effects, in the order of their coefficients."""
-        return self.effected.effects
+        return self.scaled.effects if self.scaled else ()
 
     @property
-    def plant_size(self) -> int:
-        """Number of coordinates of the plant [-]."""
-        return len(self.base.names)
+    def columns(self) -> list[int]:
+        """Table positions of the coordinates."""
+        return self._least.columns
 
     @cached_property
-    def scale(self) -> Vector:
-        """Prior sd of each coefficient, in its unit."""
-        return np.array([one.coefficient.scale for one in self.effected.coefficients])
+    def plant_size(self) -> int:
+        """Number of coordinates of the plant [-]."""
+        return len(LeastSquares(self.plant).columns)
 
     @property
+    def scale(self) -> Vector:
+        """Prior sd of each coefficient, in its unit."""
+        wider = [self.wider.get(effect.name, 1.0) for effect in self.effects]
+        return np.array([one.coefficient.scale * wider[one.effect] for one in self.effected.coefficients])
+
+    @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of plant parameters and coefficients."""
-        return (*self.base.names, *(one.name for one in self.effected.coefficients))
+        """Names of the coordinates, as in the table."""
+        return tuple(self.posterior.table.names[k] for k in self.columns)
+
+    @property
+    def time_unit(self) -> str:
+        """Unit of all times."""
+        return self.plant.samples[0].record.time_unit
+
+    @cached_property
+    def _priors(self) -> tuple[Vector, Vector]:
+        centre, spread = [], []
+        for low, high, k in zip(*self.bounds, self.columns, strict=True):
+            row = self.posterior.table.rows[k]
+            assert row.prior is not None
+            flat = (high - low) / np.sqrt(12) if np.isfinite(high - low) else float(row.prior.frozen.std())
+            if row.prior.dist not in _NORMAL or row.log_scale:
+                pair = np.nan, flat
+            elif row.prior.dist == "norm":
+                pair = float(row.prior.frozen.mean()), float(row.prior.frozen.std())
+            else:  # its density falls from its lower end
+                pair = row.prior.support[0], row.prior.parameters.get("scale", 1.0)
+            centre.append(pair[0])
+            spread.append(pair[1])
+        return np.array(centre), np.array(spread)
 
     @property
     def centre(self) -> Vector:
-        """Prior mean of each coordinate; NaN where flat."""
-        return np.concatenate([self.base.centre, np.zeros(self.scale.size)])
+        """Prior mean of each coordinate; NaN where the prior is treated as flat within its support."""
+        return self._priors[0]
 
     @property
     def spread(self) -> Vector:
         """Prior sd of each coordinate."""
-        return np.concatenate([self.base.spread, np.ones(self.scale.size)])
+        return self._priors[1]
 
-    @property
+    @cached_property
     def bounds(self) -> tuple[Vector, Vector]:
         """Ends of the support of each coordinate."""
-        low, high = self.base.bounds
-        signed = [0.0 if one.coefficient.one_signed else -np.inf for one in self.effected.coefficients]
-        return np.concatenate([low, signed]), np.concatenate([high, np.full(len(signed), np.inf)])
+        return self._least.bounds
 
     def bounds_about(self, x: Vector) -> tuple[Vector, Vector]:
-        """The same about coordinates: orders whose terms cannot be exchanged also stay in their sequence."""
-        low, high = (ends.copy() for ends in self.bounds)
-        n = self.plant_size
-        low[:n], high[:n] = self.base.bounds_about(x[:n])
+        """Bounds within which the orders of every element with unlike priors stay decreasing and terms
+        resolved: a free neighbour comes no closer than the middle, and merged orders stay apart; a term
+        crosses 1 in its order, or the shortest resolved time, only where the other allows it."""
+        low, high = self._least.bounds_around(self._least.values(x, self.template))
+        for ends, other in zip((low, high), self.bounds, strict=True):
+            merged = (ends != other) & (np.abs(x - ends) < _MERGED)
+            ends[merged] = x[merged]
+        table, shortest = self.plant.table, np.log(self.plant.table.resolution or 1.0)
+        for t, o in table.limited:
+            time = self.columns.index(t)
+            order = self.columns.index(o) if table.rows[o].free else None
+            steep = (table.rows[o].value if order is None else x[order]) > 1.0
+            if steep or x[time] > shortest + _MERGED:
+                low[time] = max(low[time], shortest)
+            elif order is not None:
+                high[order] = min(high[order], 1.0)
         return low, high
 
     def canonical(self, x: Vector) -> Vector:
-        """Coordinates of the same curve, terms in the sequence in which they are reported."""
-        return np.concatenate([self.base.canonical(x[: self.plant_size]), x[self.plant_size :]])
+        """Coordinates of the same plant, terms that can be exchanged by decreasing order."""
+        raw = self._least.values(x, self.template)[None]
+        source = self.posterior.table.sorted_with_source(raw)[1][0]
+        out = x.copy()
+        out[np.searchsorted(self.columns, source[self.columns])] = x
+        return out
 
-    def split(self, x: Vector) -> tuple[Vector, Vector]:
-        """Table values and coefficients of coordinates."""
-        n = self.plant_size
-        return self.base.values(x[:n]), x[n:] * self.scale
+    def supported(self, x: Matrix, *, every: bool = True) -> Flags:
+        """Whether orders decrease and terms are resolved, of coordinates (batch, k), (batch,).
+
+        Unless `every`, terms that can be exchanged may be in any sequence.
+        """
+        values = np.array([self._least.values(each, self.template) for each in x])
+        table = self.posterior.table
+        return table.supported(values if every else table.canonical(values))
+
+    @property
+    def log_support(self) -> float:
+        """What the support of terms adds to the log of a prior density of terms in any sequence [nat]."""
+        return self.plant.table.log_support
+
+    def values(self, x: Vector) -> Vector:
+        """Table values of coordinates, (rows,), terms in canonical order."""
+        return np.asarray(self.posterior.table.canonical(self._least.values(x, self.template)[None])[0])
+
+    def coordinates(self, values: Vector) -> Vector:
+        """Coordinates of table values."""
+        return self._least.coordinates(values)
 
     def dead_time(self, x: Vector) -> float:
         """Shortest delay at coordinates [time unit]."""
-        return self.base.dead_time(x[: self.plant_size])
+        table, values = self.posterior.table, self.values(x)
+        return min(float(values[table.at("delay", k)]) for k in range(len(table.layout.delays)))
+
+    def held(self, x: Vector) -> tuple[ExtendedModel, Vector]:
+        """The model with its `loose` constants held at those of coordinates, and the other coordinates."""
+        table, values = self.posterior.table, self.values(x)
+        effects: list[Effect] = []
+        for effect in self.effects:
+            full = {name: f"{effect.name}.{name}" for name in effect.constants}
+            loose = {name: each for name, each in full.items() if each in self.loose}
+            moved = {name: float(values[table.names.index(each)]) for name, each in loose.items()}
+            effects.append(replace(effect, **moved))
+        fixed = [p for p, k in enumerate(self.columns) if table.rows[k].kind not in CONSTANTS]
+        return replace(self.having(*effects), loose=frozenset()), x[fixed]
+
+    @cached_property
+    def observed(self) -> Vector:
+        """Observed samples, stacked [response unit]."""
+        return np.concatenate([one.values for record in self.plant.samples for one in record.axes])
 
     def predict(self, x: Vector) -> Vector:
         """Stacked responses, (n,) [response unit]; UnstableError where there are none."""
-        if not self.effects:
-            return self.base.predict(x)
-        values, psi = self.split(x)
-        return stacked(self.base.posterior.samples, self.effected.responses(values, psi))
+        return np.asarray(self.observed + self._least.misfit(x, self.template)[: self.plant.size])
 
     def tangents(self, x: Vector) -> tuple[Vector, Matrix]:
         """Stacked responses, (n,), and their derivatives in the coordinates, (n, k)."""
-        if not self.effects:
-            return self.base.tangents(x)
-        values, psi = self.split(x)
-        samples, n = self.base.posterior.samples, self.plant_size
-        if self.exact:
-            slopes = [np.moveaxis(one, 2, 0) for one in self.effected.jacobian(values, psi)]
-            plant = self._in_coordinates(stacked(samples, slopes), x[:n], values)
-        else:
-            plant = self.base.tangents(x[:n])[1].T
-        return self.predict(x), np.vstack([plant, self._coefficient_slopes(values, psi)]).T
+        misfit, jacobian = self._least.residual(x, self.template)
+        return self.observed + misfit[: self.plant.size], jacobian[: self.plant.size]
 
     def signature(self, x: Vector, effect: Effect) -> tuple[Matrix, tuple[Placed, ...]]:
         """Derivatives in the coefficients of one more effect over their prior sd where it vanishes, (n, k)
@@ -132,23 +241,16 @@ class ExtendedModel:
         long and change a signature little.
         """
         kept = tuple(e for e in self.effects if not isinstance(e, ForceEffect))
-        more = self.having(*kept, effect)
-        placed, old = self.effected.coefficients, self.effected.effects
-        own = [k for k, one in enumerate(placed) if old[one.effect] in kept]
-        coordinates = np.concatenate([x[: self.plant_size], x[self.plant_size :][own]])
-        new = more.scale.size - len(own)
-        values, psi = more.split(np.concatenate([coordinates, np.zeros(new)]))
-        return more._coefficient_slopes(values, psi)[len(own) :].T, more.effected.coefficients[-new:]
+        more = self.effected.with_effects([*kept, effect])
+        own = [k for k, one in enumerate(self.effected.coefficients) if self.effects[one.effect] in kept]
+        values, new = self.values(x)[: len(self.plant.table.rows)], len(more.coefficients) - len(own)
+        psi = np.concatenate([x[self.plant_size :][own], np.zeros(new)])
+        scale = np.array([one.coefficient.scale for one in more.coefficients[-new:]])
+        slopes = [np.moveaxis(one, 2, 0) for one in more.signature(values, psi)]
+        raw = stacked(self.plant.samples, slopes)[len(own) :].T
+        return raw * scale, more.coefficients[-new:]
 
-    def _coefficient_slopes(self, values: Vector, psi: Vector) -> Matrix:
-        slopes = [np.moveaxis(one, 2, 0) for one in self.effected.signature(values, psi)]
-        return stacked(self.base.posterior.samples, slopes) * self.scale[:, None]
 
-    def _in_coordinates(self, slopes: Matrix, x: Vector, values: Vector) -> Matrix:
-        """Slopes in table values (rows, n) as slopes in the search coordinates (k, n)."""
-        table, least = self.base.posterior.table, self.base.least
-        raw = least.values(x, self.base.template)
-        _, source = table.sorted_with_source(raw[None])
-        moved = slopes[source[0]][least.columns]
-        logs = [values[source[0][k]] if table.rows[k].log_scale else 1.0 for k in least.columns]
-        return np.asarray(moved * np.array(logs)[:, None])
+def _template(posterior: Posterior) -> Vector:
+    unit = posterior.noise.nearly_white(1.0)
+    return np.array([unit.get(row.kind, row.value) for row in posterior.table.rows])

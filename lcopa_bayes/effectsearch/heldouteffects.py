@@ -120,7 +120,7 @@ def _measured(state: State) -> list[list[Law]]:
 
 def _left_by_fit(state: State) -> list[list[Law]]:
     """Noise that the residual of the fit leaves plausible, per axis."""
-    posterior, rng = state.model.base.posterior, np.random.default_rng(_SEED)
+    posterior, rng = state.model.plant, np.random.default_rng(_SEED)
     axes = range(len(state.whitening.noise))
     scales = Scales.of([one.record for one in posterior.samples])
     pieces = [axis_pieces(posterior, state.optimum.residual, axis) for axis in axes]

@@ -17,7 +17,6 @@ from lcopa_bayes.effectsearch.basefit import BaseFit
 from lcopa_bayes.effectsearch.explained import (
     coordinates_of,
     declarable,
-    estimate_name,
     explained_draws,
     explained_study,
     unit_of,
@@ -29,7 +28,7 @@ from lcopa_bayes.effectsearch.rounds import CLEAR, SINGLE, Round, search
 from lcopa_bayes.effectsearch.scores import Score, State, fit_scores, held_out_scores, left_out_scores
 from lcopa_bayes.effectsearch.terms import fitted_base
 from lcopa_bayes.effectsearch.trace import Trace
-from lcopa_bayes.effectsearch.verdict import ALONE, EXPLAINED, Findings, Verdict, beside, decide
+from lcopa_bayes.effectsearch.verdict import ALONE, EXPLAINED, Findings, Verdict, beside, decide, widened
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.effect import Effect
@@ -98,10 +97,10 @@ class Loop:
         """A coordinate of the final model with unit, 90 % interval and grade."""
         state = self.after.state
         if self.draws is not None:
-            name = estimate_name(state.model, self.draws, k)
+            name = state.model.names[k]
             return next(one for one in self.draws.estimates() if one.name == name).as_json()
-        name, unit, factor = unit_of(state.model, k)
-        middle, sd = float(state.optimum.x[k]) * factor, float(np.sqrt(state.covariance[k, k])) * factor
+        name, unit = unit_of(state.model, k)
+        middle, sd = float(state.optimum.x[k]), float(np.sqrt(state.covariance[k, k]))
         return {
             "name": name,
             "value": middle,
@@ -212,6 +211,8 @@ def _looped(
         verdict = beside(verdict, outliers.sentence)
     named = verdict.kind in ("explained", "disturbance")
     last_state, sampled = searched.state if named else start, None
+    wider = last_state.model.wider
+    verdict = widened(verdict, {name: wider[name] for name in names if named and name in wider})
     if verdict.kind == "unexplained" or last.alarmed:  # something significant remains
         white, residual = last_state.whitening, last_state.optimum.residual
         last_state = replace(last_state, widening=Widening.of(white.samples, residual, white.noise))
@@ -219,8 +220,8 @@ def _looped(
         explained = explained_study(problem.study, last_state.model, outliers)
         sampled = explained_draws(explained, jobs=jobs, quick=quick)
     if sampled is not None:
-        covariance = np.cov(coordinates_of(last_state.model, sampled).T)
-        last_state = replace(last_state, covariance=np.asarray(covariance))
+        covariance = np.cov(coordinates_of(last_state.model, sampled[0]).T)
+        last_state = replace(last_state, covariance=np.asarray(covariance), sampled=sampled)
     return Loop(
         problem,
         base,
@@ -233,7 +234,7 @@ def _looped(
         reached if last_state is searched.state else _side(problem, last_state),
         not study.held_out,
         cautions,
-        sampled,
+        sampled[0] if sampled is not None else None,
         outliers,
     )
 
@@ -253,5 +254,5 @@ def _alone(study: Study) -> tuple[str, ...]:
 
 def _side(problem: Problem, state: State) -> Side:
     unseen = held_out_scores(state, problem) if problem.study.held_out else left_out_scores(state)
-    log_evidence = state.optimum.log_evidence + state.model.base.log_support
+    log_evidence = state.optimum.log_evidence + state.model.log_support
     return Side(state, tuple(fit_scores(state)), tuple(unseen), log_evidence)

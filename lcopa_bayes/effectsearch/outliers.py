@@ -74,7 +74,7 @@ class Outlying:
 
 def outlying(study: Study, fit: BaseFit) -> Outlying | None:
     """Outliers in the residual of a base fit; None where there are none that belong to the noise."""
-    posterior, residual = fit.model.posterior, fit.optimum.residual
+    posterior, residual = fit.model.plant, fit.optimum.residual
     samples = posterior.samples
     delay = fit.model.dead_time(fit.optimum.x)
     far: dict[tuple[int, int], Flags] = {}

@@ -3,31 +3,48 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import final
+from typing import Any, final
 
 import numpy as np
 from scipy.stats import chi2
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.effectsearch.basefit import renewed
-from lcopa_bayes.effectsearch.constants import polished
 from lcopa_bayes.effectsearch.crossvalidation import groups, log_scores
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
-from lcopa_bayes.effectsearch.gaussnewton import Optimum, Regression
 from lcopa_bayes.effectsearch.noise import quiet_samples
+from lcopa_bayes.effectsearch.regression import Optimum, Regression
 from lcopa_bayes.effectsearch.signature import Scale
+from lcopa_bayes.effectsearch.trace import LEVEL
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.effects import Placed
+from lcopa_bayes.inference.kinds import CONSTANTS
 from lcopa_bayes.model.effects.effect import Effect
 
 SIGNIFICANT = 2.7e-3
 """Two-sided p-value of three standard deviations [-]."""
+_FAR = 3.0
+"""Coefficients beyond so many prior standard deviations widen their prior [-]."""
+_WIDER = 4.0
+"""Factor by which that prior is widened at a time [-]."""
+_STEPS = 4
+"""How often it is widened at most [-]."""
+_COMMON = 10.0
+"""How many times more common effects within a prior are than within the next wider one [-]."""
 _PROCESSES = 400
 """Plausible noise processes over which a p-value is averaged [-]."""
 _NEAR = 0.5
 """Expected gain of a step with which a descent by the plant's own tangents ends [nat]."""
+_EVALUATIONS = 15
+"""Most responses of a descent with constants [-]."""
+_BACK = 6
+"""Responses after which a constant that moved back to its grid is judged [-]."""
+_HOPELESS = 1000.0
+"""Cost beyond which these would not mend it [nat]."""
+_SLIGHT = 0.05
+"""A step that gains less is the last [nat]."""
 _DELAYS = (-0.25, -0.1)
 """Shares of a delay by which it is also started earlier, for effects that act on the drive [-]."""
 
@@ -102,7 +119,9 @@ class Refit:
         before = Regression(plain, whitening).descend(self.before.x, most=12, gain=_NEAR)
         optimum = Regression(self.model, whitening).descend(self.optimum.x, most=12, gain=_NEAR)
         optimum = _no_worse(self.model, whitening, optimum, before)
-        return replace(self, optimum=optimum, before=before, whitening=whitening)
+        model, optimum, rare = _with_room(self.model, optimum, whitening, self.added)
+        paid = self.paid - rare
+        return replace(self, model=model, optimum=optimum, before=before, whitening=whitening, paid=paid)
 
     def wald(self, name: str) -> float:
         """p-value of an effect's coefficients being zero, over all noise that is plausible [-].
@@ -153,29 +172,121 @@ def refit(
     """With effects added to those of `model`, each started from zero and from its linear estimate.
 
     `added` holds each effect with its coefficients over their prior sd; `quiet` [-] are the samples the
-    noise scale is known from (`Scale`). The descent uses the plant's own tangents first, then moves the
-    effects' internal constants too (`polished`), and ends with the tangents of the whole. The evidence pays
+    noise scale is known from (`Scale`). The descent uses the plant's own tangents first, then frees the
+    effects' internal constants too (`freed`), and ends with the tangents of the whole. The evidence pays
     for the choice among the instances that were tried. `near` are further coordinates to start from.
     ArithmeticError when no start has a bounded response.
     """
     extended = model.having(*model.effects, *(effect for effect, _ in added))
-    linear = np.concatenate([psi for _, psi in added])
+    size = sum(psi.size for _, psi in added)
+    linear = np.concatenate([psi for _, psi in added]) * extended.scale[-size:]
     low, high = extended.bounds
     starts = [np.concatenate([before.x, factor * linear]) for factor in (1.0, 0.3, 0.0)]
     if any(effect.card.place == "drive" for effect, _ in added):
         starts += [_earlier(model, starts[0], share) for share in _DELAYS]
     starts += [near] if near is not None else []
     starts = [np.clip(start, low, high) for start in starts]  # starts only
-    quick = Regression(replace(extended, exact=False), whitening).best(starts, gain=_NEAR)
-    extended, start = polished(extended, quick.x, whitening, tuple(effect.name for effect, _ in added))
+    quick, _ = Regression(replace(extended, exact=False), whitening).lowest(starts, gain=_NEAR)
+    extended, start = freed(extended, quick, whitening, tuple(effect.name for effect, _ in added))
     optimum = Regression(extended, whitening).descend(start, most=12, gain=0.02)
     optimum = _no_worse(extended, whitening, optimum, before)
-    sides = sum(one.coefficient.one_signed for one in extended.effected.coefficients[-linear.size :])
-    tried = sum(np.log(len(effect.grid(extended.effected.ranges))) for effect, _ in added)
     names = tuple(effect.name for effect, _ in added)
-    return Refit(
-        extended, optimum, before, whitening, names, quiet, sides * float(np.log(2.0)) - float(tried)
+    extended, optimum, rare = _with_room(extended, optimum, whitening, names)
+    sides = sum(one.coefficient.one_signed for one in extended.effected.coefficients[-size:])
+    tried = sum(np.log(len(effect.grid(extended.effected.ranges))) for effect, _ in added)
+    paid = sides * float(np.log(2.0)) - float(tried) - rare
+    return Refit(extended, optimum, before, whitening, names, quiet, paid)
+
+
+def freed(
+    model: ExtendedModel, x: Vector, whitening: Whitening, names: Sequence[str]
+) -> tuple[ExtendedModel, Vector]:
+    """The model with the constants of its effects `names` where the residual is smallest, and coordinates.
+
+    They are parameters like any other of the descent, which uses the plant's own tangents; those that a fit
+    holds by default stay.
+    """
+    rows = model.posterior.table.rows
+    loose = frozenset(
+        row.name for row in rows if row.kind == "constant" and row.name.partition(".")[0] in names
     )
+    wide = replace(model, exact=False, loose=loose)
+    if not any(rows[k].kind in CONSTANTS for k in wide.columns):
+        return model, x
+    best = Regression(replace(model, exact=False), whitening).cost(x)
+    try:
+        reached, _ = Regression(wide, whitening).reached(
+            wide.coordinates(model.values(x)), most=_EVALUATIONS, gain=_SLIGHT
+        )
+    except ArithmeticError:
+        return model, x
+    moved, other = wide.held(reached)
+    if Regression(moved, whitening).cost(other) < best:
+        model, x = replace(moved, exact=model.exact), other
+    return _likely(model, x, whitening, names)
+
+
+def _likely(
+    model: ExtendedModel, x: Vector, whitening: Whitening, names: Sequence[str]
+) -> tuple[ExtendedModel, Vector]:
+    """The model with constants back on the grid, of likely values, where the fit does not separate them.
+
+    A phase and a delay move together until a command falls to another refresh, which other records may show.
+    A noise that still holds what the effect takes away separates too little.
+    """
+    if whitening.dependence:
+        return model, x
+    cost = Regression(model, whitening).cost(x)
+    for k, effect in enumerate(model.effects):
+        listed = effect.grid(model.effected.ranges)
+        for name in _constants_of(effect) if effect.name in names else ():
+            here = getattr(effect, name)
+            values = np.array([getattr(one, name) for one in listed])
+            near = float(values[np.argmin(np.abs(values - here))])
+            back = _replaced(model, k, name, near)
+            fit = Regression(back, whitening)
+            if near == here or not fit.cost(x) < cost + _HOPELESS:
+                continue
+            there, _ = fit.reached(x, most=_BACK, gain=_SLIGHT)
+            if fit.cost(there) < cost + LEVEL:
+                model, x = back, there
+    return model, x
+
+
+def _replaced(model: ExtendedModel, effect: int, name: str, value: float) -> ExtendedModel:
+    """The model with one constant of one effect at another value."""
+    effects: list[Any] = list(model.effects)
+    effects[effect] = replace(effects[effect], **{name: value})
+    return model.having(*effects)
+
+
+def _constants_of(effect: Effect) -> list[str]:
+    """Names of the internal constants that are real numbers."""
+    listed = [field.name for field in fields(effect)]
+    return [name for name in listed if isinstance(getattr(effect, name), float)]
+
+
+def _with_room(
+    model: ExtendedModel, optimum: Optimum, whitening: Whitening, names: Sequence[str]
+) -> tuple[ExtendedModel, Optimum, float]:
+    """Model and optimum with priors of the effects `names` so wide that these do not pull their coefficients
+    back, and what the evidence pays for that [nat].
+
+    A prior a normal law's tail away from the data biases the coefficient, and what it takes away would look
+    like a further effect. Scales four times as large are a tenth as common: together a prior with the tails
+    of a Student law of 1.7 degrees of freedom.
+    """
+    rare = 0.0
+    for _ in range(_STEPS):
+        apart = np.abs(optimum.x[model.plant_size :]) / model.scale
+        placed = zip(model.effected.coefficients, apart, strict=True)
+        far = {model.effects[one.effect].name for one, size in placed if size > _FAR} & set(names)
+        if not far:
+            return model, optimum, rare
+        more = {name: _WIDER * model.wider.get(name, 1.0) for name in far}
+        model, rare = replace(model, wider={**model.wider, **more}), rare + len(far) * float(np.log(_COMMON))
+        optimum = Regression(model, whitening).descend(optimum.x, most=12, gain=0.02)
+    return model, optimum, rare
 
 
 def _no_worse(model: ExtendedModel, whitening: Whitening, reached: Optimum, before: Optimum) -> Optimum:
@@ -197,7 +308,7 @@ def under_one_noise(candidates: Sequence[Refit]) -> list[Refit]:
     """
     if candidates and candidates[0].whitening.dependence:
         least = max(candidates, key=lambda one: one.taken)
-        noise = renewed(least.model.base, least.optimum, least.whitening)
+        noise = renewed(least.model, least.optimum, least.whitening)
         candidates = [one.under(noise) for one in candidates]
     return sorted(candidates, key=lambda one: -one.log_bayes_factor)
 
@@ -213,8 +324,8 @@ def log_bayes_factor(before: Optimum, after: Optimum, quiet: float) -> float:
 def _earlier(model: ExtendedModel, start: Vector, share: float) -> Vector:
     """The start with every free delay changed by a share of it."""
     out = start.copy()
-    rows = model.base.posterior.table.rows
-    for position, k in enumerate(model.base.least.columns):
-        if rows[k].kind == "delay":
+    rows = model.plant.table.rows
+    for position, k in enumerate(model.columns):
+        if k < len(rows) and rows[k].kind == "delay":
             out[position] += np.log1p(share) if rows[k].log_scale else share * start[position]
     return out

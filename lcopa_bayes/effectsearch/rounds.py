@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import final
@@ -10,10 +10,16 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.effectsearch.candidates import refitted
-from lcopa_bayes.effectsearch.gaussnewton import Regression
 from lcopa_bayes.effectsearch.refits import SIGNIFICANT, Refit, log_bayes_factor, refit, under_one_noise
+from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
-from lcopa_bayes.effectsearch.signature import Signature, expected_margin, pair_evidence
+from lcopa_bayes.effectsearch.signature import (
+    Projection,
+    Signature,
+    expected_margin,
+    pair_evidence,
+    signature_of,
+)
 from lcopa_bayes.effectsearch.trace import Trace, Traced, trace
 from lcopa_bayes.effectsearch.verdict import MARGIN
 from lcopa_bayes.model.effects.effect import Effect
@@ -78,14 +84,14 @@ def search(
         if not (seen.alarmed or state.whitening.dependence) or number == MOST:
             rounds.append(Round(seen, (), (), None))
             break
-        refits, failures, tuned_best = refitted(state, seen)
+        refits, failures = refitted(state, seen)
         # what one refit leaves is not noise alone: a further effect must stand out from it
         bar = seen.threshold + (MARGIN if number else 0.0)
         chosen = _leader([one for one in refits if _accepted(one, seen, bar) and (not alone or _large(one))])
         rounds.append(Round(seen, tuple(refits), tuple(failures), chosen))
         if chosen is None:
             break
-        groups[chosen.added[0]] = group(chosen, refits, seen, tuned_best)
+        groups[chosen.added[0]] = group(state, chosen, refits, seen)
         state = _kept(chosen)
     if rounds[-1].trace.alarmed and rounds[0].trace.alarmed and not alone:
         paired = _paired(start, state, rounds[0].trace)
@@ -117,7 +123,7 @@ def _gained(start: State, state: State, quiet: float) -> tuple[float, float]:
 
 def leading(start: State, seen: Trace) -> float:
     """Largest log Bayes factor of a single named effect that would be accepted, 0 without any [nat]."""
-    refits, _, _ = refitted(start, seen)
+    refits, _ = refitted(start, seen)
     accepted = [one.log_bayes_factor for one in refits if _accepted(one, seen, seen.threshold)]
     return max(accepted, default=0.0)
 
@@ -201,9 +207,7 @@ def _best(one: Traced) -> Signature:
     return one.signatures[one.best]
 
 
-def group(
-    chosen: Refit, refits: Sequence[Refit], seen: Trace, signatures: Mapping[str, Signature]
-) -> tuple[str, ...]:
+def group(state: State, chosen: Refit, refits: Sequence[Refit], seen: Trace) -> tuple[str, ...]:
     """Names that these records confound with the chosen one, its own first.
 
     A rival that was refitted belongs to the group when it lost by less than 3 nat; one that was not, when the
@@ -211,8 +215,11 @@ def group(
     Where noise was fitted jointly that margin would count the effect as noise, and only refits say.
     """
     name = chosen.added[0]
-    own = signatures[name]
-    amplitude = chosen.optimum.x[chosen.places(name)]
+    project = Projection(state.optimum.moving * state.model.spread)
+    (effect,) = [one for one in chosen.model.effects if one.name == name]
+    own = signature_of(state.model, state.optimum.x, state.whitening, project, effect)
+    where = chosen.places(name)
+    amplitude = chosen.optimum.x[where] / chosen.model.spread[where]
     out = [name]
     fitted = {one.added[0]: one for one in refits}
     for one in seen.traced:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, final
 
 import numpy as np
@@ -13,13 +13,26 @@ from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.crossvalidation import groups, shifts
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
-from lcopa_bayes.effectsearch.gaussnewton import Optimum
-from lcopa_bayes.effectsearch.prediction import level_of, predicted
+from lcopa_bayes.effectsearch.noise import Law
+from lcopa_bayes.effectsearch.regression import Optimum
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.declared import campaign_places
+from lcopa_bayes.inference.noise import Noise, WhiteAR1
+from lcopa_bayes.inference.observations import Samples
+from lcopa_bayes.inference.parameter import Parameter, Place
+from lcopa_bayes.model.effects.declared import Declared
+from lcopa_bayes.results.prediction import disturbances, named_rng, offset_draws, plant_draws
+from lcopa_bayes.sampling.draws import Draws
 
 LEVEL = 0.9
 """Probability inside the bands [-]."""
+_DRAWS = 100
+"""Draws about an optimum behind the prediction of a held-out record [-]."""
+_MOST = 400
+"""The same of a sampled posterior, at most [-]."""
+_TRIES = 4
+"""Draws for each of them within the support [-]."""
 _WIDTH = float(norm.ppf(0.5 + LEVEL / 2))
 
 
@@ -96,6 +109,8 @@ class State:
     covariance: Matrix
     """Of the coordinates, (k, k)."""
     widening: Widening | None = None
+    sampled: tuple[Draws, Noise] | None = None
+    """Draws of the explained study and its noise; None where only the optimum is known."""
 
 
 def fit_scores(state: State) -> list[Score]:
@@ -121,22 +136,72 @@ def left_out_scores(state: State) -> list[Score]:
 
 
 def held_out_scores(state: State, problem: Problem) -> list[Score]:
-    """On the study's held-out records."""
-    unseen = predicted(problem, state.model, state.optimum.x, state.covariance, problem.study.held_out)
-    elsewhere = State(
-        state.model,
-        state.optimum,
-        Whitening(unseen.samples, state.whitening.noise),
-        state.covariance,
-        state.widening,
-    )
-    own = _own_levels(state)
-    return _scores(elsewhere, unseen.mean, unseen.variance, "the fit records", own_levels=own)
+    """On the study's held-out records, predicted as a fit predicts them: by draws, with levels by its rule.
+
+    What effects differ in from record to record is as large as on the fit records, and adds to the variance.
+    """
+    study = problem.study
+    samples, model = problem.simulated(study.held_out)
+    if state.model.effects:
+        places = campaign_places(study)
+        own = Declared(
+            tuple(type(effect) for effect in state.model.effects),
+            state.model.effected.ranges,
+            np.array([places[record.name] for record in study.held_out]),
+            tuple(one.times for one in samples),
+            (None,) * len(samples),
+        )
+        model = replace(model, effects=own)
+    draws, noise = state.sampled or _laplace(state, study.seed)
+    draws = replace(draws, values=draws.thinned(_MOST)[None])
+    table, out = draws.table, []
+    for r, record in enumerate(samples):
+        rng, alone = named_rng(study.seed, record.record.name), model.only(r)
+        values, plant = plant_draws(draws, alone)
+        apart = disturbances(table, alone, values, plant, rng)
+        for axis, observed in enumerate(record.axes):
+            if not observed.values.size:
+                continue
+            seen = plant[axis][:, observed.index]
+            seen = seen if apart is None else seen + apart[axis][:, observed.index]
+            level, source, _ = offset_draws(
+                table, values, axis, r, record, seen, noise, held_out=True, rng=rng
+            )
+            total = seen + level[:, None]
+            law = state.whitening.noise[axis]
+            mean, variance = total.mean(axis=0), total.var(axis=0)
+            out.append(_score(state, record, axis, (mean, variance), law.sd, source, held_out=True))
+    return out
+
+
+def _laplace(state: State, seed: int) -> tuple[Draws, Noise]:
+    """Normal draws about an optimum within its support, as draws of a table with the noise of the loop;
+    coordinates at an end of their support stay there."""
+    model, optimum, rng = state.model, state.optimum, np.random.default_rng([seed, 14])
+    free = np.flatnonzero(~optimum.stuck)
+    covariance = np.linalg.pinv(optimum.information[np.ix_(free, free)], hermitian=True)
+    x = np.tile(optimum.x, (_TRIES * _DRAWS, 1))
+    x[:, free] += rng.multivariate_normal(np.zeros(free.size), covariance, len(x), method="eigh")
+    low, high = model.bounds
+    inside = ((x >= low) & (x <= high))[:, free].all(axis=1)
+    x = np.concatenate([x[inside][:_DRAWS], optimum.x[None]])
+    x = x[model.supported(x, every=False)]
+    table = model.posterior.table
+    rows = [k for k, row in enumerate(table.rows) if not row.noise]
+    values = np.array([model.values(each) for each in x])[:, rows]
+    noise = [
+        Parameter(name, "", name, Place(axis, 0), None, float(value))
+        for axis, law in enumerate(state.whitening.noise)
+        for name, value in zip(WhiteAR1.names, law.parameters, strict=True)
+    ]
+    held = replace(table, rows=(*(table.rows[k] for k in rows), *noise))
+    values = np.hstack([values, np.tile([row.value for row in noise], (len(values), 1))])
+    return Draws(held, values[None], np.zeros((1, len(values))), (), float(_DRAWS)), WhiteAR1()
 
 
 def _own_levels(state: State) -> bool:
     """Whether every record has an offset of its own."""
-    table = state.model.base.posterior.table
+    table = state.model.plant.table
     return any(row.kind == "offset" and row.place.second >= 0 for row in table.rows)
 
 
@@ -153,27 +218,54 @@ def _scores(
         noise = whitening.noise[part.axis]
         centre, spread, source = mean[part.rows], variance[part.rows], level_from
         if own_levels:
-            level, doubt, source = level_of(record, part.axis, observed.values - centre, noise)
+            level, doubt, source = _level(record, part.axis, observed.values - centre, noise)
             # what the fit did not know about the level is known now
             centre, spread = centre + level, _without_level(spread, doubt)
-        if state.widening is not None:
-            spread = spread + state.widening.variance(record, part.axis)
-        axis = record.record.response_axes[part.axis]
-        out.append(
-            Score(
-                record.record.name,
-                axis.name,
-                axis.unit,
-                level_from != "the fit",
-                record.times[observed.index],
-                observed.values,
-                centre,
-                spread,
-                noise.sd,
-                source,
-            )
-        )
+        held_out = level_from != "the fit"
+        out.append(_score(state, record, part.axis, (centre, spread), noise.sd, source, held_out=held_out))
     return out
+
+
+def _score(
+    state: State,
+    record: Samples,
+    axis: int,
+    predicted: tuple[Vector, Vector],
+    noise_sd: float,
+    level_from: str,
+    *,
+    held_out: bool,
+) -> Score:
+    """Of one axis of a record, from mean and variance of its prediction."""
+    observed, named = record.axes[axis], record.record.response_axes[axis]
+    mean, variance = predicted
+    if state.widening is not None:
+        variance = variance + state.widening.variance(record, axis)
+    times = record.times[observed.index]
+    return Score(
+        record.record.name,
+        named.name,
+        named.unit,
+        held_out,
+        times,
+        observed.values,
+        mean,
+        variance,
+        noise_sd,
+        level_from,
+    )
+
+
+def _level(record: Samples, axis: int, misfit: Vector, noise: Law) -> tuple[float, float, str]:
+    """Level of a record that is not known from the fit, its variance and where it comes from.
+
+    By generalised least squares from the samples that a fit takes the offset of a held-out record from.
+    """
+    used, source = record.level_samples(axis)
+    columns = np.stack([misfit[used], np.ones(np.count_nonzero(used))])
+    white, ones = noise.whiten(columns, record.axes[axis].gaps[used])
+    power = float(ones @ ones)
+    return float(ones @ white) / power, 1.0 / power, source
 
 
 def _without_level(variance: Vector, doubt: float) -> Vector:

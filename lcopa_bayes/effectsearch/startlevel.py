@@ -12,15 +12,15 @@ from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basefit import BaseFit
-from lcopa_bayes.effectsearch.basemodel import BaseModel
-from lcopa_bayes.effectsearch.gaussnewton import Regression
+from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
+from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.verdict import MARGIN
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import problem_of
 
 _EVALUATIONS = 60
 _STEPS = 8
-"""Steps of the descent at each level tried [-]."""
+"""Evaluations of the descent at each level tried [-]."""
 
 
 class Mended(NamedTuple):
@@ -94,10 +94,12 @@ def _after(record: Record, level: Vector) -> Record:
 
 def _power(study: Study, fit: BaseFit) -> float:
     """Squared residual of the base model from where it stood [response unit^2]; infinite where it fails."""
-    model = BaseModel(problem_of(study).posterior)
-    white = Whitening(model.posterior.samples, fit.regression.whitening.noise)
+    model = ExtendedModel(problem_of(study).posterior)
+    white = Whitening(model.plant.samples, fit.regression.whitening.noise)
+    regression = Regression(model, white)
     try:
-        residual = Regression(model, white).descend(fit.optimum.x, most=_STEPS, gain=0.1).residual
+        x, _ = regression.reached(fit.optimum.x, most=_STEPS, gain=0.1)
+        residual = white.observed - model.predict(x)
     except ArithmeticError:
         return np.inf
     return float(residual @ residual)

@@ -122,7 +122,7 @@ def _effects(found: Loop, chances: dict[str, float]) -> list[dict[str, Any]]:
                 "constants": effect.constants,
                 "parameters": [
                     found.estimate(first + k)
-                    | {"prior_sd": one.coefficient.scale, "one_signed": one.coefficient.one_signed}
+                    | {"prior_sd": float(model.scale[k]), "one_signed": one.coefficient.one_signed}
                     for k, one in own
                 ],
                 "disturbance": effect.card.disturbance,
@@ -259,11 +259,11 @@ def moved(found: Loop) -> list[dict[str, Any]]:
         return []
     before, after = found.before.state, found.after.state
     base, n = found.base.model, after.model.plant_size
-    first, last = base.values(before.optimum.x), base.values(after.optimum.x[:n])
+    first, last = base.values(before.optimum.x), after.model.values(after.optimum.x)
     sds = np.sqrt(np.diag(after.covariance))[:n]
     out = []
-    rows = base.posterior.table.rows
-    for position, k in enumerate(base.least.columns):
+    rows = base.plant.table.rows
+    for position, k in enumerate(base.columns):
         shift = (after.optimum.x[position] - before.optimum.x[position]) / sds[position]
         if abs(shift) > FAR:
             row = rows[k]

@@ -16,10 +16,9 @@ from lcopa_bayes.data.rest import not_at_rest
 from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basefit import BaseFit, base_fit
-from lcopa_bayes.effectsearch.basemodel import BaseModel
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
-from lcopa_bayes.effectsearch.gaussnewton import Regression
 from lcopa_bayes.effectsearch.refits import log_bayes_factor
+from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.rounds import leading
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.startlevel import Mended, started
@@ -122,10 +121,10 @@ def _wider(study: Study, base: Base, terms: int) -> Base:
     return wider._replace(fit=fit, start=_state(study, fit))
 
 
-def _lifted(model: BaseModel, base: Base, rng: np.random.Generator) -> list[Vector]:
+def _lifted(model: ExtendedModel, base: Base, rng: np.random.Generator) -> list[Vector]:
     """Coordinates of a wider model at which it is close to the optimum of a base fit that it contains."""
     values = np.repeat(base.fit.model.values(base.fit.optimum.x)[None], _COPIES, axis=0)
-    starts = lifted(values, base.problem.posterior, model.posterior, rng)
+    starts = lifted(values, base.problem.posterior, model.plant, rng)
     return [] if starts is None else [model.coordinates(each) for each in starts]
 
 
@@ -142,21 +141,21 @@ def _based(study: Study, *key: int, contained: Base | None = None) -> Base:
 
 
 def _fit(problem: Problem, key: Sequence[int], contained: Base | None) -> BaseFit:
-    model, seed = BaseModel(problem.posterior), [problem.study.seed, 10, *key]
+    model, seed = ExtendedModel(problem.posterior), [problem.study.seed, 10, *key]
     near = _lifted(model, contained, np.random.default_rng([*seed, 1])) if contained else []
     return base_fit(model, np.random.default_rng(seed), near=near)
 
 
 def _state(study: Study, fit: BaseFit) -> State:
-    model = ExtendedModel.of(fit.model, fit.optimum.x, taken=campaign_places(study))
+    model = fit.model.at_scales(fit.optimum.x, campaign_places(study))
     return State(model, fit.optimum, fit.regression.whitening, fit.optimum.covariance)
 
 
 def _shift(fit: BaseFit, problem: Problem) -> float:
     """Largest shift of the base fit's parameters on narrower blocks than the problem's [posterior sd]."""
-    model, x, white = BaseModel(problem.posterior), fit.optimum.x, fit.regression.whitening
+    model, x, white = ExtendedModel(problem.posterior), fit.optimum.x, fit.regression.whitening
     here, tangents = model.tangents(x)
-    finer = [BaseModel(problem.refined(factor).posterior) for factor in FACTORS]
+    finer = [ExtendedModel(problem.refined(factor).posterior) for factor in FACTORS]
     changes = [white(each.predict(x) - here) for each in finer]
     return largest_shift(fit.optimum.covariance, white(tangents.T).T, changes)
 
@@ -179,8 +178,8 @@ def _later(study: Study, fit: BaseFit) -> Mended | None:
     """The study with a longer default prior of its delays, where one is at the end of it; else None."""
     model = fit.model
     stuck = []
-    for position, k in enumerate(model.least.columns):
-        row = model.posterior.table.rows[k]
+    for position, k in enumerate(model.columns):
+        row = model.plant.table.rows[k]
         late = fit.optimum.x[position] > (1 - _AT_END) * model.bounds[1][position]
         if row.kind == "delay" and row.default and late and not row.log_scale:
             stuck.append((row.name, row.domain[1]))

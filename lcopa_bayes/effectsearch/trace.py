@@ -149,7 +149,7 @@ def trace(
     present = {effect.name for effect in model.effects}
     found: list[Traced] = []
     for kind in library:
-        if kind.card.name in present or not kind.applies(model.base.posterior.table.layout):
+        if kind.card.name in present or not kind.applies(model.plant.table.layout):
             continue
         if issubclass(kind, ScatterEffect):
             joint = "the noise is known from the residual alone" if whitening.dependence else ""

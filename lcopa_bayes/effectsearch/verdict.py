@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, final
 
@@ -160,6 +160,16 @@ def beside(verdict: Verdict, said: str) -> Verdict:
     """The verdict on records with outliers, which `said` describes: they disturb, nothing else changes."""
     kind: Kind = "disturbance" if verdict.kind == "clean" else verdict.kind
     return Verdict(kind, verdict.confidence, f"{said} {verdict.sentence}")
+
+
+def widened(verdict: Verdict, wider: Mapping[str, float]) -> Verdict:
+    """The verdict on effects whose default priors were made `wider` by factors [-]."""
+    said = "".join(
+        f" The default prior of {name} is too narrow for these records and was made {factor:.0f} times as "
+        "wide."
+        for name, factor in wider.items()
+    )
+    return Verdict(verdict.kind, verdict.confidence, verdict.sentence + said)
 
 
 def _percent(share: float) -> str:

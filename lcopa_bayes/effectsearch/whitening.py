@@ -86,6 +86,14 @@ class Whitening:
         gaps = [self.samples[part.record].axes[part.axis].gaps for part in self.parts]
         return [(part, gap) for part, gap in zip(self.parts, gaps, strict=True) if gap.size]
 
+    @property
+    def held(self) -> tuple[Vector, ...]:
+        """Noise of each axis as it weights the samples: as `WhiteAR1` takes it, (3,), a sample that counts as
+        less than one the noisier."""
+        shares = self.dependence or (1.0,) * len(self.noise)
+        pairs = zip(self.noise, shares, strict=True)
+        return tuple(law.parameters * np.sqrt([share, share, 1.0]) for law, share in pairs)
+
     def __call__(self, columns: Array) -> Array:
         """Whitened columns (..., n), same shape [-]."""
         out = np.empty_like(columns, dtype=float)

@@ -15,7 +15,6 @@ from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.effects import effect_slopes
-from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.noise import GaussianNoise, Student
 from lcopa_bayes.inference.simulation import Simulation
 from lcopa_bayes.model.effects.declared import Declared
@@ -28,7 +27,6 @@ from lcopa_bayes.model.superposition import Superposition, blocks_of, phases
 
 _NOTHING = 1e-11
 """Share of a slope that is not constant below which a resting response makes up for all of it [-]."""
-_PLANT = ("gain", "time", "order", "delay", *COEFFICIENTS, *CONSTANTS)
 
 
 class Prepared(NamedTuple):
@@ -62,7 +60,9 @@ class Bench:
         """Table positions of the free plant parameters, offsets left out."""
         rows = self.problem.posterior.table.rows
         return tuple(
-            k for k, row in enumerate(rows) if row.free and row.kind in _PLANT and "[" not in row.name
+            k
+            for k, row in enumerate(rows)
+            if row.free and not row.noise and row.kind != "offset" and "[" not in row.name
         )
 
     @cached_property
@@ -134,14 +134,10 @@ class Bench:
         for axis in range(len(table.layout.responses)):
             rows = np.zeros((len(table.rows), self.sample_times.size))
             for drive, number in enumerate(table.layout.unit_of[axis]):
-                element, delay, _ = table.layout.units[number]
-                at = table.at("gain", axis, drive)
-                unit, terms = units[number], table.layout.elements[element].terms
-                rows[at] += unit[0] + command.rest[drive]
-                for i in range(terms):
-                    rows[table.at("time", element, i)] += values[at] * unit[1 + i]
-                    rows[table.at("order", element, i)] += values[at] * unit[1 + terms + i]
-                rows[table.at("delay", delay)] += values[at] * unit[1 + 2 * terms]
+                at, (unit, *slopes) = table.at("gain", axis, drive), units[number]
+                rows[at] += unit + command.rest[drive]
+                for k, slope in zip(table.shaping(number), slopes, strict=True):
+                    rows[k] += values[at] * slope
             out.append(self._whitened(rows[list(self.columns)], values, axis))
         return out
 

@@ -10,7 +10,9 @@ end to end of what the loop tries.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -19,8 +21,10 @@ from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.defaultpriors import Scales
+from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.parameter import Parameter, Place
+from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.priors import Prior
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.declared import Declared
@@ -208,6 +212,43 @@ def effect_rows(
             value = np.nan if prior else constant.low
             rows.append(Parameter(name, unit, constant.kind, Place(e, k), prior, value))
     return rows
+
+
+def with_effects(
+    posterior: Posterior,
+    effects: Sequence[Effect],
+    ranges: Ranges,
+    epochs: Vector,
+    *,
+    free: Collection[str] = (),
+    wider: Mapping[str, float] = MappingProxyType({}),
+) -> Posterior:
+    """The posterior of a plant with effects beside it, of these scales and default priors; `epochs` [-] are
+    the places of the fit records in the campaign.
+
+    Internal constants are held at those of each effect, but for those in `free`, ``<effect>.<constant>``;
+    `wider` multiplies the prior scale of the coefficients of an effect [-].
+    """
+    kinds = tuple(type(effect) for effect in effects)
+    names = [one.record.name for one in posterior.samples]
+    unit, layout = posterior.samples[0].record.time_unit, posterior.table.layout
+    rows = []
+    for row in effect_rows(kinds, ranges, names, layout, unit):
+        if row.kind in CONSTANTS and not (row.name in free and row.free):
+            value = effects[row.place.first].constants[row.name.partition(".")[2]]
+            row = replace(row, prior=None, value=float(value))
+        elif row.kind in COEFFICIENTS and row.prior is not None:
+            scale = row.prior.parameters["scale"] * wider.get(effects[row.place.first].name, 1.0)
+            row = replace(row, prior=Prior(row.prior.dist, {"loc": 0.0, "scale": scale}))
+        rows.append(row)
+    times, fitted = tuple(one.times for one in posterior.samples), tuple(range(len(names)))
+    table = replace(
+        posterior.table,
+        rows=(*posterior.table.rows, *rows),
+        effects=Declared(kinds, ranges, np.zeros(0), (), ()),
+    )
+    model = replace(posterior.model, effects=Declared(kinds, ranges, epochs, times, fitted))
+    return replace(posterior, table=table, model=model, surrogate=None)
 
 
 def coefficient_prior(one: Coefficient) -> Prior:

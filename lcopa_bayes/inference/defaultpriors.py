@@ -17,7 +17,7 @@ nu           gamma(2, scale 10)                      Juarez and Steel 2010, J. A
 ===========  ======================================  ============================================
 
 Noise of the kind ``white+ar1`` learns from Q, the samples taken before any drive has changed, where an axis
-has 8 independent ones or more on 5 levels or more (`restnoise`). N is span / period:
+has 8 independent ones or more on 5 levels or more. N is span / period:
 
 ===========  ======================================  ============================================
 sigma        log-normal(median by Q, s)              s^2 = (ln 2)^2 + variance of ln sigma by Q: noise
@@ -28,12 +28,12 @@ sigma        log-uniform(1e-6 A, 2 A)                without Q
 sigma_ar     log-uniform(1e-6 A, 2 A)                without Q
 rho          uniform(exp(-1), exp(-20 / N)),         from one sampling period, as faster noise is white,
              upper end not below exp(-1 / 2)         to a twentieth of a record: what lasts longer is a
-                                                     trend, and the plant's to explain
+                                                     trend that the plant has to explain
 ===========  ======================================  ============================================
 
 Terms of order above 1 resonate near 1 / T. Faster than the Nyquist frequency of the samples such a resonance
 is an alias of whatever is periodic in the record, and blocks as wide as a sample cannot follow it: where both
-priors are default ones, terms of order above 1 have time constants of period / pi or longer (`resolution`).
+priors are default ones, terms of order above 1 have time constants of period / pi or longer.
 
 The end of `sigma_ar` is hard. A tail, however thin, would not hold: noise of 0.05 at rest under a misfit of
 0.5 gains thousands of nats by growing tenfold, and what the plant lacks is then called noise.

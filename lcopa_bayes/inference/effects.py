@@ -30,7 +30,7 @@ from lcopa_bayes.model.effects.effect import Coefficient, Effect, Ranges
 from lcopa_bayes.model.effects.jacobian import coefficient_slopes, plant_slopes
 from lcopa_bayes.model.effects.passage import Plant
 from lcopa_bayes.model.effects.scales import ranges_of
-from lcopa_bayes.model.effects.simulator import Simulator
+from lcopa_bayes.model.effects.simulator import Latest, Simulator
 from lcopa_bayes.model.forward import ForwardModel
 
 _STEP = 1e-4
@@ -100,7 +100,7 @@ class Effected:
     def over(self, model: ForwardModel, samples: Sequence[Samples], epochs: Vector) -> Effected:
         """The same plant and effects over records held out; their offsets are left out."""
         times = tuple(one.times for one in samples)
-        simulator = replace(self.simulator, model=model, times=times, epochs=epochs)
+        simulator = replace(self.simulator, model=model, times=times, epochs=epochs, still=Latest())
         return replace(
             self, simulator=simulator, records=tuple(one.record.name for one in samples), offsets=None
         )
@@ -133,7 +133,7 @@ class Effected:
             made = np.zeros((*next(iter(slope.values())).shape, len(table.rows)))
             for k, row in enumerate(table.rows):
                 first, second = row.place
-                if row.kind in ("gain", "time", "order", "delay"):
+                if (row.kind, first, second) in slope:
                     made[..., k] = slope[row.kind, first, second]
                 elif row.kind == "offset" and self.offsets is not None and second in (-1, self.offsets[r]):
                     made[:, first, k] = 1.0
@@ -174,14 +174,18 @@ def carried(psi: Vector, source: Effected, target: Effected) -> Vector:
     return np.array([shared.get(one.name, 0.0) if one.record is None else 0.0 for one in target.coefficients])
 
 
-def effect_slopes(simulation: Simulation, values: Vector, *, exact: bool = True) -> list[Array]:
+def effect_slopes(
+    simulation: Simulation, values: Vector, *, exact: bool = True, model: Effected | None = None
+) -> list[Array]:
     """Per record (samples, axes, rows), in the table's units, at canonical values (rows,).
+
+    `model` is that of `effected_at`, where it is there already.
 
     Coefficients by differences through the simulator (`model.effects.jacobian`), constants by central ones
     over 1e-4. The plant's rows as there; unless `exact` those of the plant alone, fifty times cheaper and
     good enough to descend with. Raises UnstableError where there is no bounded response.
     """
-    model, psi = _effected(simulation, values), simulation.psi(values)
+    model, psi = model or effected_at(simulation, values), simulation.psi(values)
     plant = model if exact else model.with_effects(())
     out = plant.jacobian(values, psi if exact else plant.vanishing)
     rows = [k for each in simulation.coefficients for k in each]
@@ -196,7 +200,8 @@ def effect_slopes(simulation: Simulation, values: Vector, *, exact: bool = True)
     return out
 
 
-def _effected(simulation: Simulation, values: Vector) -> Effected:
+def effected_at(simulation: Simulation, values: Vector) -> Effected:
+    """The plant with the internal constants of table values, (rows,), and offsets."""
     declared = simulation.declared
     names = tuple(one.name for one in simulation.model.experiments)
     offsets = tuple(-2 if place is None else place for place in declared.fitted)

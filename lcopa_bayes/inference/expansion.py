@@ -11,7 +11,7 @@ from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.noise import LOG_2PI, GaussianNoise
 from lcopa_bayes.inference.posterior import Posterior
 
-_PORTION = 32
+_PORTION = 64
 """Parameter sets expanded at once."""
 
 
@@ -119,9 +119,6 @@ def _series(posterior: Posterior, axis: int, columns: Sequence[int]) -> list[_Se
     table = posterior.table
     out = []
     for drive, unit in enumerate(table.layout.unit_of[axis]):
-        element, delay, _ = table.layout.units[unit]
-        terms = table.layout.elements[element].terms
-        out += [_Series(table.at("time", element, i), drive, unit, i) for i in range(terms)]
-        out.append(_Series(table.at("delay", delay), drive, unit, 2 * terms))
+        out += [_Series(k, drive, unit, position) for position, k in enumerate(table.shaping(unit))]
     out += [_Series(k) for k in posterior.acting[axis]]
     return [one for one in out if one.row in columns]

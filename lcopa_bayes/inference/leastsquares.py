@@ -9,14 +9,15 @@ from itertools import pairwise
 from typing import final
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.inference.effects import effect_slopes
-from lcopa_bayes.inference.noise import GaussianNoise, White
+from lcopa_bayes.inference.effects import Effected, effect_slopes, effected_at
+from lcopa_bayes.inference.noise import GaussianNoise, White, WhiteAR1
 from lcopa_bayes.inference.noisefit import NoiseFit
 from lcopa_bayes.inference.observations import Observed
-from lcopa_bayes.inference.posterior import Posterior, bounded
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.model.effects.effect import Effect, UnstableError
 
 _EDGE = 1e-6
 """Distance kept from the ends of a parameter's domain, relative to the domain or to 1."""
@@ -43,6 +44,8 @@ class LeastSquares:
     posterior: Posterior
     exact: bool = True
     """Whether slopes of the plant are those with the effects in place."""
+    held: tuple[Vector, ...] = ()
+    """Parameters of `WhiteAR1` of each response axis, (3,), in place of the posterior's noise; or none."""
 
     @cached_property
     def columns(self) -> list[int]:
@@ -73,11 +76,8 @@ class LeastSquares:
         """
         low, high = (ends.copy() for ends in self.bounds)
         table = self.posterior.table
-        for element, slot in enumerate(table.layout.elements):
-            if table.exchangeable[element]:
-                continue
-            columns = [table.at("order", element, term) for term in range(slot.terms)]
-            for upper, lower in pairwise(columns):
+        for terms, exchangeable in zip(table.terms, table.exchangeable, strict=True):
+            for upper, lower in () if exchangeable else pairwise(terms.orders):
                 free = table.rows[upper].free, table.rows[lower].free
                 wall = values[upper] if not free[0] else values[lower]
                 wall = (values[upper] + values[lower]) / 2 if all(free) else wall
@@ -106,14 +106,43 @@ class LeastSquares:
         posterior, table = self.posterior, self.posterior.table
         raw = self.values(x, template)
         values = table.sorted_with_source(raw[None], every=True)[0]
-        units, parts = posterior.responses(values), []
-        if posterior.simulation is not None and not bounded(units)[0]:
-            return np.full(posterior.size + len(self._prior_rows(raw)[1]), np.inf)
+        prior, parts = self._prior_rows(raw)[1], []
+        try:
+            for axis, observed, misfit in self._misfits(values):
+                parts.append(self._whiten(misfit[None], values, axis, observed.gaps)[0])
+        except UnstableError:
+            return np.full(posterior.size + prior.size, np.inf)
+        return np.concatenate([*parts, prior])
+
+    def _misfits(self, values: Matrix) -> Iterator[tuple[int, Observed, Vector]]:
+        """Response axis, samples and misfit (model minus data) of every axis of every record; UnstableError
+        where effects leave no bounded response."""
+        posterior = self.posterior
+        if posterior.simulation is not None and posterior.surrogate is None:
+            model = self._effected_at(values[0])
+            responses = model.responses(values[0], posterior.simulation.psi(values[0]))
+            for response, samples in zip(responses, posterior.samples, strict=True):
+                for axis, observed in enumerate(samples.axes):
+                    yield axis, observed, response[observed.index, axis] - observed.values
+            return
+        units = posterior.responses(values)
         for r, samples in enumerate(posterior.samples):
             for axis, observed in enumerate(samples.axes):
-                misfit = -posterior.residual(axis, r, observed, values, units[r])
-                parts.append(self._whiten(misfit, values, axis, observed.gaps)[0])
-        return np.concatenate([*parts, self._prior_rows(raw)[1]])
+                yield axis, observed, -posterior.residual(axis, r, observed, values, units[r])[0]
+
+    @cached_property
+    def _latest(self) -> dict[tuple[Effect, ...], Effected]:
+        """The plant with the constants it was asked for last, so that slopes at a place where the response is
+        known simulate only what is new."""
+        return {}
+
+    def _effected_at(self, values: Vector) -> Effected:
+        assert self.posterior.simulation is not None
+        key = self.posterior.simulation.effects(values)
+        if key not in self._latest:
+            self._latest.clear()
+            self._latest[key] = effected_at(self.posterior.simulation, values)
+        return self._latest[key]
 
     def residual(self, x: Vector, template: Vector) -> tuple[Vector, Matrix]:
         """Whitened residual (model minus data, then prior rows) and its exact Jacobian in `x`.
@@ -163,29 +192,28 @@ class LeastSquares:
                         block[:, k] = column[0]
                 for drive, unit in enumerate(table.layout.unit_of[axis]):
                     gain = values[0, table.at("gain", axis, drive)]
-                    element, delay, _ = table.layout.units[unit]
-                    slope = gain * unit_slopes[unit][:, 0, observed.index]
-                    terms = table.layout.elements[element].terms
-                    for i in range(terms):
-                        block[:, table.at("time", element, i)] += slope[i]
-                        block[:, table.at("order", element, i)] += slope[terms + i]
-                    block[:, table.at("delay", delay)] += slope[2 * terms]
+                    slopes_here = gain * unit_slopes[unit][:, 0, observed.index]
+                    for k, slope in zip(table.shaping(unit), slopes_here, strict=True):
+                        block[:, k] += slope
                 yield axis, observed, block, misfit
 
     def _effected(self, values: Matrix) -> Iterator[tuple[int, Observed, Matrix, Vector]]:
         """The same with effects."""
         posterior, table = self.posterior, self.posterior.table
         assert posterior.simulation is not None
-        units = posterior.responses(values)
-        slopes = effect_slopes(posterior.simulation, values[0], exact=self.exact)
+        model = self._effected_at(values[0])
+        slopes = effect_slopes(posterior.simulation, values[0], exact=self.exact, model=model)
         times = table.of_kind("time")
-        for r, samples in enumerate(posterior.samples):
-            slopes[r][..., times] *= values[0, times]
-            for axis, observed in enumerate(samples.axes):
-                misfit = -posterior.residual(axis, r, observed, values, units[r])[0]
-                yield axis, observed, slopes[r][observed.index, axis], misfit
+        for each in slopes:
+            each[..., times] *= values[0, times]
+        misfits = self._misfits(values)
+        for each, samples in zip(slopes, posterior.samples, strict=True):
+            for _, (axis, observed, misfit) in zip(samples.axes, misfits, strict=False):
+                yield axis, observed, each[observed.index, axis], misfit
 
     def _whiten(self, columns: Matrix, values: Matrix, axis: int, gaps: Vector) -> Matrix:
+        if self.held:
+            return np.asarray(WhiteAR1().whiten(columns[None], self.held[axis][None], gaps)[0][0])
         noise = self.posterior.noise if isinstance(self.posterior.noise, GaussianNoise) else White()
         parameters = self.posterior.noise_parameters(values, axis)
         white: Matrix = noise.whiten(columns[None], parameters, gaps)[0][0]
@@ -213,18 +241,35 @@ class LeastSquares:
 
         UnstableError where effects leave no bounded response at the start.
         """
-        low, high = self.bounds_around(values)
-        start = np.clip(self.coordinates(values), low, high)
-        plain = self.posterior.simulation is None
-        found = least_squares(
-            *self.functions(values, start),
-            bounds=(low, high),
-            x_scale="jac",
-            max_nfev=100 if plain else _EVALUATIONS,
-            ftol=1e-8 if plain else _ENOUGH,
-        )
+        bounds = self.bounds_around(values)
+        found = self.search(np.clip(self.coordinates(values), *bounds), values, bounds)
         solution = self.posterior.table.canonical(self.values(found.x, values)[None])[0]
         return solution, np.asarray(found.jac)
+
+    def search(
+        self,
+        start: Vector,
+        template: Vector,
+        bounds: tuple[Vector, Vector],
+        *,
+        evaluations: int | None = None,
+        enough: float | None = None,
+    ) -> OptimizeResult:
+        """From search coordinates within `bounds` to a local minimum: `scipy.optimize.least_squares` with at
+        most so many `evaluations` of the response, ended by a relative gain of the sum of squares of less
+        than `enough`. UnstableError where effects leave no bounded response at the start."""
+        plain = self.posterior.simulation is None
+        if not plain:
+            table = self.posterior.table
+            raw = self.values(start, template)
+            list(self._misfits(table.sorted_with_source(raw[None], every=True)[0]))
+        return least_squares(
+            *self.functions(template, start),
+            bounds=bounds,
+            x_scale="jac",
+            max_nfev=evaluations or (100 if plain else _EVALUATIONS),
+            ftol=enough or (1e-8 if plain else _ENOUGH),
+        )
 
     def functions(
         self, values: Vector, start: Vector

@@ -45,8 +45,11 @@ class Optimum:
     """Log posterior density of the sampled coordinates there [nat]."""
 
 
-def find_optima(posterior: Posterior, rng: np.random.Generator, *, starts: int = 12) -> tuple[Optimum, ...]:
-    """Local optima from the best of many prior draws, best first, duplicates removed.
+def find_optima(
+    posterior: Posterior, rng: np.random.Generator, *, starts: int = 12, near: Sequence[Vector] = ()
+) -> tuple[Optimum, ...]:
+    """Local optima from the best of many prior draws, best first, duplicates removed; `near` are further
+    table values, (rows,), looked at like draws.
 
     Screening and a first solve treat the residual as nearly white; a second solve uses the noise model with
     its parameters estimated from the first residual. With effects the plant alone is searched first, and its
@@ -57,6 +60,7 @@ def find_optima(posterior: Posterior, rng: np.random.Generator, *, starts: int =
         alone = find_optima(posterior.without_effects, rng, starts=starts)
         return _kept(posterior, _descended(posterior, _near(posterior, effect_starts(posterior, alone, rng))))
     drawn = table.draw(_SCREENED, rng)
+    drawn[: len(near)] = np.array(near).reshape(-1, len(table.rows))
     for axis, scale in enumerate(_spread(posterior)):
         for name, value in posterior.noise.nearly_white(0.05 * scale).items():
             if table.rows[table.at(name, axis)].free:

@@ -8,7 +8,7 @@ from math import inf, log
 from typing import NamedTuple, final
 
 import numpy as np
-from scipy.special import expit, logit
+from scipy.special import expit, log_expit, logit
 
 from lcopa_bayes.core.arrays import Array, Vector
 from lcopa_bayes.inference.kinds import KINDS, Kind
@@ -110,6 +110,16 @@ class Parameter:
         # also for a prior within the domain: far logits and logarithms round to its ends, where there
         # is no likelihood (a correlation of 1) or a density may be infinite (a scale of 0)
         return np.where(self.declared.contains(x), self.prior.log_density(x) - self._log_mass, -np.inf)
+
+    def log_density(self, coordinate: Vector) -> Vector:
+        """Log density of the prior in the coordinate the parameter is sampled by, same shape."""
+        x = self.value_at(coordinate)
+        stretch = np.zeros(x.shape)
+        if self.log_scale:
+            stretch = coordinate
+        elif self.logit_scale:
+            stretch = log_expit(coordinate) + log_expit(-coordinate)
+        return np.asarray(self.log_prior(x) + stretch)
 
     def mass_below(self, x: float) -> float:
         """Prior probability of values below `x`, within the domain."""

@@ -18,7 +18,6 @@ import numpy as np
 from lcopa_bayes.core.arrays import Array, Flags, Index, Matrix, Vector
 from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.parameters import ParameterTable
-from lcopa_bayes.model.effects.batchpassage import BatchPassage
 from lcopa_bayes.model.effects.declared import Declared
 from lcopa_bayes.model.effects.effect import (
     DriveEffect,
@@ -29,7 +28,7 @@ from lcopa_bayes.model.effects.effect import (
     Scene,
     UnstableError,
 )
-from lcopa_bayes.model.effects.passage import Moved, Plant, deflections
+from lcopa_bayes.model.effects.passage import Moved, Passage, Plant, Spectra, deflections
 from lcopa_bayes.model.effects.simulator import Simulator
 from lcopa_bayes.model.forward import ForwardModel
 
@@ -143,9 +142,9 @@ class Simulation:
             for r, n in enumerate(sizes)
         ]
         effects, simulator = None, None
-        pending = np.arange(batch)
+        pending = np.arange(0 if declared.forced else batch)
         if declared.forced:
-            pending = self._forced(values, out)
+            self._forced(values, out, bounded)
         elif self._scales_commands(values):
             pending = self._commanded(values, out)
         for b in pending.tolist():
@@ -158,9 +157,9 @@ class Simulation:
                 self._one(simulator, row, units, b, out)
             except UnstableError:
                 bounded[b] = False
-                for record in out:
-                    for each in (*record.base, *record.columns.values()):
-                        each[b] = 0.0
+        for record in out:
+            for each in (*record.base, *record.columns.values()):
+                each[~bounded] = 0.0
         return out
 
     def responses(self, values: Matrix) -> list[Array]:
@@ -198,8 +197,8 @@ class Simulation:
             return experiment.drives[drive].moves or experiment.rest[drive] != 0.0
         return self.declared.fitted[r] == row.place.second // self._counts[row.place.first]
 
-    def _forced(self, values: Matrix, out: list[Simulated]) -> Index:
-        """Write the responses of plants under forces, all at once; returns those that ask for more."""
+    def _forced(self, values: Matrix, out: list[Simulated], bounded: Flags) -> None:
+        """Write the responses of plants under forces, all at once."""
         declared, layout, table = self.declared, self.table.layout, self.table
         axes, gains, dynamics = len(layout.responses), table.gains(values), table.dynamics(values)
         forces = []
@@ -208,21 +207,19 @@ class Simulation:
                 psi = np.repeat(values[:, rows].T, axes, axis=1)[..., None]
                 own = [np.repeat(values[:, k], axes)[:, None] for k in constants]
                 forces.append((kind(*(c if np.ptp(c) else float(c[0, 0]) for c in own)), psi))
-        simulator = self.simulator(self.effects(values[0]))
-        done = np.ones(len(values), dtype=bool)
+        simulator, spectra = self.simulator(self.effects(values[0])), Spectra()
         for r, units in enumerate(self.model.plain.unit_responses(dynamics)):
-            scene = simulator.scene(r, self.plant(values[0]))
-            change, solved = BatchPassage(self.model, r, scene, gains, dynamics).change(forces)
-            done &= solved
+            scene, experiment = simulator.scene(r, self.plant(values[0])), self.model.experiments[r]
+            change, failures = Passage(layout, experiment, scene, gains, dynamics, forces, spectra).change()
+            bounded[list(failures)] = False
             for i, row in enumerate(layout.unit_of):
                 for j, unit in enumerate(row):
                     out[r].base[i] += gains[:, i, j, None] * (scene.rest[j] + units[unit])
             out[r].base[...] += change
         if len(forces) < len(declared.kinds):
-            for b in np.flatnonzero(done).tolist():
+            for b in np.flatnonzero(bounded).tolist():
                 simulator = self.simulator(self.effects(values[b]))
                 self._finished(simulator, values[b], b, out)
-        return np.flatnonzero(~done)
 
     def _scales_commands(self, values: Matrix) -> bool:
         """Whether all plants share one effect on the commands that is proportional to its coefficient, and

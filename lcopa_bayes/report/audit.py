@@ -40,17 +40,13 @@ def write_audit(folder: Path) -> Path:
 
     InputError when the folder holds no audit or it cannot be used.
     """
-    return write_graded(
-        folder,
-        "audit",
-        "identifiability",
-        lambda values: [*_tables(values), *_figures(values, load_run(folder))],
-    )
 
+    def sections(values: Mapping[str, Any]) -> list[Section]:
+        run = load_run(folder)
+        texts = [part(values) for part in (_verdicts, _next, _symmetries, _functions, _delays)]
+        return [*texts, _profiles(values, run), _spectrum(values), _pairs(values, run)]
 
-def _tables(results: Mapping[str, Any]) -> list[Section]:
-    """The sections of an audit that hold text and tables."""
-    return [_verdicts(results), _next(results), _symmetries(results), _functions(results), _delays(results)]
+    return write_graded(folder, "audit", "identifiability", sections)
 
 
 def _verdicts(results: Mapping[str, Any]) -> Section:
@@ -203,11 +199,6 @@ def _delays(results: Mapping[str, Any]) -> Section:
     return Section("Delays of the paths", text, tables=(table,))
 
 
-def _figures(results: Mapping[str, Any], run: SavedRun) -> list[Section]:
-    """Every figure of an audit."""
-    return [_profiles(results, run), _spectrum(results), _pairs(results, run)]
-
-
 def _profiles(results: Mapping[str, Any], run: SavedRun) -> Section:
     rows = results["parameters"]
     caption = (
@@ -240,9 +231,8 @@ def _profile_page(rows: Sequence[Mapping[str, Any]], run: SavedRun) -> str:
         else:
             panel.set_xlim(low - margin * (high - low), high + margin * (high - low))
             panel.locator_params(axis="x", nbins=4)
-        panel.set_ylim(0.0, _TOP)
-        panel.set_xlabel(label(name, run.units[name]))
-        panel.set_title(row["verdict"], fontsize=7.5, loc="left")
+        panel.set(ylim=(0.0, _TOP), xlabel=label(name, run.units[name]))
+        panel.set_title(row["verdict"], fontsize=7.5)
     return svg_of(figure)
 
 
@@ -264,8 +254,7 @@ def _spectrum(results: Mapping[str, Any]) -> Section:
     panel.set_xscale("log")
     panel.invert_yaxis()
     panel.set_yticks(range(len(rows)), [str(place + 1) for place in range(len(rows))])
-    panel.set_xlabel("precision of the data over that of the prior [-]")
-    panel.set_ylabel("direction")
+    panel.set(xlabel="precision of the data over that of the prior [-]", ylabel="direction")
     caption = (
         "Eigenvalues of the Fisher information at the maximum, in prior standard deviations; below 1 the "
         "prior is more informative than the data. Beside each, the parameters of its eigenvector."
@@ -303,5 +292,4 @@ def _pair(panel: Axes, run: SavedRun, a: str, b: str) -> None:
         if run.spans_decades(name):
             scale("log")
             log_ticks(axis, float(values.min()), float(values.max()))
-    panel.set_xlabel(label(a, run.units[a]))
-    panel.set_ylabel(label(b, run.units[b]))
+    panel.set(xlabel=label(a, run.units[a]), ylabel=label(b, run.units[b]))

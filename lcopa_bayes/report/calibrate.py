@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 
 from lcopa_bayes.report.formatting import NONE, figures, percent, probability
 from lcopa_bayes.report.page import write_graded
-from lcopa_bayes.report.section import Cell, Column, Drawing, Kind, Section, Table
+from lcopa_bayes.report.section import Cell, Drawing, Kind, Section, Table
 from lcopa_bayes.report.theme import BAND, HELD_OUT, INK, NOISE, blank, grid, plain, svg_of
 
 _PER_FIGURE = 18
@@ -88,8 +88,7 @@ def _dots(results: Mapping[str, Any]) -> str:
             seen = np.array([row["observed"] for row in rows])
             ends = np.array([[row["lower"], row["upper"]] for row in rows]).T
             panel.errorbar(seen, at, xerr=np.abs(ends - seen), fmt="o", ms=3, lw=1, color=colour, label=name)
-        panel.set_title(f"{percent(level)} intervals", loc="left")
-        panel.set_xlabel("coverage [-]")
+        panel.set(title=f"{percent(level)} intervals", xlabel="coverage [-]")
     panels[0].set_yticks(range(len(names)), [plain(name) for name in names])
     panels[0].set_ylim(len(names) - 0.5, -0.5)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
@@ -136,7 +135,7 @@ def _pages(
         figure, panels = grid(len(rows), columns=3, height=height)
         for panel, row in zip(panels, rows, strict=True):
             draw(panel, row, results)
-            panel.set_title(plain(row["parameter"]), loc="left", fontsize=7.5)
+            panel.set_title(plain(row["parameter"]), fontsize=7.5)
         for panel in panels[-3:]:
             panel.set_xlabel("rank [-]")
         out.append(Drawing(f"{stem}_{number:02d}", svg_of(figure), caption))
@@ -149,8 +148,7 @@ def _histogram(panel: Axes, row: Mapping[str, Any], results: Mapping[str, Any]) 
     panel.axhspan(band["lower"], band["upper"], color=NOISE, alpha=0.3, lw=0)
     panel.axhline(results["replicas"] / band["bins"], color=NOISE, lw=0.8)
     panel.stairs(counts.reshape(band["bins"], -1).sum(axis=1), edges, fill=True, color=BAND, alpha=0.75)
-    panel.set_xlim(0, counts.size)
-    panel.set_ylabel("replicas")
+    panel.set(xlim=(0, counts.size), ylabel="replicas")
 
 
 def _difference(panel: Axes, row: Mapping[str, Any], results: Mapping[str, Any]) -> None:
@@ -177,27 +175,27 @@ def _difference(panel: Axes, row: Mapping[str, Any], results: Mapping[str, Any])
 def _replicas(results: Mapping[str, Any]) -> Section:
     gap, seconds, counted = results["model_gap"], results["seconds"], results["grades"]
     engine, width = results["engine"], results["discretisation"]
-    rows = (
-        ("replicas requested", str(results["asked"])),
-        *((f"graded {name}" if name != "failed" else "failed", str(n)) for name, n in counted.items()),
-        ("truths", _origin(results["truths"])),
-        ("draws by importance sampling", f"{engine['importance']}"),
-        ("draws by ensembles", f"{engine['sampling']}"),
-        ("Pareto k of importance weights, median", _number(engine["median_k"])),
-        ("Pareto k of importance weights, largest", _number(engine["largest_k"])),
-        ("seed", str(results["seed"])),
-        ("processor time of a replica, median [s]", figures(seconds["median"])),
-        ("processor time of a replica, largest [s]", figures(seconds["largest"])),
-        ("processor time in all [s]", figures(seconds["total"])),
-        ("forward model from bench at the truth, median [noise sd]", figures(gap["median"])),
-        ("forward model from bench at the truth, 90 % quantile [noise sd]", figures(gap["quantile_90"])),
-        ("forward model from bench at the truth, largest [noise sd]", figures(gap["largest"])),
-        ("shift by the width of the blocks is negligible", f"{width['negligible']} replicas"),
-        ("shift by the width of the blocks, median [posterior sd]", figures(width["median"], 2)),
-        ("shift by the width of the blocks, largest [posterior sd]", figures(width["largest"], 2)),
-        *((name.replace("_", " "), str(value)) for name, value in results["sampler"].items()),
-    )
-    lists = [Table((Column("replicas"), Column("value", "number")), rows)]
+    rows = {
+        "replicas requested": str(results["asked"]),
+        **{f"graded {name}" if name != "failed" else "failed": n for name, n in counted.items()},
+        "truths": _origin(results["truths"]),
+        "draws by importance sampling": f"{engine['importance']}",
+        "draws by ensembles": f"{engine['sampling']}",
+        "Pareto k of importance weights, median": _number(engine["median_k"]),
+        "Pareto k of importance weights, largest": _number(engine["largest_k"]),
+        "seed": str(results["seed"]),
+        "processor time of a replica, median [s]": figures(seconds["median"]),
+        "processor time of a replica, largest [s]": figures(seconds["largest"]),
+        "processor time in all [s]": figures(seconds["total"]),
+        "forward model from bench at the truth, median [noise sd]": figures(gap["median"]),
+        "forward model from bench at the truth, 90 % quantile [noise sd]": figures(gap["quantile_90"]),
+        "forward model from bench at the truth, largest [noise sd]": figures(gap["largest"]),
+        "shift by the width of the blocks is negligible": f"{width['negligible']} replicas",
+        "shift by the width of the blocks, median [posterior sd]": figures(width["median"], 2),
+        "shift by the width of the blocks, largest [posterior sd]": figures(width["largest"], 2),
+        **{name.replace("_", " "): value for name, value in results["sampler"].items()},
+    }
+    lists = [Table.pairs("replicas", "value", "number", rows)]
     listed: tuple[tuple[str, str, tuple[tuple[str, Kind, Cell], ...]], ...] = (
         ("not_reliable", "replica", (("grade", "grade", "grade"), ("reason", "prose", "reason"))),
         ("failures", "failed replica", (("error", "prose", "error"),)),

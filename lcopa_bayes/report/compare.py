@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import hypot
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,10 @@ from matplotlib.ticker import MaxNLocator
 from lcopa_bayes.comparison.compare import folder_name
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.report.decimation import draw_band, draw_line
-from lcopa_bayes.report.formatting import NONE, figures, interval, percent, to_spread
+from lcopa_bayes.report.formatting import NONE, figures, interval, percent, to_spread, with_error
 from lcopa_bayes.report.page import Verdict, write_graded
 from lcopa_bayes.report.section import Drawing, Section, Table
-from lcopa_bayes.report.theme import CYCLE, HELD_OUT, NOISE, SEEN, blank, label, plain, svg_of
+from lcopa_bayes.report.theme import CYCLE, NOISE, blank, headed, label, legend_above, plain, svg_of
 from lcopa_bayes.results.bands import POINTWISE
 
 _NEAR = 60.0
@@ -28,9 +29,12 @@ def write_comparison(folder: Path) -> Path:
 
     InputError when the folder holds no comparison or it cannot be used.
     """
-    return write_graded(
-        folder, "compare", "comparison", lambda values: _sections(values, folder), box=_verdict
-    )
+
+    def sections(values: Mapping[str, Any]) -> list[Section]:
+        texts = [part(values) for part in (_priors, _predicted, _orders, _warnings)]
+        return [_scores(values), _averaged(values), _figures(values, _curves(folder, values)), *texts]
+
+    return write_graded(folder, "compare", "comparison", sections, box=_verdict)
 
 
 def _verdict(results: Mapping[str, Any]) -> Verdict:
@@ -52,12 +56,6 @@ def _curves(folder: Path, results: Mapping[str, Any]) -> dict[str, pd.DataFrame]
     if problems:
         raise InputError(problems)
     return out
-
-
-def _sections(results: Mapping[str, Any], folder: Path) -> list[Section]:
-    """Every part of the page."""
-    parts = (_priors, _predicted, _orders, _warnings)
-    return [_scores(results), _figures(results, _curves(folder, results)), *(part(results) for part in parts)]
 
 
 def _scores(results: Mapping[str, Any]) -> Section:
@@ -104,6 +102,41 @@ def _scores(results: Mapping[str, Any]) -> Section:
         caption=caption,
     )
     return Section("Scores", tuple(text), tables=(scores, others))
+
+
+def _averaged(results: Mapping[str, Any]) -> Section:
+    """Numbers that every candidate has, and the part of their uncertainty that the choice of a model adds."""
+    rows = results["averaged"]
+    if not rows:
+        return Section("Numbers over all models", ("Fewer than two usable candidates have an evidence.",))
+    table = Table.of(
+        rows,
+        ("number", "code", "name"),
+        ("median", "number", lambda row: to_spread(row["value"], _both(row))),
+        ("unit", "text", "unit"),
+        ("90 % interval", "interval", lambda row: interval(row["lower"], row["upper"], _both(row))),
+        ("sd by noise", "number", lambda row: figures(row["sd_noise"], 2)),
+        ("sd by structure", "number", lambda row: figures(row["sd_structure"], 2)),
+        ("weights", "prose", _weights),
+        ("grade", "grade", "grade"),
+        caption="Equal-tailed credible intervals of the mixture of all models. Weights are posterior "
+        "probabilities; a richer model that is not rejected and moves a number by more than half of its "
+        "standard deviation (*) weighs as much as the most probable one, and its interval is held. Standard "
+        "deviations are of draws within the models and of means between them; open where a number is not "
+        "reached.",
+    )
+    return Section("Numbers over all models", (), tables=(table,))
+
+
+def _both(row: Mapping[str, Any]) -> float | None:
+    parts = row["sd_noise"], row["sd_structure"]
+    return None if None in parts else float(hypot(*parts))
+
+
+def _weights(row: Mapping[str, Any]) -> str:
+    return ", ".join(
+        f"{name}{'*' * (name in row['raised'])} {weight:.2f}" for name, weight in row["weights"].items()
+    )
 
 
 def _priors(results: Mapping[str, Any]) -> Section:
@@ -211,10 +244,7 @@ def _warnings(results: Mapping[str, Any]) -> Section:
 
 def _with_error(row: Mapping[str, Any], key: str, error: str | None = None, *, places: int = 2) -> str:
     """`value ± error` of a key and that of its error, by default the one with `_sd`."""
-    value, sd = row[key], row.get(f"{key}_sd" if error is None else error)
-    if value is None:
-        return NONE
-    return f"{value:.{places}f}" if sd is None else f"{value:.{places}f} ± {sd:.{places}f}"
+    return with_error(row[key], row.get(f"{key}_sd" if error is None else error), places)
 
 
 def _figures(results: Mapping[str, Any], curves: Mapping[str, pd.DataFrame]) -> Section:
@@ -258,8 +288,7 @@ def _evidence(results: Mapping[str, Any]) -> list[Drawing]:
     low = min(row["log_evidence"] - best for row in rows)
     panel.set_ylim(bottom=max(1.1 * low, -_NEAR) - 3)
     panel.axhline(0.0, color=NOISE, lw=0.7)
-    panel.set_xlabel("viscous terms [-]")
-    panel.set_ylabel("log evidence less the best [nat]")
+    panel.set(xlabel="viscous terms [-]", ylabel="log evidence less the best [nat]")
     panel.xaxis.set_major_locator(MaxNLocator(integer=True))
     panel.margins(x=0.15)
     panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
@@ -310,20 +339,18 @@ def _drawn(
     figure = blank(4.3)
     top, below = figure.subplots(2, 1, sharex=True, height_ratios=[2.0, 1.3])
     some = parts[rows[0]["name"]]
-    colour, unit = HELD_OUT if held else SEEN, str(some["unit"].iloc[0])
+    colour, unit = headed(top, record, axis, held_out=held), str(some["unit"].iloc[0])
     seen, time = some["observed"].to_numpy(), some["time"].to_numpy()
     draw_line(top, time, seen, ".", ms=2.5, mew=0, color=colour, label="observed", zorder=1)
     for row, own in zip(rows, CYCLE * len(rows), strict=False):
         _rival(
             top, below, parts[row["name"]], plain(row["name"]), own, row["name"] == results["preferred"], held
         )
-    top.set_title(plain(f"{record}, {axis}: {'held out' if held else 'fit'}"), loc="left", color=colour)
     top.set_ylabel(label(axis, unit))
     below.axhline(0.0, color=NOISE, lw=0.7)
-    below.set_ylabel(label("residual", unit))
-    below.set_xlabel(label("time", results["time_unit"]))
+    below.set(ylabel=label("residual", unit), xlabel=label("time", results["time_unit"]))
     figure.align_ylabels()
-    figure.legend(*top.get_legend_handles_labels(), loc="outside upper center", ncols=5, markerscale=2)
+    legend_above(figure, top, 5, markerscale=2)
     return svg_of(figure)
 
 

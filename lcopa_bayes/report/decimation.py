@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 
 from lcopa_bayes.core.arrays import Index, Vector
@@ -48,6 +50,16 @@ def draw_band(panel: Axes, x: Vector, low: Vector, high: Vector, **style: Any) -
     """`panel.fill_between` through the extremes of both ends (n,), without an edge."""
     at = extremes(low, high)
     panel.fill_between(x[at], low[at], high[at], lw=0, **style)
+
+
+def draw_bands(
+    panel: Axes, x: Vector, rows: pd.DataFrame, bands: Sequence[tuple[str, str, str, str, float, str]]
+) -> None:
+    """Bands between columns of a table, each given by what the names of its columns begin with, the names of
+    its ends, colour, opacity and label."""
+    for column, low, high, colour, alpha, name in bands:
+        lower, upper = (rows[f"{column}_{end}"].to_numpy() for end in (low, high))
+        draw_band(panel, x, lower, upper, color=colour, alpha=alpha, label=name)
 
 
 def said(size: int, *, most: int = MOST) -> str:

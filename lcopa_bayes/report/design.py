@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lcopa_bayes.report.formatting import NONE, ends, figures, sentence
+from lcopa_bayes.report.formatting import NONE, ends, figures
 from lcopa_bayes.report.page import write_graded
 from lcopa_bayes.report.section import Drawing, Section, Table
 from lcopa_bayes.report.theme import BAND, HELD_OUT, INK, grid, label, plain, svg_of
@@ -67,11 +67,9 @@ def _curve(results: Mapping[str, Any]) -> Section:
             spread = np.array([row[key][name] for row in curve], dtype=float)
             panel.plot(times, spread, color=colour, marker=".", markersize=4, label=told_as)
         panel.axhline(0.1, color=INK, linewidth=0.7, linestyle=":")
-        panel.set_xscale("log")
-        panel.set_yscale("log")
-        panel.set_title(plain(name), fontsize=7.5, loc="left")
-        panel.set_xlabel(label("bench time", results["time_unit"]))
-        panel.set_ylabel("relative sd [-]")
+        panel.set(xscale="log", yscale="log")
+        panel.set_title(plain(name), fontsize=7.5)
+        panel.set(xlabel=label("bench time", results["time_unit"]), ylabel="relative sd [-]")
     panels[0].legend()
     caption = (
         "Expected relative standard deviation (median over draws) after the best drive and after the plain "
@@ -133,7 +131,7 @@ def _confirmed(results: Mapping[str, Any]) -> Section:
         )
         for trial in trials
     )
-    text = tuple(sentence(trial["sentence"]) for trial in trials)
+    text = tuple(trial["sentence"] for trial in trials)
     return Section("Confirmation", text, tables=tables)
 
 

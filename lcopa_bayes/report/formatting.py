@@ -64,6 +64,14 @@ def probability(p: float) -> str:
     return f"p\u00a0=\u00a0{figures(p, 2)}" if p > 0 else "p below the smallest number a computer holds"
 
 
+def with_error(value: float | None, error: float | None, places: int = 2, *, bare: bool = True) -> str:
+    """`value ± error` to so many decimals; without an error the value alone, unless that may not stand
+    `bare`."""
+    if value is None or (error is None and not bare):
+        return NONE
+    return f"{value:.{places}f}" if error is None else f"{value:.{places}f} ± {error:.{places}f}"
+
+
 def sentence(clause: str) -> str:
     """A clause with a capital and a full stop."""
     return stopped(f"{clause[0].upper()}{clause[1:]}")

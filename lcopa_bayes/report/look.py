@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from lcopa_bayes.core.errors import refuse_if
-from lcopa_bayes.report.formatting import figures, interval, to_spread
+from lcopa_bayes.report.formatting import interval, to_spread
 from lcopa_bayes.report.page import write_graded
 from lcopa_bayes.report.savedrun import TABLES, SavedRun, read_table
 from lcopa_bayes.report.section import Section, Table
-from lcopa_bayes.report.sections import records, residuals
+from lcopa_bayes.report.sections import parameters, records
 from lcopa_bayes.results.firstlook import TABLES as SHOWN
 
 _RESIDUAL = (
@@ -35,8 +35,8 @@ def write_look(folder: Path) -> Path:
 
     def sections(values: Mapping[str, Any]) -> list[Section]:
         run = SavedRun(values, {}, tables, {})
-        left = replace(residuals.section(run), text=(_RESIDUAL,))
-        return [records.section(run), left, _parameters(values)]
+        left = replace(records.residuals(run), text=(_RESIDUAL,))
+        return [records.data(run), left, _parameters(values)]
 
     return write_graded(folder, "look", "first look", sections)
 
@@ -53,12 +53,5 @@ def _parameters(values: Mapping[str, Any]) -> Section:
         )
     ]
     if values["fixed"]:
-        tables.append(
-            Table.of(
-                values["fixed"],
-                ("fixed parameter", "code", "name"),
-                ("value", "number", lambda row: figures(row["value"], 6)),
-                ("unit", "text", "unit"),
-            )
-        )
+        tables.append(parameters.fixed(values["fixed"]))
     return Section("Parameters", tables=tuple(tables))

@@ -30,25 +30,17 @@ def write_loop(folder: Path) -> Path:
         folder,
         "loop",
         "what the model lacks",
-        lambda values: [*_tables(values), *_figures(values, shown)],
+        lambda values: [
+            *(part(values) for part in (_effects, _errors, _noise, _evidence, _rounds, _moved, _bars)),
+            _residuals(values, shown["curves"]),
+            _views(shown["views"]),
+        ],
         box=lambda values: Verdict(
             str(values["grade"]),
             f"{values['verdict']} ({values['confidence']}): {values['sentence']}",
             str(values["grade_reason"]),
         ),
     )
-
-
-def _tables(results: Mapping[str, Any]) -> list[Section]:
-    """The sections of a loop that hold text and tables."""
-    return [
-        _effects(results),
-        _errors(results),
-        _noise(results),
-        _evidence(results),
-        _rounds(results),
-        _moved(results),
-    ]
 
 
 def _effects(results: Mapping[str, Any]) -> Section:
@@ -91,8 +83,8 @@ def _effects(results: Mapping[str, Any]) -> Section:
 def _errors(results: Mapping[str, Any]) -> Section:
     before, after = results["before"], results["after"]
     text = (
-        f"Held-out records were predicted by {results['unseen_by']}. Pointwise 90 % bands hold "
-        f"{percent(before['held_out_coverage_90'])} of their samples before and "
+        f"Unseen samples: {results['unseen_by']}. Pointwise 90 % bands hold "
+        f"{percent(before['held_out_coverage_90'])} of them before and "
         f"{percent(after['held_out_coverage_90'])} after; log evidence "
         f"{figures(before['log_evidence'], 6)} before and {figures(after['log_evidence'], 6)} after "
         "(Laplace approximation, noise held at its estimate)."
@@ -196,11 +188,6 @@ def _moved(results: Mapping[str, Any]) -> Section:
     return Section("Bias of the parameters without the effect", (text,), tables=(table,))
 
 
-def _figures(results: Mapping[str, Any], shown: Mapping[str, Any]) -> list[Section]:
-    """Every figure of a loop."""
-    return [_bars(results), _residuals(results, shown["curves"]), _views(shown["views"])]
-
-
 def _bars(results: Mapping[str, Any]) -> Section:
     evidence = results["evidence"]
     listed = [
@@ -223,9 +210,8 @@ def _bars(results: Mapping[str, Any]) -> Section:
     top = listed[0]
     above = int((values > evidence["threshold"]).sum())
     caption = (
-        f"Of {len(evidence['classes'])} classes {above} exceed the level that chance reaches (dashed); the "
-        "largest is "
-        f"{top['name']}. Linear below 10 nat, logarithmic above."
+        f"Of {len(evidence['classes'])} effects {above} exceed the level that chance reaches (dashed); the "
+        f"largest is {top['name']}. Linear below 10 nat, logarithmic above."
     )
     return Section("Evidence", (), (Drawing("loop_evidence", svg_of(figure), caption),))
 
@@ -269,8 +255,7 @@ def _residual(axes: Axes, curve: Mapping[str, Any], when: str, colour: str, unit
     axes.fill_between(time, -width, width, color=NOISE, alpha=0.25, lw=0)
     axes.plot(time, curve[when], ".", ms=1.6, mew=0, color=colour)
     axes.axhline(0.0, color=NOISE, lw=0.6)
-    axes.set_title(plain(f"{curve['record']}, {curve['axis']}: {when}"), loc="left")
-    axes.set_xlabel(label("time", unit))
+    axes.set(title=plain(f"{curve['record']}, {curve['axis']}: {when}"), xlabel=label("time", unit))
 
 
 def _views(views: Mapping[str, Sequence[Mapping[str, Any]]]) -> Section:
@@ -287,10 +272,10 @@ def _views(views: Mapping[str, Sequence[Mapping[str, Any]]]) -> Section:
             axes.axhline(level, color=NOISE, lw=0.7)
             axes.errorbar(x, y, yerr=1.645 * error, fmt=".-", ms=3, lw=0.8, elinewidth=0.6, color=BAND)
             if view["name"] == "spectrum" and x.size:
-                axes.set_xscale("log")
-                axes.set_yscale("log")
-            axes.set_title(plain(f"{view['axis']}, {view['name']}: {when}"), loc="left")
-            axes.set_xlabel(plain(str(view["across"]))[:70])
+                axes.set(xscale="log", yscale="log")
+            axes.set(
+                title=plain(f"{view['axis']}, {view['name']}: {when}"), xlabel=plain(str(view["across"]))[:70]
+            )
         panels[0].set_ylabel(plain(str(before["along"])))
         caption = (
             f"Before: {before['sentence']}. After: {after['sentence']}. Bars: 90 % intervals of pure noise."

@@ -16,36 +16,24 @@ from lcopa_bayes.core.files import writable_folder, write_text
 from lcopa_bayes.report.formatting import stopped
 from lcopa_bayes.report.savedrun import load_run
 from lcopa_bayes.report.section import Drawing, Section
-from lcopa_bayes.report.sections import (
-    crosscheck,
-    evidence,
-    frequency,
-    pairs,
-    parameters,
-    priors,
-    provenance,
-    records,
-    residuals,
-    sensitivity,
-    steps,
-    traces,
-)
+from lcopa_bayes.report.sections import overview, parameters, records, responses, sampling
 from lcopa_bayes.report.theme import inlined, look
 from lcopa_bayes.results.stored import stored_values
 
 _SECTIONS = (
-    records.section,
-    residuals.section,
-    parameters.section,
-    pairs.section,
-    traces.section,
-    steps.section,
-    frequency.section,
-    priors.section,
-    sensitivity.section,
-    evidence.section,
-    crosscheck.section,
-    provenance.section,
+    overview.overview,
+    parameters.estimates,
+    responses.steps,
+    responses.frequency,
+    records.data,
+    records.residuals,
+    parameters.pairs,
+    parameters.priors,
+    parameters.sensitivity,
+    parameters.traces,
+    sampling.evidence,
+    sampling.cross_check,
+    sampling.provenance,
 )
 """What a report shows, in this order; a later stage adds its own section here."""
 _ADVICE = {

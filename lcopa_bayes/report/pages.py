@@ -7,6 +7,7 @@ from pathlib import Path
 
 from lcopa_bayes.report.audit import write_audit
 from lcopa_bayes.report.calibrate import write_calibration
+from lcopa_bayes.report.check import write_check
 from lcopa_bayes.report.compare import write_comparison
 from lcopa_bayes.report.design import write_design
 from lcopa_bayes.report.look import write_look
@@ -16,6 +17,7 @@ from lcopa_bayes.report.paperpages import write_claims, write_identification, wr
 from lcopa_bayes.report.predict import write_prediction
 
 _PAGES: Mapping[str, Callable[[Path], Path]] = {
+    "check": write_check,
     "look": write_look,
     "fit": write_report,
     "audit": write_audit,

@@ -11,10 +11,9 @@ import pandas as pd
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.paper.opticsplan import OpticsPlan
 from lcopa_bayes.paper.staticoptics import static_optics
-from lcopa_bayes.report.formatting import figures
 from lcopa_bayes.report.page import write_page
-from lcopa_bayes.report.section import Column, Section, Table
-from lcopa_bayes.report.sections import claimfigures, director, farfields, identification
+from lcopa_bayes.report.section import Section, Table
+from lcopa_bayes.report.sections import claimfigures, identification, optics
 from lcopa_bayes.report.theme import look
 from lcopa_bayes.results.stored import stored_values
 
@@ -30,7 +29,7 @@ def write_optics(folder: Path) -> Path:
     except TypeError as error:
         raise InputError(f"{folder / 'optics.json'}: holds no plan ({error}); run `optics` again") from None
     with look():
-        sections = [*farfields.sections(calculated), *director.sections(calculated)]
+        sections = optics.sections(calculated)
     return write_page(folder, "Static optics of the array", sections, name="optics.html")
 
 
@@ -62,16 +61,14 @@ def write_claims(folder: Path) -> Path:
 
 def _verdicts(values: Mapping[str, Any]) -> Section:
     """The table of claims."""
-    columns = (
-        *(Column("id"), Column("claim", "prose"), Column("verdict")),
-        *(Column("number", "number"), Column("unit"), Column("how", "prose")),
-    )
-    rows = tuple(
-        (
-            *(row["id"], f"{row['text']} ({row['source']})", row["verdict"]),
-            *(figures(row["number"]), row["unit"], row["how"]),
-        )
-        for row in values["claims"]
+    table = Table.of(
+        values["claims"],
+        ("id", "text", "id"),
+        ("claim", "prose", lambda row: f"{row['text']} ({row['source']})"),
+        ("verdict", "text", "verdict"),
+        ("number", "number", "number"),
+        ("unit", "text", "unit"),
+        ("how", "prose", "how"),
     )
     return Section(
         "Verdicts",
@@ -79,5 +76,5 @@ def _verdicts(values: Mapping[str, Any]) -> Section:
             f"{values['verdict']} A verdict follows from the printed numbers by the calculation beside it; "
             "undecided means that data needed to decide it are missing.",
         ),
-        tables=(Table(columns, rows),),
+        tables=(table,),
     )

@@ -14,8 +14,9 @@ from lcopa_bayes.report.decimation import draw_line
 from lcopa_bayes.report.formatting import ends, figures
 from lcopa_bayes.report.page import write_graded
 from lcopa_bayes.report.section import Drawing, Section, Table, score_columns
-from lcopa_bayes.report.sections.records import draw_bands, draw_drives
-from lcopa_bayes.report.theme import BAND, HELD_OUT, NOISE, blank, label, svg_of
+from lcopa_bayes.report.sections.records import BANDS as RESPONSE
+from lcopa_bayes.report.sections.records import above_drives, draw_response
+from lcopa_bayes.report.theme import BAND, HELD_OUT, NOISE, legend_above, svg_of
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
 from lcopa_bayes.results.newdrive import BANDS, DRIVES
 from lcopa_bayes.results.stored import stored_values
@@ -74,45 +75,25 @@ def _curves(values: Mapping[str, Any], bands: pd.DataFrame, drives: pd.DataFrame
 
 
 def _drawn(values: Mapping[str, Any], rows: pd.DataFrame, drives: pd.DataFrame) -> str:
-    units = list(dict.fromkeys(drives["unit"]))
-    figure = blank(3.0 + 0.85 * len(units))
-    top, *below = figure.subplots(
-        1 + len(units), 1, sharex=True, squeeze=False, height_ratios=[3.4] + [1.0] * len(units)
-    ).ravel()
+    figure, top, below = above_drives(rows, drives, str(values["time_unit"]), height=3.0, ratio=3.4)
     _bands(top, rows, measured=bool(values["measured"]))
     time = rows["time"].to_numpy()
-    first, last = float(time[0]), float(time[-1])
     beyond = time[~rows["inside"].to_numpy(dtype=bool)]
     for panel in (top, *below):
         if beyond.size:
             shade = "outside the fitted range" if panel is top else None
-            panel.axvspan(float(beyond[0]), last, color=_OUTSIDE, lw=0, zorder=-1, label=shade)
-    for panel, unit in zip(below, units, strict=True):
-        draw_drives(panel, drives[drives["unit"] == unit], unit, until=last)
-    top.set_ylabel(label(str(rows["axis"].iloc[0]), str(rows["unit"].iloc[0])))
-    margin = 0.02 * (last - first)
-    top.set_xlim(first - margin, last + margin)
-    (below[-1] if below else top).set_xlabel(label("time", str(values["time_unit"])))
-    figure.align_ylabels()
-    figure.legend(*top.get_legend_handles_labels(), loc="outside upper center", ncols=4, markerscale=2)
+            panel.axvspan(float(beyond[0]), float(time[-1]), color=_OUTSIDE, lw=0, zorder=-1, label=shade)
+    legend_above(figure, top, 4, markerscale=2)
     return svg_of(figure)
 
 
 def _bands(panel: Axes, rows: pd.DataFrame, *, measured: bool) -> None:
     time = rows["time"].to_numpy()
-    draw_bands(
-        panel,
-        rows,
-        (
-            ("noisy", "05", "95", NOISE, 0.30, f"90 % with noise, {POINTWISE}"),
-            ("plant", "05", "95", BAND, 0.30, f"90 % plant, {POINTWISE}"),
-            ("plant", "25", "75", BAND, 0.55, f"50 % plant, {POINTWISE}"),
-        ),
-    )
+    names = (f"90 % with noise, {POINTWISE}", f"90 % plant, {POINTWISE}", f"50 % plant, {POINTWISE}")
+    draw_response(panel, rows, [(*band[:-1], name) for band, name in zip(RESPONSE, names, strict=True)])
     for what, colour, name in (("noisy", NOISE, "with noise"), ("plant", BAND, "plant")):
-        for end in ("05", "95"):
+        for end, text in (("05", f"90 % {name}, {SIMULTANEOUS}"), ("95", None)):
             edge = rows[f"{what}_{SIMULTANEOUS}_{end}"].to_numpy()
-            text = f"90 % {name}, {SIMULTANEOUS}" if end == "05" else None
             draw_line(panel, time, edge, color=colour, lw=0.7, ls=(0, (4, 3)), label=text)
     if measured:
         seen = rows["observed"].to_numpy()

@@ -11,12 +11,13 @@ from typing import Any, final
 
 import numpy as np
 import pandas as pd
-import xarray as xr
 
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.results.bands import POINTWISE, QUANTILE_NAMES, SIMULTANEOUS
+from lcopa_bayes.results.datatree import posterior_draws
 from lcopa_bayes.results.runfolder import ORIGINS
+from lcopa_bayes.results.summary import IMPORTANCE
 
 _WORDS = ("record", "axis", "unit", "name", "path", "prior", "from")
 _FLAGS = ("held_out", "log_scale", "integrated_out")
@@ -48,9 +49,9 @@ _CHECK_TABLES: Mapping[str, tuple[str, ...]] = {
 }
 """The same of a run that was checked by a second method."""
 _RESULTS = (
-    *("study", "verdict", "grade", "grade_reason", "time_unit", "parameters", "fixed", "held_out"),
-    *("fit_scores", "step_metrics", "residual_tests", "sampler"),
-    *("modes", "sensitivity", "cross_check"),
+    *("study", "verdict", "overview", "grade", "grade_reason", "time_unit"),
+    *("parameters", "fixed", "held_out", "fit_scores", "step_metrics", "residual_tests"),
+    *("sampler", "modes", "sensitivity", "cross_check"),
 )
 _PROVENANCE = ("command", "seed", "inputs_sha256", "python", "versions")
 
@@ -71,6 +72,11 @@ class SavedRun:
     def time_unit(self) -> str:
         """Unit of all times."""
         return str(self.results["time_unit"])
+
+    @property
+    def weighted(self) -> bool:
+        """Whether the draws are importance draws, else those of ensembles."""
+        return bool(self.results["sampler"]["method"] == IMPORTANCE)
 
     @property
     def units(self) -> dict[str, str]:
@@ -184,12 +190,7 @@ def _draws(path: Path, problems: list[str]) -> dict[str, Matrix]:
         problems.append(_missing(path))
         return {}
     try:
-        with xr.open_dataset(path, group="posterior", engine="h5netcdf") as posterior:
-            return {
-                str(values.attrs.get("parameter", name)): values.transpose("chain", "draw").to_numpy()
-                for name, values in posterior.data_vars.items()
-                if values.dims in (("chain", "draw"), ("draw", "chain"))
-            }
+        return posterior_draws(path)
     except (OSError, ValueError, KeyError) as error:
         problems.append(f"{path}: cannot be read as draws ({error}); run `fit` again to write it")
         return {}

@@ -46,6 +46,13 @@ class Table:
             caption,
         )
 
+    @classmethod
+    def pairs(cls, name: str, value: str, kind: Kind, rows: Mapping[str, object]) -> Table:
+        """Two columns, of the keys and of the values; titles of both and the kind of the second."""
+        return cls(
+            (Column(name), Column(value, kind)), tuple((str(key), str(one)) for key, one in rows.items())
+        )
+
     def __post_init__(self) -> None:
         wrong = [row for row in self.rows if len(row) != len(self.columns)]
         if wrong:

@@ -32,6 +32,7 @@ _LOOK: Mapping[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 8.5,
     "axes.titlesize": 9,
+    "axes.titlelocation": "left",
     "axes.labelsize": 8.5,
     "xtick.labelsize": 7.5,
     "ytick.labelsize": 7.5,
@@ -87,6 +88,18 @@ def log_ticks(axis: Axis, low: float, high: float) -> None:
     else:
         axis.set_major_locator(LogLocator(numticks=4))
         axis.set_minor_formatter(NullFormatter())
+
+
+def legend_above(figure: Figure, panel: Axes, columns: int, **style: Any) -> None:
+    """The legend of a panel above the whole figure."""
+    figure.legend(*panel.get_legend_handles_labels(), loc="outside upper center", ncols=columns, **style)
+
+
+def headed(panel: Axes, record: str, axis: str, *, held_out: bool) -> str:
+    """Title a panel with an axis of a record and its use, in the colour of that use, which is returned."""
+    colour, use = (HELD_OUT, "held out") if held_out else (SEEN, "fit")
+    panel.set_title(plain(f"{record}, {axis}: {use}"), color=colour)
+    return colour
 
 
 def plain(text: str) -> str:

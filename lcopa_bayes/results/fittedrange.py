@@ -75,7 +75,7 @@ class FittedRange:
     @property
     def rests(self) -> tuple[Vector, Vector]:
         """Least and largest value of each drive before the first change of a record [drive unit]."""
-        rests = np.array([record.drive[0] for record in self.records])
+        rests = np.array([record.drive[0] for record in self.records]) + 0.0  # no negative zero in sentences
         return rests.min(axis=0), rests.max(axis=0)
 
     @property

@@ -57,6 +57,9 @@ class Band:
     """Samples of a held-out record that its own offset was taken from [-]; 0 for an offset of the fit."""
     draws: int
     """Draws behind the quantiles."""
+    p_inside: float
+    """Share of simulated responses, plant and noise of one draw each, that have no more samples in the
+    pointwise 90 % band than were observed there [-]."""
 
     def table(self) -> pd.DataFrame:
         """One row per time: what was observed, and the ends of the bands by kind [`unit`]."""
@@ -217,6 +220,9 @@ def band_of(
     response = response + level[:, None]
     noisy = response + noises
     plant, with_noise = Bands.of(response), Bands.of(noisy)
+    low, high = with_noise.pointwise[0], with_noise.pointwise[4]
+    shares = np.mean((noisy >= low) & (noisy <= high), axis=1)
+    share = np.mean((observed >= low) & (observed <= high))
     return Band(
         name,
         axis.name,
@@ -231,6 +237,7 @@ def band_of(
         source,
         used,
         response.shape[0],
+        float((1 + np.count_nonzero(shares <= share)) / (1 + shares.size)),
     )
 
 
@@ -247,13 +254,13 @@ def offset_draws(
     rng: np.random.Generator,
 ) -> tuple[Vector, str, int]:
     """Offset of a record for each draw, where it comes from, and from how many samples of the record."""
-    places = {(table.rows[k].place.first, table.rows[k].place.second): k for k in table.of_kind("offset")}
+    places = table.offsets(axis)
     if not places:
         return np.zeros(values.shape[0]), "no offset", 0
-    if (axis, -1) in places:
-        return values[:, places[axis, -1]], "shared with the fit records", 0
+    if -1 in places:
+        return values[:, places[-1]], "shared with the fit records", 0
     if not held_out:
-        return values[:, places[axis, r]], "fitted", 0
+        return values[:, places[r]], "fitted", 0
     used, source = record.level_samples(axis)
     offset = _given(record.axes[axis], used, response, noise, table, values, axis, rng)
     return offset, source, int(used.sum())

@@ -24,7 +24,7 @@ from lcopa_bayes.core.files import writable_folder, write_whole
 from lcopa_bayes.data.studywriter import study_from_json, study_to_json
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.parameters import ParameterTable
-from lcopa_bayes.results.datatree import POSTERIOR, load_tree
+from lcopa_bayes.results.datatree import POSTERIOR, load_tree, posterior_draws
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.provenance import provenance
 from lcopa_bayes.results.runfolder import add_origin, opened, origins
@@ -34,7 +34,7 @@ from lcopa_bayes.sampling.modes import Modes
 
 NAME = "fit.json"
 """The file beside `posterior.nc`."""
-_AGAIN = "run `fit` again with this version of lcopa-bayes"
+_AGAIN = "run `fit` on the study again with this version of lcopa-bayes"
 _CUT = "the run was cut short, or files of two runs are mixed; run `fit` again"
 
 
@@ -153,11 +153,7 @@ def _draws(path: Path, table: ParameterTable) -> tuple[Array, Array]:
     if not path.is_file():
         raise InputError(f"{path}: this file of the run folder is missing; {_CUT}")
     try:
-        with xr.open_dataset(path, group="posterior", engine="h5netcdf") as group:
-            columns_read = {
-                str(one.attrs.get("parameter", name)): one.transpose("chain", "draw").to_numpy()
-                for name, one in group.data_vars.items()
-            }
+        columns_read = posterior_draws(path)
         with xr.open_dataset(path, group="sample_stats", engine="h5netcdf") as group:
             density = group["lp"].transpose("chain", "draw").to_numpy()
     except (OSError, ValueError, KeyError, RuntimeError) as error:

@@ -11,7 +11,6 @@ from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.core.estimate import plain
-from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.convergence import Level
 from lcopa_bayes.sampling.draws import Draws
@@ -76,7 +75,7 @@ def sensitivity(draws: Draws, posterior: Posterior) -> tuple[Sensitivity, ...]:
     """
     rows = [(k, row) for k, row in enumerate(posterior.table.rows) if row.free]
     shape, flat = draws.values.shape[:2], draws.flat
-    log_prior = np.sum([row.log_prior(flat[:, k]) + _log_stretch(row, flat[:, k]) for k, row in rows], axis=0)
+    log_prior = np.sum([row.log_density(row.coordinate(flat[:, k])) for k, row in rows], axis=0)
     log_likelihood = posterior.joint_log_likelihood(flat)
     scaled = [row.coordinate(draws.values[..., k]) for k, row in rows]
     grades = {estimate.name: estimate.grade for estimate in draws.estimates()}
@@ -88,13 +87,6 @@ def sensitivity(draws: Draws, posterior: Posterior) -> tuple[Sensitivity, ...]:
         log_likelihood.reshape(shape),
         [grades[name] for name in names],  # type: ignore[misc]
     )
-
-
-def _log_stretch(row: Parameter, x: Vector) -> Vector:
-    """Log of the derivative of a parameter in its sampled coordinate, (draws,)."""
-    if row.log_scale:
-        return np.asarray(np.log(x))
-    return np.asarray(np.log(x) + np.log1p(-x)) if row.logit_scale else np.zeros(x.size)
 
 
 def power_scaled(

@@ -8,12 +8,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.results.overview import overview
 from lcopa_bayes.results.residuals import WHITE_P
 from lcopa_bayes.results.steps import share_unsettled
 from lcopa_bayes.sampling.convergence import Grade, shares_grade
 
 if TYPE_CHECKING:
     from lcopa_bayes.results.fit import Fit
+
+IMPORTANCE = "importance draws"
+"""Method of a fit whose draws are not those of ensembles."""
 
 
 def verdict(fit: Fit) -> str:
@@ -67,6 +71,7 @@ def results(fit: Fit) -> dict[str, Any]:
         {
             "study": fit.study.name,
             "verdict": verdict(fit),
+            "overview": overview(fit),
             "grade": grade.level,
             "grade_reason": grade.reason,
             "limitations": [one.as_json() for one in fit.draws.limitations],
@@ -122,20 +127,27 @@ def scores(fit: Fit, *, held_out: bool) -> list[dict[str, Any]]:
 def _sampler(fit: Fit) -> Mapping[str, Any]:
     plan, ensembles, weighted = fit.run.plan, fit.run.ensembles, fit.run.weighted
     common = {
-        "method": "ensembles" if weighted is None else "importance draws",
-        "ensembles": plan.ensembles,
-        "walkers": plan.walkers,
-        "steps": ensembles[0].steps if ensembles else 0,
-        "most_steps": plan.steps,
-        "thin": plan.thin,
-        "acceptance": float(np.mean([ensemble.acceptance for ensemble in ensembles])) if ensembles else None,
         "smallest_ess": fit.draws.ess,
         "largest_rhat": max(q.rhat for q in fit.draws.qualities),
         "target_ess": plan.target_ess,
         "seed": plan.seed,
     }
-    if weighted is None:
-        return common
-    for key in ("steps", "most_steps", "thin", "acceptance"):
-        common.pop(key)
-    return {**common, "draws": weighted.count, "pareto_k": weighted.pareto_k, "weights_ess": weighted.ess}
+    if weighted is not None:
+        return {
+            "method": IMPORTANCE,
+            "batches": len(weighted.parts),
+            "draws": weighted.count,
+            "pareto_k": weighted.pareto_k,
+            "weights_ess": weighted.ess,
+            **common,
+        }
+    return {
+        "method": "ensembles",
+        "ensembles": plan.ensembles,
+        "walkers": plan.walkers,
+        "steps": ensembles[0].steps,
+        "most_steps": plan.steps,
+        "thin": plan.thin,
+        "acceptance": float(np.mean([ensemble.acceptance for ensemble in ensembles])),
+        **common,
+    }

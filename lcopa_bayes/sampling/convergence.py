@@ -101,7 +101,7 @@ class Quality:
         reasons, steps = [], "sample more steps"
         if self.rhat > RELIABLE_RHAT:
             reasons.append(
-                f"its estimates differ between the independent ensembles (R-hat {self.rhat:.3f}, at most "
+                f"its estimates differ between independent sets of draws (R-hat {self.rhat:.3f}, at most "
                 f"{RELIABLE_RHAT:g} when they agree): the posterior has several modes or a strong correlation"
             )
         if self.memory > RELIABLE_MEMORY:
@@ -111,8 +111,8 @@ class Quality:
             )
         if self.rhat <= RELIABLE_RHAT and self.scatter > RELIABLE_SCATTER:
             reasons.append(
-                f"the mean of each ensemble may have an error of {self.scatter:.2f} standard deviations (at "
-                f"most {RELIABLE_SCATTER:g} when they agree closely enough)"
+                f"the mean of each set of draws may have an error of {self.scatter:.2f} standard deviations "
+                f"(at most {RELIABLE_SCATTER:g} when they agree closely enough)"
             )
             steps += ", or with more ensembles"
         if self.ess_drift < target_ess:
@@ -322,7 +322,7 @@ def _by_quality(qualities: Sequence[Quality], target_ess: float) -> Grade:
     if grade.level == "reliable":
         return Grade(
             "reliable",
-            f"independent ensembles agree (largest R-hat {max(q.rhat for q in qualities):.3f}) and the "
+            f"independent sets of draws agree (largest R-hat {max(q.rhat for q in qualities):.3f}) and the "
             f"smallest effective sample size is {min(q.ess for q in qualities):.0f} ({worst.name})",
         )
     others = f" (also {', '.join(n for n in weak if n != worst.name)})" if len(weak) > 1 else ""

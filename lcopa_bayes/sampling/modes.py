@@ -115,11 +115,12 @@ class Modes:
         counted = f"{_COUNT.get(modes, str(modes))} modes of {self.parameter} ({split})"
         if self.spread == 0.0:
             shares = " and ".join(f"{share:.2f}" for share in self.pooled)
-            return f"{counted}, shares {shares}, equal in all ensembles within Monte Carlo error"
+            return f"{counted}, shares {shares}, equal in all sets of draws within Monte Carlo error"
         k = int(np.argmax(np.ptp(self.shares, axis=0)))
         which = ("the lower mode" if k == 0 else "the upper mode") if modes == 2 else f"mode {k + 1}"
         low, high = self.shares[:, k].min(), self.shares[:, k].max()
-        return f"{counted}, share of {which} {low:.2f} to {high:.2f} over the ensembles: run longer"
+        share = f"share of {which} {low:.2f} to {high:.2f} over independent sets of draws"
+        return f"{counted}, {share}: run longer"
 
 
 def modes_of(parameter: str, unit: str, values: Array, *, log_scale: bool = False) -> Modes:

@@ -3,10 +3,42 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 RUNS = Path("runs")
 """Where run folders go unless `--out` names another."""
+EXAMPLES: Mapping[str, str] = {
+    "new": "oven step1.xlsx step2.csv --drive 'Heater [%]'",
+    "check": "oven",
+    "look": "oven",
+    "run": "studies/paper-step",
+    "fit": "on.csv off.csv --held-out both.csv",
+    "audit": "runs/paper-step",
+    "design": "runs/paper-step --time 1000",
+    "compare": "studies/paper-step --pick fractional-2 second-order",
+    "loop": "studies/undeclared --quick",
+    "calibrate": "studies/paper-step-x --replicas 20 --quick",
+    "predict": "runs/paper-step drive.csv",
+    "identify": "studies/paper-step-x",
+    "optics": "--targets 1 2 3",
+    "claims": "--out runs/claims",
+    "explain": "R-hat",
+    "report": "runs/paper-step",
+    "simulate": "studies/paper-step/campaign.toml --out bench",
+}
+"""A command line of every verb, without the verb."""
+
+
+def _whole(least: int) -> Callable[[str], int]:
+    """Reads a whole number of at least `least`."""
+
+    def read(text: str) -> int:
+        if not (text.removeprefix("-").isdecimal() and int(text) >= least):
+            raise argparse.ArgumentTypeError(f"must be a whole number of at least {least}; got {text!r}")
+        return int(text)
+
+    return read
 
 
 def study(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
@@ -16,13 +48,13 @@ def study(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
     )
     parser.add_argument("--held-out", nargs="+", type=Path, default=[], help="records not to fit")
     parser.add_argument("--out", type=Path, help=f"run folder (default: {out})")
-    parser.add_argument("--seed", type=int, help="seed in place of the study's")
+    parser.add_argument("--seed", type=_whole(0), help="seed in place of the study's")
 
 
 def parallel(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
     """Of verbs about a study that use several processes."""
     study(parser, out)
-    parser.add_argument("--jobs", type=int, default=None, help="processes (default: all cores)")
+    parser.add_argument("--jobs", type=_whole(1), help="processes (default: all cores)")
 
 
 def sampled(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
@@ -33,7 +65,9 @@ def sampled(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
 
 
 def _quick(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--quick", action="store_true", help="a quarter of the steps")
+    parser.add_argument(
+        "--quick", action="store_true", help="a quarter of the steps or replicas: to see that it runs"
+    )
 
 
 def fit(parser: argparse.ArgumentParser) -> None:
@@ -67,6 +101,29 @@ def loop(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--as-stated", action="store_true", help="keep the number of viscous terms the study states"
     )
+
+
+def new(parser: argparse.ArgumentParser) -> None:
+    """Of `new`."""
+    parser.add_argument("folder", type=Path, help="folder for the records and their study")
+    parser.add_argument("files", nargs="+", type=Path, help="tables: text of any separator, or workbooks")
+    parser.add_argument("--held-out", nargs="+", type=Path, default=[], help="tables not to fit")
+    column = "by header or number, perhaps with a new name: 'heater [%%]=Column B'"
+    parser.add_argument("--time", default="", metavar="COLUMN", help="the time column")
+    parser.add_argument("--drive", nargs="+", default=[], metavar="COLUMN", help=f"drives, {column}")
+    parser.add_argument("--response", nargs="+", default=[], metavar="COLUMN", help=f"responses, {column}")
+    parser.add_argument("--time-unit", default="", help="unit of a numeric time column")
+    parser.add_argument("--decimal", default="", help="decimal sign, . or ,")
+    parser.add_argument(
+        "--time-format", default="", help="format of time stamps, as '%%d.%%m.%%Y %%H:%%M:%%S'"
+    )
+    parser.add_argument("--sheet", help="sheet of a workbook")
+    parser.add_argument("--overwrite", action="store_true", help="replace files that are there")
+
+
+def explain(parser: argparse.ArgumentParser) -> None:
+    """Of `explain`."""
+    parser.add_argument("term", nargs="+", help="a word of a page or a message")
 
 
 def claims(parser: argparse.ArgumentParser) -> None:
@@ -111,7 +168,7 @@ def simulate(parser: argparse.ArgumentParser) -> None:
     """Of `simulate`."""
     parser.add_argument("campaign", type=Path, help="campaign file (TOML)")
     parser.add_argument("--out", type=Path, required=True, help="folder for the records and their study")
-    parser.add_argument("--seed", type=int, help="seed in place of the campaign's")
+    parser.add_argument("--seed", type=_whole(0), help="seed in place of the campaign's")
     parser.add_argument("--overwrite", action="store_true", help="replace records that are there")
 
 

@@ -44,6 +44,13 @@ class Comparison(StoredResult):
         name: str | None = self.values["preferred"]
         return name
 
+    @property
+    def averaged(self) -> pd.DataFrame:
+        """One row per number that every candidate has: median and ends of its 90 % interval over candidates
+        [`unit`], and standard deviations by noise and by structure [`unit`]; see `comparison.averaging`."""
+        keys = ("name", "value", "lower", "upper", "unit", "sd_noise", "sd_structure", "grade")
+        return pd.DataFrame([{key: row[key] for key in keys} for row in self.values["averaged"]])
+
     def summary(self) -> pd.DataFrame:
         """One row per candidate, in the order given: sampled parameters, log evidence with its standard
         deviation [nat], None where undefined, probability [-], and grade."""

@@ -17,6 +17,7 @@ from lcopa_bayes.results.savedfit import load_fit
 from lcopa_bayes.results.stored import StoredResult
 from lcopa_bayes.verbs.audit import AuditResult
 from lcopa_bayes.verbs.calibrate import CalibrationResult
+from lcopa_bayes.verbs.check import CheckResult
 from lcopa_bayes.verbs.compare import Comparison
 from lcopa_bayes.verbs.design import DesignResult
 from lcopa_bayes.verbs.look import LookResult
@@ -39,7 +40,7 @@ class SavedPrediction(StoredResult):
 _KINDS: Mapping[str, type[StoredResult]] = {
     kind.verb: kind
     for kind in (
-        LookResult,
+        *(CheckResult, LookResult),
         *(AuditResult, DesignResult, Comparison, LoopResult, CalibrationResult, SavedPrediction),
         *(OpticsResult, IdentifyResult, ClaimsResult),
     )

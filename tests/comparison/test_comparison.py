@@ -259,6 +259,8 @@ def card(name: str, evidence: float | None, lpd: float, **told: object) -> dict:
     base = {
         "name": name,
         "usable": True,
+        "max_log_likelihood": lpd,
+        "quantiles": {},
         "grade": "reliable",
         "grade_reason": "fine",
         "integer": "order" in name,

@@ -55,7 +55,8 @@ def test_three_lines_are_a_study(tmp_path):
     assert [record.name for record in study.fit] == ["again", "step"]
     assert study.held_out == ()
     assert study.drive_axes == study.response_axes == (Axis("x", "rad"),)
-    assert (study.model, study.noise, study.sampler) == (ModelSettings(), NoiseSettings(), SamplerSettings())
+    model = ModelSettings(share="paper", delay="shared")
+    assert (study.model, study.noise, study.sampler) == (model, NoiseSettings(), SamplerSettings())
     assert dict(study.priors) == {}
     assert study.stages == ("fit", "rival")
     expected = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in os.listdir(folder)}
@@ -259,8 +260,9 @@ def test_bad_toml_is_named_by_line(tmp_path, text, line):
 
 
 def test_study_files_that_cannot_be_read(tmp_path):
-    (problem,) = problems_of(tmp_path)
-    assert "study.toml" in problem
+    assert "holds neither a study.toml nor a record" in problems_of(tmp_path)[0]
+    (tmp_path / "camera.toml").write_text("")
+    assert problems_of(tmp_path / "camra.toml")[0].endswith("no such file; did you mean 'camera.toml'?")
     folder_of(tmp_path, "")
     (tmp_path / "bench" / "study.toml").write_bytes("[study]\nname = 'ä'".encode("latin-1"))
     assert "cannot be read as UTF-8" in problems_of(tmp_path / "bench")[0]
@@ -382,7 +384,7 @@ def test_a_study_is_locked_and_can_be_sent_to_another_process(tmp_path):
 
 def test_a_study_made_by_hand_is_checked_too(tmp_path):
     (record,) = load_study(folder_of(tmp_path, "")).fit
-    assert Study("mine", None, "ms", 0, (record,)).model == ModelSettings()
+    assert Study("mine", None, "ms", 0, (record,)).model == ModelSettings().for_plant(1, 1)
     with pytest.raises(InputError, match="record 'step' is in ms"):
         Study("mine", None, "s", 0, (record,))
     with pytest.raises(InputError, match="2 records are named 'step'"):

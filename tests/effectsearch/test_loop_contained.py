@@ -10,8 +10,8 @@ from small import record, study
 
 from lcopa_bayes.bench.command import on_off, staircase
 from lcopa_bayes.effectsearch import basefit, refits, terms
-from lcopa_bayes.effectsearch.gaussnewton import Regression
 from lcopa_bayes.effectsearch.refits import refit
+from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.model.effects.catalogue import bundled
 
 NOISE = 0.01
@@ -69,7 +69,7 @@ def test_more_terms_that_stay_less_likely_are_no_base(base, monkeypatch):
 
 def test_starts_of_a_wider_model_are_close_to_the_smaller_one(base):
     problem = terms.problem_of(replace(STUDY, model=replace(STUDY.model, terms=3)))
-    model = terms.BaseModel(problem.posterior)
+    model = terms.ExtendedModel(problem.posterior)
     regression = Regression(model, base.fit.regression.whitening)
     starts = terms._lifted(model, base, np.random.default_rng(1))
     low, high = model.bounds
@@ -91,7 +91,7 @@ def test_a_refit_is_at_least_as_likely_as_without_its_effect(base, effect, monke
         away[: model.plant_size] = 0.5 * (away[: model.plant_size] + model.bounds[0][: model.plant_size])
         return model, np.where(np.isfinite(away), away, x)
 
-    monkeypatch.setattr(refits, "polished", spoilt)
+    monkeypatch.setattr(refits, "freed", spoilt)
     made = refit(state.model, state.optimum, state.whitening, [(effect, np.ones(1))], 50.0)
     assert made.optimum.cost <= state.optimum.cost + 1e-9
     assert made.taken >= 0.0

@@ -12,7 +12,7 @@ from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.effectsearch.basefit import base_fit
-from lcopa_bayes.effectsearch.basemodel import BaseModel
+from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.heldouteffects import missed
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.rounds import SINGLE
@@ -48,7 +48,7 @@ def study_of(start, **more):
 
 
 def fitted(study):
-    return base_fit(BaseModel(problem_of(study).posterior), np.random.default_rng(0))
+    return base_fit(ExtendedModel(problem_of(study).posterior), np.random.default_rng(0))
 
 
 def test_a_start_away_from_rest_is_found():

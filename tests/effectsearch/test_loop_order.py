@@ -12,9 +12,9 @@ from small import U, Y, path, problem, record
 
 from lcopa_bayes.bench.command import staircase
 from lcopa_bayes.bench.device import Device
-from lcopa_bayes.effectsearch.basemodel import BaseModel
-from lcopa_bayes.effectsearch.gaussnewton import Regression
+from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.noise import Law
+from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.summary import moved
 from lcopa_bayes.effectsearch.whitening import Whitening
 
@@ -32,9 +32,9 @@ FIRST, SECOND = 2, 4
 """Coordinates order_1 and order_2."""
 
 
-def fitted(**priors: object) -> tuple[BaseModel, Regression]:
+def fitted(**priors: object) -> tuple[ExtendedModel, Regression]:
     posterior = problem(TAKEN, terms=2, offset="none", priors=priors).posterior
-    model = BaseModel(posterior)
+    model = ExtendedModel(posterior)
     assert model.names == ("gain", "time_1", "order_1", "time_2", "order_2", "delay")
     noise = (Law(NOISE),)
     return model, Regression(model, Whitening(posterior.samples, noise))
@@ -107,7 +107,7 @@ def test_orders_of_unlike_terms_never_change_places(gap):
 def test_terms_stay_resolved_wherever_a_descent_begins(start):
     """Of default priors, a term of order above 1 is no faster than the samples show; slower ones may be."""
     posterior = problem(TAKEN, terms=2, offset="none").posterior
-    model = BaseModel(posterior)
+    model = ExtendedModel(posterior)
     assert len(posterior.table.limited) == 2
     noise = (Law(NOISE),)
     regression = Regression(model, Whitening(posterior.samples, noise))
@@ -134,7 +134,7 @@ def test_shifts_are_those_of_the_reported_numbers():
             state=SimpleNamespace(
                 optimum=one,
                 covariance=before.covariance,
-                model=SimpleNamespace(plant_size=x.size),
+                model=SimpleNamespace(plant_size=x.size, values=model.values),
             )
         )
         for one in (before, after)

@@ -9,8 +9,8 @@ from test_loop import LIBRARY, NOISE, study
 from lcopa_bayes.data.settings import NoiseSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basefit import base_fit
-from lcopa_bayes.effectsearch.basemodel import BaseModel
 from lcopa_bayes.effectsearch.explained import explained_study
+from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.outliers import outlying
 from lcopa_bayes.effectsearch.summary import results
@@ -37,7 +37,7 @@ def struck(made: Study, seed: int, *, at_rest: bool = True) -> tuple[Study, list
 
 
 def fitted(made: Study):
-    return base_fit(BaseModel(problem_of(made).posterior), np.random.default_rng(1), starts=1)
+    return base_fit(ExtendedModel(problem_of(made).posterior), np.random.default_rng(1), starts=1)
 
 
 def test_outliers_are_found_where_they_are():

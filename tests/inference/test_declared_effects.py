@@ -22,6 +22,7 @@ from lcopa_bayes.inference.effects import Effected, effected
 from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.optimum import find_optima
+from lcopa_bayes.model.effects import passage
 from lcopa_bayes.model.effects.catalogue import bundled
 
 ACTING = sorted(set(bundled()) - {"outliers"})
@@ -342,7 +343,25 @@ def test_many_plants_at_once_are_each_by_itself(names: tuple[str, ...]):
             assert_allclose(together[:, k], y.T, rtol=0, atol=1e-9)
 
 
-def test_a_force_that_runs_away_is_left_to_the_single_plant():
+@pytest.mark.parametrize(
+    "name", ["cubic_stiffness", "level_dependent_speed", "rise_fall_asymmetry", "overflow"]
+)
+def test_iterating_the_whole_and_dividing_it_give_one_response(name: str, monkeypatch: pytest.MonkeyPatch):
+    """Accelerated sweeps of all plants against Newton's method stretch by stretch, plant by plant."""
+    made = using(TWO_AXES, name)
+    rng = np.random.default_rng(4)
+    values = np.tile(values_of(made, 0.7), (3, 1))
+    values *= 1 + 0.05 * rng.random(values.shape)
+    simulation = made.posterior.simulation
+    assert simulation is not None
+    swept = simulation.responses(values)
+    monkeypatch.setattr(passage, "_SWEEPS", 0)
+    for one, other in zip(swept, simulation.responses(values), strict=True):
+        assert np.isfinite(one).all()
+        assert_allclose(one, other, rtol=0, atol=1e-9)
+
+
+def test_a_force_that_runs_away_leaves_the_other_plants_alone():
     made = using(one_axis(), "cubic_stiffness")
     values = np.tile(values_of(made, 1.0), (3, 1))
     values[1, made.posterior.table.names.index("cubic_stiffness.c")] = -300.0

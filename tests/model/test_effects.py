@@ -296,8 +296,27 @@ def test_balance_of_a_linear_force_is_a_geometric_series():
     f = rng.normal(size=(1, n)).cumsum(axis=1)
     matrix = np.array([[kernel[0, i - j] if i >= j else 0.0 for j in range(n)] for i in range(n)])
     exact = np.linalg.solve(np.eye(n) + a * matrix, matrix @ f[0])
-    told = balance.balanced(kernel, lambda blocks, y, one, two: f[:, blocks] - a * y, np.ones(1))
+    start = np.zeros((1, n))
+    told = balance.balanced(kernel, lambda blocks, y, one, two: f[:, blocks] - a * y, np.ones((1, 1)), start)
     assert_allclose(told[0], exact, atol=1e-9)
+
+
+def test_plants_iterated_together_end_where_each_does_by_itself():
+    """``y = c + s y`` ends at c / (1 - s) where |s| < 1; acceleration reaches it for s < -1 too, and what
+    squares runs away."""
+    c, slope = np.array([1.0, -2.0, 0.5]), np.array([0.9, -3.0, 0.0])
+
+    def swept(plants, y):
+        steep = np.where(plants[:, None, None] == 2, 10.0 + y**2, slope[plants][:, None, None] * y)
+        return c[plants][:, None, None] + steep
+
+    start, scale = np.zeros((3, 1, 2)), np.ones((3, 1, 1))
+    found, solved = balance.iterated(swept, start, scale, 50)
+    assert solved.tolist() == [True, True, False]
+    assert_allclose(found[:2, 0, 0], c[:2] / (1 - slope[:2]), rtol=1e-11)
+    for k in range(2):
+        alone, _ = balance.iterated(lambda _, y, k=k: swept(np.array([k]), y), start[:1], scale[:1], 50)
+        assert_allclose(alone[0], found[k], rtol=1e-11)
 
 
 def test_backflow_kicks_only_after_falls():

@@ -3,6 +3,7 @@
 import inspect
 import json
 import re
+from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
@@ -23,7 +24,7 @@ from lcopa_bayes.report.decimation import extremes
 from lcopa_bayes.report.formatting import NOT_REACHED, figures, interval, sentence, stopped, to_spread
 from lcopa_bayes.report.savedrun import load_run
 from lcopa_bayes.report.section import Column, Drawing, Section, Table
-from lcopa_bayes.report.sections import pairs, parameters, records, residuals, sensitivity, steps
+from lcopa_bayes.report.sections import parameters, records, responses, sampling
 from lcopa_bayes.report.theme import inlined
 from lcopa_bayes.sampling.modes import Modes
 
@@ -119,6 +120,13 @@ def results_of() -> dict:
     return {
         "study": "bench & co",
         "verdict": "Something was learned.",
+        "overview": {
+            "plant": ["y / <i>odd$name$ = 1.2 rad/V exp(-3 s) / (1 + (1.8 s)^0.8)"],
+            "answers": [
+                {"question": "What is missing?", "answer": "<i>odd$name$ & co.", "section": "Residuals"},
+                {"question": "What next?", "answer": "Measure again.", "section": ""},
+            ],
+        },
         "grade": "tentative",
         "grade_reason": "too few draws of time_1",
         "time_unit": "ms",
@@ -145,7 +153,14 @@ def results_of() -> dict:
             {"record": record, "axis": "x", "held_out": held, "p_white": 3.2e-7, "rms": 1e-4}
             for record, held in RECORDS
         ],
-        "sampler": {"ensembles": 2, "steps": 400, "thin": 4, "acceptance": 0.31234, "largest_rhat": 1.0041},
+        "sampler": {
+            "method": "ensembles",
+            "ensembles": 2,
+            "steps": 400,
+            "thin": 4,
+            "acceptance": 0.31234,
+            "largest_rhat": 1.0041,
+        },
     }
 
 
@@ -196,16 +211,18 @@ def test_verdict_stands_on_top_coloured_and_in_words(html):
 def test_sections_come_in_the_order_of_reading(html):
     titles = re.findall(r"<h2>(.*?)</h2>", html)
     assert titles == [
-        *("Data and bands", "Residuals", "Parameters", "Pairs of parameters", "Traces", "Step responses"),
-        "Frequency response",
-        *(
-            "Priors and posteriors",
-            "Prior sensitivity",
-            "Evidence",
-            "Second method",
-            "Sampler and provenance",
-        ),
+        *("Summary", "Parameters", "Step responses", "Frequency response", "Data and bands", "Residuals"),
+        *("Pairs of parameters", "Priors and posteriors", "Prior sensitivity", "Traces", "Evidence"),
+        *("Second method", "Sampler and provenance"),
     ]
+
+
+def test_the_answers_come_first_with_links(html):
+    first = html[html.index('<section id="summary">') : html.index("</section>")]
+    assert "<strong>What is missing?</strong> &lt;i&gt;odd$name$ &amp; co." in first
+    assert '<a href="#residuals">Residuals</a>' in first
+    assert first.count("<a ") == 1
+    assert "y / &lt;i&gt;odd$name$ = 1.2 rad/V" in first
 
 
 def test_every_parameter_has_its_unit_interval_and_grade(html):
@@ -335,7 +352,7 @@ def test_records_too_short_for_residuals_leave_a_sentence(tmp_path):
     folder = run_folder(tmp_path / "run")
     for name in ("residuals", "autocorrelation", "spectrum"):
         (folder / "tables" / f"{name}.csv").write_text("\n", encoding="utf-8")
-    section = residuals.section(load_run(folder))
+    section = records.residuals(load_run(folder))
     assert section.drawings == ()
     assert "too short" in section.text[0]
 
@@ -351,7 +368,7 @@ def test_names_that_look_like_numbers_or_nothing_stay_names(tmp_path):
 
 def test_long_records_make_small_figures_and_say_so(tmp_path):
     run = load_run(run_folder(tmp_path / "run", size=40_000))
-    drawings = (*records.section(run).drawings, *residuals.section(run).drawings)
+    drawings = (*records.data(run).drawings, *records.residuals(run).drawings)
     assert max(len(drawing.svg) for drawing in drawings) < 300_000
     assert all("the record has 40000 samples" in drawing.caption for drawing in drawings)
 
@@ -413,7 +430,7 @@ def test_intervals_and_significant_digits():
 
 def test_interesting_parameters_come_first_and_the_rest_is_named(tmp_path):
     names = ["sigma", "gain_a", "offset", "delay", "gate_1", "order_1", "time_2", "time_1"]
-    assert pairs.ranked(names) == [
+    assert parameters.ranked(names) == [
         "time_2",
         "time_1",
         "order_1",
@@ -442,7 +459,7 @@ def test_a_page_of_any_sections_can_be_written(tmp_path):
 def test_step_table_is_left_out_when_there_are_no_metrics(folder, tmp_path):
     run = load_run(folder)
     bare = type(run)({**run.results, "step_metrics": []}, run.provenance, run.tables, run.draws)
-    assert steps.section(bare).tables == ()
+    assert responses.steps(bare).tables == ()
 
 
 def test_a_clause_becomes_a_sentence_once():
@@ -456,10 +473,10 @@ def with_results(folder: Path, **more: object):
 
 
 def test_several_modes_are_shown_with_their_shares(folder):
-    assert len(parameters.section(load_run(folder)).tables) == 2
+    assert len(parameters.estimates(load_run(folder)).tables) == 2
     found = Modes("time_1", "ms", (1.1,), np.array([[0.3, 0.7], [0.5, 0.5]]), np.full((2, 2), 0.02))
     row = found.as_json() | {"grade": "tentative"}
-    table = parameters.section(with_results(folder, modes=[row])).tables[1]
+    table = parameters.estimates(with_results(folder, modes=[row])).tables[1]
     assert table.rows[0][:6] == (
         *("time_1", "1.10", "ms", "0.40 ± 0.10, 0.60 ± 0.10", "0.30 to 0.50, 0.50 to 0.70", "tentative"),
     )
@@ -467,17 +484,38 @@ def test_several_modes_are_shown_with_their_shares(folder):
 
 
 def test_the_most_prior_sensitive_parameters_are_shown_and_the_rest_counted(folder):
-    shown = sensitivity.section(load_run(folder))
+    shown = parameters.sensitivity(load_run(folder))
     assert shown.tables[0].rows[0] == (
         *("time_1", "0.210 ± 0.012", "0.210 ± 0.012", "prior-data conflict", "0.31", "tentative", ""),
     )
     assert shown.tables[0].rows[1][1:4] == ("–", "–", "not trusted")  # noqa: RUF001
     assert any("matters for 1 of 2 parameters: time_1" in text for text in shown.text)
     assert any("Not trusted for 1 parameter(s), gain" in text for text in shown.text)
-    many = sensitivity.section(
+    many = parameters.sensitivity(
         with_results(folder, sensitivity=[moved(f"p{k}", 0.01, "-") for k in range(30)])
     )
     assert len(many.tables[0].rows) == 20
     assert any("20 most affected of 30" in text for text in many.text)
     assert any("No parameter depends noticeably" in text for text in many.text)
-    assert sensitivity.section(with_results(folder, sensitivity=[])).tables == ()
+    assert parameters.sensitivity(with_results(folder, sensitivity=[])).tables == ()
+
+
+def test_a_page_of_importance_draws_speaks_of_no_ensembles(folder):
+    """Batches of weighted draws are no ensembles of walkers, and their evidence is no bridge."""
+    of_ensembles, settings = with_results(folder), {"method": "importance draws", "batches": 2, "seed": 1}
+    assert "by bridge sampling" in str(sampling.evidence(of_ensembles))
+    assert "Each colour is an independent ensemble" in str(parameters.traces(of_ensembles))
+    weighted = with_results(folder, sampler=settings)
+    shown = [sampling.evidence(weighted), parameters.traces(weighted), sampling.provenance(weighted)]
+    assert "the mean weight of the importance draws" in shown[0].text[0]
+    assert "ensemble" not in "".join(str(one.text) for one in shown)
+
+
+def test_a_fixed_parameter_is_not_called_sampled(folder):
+    run = with_results(folder)
+    row = {"unit": "-", "prior": "x", "from": "study", "integrated_out": False}
+    rows = pd.DataFrame([{"name": name, **row} for name in ("a", "b")])
+    results = {**run.results, "fixed": [{"name": "a", "value": 1.0, "unit": "-"}]}
+    run = replace(run, results=results, tables={**run.tables, "priors": rows})
+    (table,) = parameters.priors(run).tables
+    assert [cells[-1] for cells in table.rows] == ["fixed", "sampled"]

@@ -112,6 +112,29 @@ def test_coverage_is_judged_by_the_independent_samples_there_are():
     assert small <= 40 * 0.05 + 4 * np.sqrt(40 * 0.05)
 
 
+def unpredicted(seed: int, spread: float, **changes: float) -> tuple[Limitation, ...]:
+    """Limitations by a held-out record alone."""
+    made = problem(measured(seed), noise="white")
+    draws = about(made, spread, **changes)
+    samples, model = made.simulated((measured(seed + 100, name="held"),))
+    shown = bands(draws, model, samples, made.posterior.noise, held_out=True, seed=seed)
+    return limitations(made, draws, shown, [], np.random.default_rng(2))
+
+
+def test_a_held_out_record_that_the_bands_do_not_hold_is_named():
+    """An error of 3 % beyond what the draws allow is, the same error within their spread is not."""
+    wrong = {"gain": 1.03 * TRUTH["gain"]}
+    (one,) = unpredicted(1, 1e-3, **wrong)
+    assert one.level == "tentative"
+    assert "predicts held, axis y, worse than it claims" in one.reason
+    assert unpredicted(1, 0.03, **wrong) == ()
+
+
+def test_held_out_records_of_the_model_itself_are_rarely_named():
+    alarms = sum(bool(unpredicted(seed, 1e-3)) for seed in range(30))
+    assert alarms <= 30 * 0.01 + 4 * np.sqrt(30 * 0.01)
+
+
 def test_a_residual_far_above_the_scatter_at_rest_is_named():
     """The same misfit is called where samples at rest are there to compare with, and only there."""
     wrong = {"gain": 2.4, "sigma": 0.3}

@@ -15,9 +15,9 @@ from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import Command, on_off, step
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.drive import Drive
-from lcopa_bayes.data.record import save_record
+from lcopa_bayes.data.record import Axis, save_record
 from lcopa_bayes.results.fit import Fit, fit
-from lcopa_bayes.results.fittedrange import energies
+from lcopa_bayes.results.fittedrange import FittedRange, energies
 from lcopa_bayes.results.newdrive import fitted_range, predict
 from lcopa_bayes.results.prediction import responses
 from lcopa_bayes.results.summary import results
@@ -213,6 +213,12 @@ def test_drives_of_another_plant_are_refused(drive, words):
     with pytest.raises(InputError, match=words) as raised:
         predict(prepared, uncertain(prepared), drive)
     assert len(raised.value.problems) == 1
+
+
+def test_a_rest_at_negative_zero_is_zero():
+    drive = Drive.of_arrays([0, 1], u=[-0.0, 1.0])
+    (clause,) = FittedRange((drive,), (Axis("u", "V"),), 1.0, 0.1, "ms").other_rest([0.5])
+    assert clause.endswith("rest at 0 V")
 
 
 @pytest.fixture(scope="module")

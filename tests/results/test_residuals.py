@@ -21,7 +21,7 @@ def residual_of(values: np.ndarray, noise: str = "white", time: np.ndarray | Non
     n = values.size
     time = np.arange(n) * 0.5 if time is None else time
     five, four = np.ones((5, n)), np.ones((4, n))
-    band = Band("r", "y", "rad", False, time, 1.0 + values, five, five, four, four, "", 0, 4)
+    band = Band("r", "y", "rad", False, time, 1.0 + values, five, five, four, four, "", 0, 4, 1.0)
     (found,) = residuals(draws, [band], posterior.noise, 0.5)
     return found
 

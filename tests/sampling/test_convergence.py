@@ -40,7 +40,7 @@ def test_independent_normal_draws_are_reliable():
     assert 0.5 * count < quality.ess_tail < 1.5 * count
     assert quality.grade(400).level == "reliable"
     assert overall([quality], 400).level == "reliable"
-    assert "independent ensembles agree" in overall([quality], 400).reason
+    assert "independent sets of draws agree" in overall([quality], 400).reason
 
 
 def test_ensembles_on_different_hills_are_unusable_however_many_draws():

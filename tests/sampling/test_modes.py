@@ -146,7 +146,7 @@ def test_unequal_shares_lower_the_grade(lower, error, spread, level):
     assert ("run longer" in graded.reason) == (level != "reliable")
     if level != "reliable":
         wanted = f"two modes of order_2 (below and above 1.1), share of the lower mode {min(lower):.2f} to "
-        assert graded.reason.startswith(f"{wanted}{max(lower):.2f} over the ensembles")
+        assert graded.reason.startswith(f"{wanted}{max(lower):.2f} over independent sets of draws")
 
 
 def test_the_worse_of_shares_and_quality_counts_and_both_are_told():
@@ -171,7 +171,7 @@ def test_from_draws_to_the_grade():
         *("reliable", "unusable", "unusable"),
     ]
     assert alike.spread == 0.0
-    assert "equal in all ensembles" in alike.sentence()
+    assert "equal in all sets of draws" in alike.sentence()
     assert uneven.spread == pytest.approx(0.3, abs=0.06)
     assert apart.spread > 0.98
 

@@ -170,3 +170,17 @@ def test_a_plant_that_cannot_be_read_is_not_judged_further(tmp_path, capsys):
     assert len(lines) == 2  # whether there is a fourth term depends on what `terms` should have been
     assert "`terms` must be a whole number from 1 to 6; got 9" in lines[0]
     assert "`kind` must be one of white, ar1, white+ar1, student; got 'ar'; did you mean 'ar1'?" in lines[1]
+
+
+@pytest.mark.parametrize(
+    ("option", "least"), [("--jobs=0", 1), ("--jobs=-2", 1), ("--seed=-1", 0), ("--seed=1.5", 0)]
+)
+def test_numbers_of_the_command_line_that_cannot_be_used_are_named(option, least, tmp_path, capsys):
+    """No cores were taken for all of them, and fewer for one."""
+    name, _, text = option.partition("=")
+    with pytest.raises(SystemExit) as end:
+        main(["fit", str(tmp_path / "study"), "--out", str(tmp_path / "run"), option])
+    assert end.value.code == 2
+    printed = f"argument {name}: must be a whole number of at least {least}; got {text!r}"
+    assert printed in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()

@@ -1,16 +1,17 @@
-"""Passage of one record through the plant, from the commands that act to the deflection that is read."""
+"""Passage of a record through a plant or many, from the commands that act to the deflection that is read."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import NamedTuple, final
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple, TypeAlias, final
 
 import numpy as np
+from scipy import fft
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
-from lcopa_bayes.model.effects.balance import RunawayError, balanced, resting
+from lcopa_bayes.model.effects.balance import RunawayError, balanced, earlier, iterated, resting
 from lcopa_bayes.model.effects.effect import (
     Effect,
     ElementEffect,
@@ -24,8 +25,15 @@ from lcopa_bayes.model.layout import Layout
 from lcopa_bayes.model.powerseries import Spectrum
 from lcopa_bayes.model.transfer import transfer
 
-Acting = Sequence[tuple[Effect, Vector]]
+Acting: TypeAlias = Sequence[tuple[Effect, Vector]]
 """Effects with their coefficients."""
+Forces: TypeAlias = Sequence[tuple[ForceEffect, Array]]
+"""Forces with their coefficients: (coefficients,) of one plant, or (coefficients, plants times axes, 1), the
+constants that differ likewise."""
+Spectra: TypeAlias = dict[tuple[int, int, float, float], Spectrum]
+"""By element, number and width of the blocks, and the factor on time constants."""
+_SWEEPS = 100
+"""Most sweeps of the iteration [-]: what they do not bring to rest is solved by dividing the record."""
 
 
 @final
@@ -83,123 +91,178 @@ def deflections(layout: Layout, scene: Scene, gains: Matrix, units: Matrix) -> M
 def passed(
     model: ForwardModel, scenes: Sequence[Scene], plant: Plant, acting: Sequence[Acting]
 ) -> list[Moved]:
-    """Every record with effects on elements, forces and sensors; raises UnstableError.
-
-    The effects are simulated on blocks at fixed times, which misread the kink at an onset. So only the change
-    they make there is taken, and added to the response of the linear plant.
-    """
-    spectra: dict[tuple[int, int, float, float], Spectrum] = {}
-    return [
-        _Passage(model.layout, experiment, scene, plant, own, spectra).moved(without)
-        for experiment, scene, own, without in zip(
-            model.experiments, scenes, acting, linear(model, scenes, plant), strict=True
-        )
-    ]
+    """Every record with effects on elements, forces and sensors; raises UnstableError."""
+    spectra: Spectra = {}
+    out = []
+    for experiment, scene, own, without in zip(
+        model.experiments, scenes, acting, linear(model, scenes, plant), strict=True
+    ):
+        stretch = float(np.prod([e.stretch(scene, psi) for e, psi in own if isinstance(e, ElementEffect)]))
+        failures = {0: f"its time constants would be multiplied by {stretch:.3g}"}
+        if 0 < stretch < np.inf:
+            passage = Passage(
+                model.layout,
+                experiment,
+                scene,
+                plant.gains[None],
+                plant.dynamics,
+                [(e, psi) for e, psi in own if isinstance(e, ForceEffect)],
+                spectra,
+                stretch,
+                [(e, psi) for e, psi in own if isinstance(e, SensorEffect)],
+            )
+            change, failures = passage.change()
+        if failures:
+            raise UnstableError(tuple(effect.name for effect, _ in own), experiment.name, failures[0])
+        out.append(Moved(scene, without.deflection + change[:, 0].T))
+    return out
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class _Passage:
-    """One record on its grid."""
+class Passage:
+    """One record through one plant or many, with what acts between commands and reading.
+
+    Effects are simulated on blocks at fixed times, which misread the kink at an onset. So only the change
+    they make there is taken: it is added to the response of the linear plants.
+    """
 
     layout: Layout
     experiment: Experiment
     scene: Scene
-    plant: Plant
-    acting: Acting
-    spectra: dict[tuple[int, int, float, float], Spectrum]
+    """Of any of the plants: commands, scales and the grid are those of all."""
+    gains: Array
+    """(batch, responses, drives) [response unit per drive unit]."""
+    dynamics: Dynamics
+    forces: Forces
+    spectra: Spectra
+    """Of elements, (batch, points), shared by the records of these plants."""
+    stretch: float = 1.0
+    """Factor on all time constants [-]."""
+    filters: Sequence[tuple[SensorEffect, Vector]] = ()
+    """Of the sensor, with their coefficients."""
 
-    def moved(self, without: Moved) -> Moved:
-        """Deflection at the samples, from that of the linear plant."""
-        scene, gains = self.scene, self.plant.gains
-        bent = [(effect, own) for effect, own in self.acting if isinstance(effect, ForceEffect)]
-        at_rest = gains @ scene.rest
-        change = np.zeros((scene.ranges.axes, self.experiment.mesh.grid.n))
+    def change(self) -> tuple[Array, dict[int, str]]:
+        """What effects add to the deflections at the samples, (axes, batch, samples) [response unit], and why
+        some plants, by number, have no bounded response."""
+        ranges, batch, n = self.scene.ranges, len(self.gains), self.experiment.mesh.grid.n
+        linear, moved = np.zeros((ranges.axes, batch, n)), np.zeros((ranges.axes, batch, n))
         for i, row in enumerate(self.layout.unit_of):
             for j, unit in enumerate(row):
-                if not (bent and j == scene.ranges.direct[i]):
-                    change[i] += gains[i, j] * self._unit(unit, self._stretch)
-        if bent:
-            level, moving = self._balance(bent)
-            own = np.array([gains[i, j] * scene.rest[j] for i, j in enumerate(scene.ranges.direct)])
-            at_rest, change = at_rest - own + level, change + moving
-        for effect, own in self.acting:
-            if isinstance(effect, SensorEffect):
-                change = effect.filtered(change, scene, own)
-        rest_change, change = at_rest - gains @ scene.rest, change - self._linear()
-        read = without.deflection + self.experiment.mesh.reading(change).T + rest_change
-        if not np.isfinite(read).all():
-            raise self._unstable("the response is not finite")
-        return Moved(scene, read)
-
-    def _linear(self) -> Matrix:
-        """Block means of the linear plant's deviation from rest, (axes, blocks)."""
-        gains, units = self.plant.gains, self.layout.unit_of
-        rows = [
-            [gains[i, j] * self._unit(unit, 1.0) for j, unit in enumerate(row)] for i, row in enumerate(units)
-        ]
-        return np.asarray(np.sum(rows, axis=1))
-
-    @cached_property
-    def _stretch(self) -> float:
-        """Factor on all time constants [-]."""
-        factors = [e.stretch(self.scene, own) for e, own in self.acting if isinstance(e, ElementEffect)]
-        stretch = float(np.prod(factors))
-        if not 0 < stretch < np.inf:
-            raise self._unstable(f"its time constants would be multiplied by {stretch:.3g}")
-        return stretch
+                gain = self.gains[:, i, j, None]
+                linear[i] += gain * self._unit(unit, 1.0)
+                if not (self.forces and j == ranges.direct[i]):
+                    moved[i] += gain * self._unit(unit, self.stretch)
+        at_rest, failures = np.zeros((ranges.axes, batch)), dict[int, str]()
+        if self.forces:
+            at_rest, bent, failures = self._balanced()
+            moved += bent
+        for effect, psi in self.filters:
+            moved = np.stack([effect.filtered(moved[:, b], self.scene, psi) for b in range(batch)], axis=1)
+        read = self.experiment.mesh.reading((moved - linear).reshape(-1, n))
+        out = read.reshape(ranges.axes, batch, -1) + at_rest[..., None]
+        for b in np.flatnonzero(~np.isfinite(out).all(axis=(0, 2))).tolist():
+            failures.setdefault(b, "the response is not finite")
+        return out, failures
 
     def _spectrum(self, element: int, stretch: float) -> Spectrum:
         grid = self.experiment.mesh.grid
         key = (element, grid.n, grid.step, stretch)
         if key not in self.spectra:
-            times, orders = self.plant.dynamics.times[element], self.plant.dynamics.orders[element]
-            self.spectra[key] = transfer(stretch * times, orders, self.experiment.circle, grid.step)[0]
+            times, orders = self.dynamics.times[element], self.dynamics.orders[element]
+            self.spectra[key] = transfer(stretch * times, orders, self.experiment.circle, grid.step)
         return self.spectra[key]
 
-    def _means(self, unit: int) -> Vector:
-        """Block means of the delayed drive of a unit [drive unit]."""
+    def _means(self, unit: int) -> Matrix:
+        """Block means of the delayed drive of a unit, (batch, blocks) [drive unit]."""
         _, delay, axis = self.layout.units[unit]
-        late = self.plant.dynamics.delays[:, delay]
-        means, _ = self.scene.drives[axis].block_means(self.experiment.edges, late)
-        return np.asarray(means[0])
+        late = self.dynamics.delays[:, delay]
+        return self.scene.drives[axis].block_means(self.experiment.edges, late)[0]
 
     def _unit(self, unit: int, stretch: float) -> Array:
-        """Block means of a unit response with all time constants times `stretch` [drive unit]."""
+        """Block means of a unit response with all time constants times `stretch`, (batch, blocks)."""
         element, _, axis = self.layout.units[unit]
         if not self.scene.drives[axis].moves:
-            return np.zeros(self.experiment.mesh.grid.n)
+            return np.zeros((len(self.gains), self.experiment.mesh.grid.n))
         circle = self.experiment.circle
         return circle.coefficients(self._spectrum(element, stretch) * circle.spectrum(self._means(unit)))
 
-    def _balance(self, bent: Sequence[tuple[ForceEffect, Vector]]) -> tuple[Vector, Matrix]:
-        """Deflection of the direct paths at rest, (axes,), and deviation from it, (axes, blocks)."""
-        scene, circle = self.scene, self.experiment.circle
-        direct = list(enumerate(scene.ranges.direct))
-        gains = np.array([self.plant.gains[i, j] for i, j in direct])[:, None]
-        f0 = gains * scene.rest[scene.ranges.direct][:, None]
-        f = f0 + gains * np.stack([self._means(self.layout.unit_of[i][j]) for i, j in direct])
-        kernel = np.stack(
-            [
-                circle.coefficients(self._spectrum(self.layout.element_of[i][j], self._stretch))
-                for i, j in direct
-            ]
+    def _balanced(self) -> tuple[Matrix, Array, dict[int, str]]:
+        """What forces add to the level of the direct paths at rest, (axes, batch), deflection of these paths
+        from that level, (axes, batch, blocks), and why some plants have none."""
+        ranges, batch, n = self.scene.ranges, len(self.gains), self.experiment.mesh.grid.n
+        direct = list(enumerate(ranges.direct.tolist()))
+        gains = np.stack([self.gains[:, i, j] for i, j in direct], axis=1)
+        rest = gains * self.scene.rest[ranges.direct]
+        means = np.stack([self._means(self.layout.unit_of[i][j]) for i, j in direct], axis=1)
+        spectra = [self._spectrum(self.layout.element_of[i][j], self.stretch) for i, j in direct]
+        kernel = np.stack([self.experiment.circle.coefficients(one) for one in spectra], axis=1)
+        f0 = rest.reshape(-1, 1)
+        problem = _Forced(
+            self.forces,
+            replace(self.scene, ranges=replace(ranges, response=np.tile(ranges.response, batch))),
+            f0 + (gains[..., None] * means).reshape(len(f0), -1),
+            self.experiment.mesh.grid.step,
         )
+        every, scale = np.arange(len(f0)), problem.scene.ranges.column
+        level, settled = resting(lambda y: problem.acting(every, f0, y, np.zeros_like(y)), f0, scale)
+        places = every.reshape(batch, ranges.axes)
+        length = fft.next_fast_len(2 * n - 1, real=True)
+        spectrum, before = fft.rfft(kernel, length), np.zeros((len(f0), 2))
 
-        def acting(f: Matrix, y: Matrix, rate: Matrix) -> Matrix:
-            for effect, own in bent:
-                f = effect.force(f, y, rate, scene, own)
-            return f
+        def swept(plants: Index, y: Array) -> Array:
+            rows, flat = places[plants].ravel(), y.reshape(-1, n)
+            v = problem.deviation(level, rows, slice(None), flat, *earlier(before[rows], flat))
+            chosen = spectrum if plants.size == batch else spectrum[plants]
+            return np.asarray(fft.irfft(chosen * fft.rfft(v.reshape(y.shape), length), length)[..., :n])
 
-        def deviation(blocks: slice | Index, y: Matrix, one: Matrix, two: Matrix) -> Matrix:
-            rate = (1.5 * y - 2.0 * one + 0.5 * two) / self.experiment.mesh.grid.step
-            return acting(f[:, blocks], level + y, rate) - level
+        y, solved = iterated(swept, np.zeros(kernel.shape), scale.reshape(batch, -1, 1), _SWEEPS)
+        failures: dict[int, str] = {}
+        for b in np.flatnonzero(~solved).tolist():
+            try:
+                if not settled[places[b]].all():
+                    raise RunawayError(0)
+                force = partial(problem.deviation, level, places[b])
+                y[b] = balanced(kernel[b], force, scale[places[b]], y[b])
+            except RunawayError as error:
+                failures[b] = str(error)
+        return (level.reshape(rest.shape) - rest).T, np.moveaxis(y, 1, 0), failures
 
-        try:
-            level = resting(lambda y: acting(f0, y, np.zeros_like(y)), f0, scene.ranges.response)
-            return level[:, 0], balanced(kernel, deviation, scene.ranges.response)
-        except RunawayError as error:
-            raise self._unstable(str(error)) from error
 
-    def _unstable(self, why: str) -> UnstableError:
-        return UnstableError(tuple(effect.name for effect, _ in self.acting), self.experiment.name, why)
+@final
+@dataclass(frozen=True, eq=False)
+class _Forced:
+    """Forces on the direct paths of plants, a row for every axis of every plant."""
+
+    forces: Forces
+    scene: Scene
+    """Its scales have a value per row."""
+    f: Matrix
+    """Gain times delayed drive, (rows, blocks) [response unit]."""
+    step: float
+    """Width of a block [time unit]."""
+
+    def acting(self, rows: Index, f: Matrix, y: Matrix, rate: Matrix) -> Matrix:
+        """The force that acts on some of the rows."""
+        ranges = self.scene.ranges
+        own = replace(self.scene, ranges=replace(ranges, response=ranges.response[rows]))
+        for effect, psi in self.forces:
+            one, mine = (effect, psi) if psi.ndim == 1 else (_of_rows(effect, rows), psi[:, rows])
+            f = one.force(f, y, rate, own, mine)
+        return f
+
+    def deviation(
+        self, level: Matrix, rows: Index, blocks: slice | Index, y: Matrix, one: Matrix, two: Matrix
+    ) -> Matrix:
+        """That force less the level (rows, 1), from y less the level and its values one and two blocks
+        before."""
+        rate = (1.5 * y - 2.0 * one + 0.5 * two) / self.step
+        return self.acting(rows, self.f[rows][:, blocks], level[rows] + y, rate) - level[rows]
+
+
+def _of_rows(effect: ForceEffect, rows: Index) -> ForceEffect:
+    """The effect with those constants that differ from row to row taken of some rows."""
+    constants = {
+        name: value[rows] for name, value in effect.constants.items() if isinstance(value, np.ndarray)
+    }
+    return replace(effect, **constants) if constants else effect

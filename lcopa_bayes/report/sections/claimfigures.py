@@ -19,7 +19,7 @@ from lcopa_bayes.paper.opticsclaims import FAR_WEAKER, tilt_checks
 from lcopa_bayes.paper.printedmodel import RECORD_LENGTH, SETTLING_BANDS, PrintedModel, integer_rival
 from lcopa_bayes.report.formatting import figures
 from lcopa_bayes.report.section import Drawing, Section
-from lcopa_bayes.report.theme import BAND, CYCLE, HELD_OUT, NOISE, STEADY, blank, svg_of
+from lcopa_bayes.report.theme import BAND, CYCLE, HELD_OUT, NOISE, STEADY, blank, legend_above, svg_of
 
 _SHOWN = 100.0
 """Time of the long panel [ms]."""
@@ -27,67 +27,50 @@ _SHOWN = 100.0
 
 def sections(stated: Stated = PAPER) -> list[Section]:
     """One section for each family of claims."""
-    rival = integer_rival(stated)
-    costs = delay_costs(stated)
-    return [
-        Section(
+    rival, costs = integer_rival(stated), delay_costs(stated)
+    shown = (
+        (
             "M2, M3: steady state and settling",
-            drawings=(
-                Drawing(
-                    "claim_steady",
-                    _steady(stated),
-                    "The step of Fig. 13 through Eq. 65, over a record and beyond it, with 2 and 5 % bands "
-                    "about the value it tends to; the integer-order model closest to it over the record "
-                    f"(RMSE {figures(rival.rmse)} rad); the measured steady value.",
-                ),
-            ),
+            "steady",
+            _steady,
+            "The step of Fig. 13 through Eq. 65, over a record and beyond it, with 2 and 5 % bands "
+            "about the value it tends to; the integer-order model closest to it over the record "
+            f"(RMSE {figures(rival.rmse)} rad); the measured steady value.",
         ),
-        Section(
+        (
             "X1 to X3: crosstalk and two axes",
-            drawings=(
-                Drawing(
-                    "claim_crosstalk",
-                    _crosstalk(stated),
-                    "Left: b / k of the coupling paths against the printed crosstalk gains. Middle: y over x "
-                    "with x driven, at rest and at the end of the record, against the measured ratio. Right: "
-                    "steady values of both axes driven together.",
-                ),
-            ),
+            "crosstalk",
+            _crosstalk,
+            "Left: b / k of the coupling paths against the printed crosstalk gains. Middle: y over x "
+            "with x driven, at rest and at the end of the record, against the measured ratio. Right: "
+            "steady values of both axes driven together.",
         ),
-        Section(
+        (
             "N2: delays in whole blocks",
-            drawings=(
-                Drawing(
-                    "claim_delay",
-                    _delays(stated),
-                    "Shift of the other parameters when the delay is held at the nearest camera period, for "
-                    f"the printed delay of {figures(costs[0].delay, 4)} ms and for the worst delay, "
-                    f"{figures(costs[1].delay, 4)} ms.",
-                ),
-            ),
+            "delay",
+            _delays,
+            "Shift of the other parameters when the delay is held at the nearest camera period, for "
+            f"the printed delay of {figures(costs[0].delay, 4)} ms and for the worst delay, "
+            f"{figures(costs[1].delay, 4)} ms.",
         ),
-        Section(
+        (
             "S1: tilt law",
-            drawings=(
-                Drawing(
-                    "claim_tilt",
-                    _tilt(stated),
-                    "Mean tilt in a uniform and a self-consistent field, and Eq. 24; right: about the knee.",
-                ),
-            ),
+            "tilt",
+            _tilt,
+            "Mean tilt in a uniform and a self-consistent field, and Eq. 24; right: about the knee.",
         ),
-        Section(
+        (
             "S2 to S4: lobes, linearised steering, geometry",
-            drawings=(
-                Drawing(
-                    "claim_steering",
-                    _steering(stated),
-                    "Left: strongest grating lobe over the main lobe. Middle: size of the error of Eq. 26, "
-                    "and the steady-state error the paper claims. Right: angle by Eq. 5 for the pitch of "
-                    "Section 2 and for the pitch that the measured step implies.",
-                ),
-            ),
+            "steering",
+            _steering,
+            "Left: strongest grating lobe over the main lobe. Middle: size of the error of Eq. 26, "
+            "and the steady-state error the paper claims. Right: angle by Eq. 5 for the pitch of "
+            "Section 2 and for the pitch that the measured step implies.",
         ),
+    )
+    return [
+        Section(title, drawings=(Drawing(f"claim_{stem}", draw(stated), caption),))
+        for title, stem, draw, caption in shown
     ]
 
 
@@ -116,11 +99,9 @@ def _steady(stated: Stated) -> str:
             given.measured.steady, color=STEADY, lw=0.8, ls=(0, (1, 1.5)), label="measured steady value"
         )
         panel.axvline(given.fractional.settling, color=NOISE, lw=0.8, label="settling as printed")
-        panel.set_xlabel("time [ms]")
-        panel.set_xlim(0, end)
-    near.set_ylabel("x [rad]")
-    near.set_ylim(0.8 * steady, 1.06 * steady)
-    figure.legend(*near.get_legend_handles_labels(), loc="outside upper center", ncols=3)
+        panel.set(xlabel="time [ms]", xlim=(0, end))
+    near.set(ylabel="x [rad]", ylim=(0.8 * steady, 1.06 * steady))
+    legend_above(figure, near, 3)
     return svg_of(figure)
 
 
@@ -163,8 +144,7 @@ def _delays(stated: Stated) -> str:
         sizes = [abs(shift) for shift in cost.shifts.values()]
         panel.bar(at, sizes, 0.36, color=colour, label=f"{cost.delay:g} held at {cost.rounded:g} ms")
     panel.set_xticks(range(len(cost.shifts)), [name.replace("_", " ") for name in cost.shifts])
-    panel.set_ylabel("shift [sd]")
-    panel.set_ylim(top=panel.get_ylim()[1] * 1.25)
+    panel.set(ylabel="shift [sd]", ylim=(None, panel.get_ylim()[1] * 1.25))
     panel.legend(loc="upper left", ncols=2)
     return svg_of(figure)
 
@@ -188,11 +168,9 @@ def _tilt(stated: Stated) -> str:
             panel.plot(above, law(above), color=shade, ls=dashes)
         panel.axhline(pi / 2, color=NOISE, lw=0.7, label="pi/2")
         panel.set_xlabel("voltage [V]")
-    whole.set_ylabel("mean tilt [rad]")
-    whole.set_ylim(0, 1.8)
-    knee.set_xlim(optics.knee_voltage - 0.3, optics.knee_voltage + 0.3)
-    knee.set_ylim(1.0, 1.7)
-    figure.legend(*whole.get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    whole.set(ylabel="mean tilt [rad]", ylim=(0, 1.8))
+    knee.set(xlim=(optics.knee_voltage - 0.3, optics.knee_voltage + 0.3), ylim=(1.0, 1.7))
+    legend_above(figure, whole, 3)
     return svg_of(figure)
 
 
@@ -205,9 +183,7 @@ def _steering(stated: Stated) -> str:
         height = strongest_grating_lobe(np.radians(targets), optics, fill_factor=fill)
         lobes.plot(targets, height, color=colour, label=name)
     lobes.axhline(FAR_WEAKER, color=NOISE, lw=0.8, ls=(0, (4, 3)), label="far weaker")
-    lobes.set_xlabel("steering angle [deg]")
-    lobes.set_ylabel("grating lobe over main lobe [-]")
-    lobes.set_ylim(0, 1.45)
+    lobes.set(xlabel="steering angle [deg]", ylabel="grating lobe over main lobe [-]", ylim=(0, 1.45))
     phases = np.linspace(0.0, pi, 400)
     implied = LinearArray(optics.elements, check.implied_pitch, optics.wavelength)
     pitches = (
@@ -219,11 +195,9 @@ def _steering(stated: Stated) -> str:
         angle.plot(phases, array.steering_angle(phases), color=colour, label=name)
     limit = stated.records.steady_state_error
     error.axhline(limit, color=NOISE, lw=0.8, ls=(0, (4, 3)), label="claimed error")
-    error.set_ylabel("error of Eq. 26 [-]")
-    error.set_ylim(1e-6, 2.0)
+    error.set(ylabel="error of Eq. 26 [-]", ylim=(1e-6, 2.0))
     angle.plot(check.step, check.measured_angle, "o", ms=4, color=STEADY, label="measured")
-    angle.set_ylabel("angle [rad]")
-    angle.set_ylim(0, 0.65)
+    angle.set(ylabel="angle [rad]", ylim=(0, 0.65))
     for panel in (error, angle):
         panel.set_xlabel("phase step [rad]")
     for panel in (lobes, error, angle):

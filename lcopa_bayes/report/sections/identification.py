@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -11,10 +12,10 @@ import pandas as pd
 from lcopa_bayes.model.path import Normalisation
 from lcopa_bayes.paper.figures import KINDS
 from lcopa_bayes.paper.steptable import PRINTED
-from lcopa_bayes.report.decimation import extremes, said
+from lcopa_bayes.report.decimation import draw_line, said
 from lcopa_bayes.report.formatting import NONE, OPEN, figures, interval
-from lcopa_bayes.report.section import Column, Drawing, Section, Table
-from lcopa_bayes.report.theme import CYCLE, HELD_OUT, SEEN, STEADY, blank, label, plain, svg_of
+from lcopa_bayes.report.section import Cell, Drawing, Kind, Section, Table
+from lcopa_bayes.report.theme import CYCLE, HELD_OUT, SEEN, STEADY, blank, label, legend_above, plain, svg_of
 
 Values: TypeAlias = Mapping[str, Any]
 """A part of `identify.json`."""
@@ -61,48 +62,38 @@ def sections(values: Values, samples: Sequence[pd.DataFrame]) -> list[Section]:
     ]
 
 
+def _models(paths: Sequence[Values]) -> list[dict[str, Any]]:
+    return [model | {"path": path["path"]} for path in paths for model in path["models"]]
+
+
 def _errors(paths: Sequence[Values], time_unit: str) -> Table:
-    columns = (
-        *(Column("path"), Column("model"), Column("orders", "interval")),
-        *(Column(f"delay [{time_unit}]", "number"), Column("steady gain", "number")),
-        *(Column("equation error", "number"), Column("output error", "number"), Column("scanned", "number")),
-        Column("physical"),
-    )
-    rows = tuple(
-        (
-            *(path["path"], model["method"], ", ".join(map(figures, model["orders"]))),
-            *(figures(model["delay"], 4), figures(model["steady"], 4), figures(model["equation_rmse"])),
-            *(
-                figures(model["output_rmse"]),
-                NONE if model["candidates"] is None else str(model["candidates"]),
-            ),
-            "yes" if model["physical"] else "no",
-        )
-        for path in paths
-        for model in path["models"]
-    )
     units = ", ".join(dict.fromkeys(f"{path['response_unit']}/{path['drive_unit']}" for path in paths))
-    caption = (
-        "Root mean square errors in the unit of the response; physical: viscosities and k are positive. The "
-        f"steady gain is response over drive at rest [{units}]; scanned counts candidates."
+    return Table.of(
+        _models(paths),
+        ("path", "text", "path"),
+        ("model", "text", "method"),
+        ("orders", "interval", lambda row: ", ".join(map(figures, row["orders"]))),
+        (f"delay [{time_unit}]", "number", lambda row: figures(row["delay"], 4)),
+        ("steady gain", "number", lambda row: figures(row["steady"], 4)),
+        ("equation error", "number", "equation_rmse"),
+        ("output error", "number", "output_rmse"),
+        ("scanned", "number", "candidates"),
+        ("physical", "text", lambda row: "yes" if row["physical"] else "no"),
+        caption="Root mean square errors in the unit of the response; physical: viscosities and k are "
+        f"positive. The steady gain is response over drive at rest [{units}]; scanned counts candidates.",
     )
-    return Table(columns, rows, caption)
 
 
 def _coefficients(paths: Sequence[Values], normalisation: str) -> Table:
-    columns = (
-        *(Column("path"), Column("model"), Column("gain b", "number")),
-        *(Column("viscosities", "interval"), Column("k", "number")),
+    return Table.of(
+        [model | model["coefficients"][normalisation] for model in _models(paths)],
+        ("path", "text", "path"),
+        ("model", "text", "method"),
+        ("gain b", "number", lambda row: figures(row["gain"], 4)),
+        ("viscosities", "interval", lambda row: ", ".join(map(figures, row["etas"]))),
+        ("k", "number", lambda row: figures(row["stiffness"], 4)),
+        caption=f"Coefficients scaled so that: {normalisation}.",
     )
-    rows = []
-    for path in paths:
-        for model in path["models"]:
-            own = model["coefficients"][normalisation]
-            etas = ", ".join(map(figures, own["etas"]))
-            rows.append(
-                (path["path"], model["method"], figures(own["gain"], 4), etas, figures(own["stiffness"], 4))
-            )
-    return Table(columns, tuple(rows), f"Coefficients scaled so that: {normalisation}.")
 
 
 def _drawing(entry: Values, samples: pd.DataFrame, time_unit: str) -> Drawing:
@@ -126,80 +117,78 @@ def _drawn(entry: Values, samples: pd.DataFrame, time_unit: str) -> str:
     figure = blank(3.9)
     top, below = figure.subplots(2, 1, sharex=True, height_ratios=[2.2, 1.0])
     time, observed = samples["time"].to_numpy(), samples["observed"].to_numpy()
-    at = extremes(observed)
     colour = HELD_OUT if entry["held_out"] else SEEN
-    top.plot(time[at], observed[at], ".", ms=2.5, mew=0, color=colour, label="observed")
+    draw_line(top, time, observed, ".", ms=2.5, mew=0, color=colour, label="observed")
     for kind in KINDS:
-        response = samples[kind].to_numpy()
-        at = extremes(response)
-        shade, dashed = _COLOURS[kind], (0, (4, 2)) if "," in kind else "-"
-        top.plot(time[at], response[at], color=shade, ls=dashed, label=kind)
-        residual = observed - response
+        response, shade = samples[kind].to_numpy(), _COLOURS[kind]
+        dashed: Any = (0, (4, 2)) if "," in kind else "-"
+        draw_line(top, time, response, color=shade, ls=dashed, label=kind)
         if "," not in kind:
-            at = extremes(residual)
-            below.plot(time[at], residual[at], ".", ms=2.2, mew=0, color=shade)
+            draw_line(below, time, observed - response, ".", ms=2.2, mew=0, color=shade)
     if entry["printed_level"] is not None:
         top.axhline(entry["printed_level"], color=STEADY, lw=0.8, ls=(0, (4, 3)), label="steady, as printed")
     below.axhline(0, color="#b0b0b0", lw=0.6, zorder=0)
     where = f" ({entry['figure']})" if entry["figure"] else ""
-    top.set_title(plain(f"{entry['record']}, {entry['axis']}{where}"), loc="left", color=colour)
+    top.set_title(plain(f"{entry['record']}, {entry['axis']}{where}"), color=colour)
     top.set_ylabel(label(entry["axis"], entry["unit"]))
-    below.set_ylabel(label("residual", entry["unit"]))
-    below.set_xlabel(label("time", time_unit))
+    below.set(ylabel=label("residual", entry["unit"]), xlabel=label("time", time_unit))
     figure.align_ylabels()
-    figure.legend(*top.get_legend_handles_labels(), loc="outside upper center", ncols=3, markerscale=2)
+    legend_above(figure, top, 3, markerscale=2)
     return svg_of(figure)
 
 
 def _scores(records: Sequence[Values]) -> Table:
-    columns = (
-        *(Column("record"), Column("axis"), Column("figure"), Column("use"), Column("unit")),
-        *(Column(heading, "number") for heading in _HEADINGS),
-        Column("printed: fract. / int.", "number"),
-    )
-    rows = tuple(
+    return Table.of(
+        records,
+        ("record", "text", "record"),
+        ("axis", "text", "axis"),
+        ("figure", "text", lambda row: row["figure"] or NONE),
+        ("use", "text", lambda row: "held out" if row["held_out"] else "fit"),
+        ("unit", "text", "unit"),
+        *_by_kind(lambda row, k: figures(row["curves"][k]["rmse"])),
         (
-            *(one["record"], one["axis"], one["figure"] or NONE, "held out" if one["held_out"] else "fit"),
-            *(one["unit"], *(figures(curve["rmse"]) for curve in one["curves"])),
-            " / ".join(curve["printed_rmse"] for curve in one["curves"][:2]) if one["figure"] else NONE,
-        )
-        for one in records
+            "printed: fract. / int.",
+            "number",
+            lambda row: (
+                " / ".join(curve["printed_rmse"] for curve in row["curves"][:2]) if row["figure"] else NONE
+            ),
+        ),
+        caption="RMSE of every model on every record, and what the text prints for such a record. Fractional "
+        "and integer: the scan; then the output-error fits with free and with integer orders.",
     )
-    caption = (
-        "RMSE of every model on every record, and what the text prints for such a record. Fractional and "
-        "integer: the scan; then the output-error fits with free and with integer orders."
-    )
-    return Table(columns, rows, caption)
+
+
+def _by_kind(cell: Callable[[Values, int], str]) -> Iterator[tuple[str, Kind, Cell]]:
+    """A column for each of the `KINDS`, filled by its position."""
+    for k, heading in enumerate(_HEADINGS):
+        yield heading, "number", partial(lambda row, k: cell(row, k), k=k)
 
 
 def _metrics(rows: Sequence[Values]) -> Table:
-    columns = (
-        *(Column("path"), Column("metric"), Column("unit")),
-        *(Column(heading, "number") for heading in _HEADINGS),
-        Column("Table 1: measured/fract./int.", "number"),
-        *(Column("90 % credible", "interval"), Column("grade", "grade")),
-    )
-    cells = tuple(
-        (
-            *(row["path"], row["metric"], row["unit"]),
-            *(_reached(row["values"][kind]) for kind in KINDS),
-            " / ".join(_printed(row, column) for column in PRINTED) if row["printed"] else NONE,
-            *_credible(row["posterior"]),
-        )
-        for row in rows
-    )
-    if all(row["posterior"] is None for row in rows):
-        columns, cells = columns[:-2], tuple(row[:-2] for row in cells)
     sizes = ", ".join(
         f"{path} {figures(size)}" for path, size in {row["path"]: row["step"] for row in rows}.items()
     )
-    caption = (
-        f"Steps in the unit of the drive: {sizes}. "
+    credible: tuple[tuple[str, Kind, Cell], ...] = (
+        ("90 % credible", "interval", lambda row: _credible(row["posterior"])),
+        ("grade", "grade", lambda row: str((row["posterior"] or {"grade": ""})["grade"])),
+    )
+    return Table.of(
+        rows,
+        ("path", "text", "path"),
+        ("metric", "text", "metric"),
+        ("unit", "text", "unit"),
+        *_by_kind(lambda row, k: _reached(row["values"][KINDS[k]])),
+        (
+            "Table 1: measured/fract./int.",
+            "number",
+            lambda row: " / ".join(_printed(row, column) for column in PRINTED) if row["printed"] else NONE,
+        ),
+        *(credible if any(row["posterior"] is not None for row in rows) else ()),
+        caption=f"Steps in the unit of the drive: {sizes}. "
         f"{OPEN}: not reached within the record. Printed values are those of Table 1 for the measured and "
         "both modelled responses. The table does not state into which band a response stabilises, so its "
-        "single time is shown in both rows."
+        "single time is shown in both rows.",
     )
-    return Table(columns, cells, caption)
 
 
 def _reached(value: float | None) -> str:
@@ -213,9 +202,9 @@ def _printed(row: Values, column: str) -> str:
     return bound + figures(row["printed"][column])
 
 
-def _credible(estimate: Mapping[str, Any] | None) -> tuple[str, str]:
+def _credible(estimate: Mapping[str, Any] | None) -> str:
     if estimate is None:
-        return NONE, ""
+        return NONE
     lower, upper = estimate["lower"], estimate["upper"]
     spread = abs(upper - lower) / 4 if lower is not None and upper is not None else None
-    return interval(lower, upper, spread), str(estimate["grade"])
+    return interval(lower, upper, spread)

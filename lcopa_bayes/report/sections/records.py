@@ -1,29 +1,47 @@
-"""Each record with the bands the posterior predicts for it."""
+"""Each record with the bands the posterior predicts for it, and what the model leaves of it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import log
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from lcopa_bayes.report.decimation import draw_band, draw_line, extremes, said
-from lcopa_bayes.report.formatting import figures, percent
+from lcopa_bayes.core.arrays import Index, Vector
+from lcopa_bayes.report.decimation import draw_bands, draw_line, extremes, said
+from lcopa_bayes.report.formatting import figures, percent, probability
 from lcopa_bayes.report.savedrun import SavedRun
 from lcopa_bayes.report.section import Drawing, Section, Table, score_columns
-from lcopa_bayes.report.theme import BAND, CYCLE, HELD_OUT, NOISE, SEEN, blank, label, plain, svg_of
-from lcopa_bayes.results.bands import POINTWISE
-
-_BANDS = (
-    ("noisy", "05", "95", NOISE, 0.30, "90 % with noise"),
-    ("plant", "05", "95", BAND, 0.30, "90 % plant"),
-    ("plant", "25", "75", BAND, 0.55, "50 % plant"),
+from lcopa_bayes.report.theme import (
+    BAND,
+    CYCLE,
+    INK,
+    NOISE,
+    blank,
+    headed,
+    label,
+    legend_above,
+    plain,
+    svg_of,
 )
+from lcopa_bayes.results.bands import POINTWISE
+from lcopa_bayes.results.residuals import WHITE_P
+
+BANDS = (
+    (f"noisy_{POINTWISE}", "05", "95", NOISE, 0.30, "90 % with noise"),
+    (f"plant_{POINTWISE}", "05", "95", BAND, 0.30, "90 % plant"),
+    (f"plant_{POINTWISE}", "25", "75", BAND, 0.55, "50 % plant"),
+)
+"""Pointwise bands of a response: columns, ends, colour, opacity and label."""
+_ORDINATE_BAND = (-log(0.975), -log(0.025))
+"""2.5 and 97.5 % quantiles of the unit exponential law of a periodogram ordinate over its mean [-]."""
 
 
-def section(run: SavedRun) -> Section:
+def data(run: SavedRun) -> Section:
     """Observed and predicted responses with their drives, fitted records first, and the scores."""
     scores = {
         (row["record"], row["axis"], held): row
@@ -38,8 +56,8 @@ def section(run: SavedRun) -> Section:
         drawings.append(
             Drawing(
                 f"data_{number:02d}_{record}_{axis}",
-                _drawn(run, rows, record, axis, held=held),
-                _caption(score, record, axis, len(rows), held=held) + _before(run, rows, record),
+                _data(run, rows, record, axis, held=held),
+                _described(score, record, axis, len(rows), held=held) + _before(run, rows, record),
                 mark="held out" if held else "",
             )
         )
@@ -55,45 +73,46 @@ def section(run: SavedRun) -> Section:
     )
 
 
-def _drawn(run: SavedRun, rows: pd.DataFrame, record: str, axis: str, *, held: bool) -> str:
+def _data(run: SavedRun, rows: pd.DataFrame, record: str, axis: str, *, held: bool) -> str:
     drives = run.tables["drives"]
-    drives = drives[drives["record"] == record]
-    units = list(dict.fromkeys(drives["unit"]))
-    figure = blank(2.6 + 0.85 * len(units))
-    top, *below = figure.subplots(
-        1 + len(units), 1, sharex=True, squeeze=False, height_ratios=[3.2] + [1.0] * len(units)
-    ).ravel()
-    colour = HELD_OUT if held else SEEN
-    _bands(top, rows, colour)
-    top.set_ylabel(label(axis, rows["unit"].iloc[0]))
-    top.set_title(plain(f"{record}, {axis}: {'held out' if held else 'fit'}"), loc="left", color=colour)
-    for panel, unit in zip(below, units, strict=True):
-        draw_drives(panel, drives[drives["unit"] == unit], unit, until=float(rows["time"].max()))
-    margin = 0.02 * float(np.ptp(rows["time"]))
-    top.set_xlim(rows["time"].min() - margin, rows["time"].max() + margin)
-    (below[-1] if below else top).set_xlabel(label("time", run.time_unit))
-    figure.align_ylabels()
-    figure.legend(*top.get_legend_handles_labels(), loc="outside upper center", ncols=5, markerscale=2)
+    figure, top, _ = above_drives(
+        rows, drives[drives["record"] == record], run.time_unit, height=2.6, ratio=3.2
+    )
+    draw_response(top, rows, BANDS)
+    colour = headed(top, record, axis, held_out=held)
+    seen = rows["observed"].to_numpy()
+    size = 2.5 if extremes(seen).size > 300 else 3.2
+    draw_line(
+        top, rows["time"].to_numpy(), seen, ".", ms=size, mew=0, color=colour, label="observed", zorder=3
+    )
+    legend_above(figure, top, 5, markerscale=2)
     return svg_of(figure)
 
 
-def _bands(panel: Axes, rows: pd.DataFrame, marked: str) -> None:
-    time = rows["time"].to_numpy()
-    draw_bands(panel, rows, _BANDS)
-    seen = rows["observed"].to_numpy()
-    size = 2.5 if extremes(seen).size > 300 else 3.2
-    draw_line(panel, time, seen, ".", ms=size, mew=0, color=marked, label="observed", zorder=3)
+def above_drives(
+    rows: pd.DataFrame, drives: pd.DataFrame, time_unit: str, *, height: float, ratio: float
+) -> tuple[Figure, Axes, list[Axes]]:
+    """A figure with a panel for a response, still empty, and below it one for the drives of each unit.
 
-
-def draw_bands(
-    panel: Axes, rows: pd.DataFrame, which: Sequence[tuple[str, str, str, str, float, str]]
-) -> None:
-    """Pointwise bands of a response, by column, ends, colour, opacity and label, and the median."""
-    time = rows["time"].to_numpy()
-    for column, low, high, colour, alpha, name in which:
-        lower, upper = (rows[f"{column}_{POINTWISE}_{end}"].to_numpy() for end in (low, high))
-        draw_band(panel, time, lower, upper, color=colour, alpha=alpha, label=name)
-    draw_line(panel, time, rows[f"plant_{POINTWISE}_50"].to_numpy(), color=BAND, label="median")
+    `rows` are those of the response, whose times all panels span; `height` [in] is that without drives, and
+    `ratio` that of the panel of the response over another's.
+    """
+    units = list(dict.fromkeys(drives["unit"]))
+    figure = blank(height + 0.85 * len(units))
+    top, *below = figure.subplots(
+        1 + len(units), 1, sharex=True, squeeze=False, height_ratios=[ratio] + [1.0] * len(units)
+    ).ravel()
+    first, last = float(rows["time"].min()), float(rows["time"].max())
+    for panel, unit in zip(below, units, strict=True):
+        draw_drives(panel, drives[drives["unit"] == unit], unit, until=last)
+    margin = 0.02 * (last - first)
+    top.set(
+        ylabel=label(str(rows["axis"].iloc[0]), str(rows["unit"].iloc[0])),
+        xlim=(first - margin, last + margin),
+    )
+    (below[-1] if below else top).set_xlabel(label("time", time_unit))
+    figure.align_ylabels()
+    return figure, top, below
 
 
 def draw_drives(panel: Axes, drives: pd.DataFrame, unit: str, *, until: float) -> None:
@@ -111,7 +130,16 @@ def draw_drives(panel: Axes, drives: pd.DataFrame, unit: str, *, until: float) -
         panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
-def _caption(score: Mapping[str, Any], record: str, axis: str, size: int, *, held: bool) -> str:
+def draw_response(
+    panel: Axes, rows: pd.DataFrame, bands: Sequence[tuple[str, str, str, str, float, str]]
+) -> None:
+    """Bands of a response and the median of the plant."""
+    time = rows["time"].to_numpy()
+    draw_bands(panel, time, rows, bands)
+    draw_line(panel, time, rows[f"plant_{POINTWISE}_50"].to_numpy(), color=BAND, label="median")
+
+
+def _described(score: Mapping[str, Any], record: str, axis: str, size: int, *, held: bool) -> str:
     parts = [f"Record {record}, axis {axis}, {'held out of the fit' if held else 'fitted'}."]
     if score:
         parts.append(
@@ -147,3 +175,87 @@ def _scores(run: SavedRun) -> Table:
         "Where an offset comes from all samples of a held-out record, a constant error is not visible in its "
         "scores.",
     )
+
+
+def residuals(run: SavedRun) -> Section:
+    """Residual, autocorrelation and spectrum of every axis of every record."""
+    drawings = []
+    for number, (record, axis) in enumerate(run.records("residuals"), start=1):
+        rows = run.part("residuals", record, axis)
+        held = bool(rows["held_out"].iloc[0])
+        drawings.append(
+            Drawing(
+                f"residuals_{number:02d}_{record}_{axis}",
+                _residual(run, rows, record, axis, held=held),
+                _tested(run, record, axis, len(rows), held=held),
+                mark="held out" if held else "",
+            )
+        )
+    text = (
+        "The residual is observed minus the median of the plant; the two lower panels show it after the "
+        "fitted noise model has whitened it. Grey bands hold 95 % of the points if it is white."
+        if drawings
+        else "Every record is too short for residuals to be tested."
+    )
+    return Section("Residuals", (text,), tuple(drawings))
+
+
+def _residual(run: SavedRun, rows: pd.DataFrame, record: str, axis: str, *, held: bool) -> str:
+    figure = blank(3.9)
+    panels = figure.subplot_mosaic([["time", "time"], ["lags", "spectrum"]], height_ratios=[1.0, 1.15])
+    top = panels["time"]
+    colour = headed(top, record, axis, held_out=held)
+    top.axhline(0.0, color=NOISE, lw=0.7)
+    time, residual = rows["time"].to_numpy(), rows["residual"].to_numpy()
+    draw_line(top, time, residual, ".-", ms=2, mew=0, lw=0.5, color=colour)
+    top.set(xlabel=label("time", run.time_unit), ylabel=label("residual", rows["unit"].iloc[0]))
+    _lags(panels["lags"], run.part("autocorrelation", record, axis))
+    _spectrum(panels["spectrum"], run.part("spectrum", record, axis), run.time_unit)
+    return svg_of(figure)
+
+
+def _lags(panel: Axes, rows: pd.DataFrame) -> None:
+    lags, values = rows["lag"].to_numpy(), rows["autocorrelation"].to_numpy()
+    if lags.size:
+        band = float(rows["white_band_95"].iloc[0])
+        panel.axhspan(-band, band, color=NOISE, alpha=0.3, lw=0)
+    panel.axhline(0.0, color=INK, lw=0.7)
+    panel.vlines(lags, 0.0, values, color=BAND, lw=1.4)
+    panel.set(xlabel="lag [samples]", ylabel="autocorrelation [-]")
+
+
+def _spectrum(panel: Axes, rows: pd.DataFrame, time_unit: str) -> None:
+    frequency, power = rows["frequency"].to_numpy(), rows["power_over_white"].to_numpy()
+    above = power > 0
+    frequency, power = frequency[above], power[above]
+    panel.axhspan(*_ORDINATE_BAND, color=NOISE, alpha=0.3, lw=0)
+    panel.axhline(1.0, color=INK, lw=0.7)
+    at = _shown(power)
+    panel.plot(frequency[at], power[at], color=BAND, lw=0.8)
+    panel.set(
+        xscale="log",
+        yscale="log",
+        xlabel=label("frequency", f"1/{time_unit}"),
+        ylabel="power over white [-]",
+    )
+
+
+def _shown(power: Vector) -> Index:
+    """The lowest frequencies, spread wide on a logarithmic axis, singly, and extremes of the rest."""
+    few = min(power.size, 200)
+    return (
+        np.concatenate((np.arange(few), few + extremes(power[few:]))) if few < power.size else np.arange(few)
+    )
+
+
+def _tested(run: SavedRun, record: str, axis: str, size: int, *, held: bool) -> str:
+    parts = [f"Record {record}, axis {axis}."]
+    for test in run.results["residual_tests"]:
+        if (test["record"], test["axis"], test["held_out"]) == (record, axis, held):
+            p = test["p_white"]
+            unit = run.part("residuals", record, axis)["unit"].iloc[0]
+            parts.append(f"Root mean square {figures(test['rms'])} {unit}.")
+            if p is not None:
+                judged = "not white" if p < WHITE_P else "no sign that it is not white"
+                parts.append(f"Ljung-Box test of the whitened residual: {probability(p)}, {judged}.")
+    return " ".join([*parts, *filter(None, [said(size)])])

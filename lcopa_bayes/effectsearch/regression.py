@@ -1,0 +1,207 @@
+"""Least squares of a model under known noise, by the optimiser of a fit, and what an optimum is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Flags, Matrix, Vector
+from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
+from lcopa_bayes.effectsearch.whitening import Whitening
+
+_LOG_2PI = float(np.log(2 * np.pi))
+GAIN = 1e-3
+"""A step that gains less ends a descent [nat]."""
+_GLANCE = 6
+"""Evaluations of the response from each of several starts [-]."""
+_EVALUATIONS = 60
+_AT_END = 1e-3
+"""Closer to an end of its support than this share of it, a coordinate is at its bound [-]."""
+_WALLS = 8
+"""Descents between walls that move with the orders they separate, at most [-]."""
+_PUSHED = 0.3
+"""Slope of the cost per standard deviation from which such a coordinate is held by its bound [nat]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Optimum:
+    """Where a descent ended."""
+
+    x: Vector
+    """Coordinates, (k,)."""
+    residual: Vector
+    """Observed minus modelled, stacked, (n,) [response unit]."""
+    white: Vector
+    """Whitened residual, (n,) [-]."""
+    settled: Vector
+    """The same after one more linear step, so that the gradient vanishes to rounding, (n,) [-]."""
+    jacobian: Matrix
+    """Whitened tangents, (n, k) [1 / coordinate]."""
+    tangents: Matrix
+    """Tangents before whitening, (n, k) [response unit / coordinate]."""
+    information: Matrix
+    """``J' J`` plus prior precision, (k, k)."""
+    cost: float
+    """Half the squared whitened residual, plus the normal priors' [nat]."""
+    log_evidence: float
+    """Laplace approximation of the log evidence; flat priors count by their width [nat]."""
+    at_bound: tuple[str, ...]
+    """Names of the coordinates at an end of their support."""
+    converged: bool
+    effective: float
+    """Independent samples [-]."""
+    stuck: Flags
+    """Coordinates held by an end of their support against the data, (k,)."""
+
+    @property
+    def moving(self) -> Matrix:
+        """The whitened tangents, zero for coordinates that are stuck, (n, k)."""
+        return np.where(self.stuck, 0.0, self.jacobian)
+
+    @cached_property
+    def covariance(self) -> Matrix:
+        """Laplace covariance of the coordinates, (k, k)."""
+        return np.asarray(np.linalg.pinv(self.information, hermitian=True))
+
+    @property
+    def sd(self) -> Vector:
+        """Laplace standard deviation of each coordinate."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """A model fitted to the stacked samples under a fixed whitening."""
+
+    model: ExtendedModel
+    whitening: Whitening
+
+    @cached_property
+    def _prior(self) -> tuple[Vector, Vector]:
+        """Mean and precision of the normal priors; precision 0 where flat."""
+        flat = np.isnan(self.model.centre)
+        return np.where(flat, 0.0, self.model.centre), np.where(flat, 0.0, 1 / self.model.spread**2)
+
+    def cost(self, x: Vector) -> float:
+        """Half the squared whitened residual and normal priors [nat]; infinite without a bounded response."""
+        try:
+            predicted = self.model.predict(x)
+        except ArithmeticError:  # an effect of this size leaves no bounded response
+            return np.inf
+        if not np.isfinite(predicted).all():
+            return np.inf
+        return self._cost(x, self.whitening(self.whitening.observed - predicted))
+
+    def _cost(self, x: Vector, white: Vector) -> float:
+        mean, precision = self._prior
+        return float(0.5 * (white @ white) + 0.5 * (precision * (x - mean) ** 2).sum())
+
+    def reached(self, start: Vector, *, most: int = _EVALUATIONS, gain: float = GAIN) -> tuple[Vector, bool]:
+        """Coordinates of a local optimum within the support, its terms in the sequence of the report, and
+        whether it was reached within so many evaluations.
+
+        ArithmeticError when the response at the start is not finite or not bounded.
+        """
+        x = np.clip(start, *self.model.bounds_about(start))  # a start only
+        cost = self.cost(x)
+        if not np.isfinite(cost):
+            raise FloatingPointError("the simulated response is not finite")
+        least, enough = self.model.least(self.whitening.held), 2 * gain / self.whitening.size
+        for _ in range(_WALLS):
+            low, high = self.model.bounds_about(x)
+            width = np.where(np.isfinite(high - low), high - low, 1.0)
+            about = low - 1e-9 * width, high + 1e-9 * width  # an order may be held by both its neighbours
+            found = least.search(x, self.model.template, about, evaluations=most, enough=enough)
+            before, x = cost, np.clip(found.x, low, high)
+            cost = float(found.cost)
+            near = np.minimum(x - low, high - x) < _AT_END * width
+            inner = (low != self.model.bounds[0]) | (high != self.model.bounds[1])
+            if not (near & inner).any() or before - cost < gain:
+                break  # else a wall between two orders moves with them
+        return self.model.canonical(x), bool(found.status > 0)
+
+    def descend(self, start: Vector, *, most: int = _EVALUATIONS, gain: float = GAIN) -> Optimum:
+        """The optimum of `reached`, described."""
+        x, converged = self.reached(start, most=most, gain=gain)
+        return self.at(x, converged=converged)
+
+    def at(self, x: Vector, *, converged: bool = True) -> Optimum:
+        """The description of a point."""
+        predicted, tangents = self.model.tangents(x)
+        if not (np.isfinite(predicted).all() and np.isfinite(tangents).all()):
+            raise FloatingPointError("the simulated response is not finite")
+        residual = self.whitening.observed - predicted
+        both = self.whitening(np.vstack([residual, tangents.T]))
+        white, jacobian = both[0], np.ascontiguousarray(both[1:].T)
+        low, high = self.model.bounds
+        spread, cost = self.model.spread, self._cost(x, white)
+        mean, precision = self._prior
+        slope = jacobian.T @ white - precision * (x - mean)
+        information = jacobian.T @ jacobian + np.diag(1 / spread**2)
+        ends = self.model.bounds_about(x)
+        near = np.minimum(x - low, high - x) < _AT_END * np.where(np.isfinite(high - low), high - low, 0.0)
+        room = _AT_END * np.where(np.isfinite(high - low), high - low, spread)
+        pushed = slope / np.sqrt(np.diag(information))
+        stuck = ((x < ends[0] + room) & (pushed < -_PUSHED)) | ((x > ends[1] - room) & (pushed > _PUSHED))
+        level = cost + 0.5 * white.size * _LOG_2PI + self.whitening.log_scale
+        scaled = np.linalg.slogdet(information * np.outer(spread, spread))[1]
+        return Optimum(
+            x,
+            residual,
+            white,
+            white - jacobian @ _solved(information, slope, ~stuck),
+            jacobian,
+            tangents,
+            information,
+            cost,
+            float(-level - 0.5 * scaled),
+            tuple(name for name, close in zip(self.model.names, near | stuck, strict=True) if close),
+            converged,
+            self.whitening.effective,
+            stuck,
+        )
+
+    def lowest(
+        self, starts: Sequence[Vector], *, glance: int = _GLANCE, gain: float = GAIN
+    ) -> tuple[Vector, bool]:
+        """`reached` from the best of several starts: a few evaluations from each, the best two taken to the
+        end.
+
+        ArithmeticError when no start has a finite response.
+        """
+        looked: list[tuple[float, Vector]] = []
+        for start in starts:
+            try:
+                x, _ = self.reached(start, most=glance if len(starts) > 1 else _EVALUATIONS, gain=gain)
+            except ArithmeticError:
+                continue
+            looked.append((self.cost(x), x))
+        if not looked:
+            raise FloatingPointError("the simulated response is not finite at any start")
+        looked.sort(key=lambda one: one[0])
+        ends = [self.reached(x, gain=gain) for _, x in looked[:2]]
+        return min(ends, key=lambda one: self.cost(one[0])) if len(ends) > 1 else ends[0]
+
+    def best(self, starts: Sequence[Vector], *, gain: float = GAIN) -> Optimum:
+        """The optimum of `lowest`, described."""
+        x, converged = self.lowest(starts, gain=gain)
+        return self.at(x, converged=converged)
+
+
+def _solved(matrix: Matrix, right: Vector, free: Flags) -> Vector:
+    """Solution of a symmetric system for the free coordinates, zero for the others; by least squares where it
+    is singular."""
+    out = np.zeros(right.size)
+    if free.any():
+        inner = matrix[np.ix_(free, free)]
+        scale = np.sqrt(np.maximum(np.diag(inner), 1e-300))
+        out[free] = (
+            np.linalg.lstsq(inner / np.outer(scale, scale), right[free] / scale, rcond=1e-14)[0] / scale
+        )
+    return out

@@ -1,0 +1,151 @@
+"""Step and frequency responses of each path, and what engineers read off them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+
+from lcopa_bayes.report.decimation import draw_bands, draw_line
+from lcopa_bayes.report.formatting import NOT_REACHED, OPEN, figures, interval, to_spread
+from lcopa_bayes.report.savedrun import SavedRun
+from lcopa_bayes.report.section import Section, Table, paged
+from lcopa_bayes.report.theme import BAND, STEADY, grid, label, legend_above, log_ticks, plain, svg_of
+from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
+
+_STEPS_PER_FIGURE, _BODE_PER_FIGURE = 6, 4
+"""Paths on one figure."""
+_WORDS = {
+    "rise_10_90": "rise time, 10 to 90 %",
+    "settling_2": "settling time to 2 %",
+    "settling_5": "settling time to 5 %",
+    "value_at_end": "value at end of record",
+    "steady_state": "steady state",
+}
+"""Names of metrics that do not read as words."""
+_TIMES = ("rise", "settling")
+
+
+def steps(run: SavedRun) -> Section:
+    """Bands of the response to a unit step, and the table of step metrics."""
+    curves = run.tables["step_response"]
+    paths = list(dict.fromkeys(curves["path"]))
+    caption = (
+        "Response of the plant to a unit step at time 0, over the longest record: median, "
+        f"{POINTWISE} 50 and 90 % bands. Dashed: median and 90 % interval of the steady state it tends to."
+    )
+    drawings = paged("step", paths, _STEPS_PER_FIGURE, lambda part: _steps(run, curves, part), caption)
+    tables = (_metrics(run.results["step_metrics"]),) if run.results["step_metrics"] else ()
+    return Section("Step responses", drawings=drawings, tables=tables)
+
+
+def _steps(run: SavedRun, curves: pd.DataFrame, paths: Sequence[str]) -> str:
+    figure, panels = grid(len(paths), columns=2, height=2.2)
+    for panel, path in zip(panels, paths, strict=True):
+        rows = curves[curves["path"] == path]
+        _path(panel, rows)
+        panel.set(
+            title=plain(path),
+            ylabel=label("response", rows["unit"].iloc[0]),
+            xlabel=label("time", run.time_unit),
+        )
+    legend_above(figure, panels[0], 4)
+    return svg_of(figure)
+
+
+def _path(panel: Axes, rows: pd.DataFrame) -> None:
+    time = rows["time"].to_numpy()
+    bands = (("response", "05", "95", BAND, 0.30, "90 %"), ("response", "25", "75", BAND, 0.45, "50 %"))
+    draw_bands(panel, time, rows, bands)
+    draw_line(panel, time, rows["response_50"].to_numpy(), color=BAND, label="median")
+    for quantile, width, name in (("50", 1.1, "steady state"), ("05", 0.7, ""), ("95", 0.7, "")):
+        level = float(rows[f"steady_{quantile}"].iloc[0])
+        panel.axhline(level, color=STEADY, lw=width, ls=(0, (4, 3)), label=name or None)
+    panel.axhline(0.0, color="#b0b0b0", lw=0.6, zorder=0)
+
+
+def _metrics(metrics: Sequence[Mapping[str, Any]]) -> Table:
+    return Table.of(
+        metrics,
+        ("path", "text", lambda row: _kind(row)[1]),
+        ("metric", "text", lambda row: _WORDS.get(_kind(row)[0], _kind(row)[0].replace("_", " "))),
+        ("median", "interval", _median),
+        ("unit", "text", "unit"),
+        ("90 % interval", "interval", _interval),
+        ("sd", "number", lambda row: figures(row["sd"], 2)),
+        ("grade", "grade", "grade"),
+        ("note", "prose", lambda row: str(row.get("note", ""))),
+        caption="Times count from the step. Intervals are 90 % equal-tailed credible; where they are open, "
+        "the response of that share of the draws does not reach them within the record, or does not remain "
+        "there after it.",
+    )
+
+
+def _kind(metric: Mapping[str, Any]) -> tuple[str, str]:
+    """Kind and path of a metric."""
+    kind, _, where = str(metric["name"]).partition("[")
+    return kind, where.rstrip("]")
+
+
+def _open(metric: Mapping[str, Any]) -> str:
+    """Text of an end that no draw bounds."""
+    return NOT_REACHED if _kind(metric)[0].startswith(_TIMES) else OPEN
+
+
+def _median(metric: Mapping[str, Any]) -> str:
+    return _open(metric) if metric["value"] is None else to_spread(metric["value"], metric["sd"])
+
+
+def _interval(metric: Mapping[str, Any]) -> str:
+    lower, upper, never = metric["lower"], metric["upper"], _open(metric)
+    ends = interval(lower, upper, metric["sd"], nothing=never)
+    return ends if (lower is None) == (upper is None) else ends.replace(OPEN, never)
+
+
+def frequency(run: SavedRun) -> Section:
+    """Bode plots: gain and phase with their bands."""
+    table = run.tables["frequency_response"]
+    paths = list(dict.fromkeys(table["path"]))
+    caption = (
+        f"Gain and phase of each path: median, {POINTWISE} 50 and 90 % bands, and the {SIMULTANEOUS} "
+        "90 % band (dashed), which holds the whole curve. From one cycle in the longest fit record to one in "
+        "two sampling periods."
+    )
+    drawings = paged("frequency", paths, _BODE_PER_FIGURE, lambda part: _bode(run, table, part), caption)
+    return Section("Frequency response", drawings=drawings)
+
+
+def _bode(run: SavedRun, table: pd.DataFrame, paths: Sequence[str]) -> str:
+    figure, panels = grid(2 * len(paths), columns=2, height=2.0)
+    for number, path in enumerate(paths):
+        rows = table[table["path"] == path]
+        gain, phase = panels[2 * number], panels[2 * number + 1]
+        for panel, name in ((gain, "gain"), (phase, "phase")):
+            _curve(panel, rows, name)
+            panel.set(xscale="log", xlabel=f"frequency [cycles per {plain(run.time_unit)}]")
+        if (rows[f"gain_{POINTWISE}_05"] > 0).all():
+            gain.set_yscale("log")
+            log_ticks(gain.yaxis, *gain.get_ylim())
+        gain.set(title=plain(path), ylabel=label("gain", rows["unit"].iloc[0]))
+        phase.set_ylabel("phase [deg]")
+        low = float(np.floor(rows[f"phase_{POINTWISE}_05"].min() / 90) * 90)
+        if low >= -720:
+            phase.set_yticks(np.arange(low, 1, 90))
+    legend_above(figure, panels[0], 4)
+    return svg_of(figure)
+
+
+def _curve(panel: Axes, rows: pd.DataFrame, name: str) -> None:
+    x, prefix = rows["frequency"].to_numpy(), f"{name}_{POINTWISE}"
+    bands = (
+        (prefix, "05", "95", BAND, 0.30, f"90 % {POINTWISE}"),
+        (prefix, "25", "75", BAND, 0.45, f"50 % {POINTWISE}"),
+    )
+    draw_bands(panel, x, rows, bands)
+    for end, text in (("05", f"90 % {SIMULTANEOUS}"), ("95", "_")):
+        edge = rows[f"{name}_{SIMULTANEOUS}_{end}"].to_numpy()
+        panel.plot(x, edge, color=BAND, lw=0.7, ls=(0, (4, 3)), label=text)
+    panel.plot(x, rows[f"{prefix}_50"].to_numpy(), color=BAND, label="median")

@@ -1,0 +1,176 @@
+"""`new`: records and a study from tables as people save them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, final
+
+import pandas as pd
+
+from lcopa_bayes.core.errors import InputError, refuse_if
+from lcopa_bayes.core.files import writable_folder, write_text
+from lcopa_bayes.data.cells import CellTable
+from lcopa_bayes.data.conversion import Mapped, convert
+from lcopa_bayes.data.record import Record, save_record
+from lcopa_bayes.data.requirements import unmet
+from lcopa_bayes.data.spreadsheet import read_spreadsheet
+from lcopa_bayes.data.study import Study
+
+_SETTINGS = """\
+[model]
+# terms = 1  # viscous terms of every element; `loop` and `compare` say whether more are needed
+# share = "none"  # every path has an element of its own; "all": one for all
+# delay = "path"  # every path has a delay of its own; "shared": one for all
+# offset = "record"  # "shared" where all records rest at the same level
+
+[priors]
+# Parameters have default priors; `lcopa-bayes check` lists them. A number fixes a parameter:
+# delay = 0.5
+
+[noise]
+# kind = "white+ar1"  # or "white", "ar1", "student"
+
+[sampler]
+# target_ess = 400  # effective draws of a reliable number
+"""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class NewStudy:
+    """Records read from tables, and how these were read."""
+
+    study: Study
+    """The study, with default settings."""
+    notes: tuple[str, ...]
+    """What was taken for what, one sentence each."""
+    warnings: tuple[str, ...]
+    """What keeps a fit of these records from meaning anything."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Notes, warnings and the records as plain values."""
+        records = {"fit": self.study.fit, "held_out": self.study.held_out}
+        return {
+            "study": self.study.name,
+            "notes": list(self.notes),
+            "warnings": list(self.warnings),
+            "records": {role: [record.name for record in own] for role, own in records.items()},
+        }
+
+    def summary(self) -> pd.DataFrame:
+        """One row per record: its axes, rows and span [time unit]."""
+        return pd.DataFrame(
+            [
+                {
+                    "record": one.name,
+                    "drives": ", ".join(f"{axis.name} [{axis.unit}]" for axis in one.drive_axes),
+                    "responses": ", ".join(f"{axis.name} [{axis.unit}]" for axis in one.response_axes),
+                    "rows": one.time.size,
+                    "span": float(one.time[-1] - one.time[0]),
+                    "unit": one.time_unit,
+                }
+                for one in (*self.study.fit, *self.study.held_out)
+            ]
+        )
+
+    def __str__(self) -> str:
+        parts = [self.summary().to_string(index=False), "\n".join(self.notes)]
+        parts += ["\n".join(f"warning: {one}" for one in self.warnings)] if self.warnings else []
+        return "\n\n".join(parts)
+
+    def save(self, folder: Path | str, *, overwrite: bool = False) -> tuple[Path, ...]:
+        """Write the records and `study.toml` into a folder; returns the paths, the study file last.
+
+        InputError when files of these names are there, unless `overwrite`, or one cannot be written.
+        """
+        folder = Path(folder)
+        records = (*self.study.fit, *self.study.held_out)
+        paths = [*(folder / f"{record.name}.csv" for record in records), folder / "study.toml"]
+        there = [path for path in paths if path.exists()]
+        if there and not overwrite:
+            raise InputError(
+                [f"{path}: is there already; choose another folder or allow --overwrite" for path in there]
+            )
+        writable_folder(folder)
+        for record, path in zip(records, paths, strict=False):
+            save_record(record, path)
+        write_text(paths[-1], self._file())
+        return tuple(paths)
+
+    def _file(self) -> str:
+        def listed(records: Sequence[Record]) -> str:
+            return ", ".join(f'"{record.name}.csv"' for record in records)
+
+        held = self.study.held_out
+        lines = [
+            "# What was understood of the tables:",
+            *(f"# - {one}" for one in self.notes),
+            "",
+            "[study]",
+            f'name = "{self.study.name}"',
+            f'time_unit = "{self.study.time_unit}"',
+            "seed = 0",
+            "",
+            "[records]",
+            f"fit = [{listed(self.study.fit)}]",
+            f"held_out = [{listed(held)}]"
+            if held
+            else '# held_out = ["another.csv"]  # only predicted: the best check of a model',
+            "",
+        ]
+        return "\n".join(lines) + "\n" + _SETTINGS
+
+
+def new(
+    folder: Path | str,
+    files: Path | str | Sequence[Path | str],
+    *,
+    held_out: Sequence[Path | str] = (),
+    time: str = "",
+    drives: Sequence[str] = (),
+    responses: Sequence[str] = (),
+    time_unit: str = "",
+    decimal: str = "",
+    time_format: str = "",
+    sheet: str | None = None,
+    overwrite: bool = False,
+) -> NewStudy:
+    """Make a study of tables as spreadsheets and loggers save them.
+
+    Parameters: `folder`, where records and `study.toml` are written; `files` and `held_out`, tables to fit
+    and to predict alone: text of any separator, encoding and decimal sign, or workbooks, of which `sheet`
+    names the sheet; `overwrite`, replace files that are there. Tables share their headers. What is ambiguous
+    in headers and data is stated: `time`, `drives` and `responses`, columns by header, by header without its
+    unit or by number, each perhaps with a new name, as in "heater [%]=Column B"; `time_unit` of a numeric
+    time column, `decimal`, the decimal sign, and `time_format` of time stamps, as of `datetime.strptime`.
+
+    InputError with everything that cannot be read or is ambiguous; then nothing is written.
+    """
+    folder = Path(folder)
+    fitted = [Path(files)] if isinstance(files, Path | str) else [Path(one) for one in files]
+    paths = [*fitted, *(Path(one) for one in held_out)]
+    problems: list[str] = []
+    tables: list[CellTable] = []
+    for path in paths:
+        try:
+            tables.append(read_spreadsheet(path, sheet=sheet))
+        except InputError as error:
+            problems += error.problems
+    stems = [path.stem for path in paths]
+    problems += [
+        f"{path}: another table is called {path.stem!r} too; rename one"
+        for k, path in enumerate(paths)
+        if path.stem in stems[:k]
+    ]
+    if not paths:
+        problems.append("no table: name one or more files")
+    refuse_if(problems)
+    stated = Mapped(time, tuple(drives), tuple(responses), time_unit, decimal, time_format)
+    converted = convert(tables, stated)
+    own, apart = converted.records[: len(fitted)], converted.records[len(fitted) :]
+    study = Study(folder.resolve().name, fit=own, held_out=apart)
+    result = NewStudy(study, tuple(converted.notes), tuple(unmet(study)))
+    result.save(folder, overwrite=overwrite)
+    return result

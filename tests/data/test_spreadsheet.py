@@ -1,0 +1,298 @@
+"""Tables as people save them: any notation is read back, and what is ambiguous is asked for."""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import io
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+from openpyxl import Workbook
+
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.conversion import Mapped, axis_of, convert, resolved
+from lcopa_bayes.data.notation import decimal_sign, numbers
+from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.data.spreadsheet import read_spreadsheet
+
+N = 60
+TIME = 0.5 * np.arange(N)
+DRIVE = np.where(TIME < 5, 0.0, np.where(TIME < 20, 40.25, 15.5))
+RESPONSE = np.round(21 + 0.35 * np.convolve(DRIVE, np.exp(-np.arange(N) / 9) / 9)[:N], 4)
+START = datetime.datetime(2026, 3, 14, 23, 59, 50)
+
+
+def table(
+    path: Path,
+    header: tuple[str, ...] = ("Time [s]", "Heater [%]", "T1 (°C)"),
+    *,
+    separator: str = ",",
+    decimal: str = ".",
+    encoding: str = "utf-8",
+    above: str = "",
+    times: list[str] | None = None,
+) -> Path:
+    def text(value: float) -> str:
+        return repr(float(value)).replace(".", decimal)
+
+    buffer = io.StringIO()
+    buffer.write(above)
+    writer = csv.writer(buffer, delimiter=separator, lineterminator="\n")
+    writer.writerow(header)
+    for k in range(N):
+        writer.writerow([times[k] if times else text(TIME[k]), text(DRIVE[k]), text(RESPONSE[k])])
+    path.write_text(buffer.getvalue(), encoding=encoding)
+    return path
+
+
+def read(path: Path, **stated: str | tuple[str, ...]) -> Record:
+    return convert([read_spreadsheet(path)], Mapped(**stated)).records[0]  # type: ignore[arg-type]
+
+
+NOTATIONS = st.tuples(
+    st.sampled_from([(",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ","), ("|", ",")]),
+    st.sampled_from(["utf-8", "utf-8-sig", "utf-16", "cp1252"]),
+    st.sampled_from(["", "Oven 3, measured by Müller\n\n", "# a\n# b\n"]),
+    st.sampled_from(
+        [
+            None,
+            "%Y-%m-%d %H:%M:%S.%f",
+            "%Y-%m-%dT%H:%M:%S.%f",
+            "%d.%m.%Y %H:%M:%S,%f",
+            "%m/%d/%Y %I:%M:%S.%f %p",
+            "%H:%M:%S.%f",
+        ]
+    ),
+)
+
+
+@given(notation=NOTATIONS)
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_what_is_written_in_any_notation_is_read_back(notation, tmp_path):
+    (separator, decimal), encoding, above, form = notation
+    stamps = None
+    if form:
+        stamps = [(START + datetime.timedelta(seconds=float(t))).strftime(form) for t in TIME]
+        if separator == ",":
+            stamps = [stamp.replace(",", ".") for stamp in stamps]
+    header = ("Clock" if form else "Time [s]", "Heater [%]", "T1 (°C)")
+    record = read(
+        table(
+            tmp_path / "x.csv",
+            header,
+            separator=separator,
+            decimal=decimal,
+            encoding=encoding,
+            above=above,
+            times=stamps,
+        )
+    )
+    assert_allclose(record.time, TIME, atol=1e-9)
+    assert_array_equal(record.drive[:, 0], DRIVE)
+    assert_array_equal(record.response[:, 0], RESPONSE)
+    assert (record.drive_axes, record.response_axes) == ((Axis("Heater", "%"),), (Axis("T1", "°C"),))
+
+
+def workbook(path: Path, sheet: str = "data") -> Path:
+    book = Workbook()
+    book.active.title = "notes"
+    page = book.create_sheet(sheet)
+    page.append(["Zeit", "Heater [%]", "T1"])
+    page.append(["", "", "[°C]"])
+    for k in range(N):
+        page.append([START + datetime.timedelta(seconds=float(TIME[k])), float(DRIVE[k]), float(RESPONSE[k])])
+    book.save(path)
+    return path
+
+
+def test_a_workbook_is_read_from_the_sheet_that_holds_a_table(tmp_path):
+    path = workbook(tmp_path / "x.xlsx")
+    record = read(path)
+    assert_allclose(record.time, TIME, atol=1e-6)
+    assert_array_equal(record.response[:, 0], RESPONSE)
+    assert record.response_axes == (Axis("T1", "°C"),)
+    with pytest.raises(InputError, match="has no sheet 'dat'; did you mean 'data'"):
+        read_spreadsheet(path, sheet="dat")
+
+
+def test_a_formula_without_a_stored_result_is_named_by_its_cell(tmp_path):
+    book = Workbook()
+    book.active.append(["t [s]", "u", "y"])
+    for k in range(5):
+        book.active.append([k, 1.0, f"=A{k + 2}*2"])
+    book.save(tmp_path / "x.xlsx")
+    with pytest.raises(InputError, match="cell C2: the formula has no stored result"):
+        read_spreadsheet(tmp_path / "x.xlsx")
+
+
+def test_date_and_time_of_day_may_stand_in_two_columns(tmp_path):
+    rows = ["Date;Time;Heater [%];T1 [°C]"]
+    for k in range(N):
+        at = START + datetime.timedelta(seconds=float(TIME[k]))
+        rows.append(f"{at:%d.%m.%Y};{at:%H:%M:%S.%f};{DRIVE[k]};{RESPONSE[k]}")
+    (tmp_path / "x.txt").write_text("\n".join(rows))
+    assert_allclose(read(tmp_path / "x.txt").time, TIME, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("header", "axis"),
+    [
+        ("Heater [%]", Axis("Heater", "%")),
+        ("T1 (°C)", Axis("T1", "°C")),
+        ("Druck in bar", Axis("Druck", "bar")),
+        ("force / N", Axis("force", "N")),
+        ("plain name", Axis("plain_name", "-")),
+        ("angle [deg_C]", Axis("angle", "degC")),
+        ("1", Axis("1", "-")),
+    ],
+)
+def test_headers_give_name_and_unit(header, axis):
+    assert axis_of(header) == axis
+
+
+def test_columns_are_meant_by_header_by_name_and_by_number():
+    names = ["Time [s]", "Heater [%]", "heater 2 [%]"]
+    assert [resolved(one, names) for one in ("Heater [%]", "heater 2", "1", "cooler")] == [
+        "Heater [%]", "heater 2 [%]", "Time [s]", None,
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("cells", "sign"),
+    [
+        (["1,5", "2"], ","),
+        (["1.5", "2"], "."),
+        (["1.234,5"], ","),
+        (["1,234.5"], "."),
+        (["1,234,567"], "."),
+        (["0,123"], ","),
+        (["1,234"], ""),
+    ],
+)
+def test_the_decimal_sign_is_recognised_or_asked_for(cells, sign, tmp_path):
+    path = tmp_path / "x.csv"
+    path.write_text("a;b\n" + "\n".join(f"1;{cell}" for cell in cells))
+    known = decimal_sign(read_spreadsheet(path))
+    assert (known.sign if not known.problem else "") == sign
+
+
+def test_numbers_in_foreign_notation():
+    assert_array_equal(
+        numbers(["1.234,5", "\u22122", "3 000", "x", "", "5%"], ","), [1234.5, -2, 3000, np.nan, np.nan, 5]
+    )
+    assert_array_equal(numbers(["1,234.5", "1e-3", "inf", "nan"], "."), [1234.5, 1e-3, np.nan, np.nan])
+
+
+def test_roles_follow_words_then_data_and_may_be_stated(tmp_path):
+    path = table(tmp_path / "x.csv", ("t [ms]", "channel 1", "channel 2"))
+    out = convert([read_spreadsheet(path)], Mapped())
+    assert [axis.name for axis in out.records[0].drive_axes] == ["channel_1"]
+    assert any("constant but for few jumps" in note for note in out.notes)
+    swapped = read(path, drives=("force [N]=channel 2",), responses=("2",))
+    assert swapped.drive_axes == (Axis("force", "N"),)
+    assert_array_equal(swapped.drive[:, 0], RESPONSE)
+    assert swapped.time_unit == "ms"
+
+
+def test_a_quantised_response_is_no_drive(tmp_path):
+    rng = np.random.default_rng(1)
+    slow = np.round(np.cumsum(rng.random(400) < 0.05) * 0.1, 1)
+    rows = [f"{k},{float(k > 20)},{slow[k]}" for k in range(400)]
+    (tmp_path / "x.csv").write_text("t [s],a,b\n" + "\n".join(rows))
+    record = read(tmp_path / "x.csv")
+    assert [axis.name for axis in (*record.drive_axes, *record.response_axes)] == ["a", "b"]
+
+
+def test_a_drive_is_constant_in_a_dark_record_and_logged_only_when_it_changes(tmp_path):
+    table(tmp_path / "on.csv")
+    rows = [f"{TIME[k]},{'0.0' if k == 0 else ''},{RESPONSE[k]}" for k in range(N)]
+    (tmp_path / "dark.csv").write_text("Time [s],Heater [%],T1 (°C)\n" + "\n".join(rows))
+    out = convert([read_spreadsheet(tmp_path / name) for name in ("on.csv", "dark.csv")], Mapped())
+    assert_array_equal(out.records[1].drive, np.zeros((N, 1)))
+    assert any("holds the value above" in note for note in out.notes)
+
+
+BROKEN = {
+    "Time [s],Clock [s],u,y\n1,1,0,0\n2,2,1,1\n3,3,1,2": "several columns may hold the time",
+    "a,u,y\n3,0,0\n2,1,1\n3,1,0": "no column increases from row to row",
+    "Time,u,y\n1,0,0\n2,1,1\n3,1,2": "has no unit; state it with --time-unit",
+    "Time [fortnight],u,y\n1,0,0\n2,1,1\n3,1,2": "'fortnight', which is not known",
+    "Time [s],u,y\n0,1,0,2,0,3\n0,2,0,2,0,3\n0,3,0,2,0,3": "decimals are written with commas",
+    "Time [s],y\n0,1.2\n1,1.3\n2,1.1\n3,1.2\n4,1.9": "no column is recognised as a drive",
+    "Time [s],u,y\n0,0,1\n1,1,2\n1,1,3": "does not come after",
+    "Time [s],u,y\n0,0,1\n1,1,2\n2,1,oops\n3,1,4": "line 4, column 'y': 'oops' is not a number of y",
+    "Time [s],u,y\n0,,1\n1,1,2\n2,0,3\n3,1,4": "first row has no value of the drive 'u'",
+    "no table at all": "holds no table",
+    "1,2,3\n2,3,4": "has no header",
+    "Time,u,y\n2026-01-02 10:00,0,1\n03.01.2026 10:00,1,2\n2026-01-04 10:00,1,4": "write all times alike",
+    "Time,u,y\n01/02/2026 10:00,0,1\n03/02/2026 10:00,1,2\n04/02/2026 10:00,1,4": "day or the month first",
+}
+
+
+@pytest.mark.parametrize(("text", "message"), BROKEN.items(), ids=BROKEN.values())
+def test_what_is_ambiguous_is_asked_for(text, message, tmp_path):
+    (tmp_path / "x.csv").write_text(text)
+    with pytest.raises(InputError, match=message):
+        read(tmp_path / "x.csv")
+
+
+def test_what_is_asked_for_can_be_stated(tmp_path):
+    days = "Time,u,y\n01/02/2026 10:00:00,0,1\n03/02/2026 10:00:00,1,2\n04/02/2026 10:00:00,1,4"
+    (tmp_path / "x.csv").write_text(days)
+    got = [
+        read(tmp_path / "x.csv", time_format=f"{form} %H:%M:%S.%f").time[1]
+        for form in ("%d/%m/%Y", "%m/%d/%Y")
+    ]
+    assert_allclose(got, [2 * 86400, 59 * 86400])
+    (tmp_path / "y.csv").write_text("Time;u;y\n1;0;1,000\n2;1;2,000\n3;1;3,000")
+    with pytest.raises(InputError, match="--decimal"):
+        read(tmp_path / "y.csv", time_unit="h")
+    for sign, value in ((",", 2.0), (".", 2000.0)):
+        record = read(tmp_path / "y.csv", time_unit="h", decimal=sign)
+        assert (record.response[1, 0], record.time_unit) == (value, "h")
+
+
+@pytest.mark.parametrize("content", [b"\x00\x01\x02", b"", b"PK\x03\x04rubbish"])
+def test_what_is_no_table_is_refused(content, tmp_path):
+    for suffix in (".csv", ".xlsx"):
+        (tmp_path / f"x{suffix}").write_bytes(content)
+        with pytest.raises(InputError, match=f"x{suffix}: "):
+            read_spreadsheet(tmp_path / f"x{suffix}")
+    with pytest.raises(InputError, match=r"no such file; did you mean 'x.csv'"):
+        read_spreadsheet(tmp_path / "xx.csv")
+
+
+CELLS = st.one_of(
+    st.floats(allow_nan=True, allow_infinity=True).map(str),
+    st.integers(-1000, 1000).map(str),
+    st.sampled_from(
+        ["", "NaN", "1,5", "1.234,5", "2026-01-02", "03.04.2026 10:00", "10:00:01", "-", "#REF!", "x"]
+    ),
+    st.text(max_size=6),
+)
+
+
+@given(
+    header=st.lists(
+        st.one_of(st.text(max_size=8), st.sampled_from(["t [s]", "u", "y", "Time", "u"])), max_size=5
+    ),
+    rows=st.lists(st.lists(CELLS, max_size=5), max_size=8),
+    separator=st.sampled_from(",;\t|"),
+    content=st.none() | st.binary(max_size=200),
+)
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_table_is_read_or_refused_in_words(header, rows, separator, content, tmp_path):
+    path = tmp_path / "x.csv"
+    if content is None:
+        text = "\n".join(separator.join(cells) for cells in [header, *rows])
+        path.write_text(text, encoding="utf-8", errors="replace")
+    else:
+        path.write_bytes(content)
+    with suppress(InputError):
+        assert read(path).time.size >= 2

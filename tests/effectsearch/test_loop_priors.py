@@ -1,0 +1,152 @@
+"""An effect far beyond its default prior: the loop widens the prior, and pays for it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_loop import LIBRARY, study
+
+from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.data.settings import ModelSettings, PriorSettings
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.effectsearch import refits
+from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
+from lcopa_bayes.effectsearch.loop import Loop, loop
+from lcopa_bayes.effectsearch.refits import refit
+from lcopa_bayes.effectsearch.regression import Regression
+from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.model.effects.catalogue import catalogue
+
+AXIS = (Axis("x", "rad"),)
+CUBE = 0.2
+"""Cubic part of the reading of the lags, per deflection squared [1/rad^2]."""
+NOISE = 0.02
+CURVATURE = 0.29
+"""Cubic part of the response at a deflection of 1 [-]: ten standard deviations of the default prior."""
+
+
+def bent(seed: int) -> Study:
+    """Records of a plant so bent, with more noise than `study` gives."""
+    made = study(seed, CURVATURE)
+    rng = np.random.default_rng(seed + 100)
+    return replace(
+        made,
+        fit=tuple(
+            replace(one, response=one.response + NOISE * rng.standard_normal(one.response.shape))
+            for one in made.fit
+        ),
+    )
+
+
+def looped(seed: int) -> Loop:
+    return loop(bent(seed), library=LIBRARY, sample=False, quick=True, as_stated=True)
+
+
+def error(found: Loop) -> float:
+    """Of the coefficient [posterior sd]."""
+    state = found.after.state
+    assert found.names == ("odd_curvature",)
+    (k,) = [k for k, name in enumerate(state.model.names) if name == "odd_curvature.c"]
+    truth = CURVATURE * state.model.effected.ranges.response[0] ** 2
+    return float((state.optimum.x[k] - truth) / state.optimum.sd[k])
+
+
+def test_a_large_effect_is_estimated_without_bias(monkeypatch):
+    """Four draws of noise; held to the default prior the same refits are wrong by three sd."""
+    seeds = (1, 2, 3, 4)
+    found = [looped(seed) for seed in seeds]
+    errors = np.array([error(one) for one in found])
+    assert np.abs(errors).max() < 3.0
+    assert abs(errors.mean()) < 3.0 / np.sqrt(len(seeds))
+    monkeypatch.setattr(refits, "_FAR", np.inf)
+    held = np.array([error(looped(seed)) for seed in seeds[:2]])
+    assert held.max() < -3.0
+    for one in found:
+        assert one.after.state.model.wider == {"odd_curvature": 4.0}
+        assert "prior of odd_curvature is too narrow" in one.verdict.sentence
+
+
+def lag(name: str, height: float, rng: np.random.Generator) -> Record:
+    """A first-order lag of 2 ms under a step, read by a sensor that adds a fifth of the cube."""
+    t = np.arange(-15.0, 12.0, 0.25)
+    y = height * -np.expm1(-np.maximum(t, 0) / 2)
+    y = y + CUBE * y**3 + 0.01 * rng.normal(size=t.size)
+    return Record(name, t, (height * (t >= 0))[:, None], y[:, None], AXIS, AXIS, "ms")
+
+
+@pytest.mark.parametrize("seed", [0])
+def test_what_a_narrow_prior_takes_away_is_no_further_effect(seed, monkeypatch):
+    """Held to the default prior the same search names hysteresis beside the curvature."""
+    rng = np.random.default_rng(seed)
+    fit = tuple(lag(f"step{k}", height, rng) for k, height in enumerate((0.4, 0.8, 1.2)))
+    made = Study(
+        "lags",
+        None,
+        "ms",
+        seed,
+        fit,
+        (lag("held", 1.0, rng),),
+        ModelSettings(orders=(1.0,), offset="none"),
+        priors={"delay": PriorSettings("delay", fixed=0.0)},
+    )
+    found = loop(made, sample=False, quick=True, as_stated=True)
+    assert found.names == ("odd_curvature",)
+    state = found.after.state
+    k = state.model.plant_size
+    truth = CUBE * state.model.effected.ranges.response[0] ** 2
+    assert abs(state.optimum.x[k] - truth) < 3.5 * state.optimum.sd[k]
+    monkeypatch.setattr(refits, "_FAR", np.inf)
+    held = loop(made, sample=False, quick=True, as_stated=True)
+    assert held.names == ("odd_curvature", "hysteresis")
+
+
+def test_the_explained_study_has_the_wider_prior():
+    found = looped(1)
+    table = problem_of(found.study).posterior.table
+    (row,) = [row for row in table.rows if row.name == "odd_curvature.c"]
+    assert row.prior is not None
+    (default,) = catalogue()["odd_curvature"]().coefficients(found.after.state.model.effected.ranges)
+    assert row.prior.parameters["scale"] == pytest.approx(4 * default.scale)
+
+
+def test_the_evidence_of_a_wider_prior_is_that_of_the_integral():
+    """Two roads: Laplace evidence of the refit, or the integral over the coefficient of optima beside it."""
+    found = looped(2)
+    state, start = found.after.state, found.before.state
+    effect = state.model.effects[0]
+    made = refit(start.model, start.optimum, start.whitening, [(effect, np.ones(1))], 1e9)
+    assert made.model.wider == {"odd_curvature": 4.0}
+    assert made.paid == pytest.approx(-np.log(refits._COMMON) - np.log(len(effect.grid(None))))
+    k = made.model.plant_size
+    sd = made.model.scale[0]
+    grid = made.optimum.x[k] + np.linspace(-6, 6, 61) * made.optimum.sd[k]
+    profile = np.array([_marginal(made.model, made.optimum.x, k, at, made.whitening) for at in grid])
+    density = profile - 0.5 * (grid / sd) ** 2 - np.log(sd * np.sqrt(2 * np.pi))
+    integral = np.log(np.trapezoid(np.exp(density - density.max()), grid)) + density.max()
+    before = start.optimum.log_evidence
+    assert integral - before == pytest.approx(made.log_bayes_factor - made.paid, abs=0.1)
+
+
+def _marginal(model: ExtendedModel, x: np.ndarray, k: int, at: float, whitening) -> float:
+    """Log evidence of the plant alone, the coefficient held at a value, linearised there [nat]."""
+    moved = x.copy()
+    moved[k] = at
+    here = Regression(model, whitening).at(moved)
+    others = np.arange(x.size) != k
+    information = here.information[np.ix_(others, others)]
+    mean, spread = np.nan_to_num(model.centre[others]), model.spread[others]
+    precision = np.where(np.isnan(model.centre[others]), 0.0, 1 / spread**2)
+    slope = here.jacobian[:, others].T @ here.white - precision * (moved[others] - mean)
+    own = 0.5 * ((at - 0.0) / model.spread[k]) ** 2
+    cost = here.cost - own - 0.5 * slope @ np.linalg.solve(information, slope)
+    constant = 0.5 * here.white.size * np.log(2 * np.pi) + whitening.log_scale
+    return float(-cost - constant - 0.5 * np.linalg.slogdet(information * np.outer(spread, spread))[1])
+
+
+def test_an_effect_within_its_prior_keeps_it():
+    found = loop(study(2, 0.06), library=LIBRARY, sample=False, quick=True, as_stated=True)
+    assert found.names == ("odd_curvature",)
+    assert found.after.state.model.wider == {}
+    assert "too narrow" not in found.verdict.sentence

@@ -1,0 +1,142 @@
+"""From a table to a study that can be fitted: `new`, `check`, and a folder without a study file."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from small import ON_OFF_TABLE as TABLE
+from small import record
+
+import lcopa_bayes as lb
+from lcopa_bayes.cli import main
+from lcopa_bayes.data.record import Record, save_record
+
+
+@pytest.fixture
+def oven(tmp_path):
+    path = tmp_path / "oven.csv"
+    path.write_text(TABLE, encoding="utf-8-sig")
+    return path
+
+
+def test_a_spreadsheet_becomes_a_study_that_is_checked_and_looked_at(oven, tmp_path, capsys):
+    folder, run = tmp_path / "study", tmp_path / "run"
+    assert main(["new", str(folder), str(oven)]) == 0
+    said = capsys.readouterr().out
+    assert "'Zeit [min]' is the time, in min." in said
+    assert "lcopa-bayes check" in said
+    study = lb.load_study(folder)
+    assert (study.name, study.time_unit, [one.name for one in study.fit]) == ("study", "min", ["oven"])
+    assert "# - 'Heater [%]' is a drive" in (folder / "study.toml").read_text()
+    assert main(["check", str(folder), "--out", str(run)]) == 0
+    said = capsys.readouterr().out
+    assert "Heater changes 1 time from 2 min on, between 0 and 40 %" in said
+    assert "The records can be fitted." in said
+    assert (run / "check.html").stat().st_size > 10_000
+    page = (run / "check.html").read_bytes()
+    assert lb.load_result(run).to_json() == json.loads((run / "check.json").read_text())
+    assert main(["report", str(run)]) == 0
+    assert (run / "check.html").read_bytes() == page
+    assert main(["look", str(folder), "--out", str(run)]) == 0
+
+
+def test_nothing_is_replaced_unless_allowed_and_nothing_written_of_what_is_refused(oven, tmp_path, capsys):
+    folder = tmp_path / "study"
+    lb.new(folder, oven)
+    (folder / "study.toml").write_text("# mine")
+    assert main(["new", str(folder), str(oven)]) == 2
+    assert "study.toml: is there already" in capsys.readouterr().err
+    assert (folder / "study.toml").read_text() == "# mine"
+    lb.new(folder, oven, overwrite=True)
+    assert "mine" not in (folder / "study.toml").read_text()
+    (tmp_path / "bad.csv").write_text("a;b\n1;x\n")
+    assert main(["new", str(tmp_path / "other"), str(oven), str(tmp_path / "bad.csv")]) == 2
+    assert not (tmp_path / "other").exists()
+    assert main(["new", str(tmp_path / "other"), str(oven), "--time", "Zeitt"]) == 2
+    assert "did you mean 'Zeit [min]'" in capsys.readouterr().err
+    with pytest.raises(lb.InputError, match="another table is called 'oven' too"):
+        lb.new(tmp_path / "other", [oven, oven])
+
+
+def test_roles_may_be_stated_on_the_command_line(oven, tmp_path):
+    given = ["--time", "Zeit", "--drive", "u [V]=Heater", "--response", "T1", "--held-out"]
+    assert main(["new", str(tmp_path / "s"), str(oven), *given, str(_renamed(oven))]) == 0
+    study = lb.load_study(tmp_path / "s")
+    assert [(axis.name, axis.unit) for axis in study.drive_axes] == [("u", "V")]
+    assert [one.name for one in study.held_out] == ["again"]
+
+
+def _renamed(path):
+    copy = path.with_name("again.csv")
+    copy.write_bytes(path.read_bytes())
+    return copy
+
+
+def test_a_folder_without_a_study_file_is_a_study_of_its_records(tmp_path):
+    folder = tmp_path / "bench"
+    folder.mkdir()
+    for name, seed in (("a", 1), ("b", 2)):
+        save_record(record(seed, camera=0.5, name=name), folder / f"{name}.csv")
+    study = lb.load_study(folder)
+    assert (study.name, [one.name for one in study.fit]) == ("bench", ["a", "b"])
+    apart = lb.load_study(folder, held_out=[folder / "b.csv"])
+    assert ([one.name for one in apart.fit], [one.name for one in apart.held_out]) == (["a"], ["b"])
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(lb.InputError, match=r"holds neither a study\.toml nor a record"):
+        lb.load_study(tmp_path / "empty")
+
+
+def test_a_check_counts_what_is_there():
+    """Against the numbers the record was made with."""
+    on = record(1, camera=0.2, name="on")
+    values = lb.check(lb.Study("small", fit=[on], terms=1)).to_json()
+    (one,) = values["records"]
+    assert (one["rows"], one["even"]) == (on.time.size, True)
+    assert_allclose(one["period"], 0.2, rtol=1e-6)
+    (drive,) = one["drives"]
+    assert (drive["changes"], drive["lowest"], drive["highest"]) == (1, 0.0, 1.0)
+    (response,) = one["responses"]
+    at_rest = (on.time <= drive["first_change"]) & np.isfinite(on.response[:, 0])
+    assert response["at_rest"] == np.count_nonzero(at_rest)
+    assert_allclose(response["scatter"], on.response[at_rest, 0].std(ddof=1))
+    priors = {row["name"]: row for row in values["parameters"]}
+    span = on.time[-1] - drive["first_change"]
+    assert_allclose([priors["order_1"]["lower"], priors["order_1"]["upper"]], [0.1, 1.9])
+    assert_allclose(
+        [priors["delay"]["lower"], priors["delay"]["upper"]], [0.02 * span, 0.38 * span], rtol=1e-6
+    )
+
+
+def test_an_onset_is_not_before_the_delay():
+    seen = []
+    for seed in range(20):
+        on = record(seed, camera=0.05, noise_sd=0.005)
+        still = Record(
+            "on", on.time + 5, on.drive, on.response, on.drive_axes, on.response_axes, time_unit=on.time_unit
+        )
+        values = lb.check(lb.Study("small", fit=[still], terms=1)).to_json()
+        onset = values["records"][0]["responses"][0]["onset"]
+        seen.append(onset)
+    assert None not in seen
+    assert min(seen) >= 0.73 - 0.1  # the delay; a sample is a mean over the exposure before it
+    assert max(seen) < 1.5
+
+
+def test_obstacles_to_a_fit_are_part_of_a_check(capsys, tmp_path):
+    on = record(1, camera=0.5, name="on")
+    flat = Record(
+        "on",
+        on.time,
+        on.drive,
+        0 * on.response + 1.0,
+        on.drive_axes,
+        on.response_axes,
+        time_unit=on.time_unit,
+    )
+    result = lb.check(lb.Study("small", fit=[flat], terms=1))
+    assert "constant throughout" in result.verdict
+    with pytest.raises(lb.InputError, match="constant throughout"):
+        lb.fit(lb.Study("small", fit=[flat], terms=1))
