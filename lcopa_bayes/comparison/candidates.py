@@ -21,6 +21,7 @@ KNOWN = (STUDY, "fractional-1", "fractional-2", "fractional-3", "first-order", "
 VARIANTS: Mapping[str, str] = {
     "separate": "an element of its own for every path",
     "delays": "a delay of its own for every path",
+    "shared": "one element and one delay for all paths",
     "no-cross": "no cross paths",
     "no-effects": "no effects",
 }
@@ -79,6 +80,7 @@ def known_settings(name: str, study: Study) -> CandidateSettings:
         )
     settings |= {"share": "none"} if "separate" in variants else {}
     settings |= {"delay": "path"} if "delays" in variants else {}
+    settings |= {"share": "all", "delay": "shared"} if "shared" in variants else {}
     settings |= {"effects": ()} if "no-effects" in variants else {}
     return CandidateSettings(name, cross="no-cross" not in variants, **settings)  # type: ignore[arg-type]
 
@@ -173,6 +175,8 @@ def _short_list(study: Study) -> list[str]:
     own = [] if plain else [STUDY]
     upto = 2 if own else min(max(most, 2), _MOST)
     fractional = [f"fractional-{terms}" for terms in range(1, upto + 1)]
+    if len(study.drive_axes) != len(study.response_axes):  # do its paths have anything in common?
+        fractional.insert(1, "fractional-1-shared")
     return [*own, *fractional, *(["first-order"] if most <= 2 and not own else []), "second-order"]
 
 
@@ -248,5 +252,11 @@ def _about(study: Study, model: ModelSettings, cross: bool) -> str:
     delays = {"shared": "one delay", "element": "a delay per element", "path": "a delay per path"}
     if len(study.drive_axes) == len(study.response_axes) == 1:
         return f"{terms}, {orders}"
-    parts = [terms, orders, shared[model.share], delays[model.delay], *([] if cross else ["no cross paths"])]
+    parts = [
+        terms,
+        orders,
+        shared[str(model.share)],
+        delays[str(model.delay)],
+        *([] if cross else ["no cross paths"]),
+    ]
     return ", ".join(parts)

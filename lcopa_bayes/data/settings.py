@@ -99,16 +99,27 @@ class ModelSettings(Ruled):
     states `orders` the default is their number."""
     orders: Annotated[Literal["free"] | tuple[float, ...], _ORDERS] = "free"
     """Fractional orders [-] in (0, 2], not increasing, one per term; "free": estimated."""
-    share: Share = "paper"
-    """Which paths share an element."""
-    delay: DelayKind = "shared"
-    """Whether the delay is one for all, one per element or one per path."""
+    share: Share | None = None
+    """Which paths share an element; None: as `for_plant` says."""
+    delay: DelayKind | None = None
+    """Whether the delay is one for all, one per element or one per path; None: as `for_plant` says."""
     offset: OffsetKind = "record"
     """Whether the offset of a response axis is one per record, one for all or zero."""
     blocks: Annotated[int | None, whole(2)] = None
     """Block pulses per record [-]; None: chosen from the record."""
     exposure_ms: Annotated[float, _EXPOSURE] = 0.0
     """Time over which a response sample is a mean [ms], whatever the time unit of the study."""
+
+    def for_plant(self, drives: int, responses: int) -> ModelSettings:
+        """The same with what paths share decided.
+
+        A plant of as many drives as responses is one of the paper's: direct paths share an element, cross
+        paths another, all of them a delay. Of any other plant nothing says that paths have anything in
+        common, so every path has an element and a delay of its own, unless `terms` names shared elements.
+        """
+        alike = drives == responses
+        share = self.share or ("paper" if alike or isinstance(self.terms, Mapping) else "none")
+        return replace(self, share=share, delay=self.delay or ("shared" if alike else "path"))
 
     def contradictions(self) -> list[str]:
         """Elements without a number of terms, and orders that are not one per term or that increase."""

@@ -133,6 +133,8 @@ class Study:
             "held_out": tuple(_in_order(r, fitted[0]) for r in apart),
             "inputs": inputs or {},
         }
+        plant = len(fitted[0].drive_axes), len(fitted[0].response_axes)
+        settings["model"] = settings["model"].for_plant(*plant)
         for key, value in settings.items():
             locked = MappingProxyType(dict(value)) if isinstance(value, Mapping) else value
             object.__setattr__(self, key, locked)

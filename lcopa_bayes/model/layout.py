@@ -29,6 +29,17 @@ class Unit(NamedTuple):
     drive: int
 
 
+class PathSlot(NamedTuple):
+    """A path from a drive to a response."""
+
+    response: int
+    drive: int
+    name: str
+    """``<response>_<drive>``, or the response's name when the plant has one path."""
+    unit: str
+    """Of its gain [response unit per drive unit]."""
+
+
 @final
 @dataclass(frozen=True)
 class Layout:
@@ -51,9 +62,10 @@ class Layout:
         `share = "paper"`: direct paths (same axis, or same position when no axis name is both drive
         and response) have one element, cross paths another (Ta et al. 2026, Eq. 65).
         """
-        by_share = _slots(drives, responses, model.share)
-        kinds = {"shared": "all", "element": model.share, "path": "none"}
-        by_delay = _slots(drives, responses, kinds[model.delay])
+        model = model.for_plant(len(drives), len(responses))
+        share, delay = str(model.share), str(model.delay)
+        by_share = _slots(drives, responses, share)
+        by_delay = _slots(drives, responses, {"shared": "all", "element": share, "path": "none"}[delay])
         names = _distinct(by_share)
         terms = _terms(names, model)
         delay_names = _distinct(by_delay)
@@ -82,6 +94,15 @@ class Layout:
             [Unit(self.element_of[i][j], self.delay_of[i][j], j) for j in range(len(self.drives))]
             for i in range(len(self.responses))
         ]
+
+    @cached_property
+    def paths(self) -> tuple[PathSlot, ...]:
+        """All paths, by response and drive."""
+        return tuple(
+            PathSlot(i, j, self.path_name(i, j) or response.name, f"{response.unit}/{drive.unit}")
+            for i, response in enumerate(self.responses)
+            for j, drive in enumerate(self.drives)
+        )
 
     def own_response(self, drive: int) -> int | None:
         """The response axis that a drive is meant to move; None when there is none."""

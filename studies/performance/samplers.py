@@ -419,7 +419,7 @@ def measured(*, quick: bool, seconds: float = np.inf) -> dict[str, Any]:
     Others have `cap` times the CPU time of this package's first run. After `seconds` of wall time no further
     run begins, the first of this package excepted.
     """
-    rounds, cap = (2, 0.3) if quick else (8, 12.0)
+    rounds, cap = (2, 1.0) if quick else (8, 12.0)
     absent = {
         method: f"{distribution} is not installed"
         for method, (module, distribution) in PACKAGES.items()

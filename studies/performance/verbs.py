@@ -11,6 +11,8 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import resource
+import signal
 import subprocess
 import sys
 import tempfile
@@ -24,13 +26,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from comparison import Spread, ratio
+from probe import SAMPLING
 
 from lcopa_bayes.cli import VERBS
 
 HERE = Path(__file__).parent
 STUDIES = HERE.parent
 ROOT = STUDIES.parent
-MEASURED = ("lcd_panel_p_from000_to153", "hair_dryer", "tclab_2x2")
+MEASURED = ("lcd_panel_p_from000_to153", "hair_dryer", "heating_system", "tclab_2x2")
 """Studies of measured records that are added where there are such records."""
 CANDIDATES = ("fractional-1", "fractional-2", "first-order", "second-order")
 REPLICAS = {True: "2", False: "20"}
@@ -111,6 +114,13 @@ def cells(sources: Sequence[Source]) -> list[Cell]:
     return simulated + easy + alone + fits + [Cell(verb, each) for each in harder for verb in rest]
 
 
+def wanted(cell: Cell, verbs: Sequence[str], studies: Sequence[str]) -> bool:
+    """Whether a cell is among those asked for; what makes a study is."""
+    verb, study = cell.place
+    of_study = not studies or study in studies
+    return of_study and (not verbs or verb in verbs or verb == "simulate")
+
+
 @dataclass(frozen=True)
 class Measurement:
     """One run of a cell."""
@@ -122,7 +132,7 @@ class Measurement:
     yardstick: float
     """CPU time of the yardstick around the run [s]."""
     outcome: str
-    """``done``, ``refused``, ``failed`` or ``stopped`` when the time for it was up."""
+    """``done``, ``refused``, ``failed`` or ``stopped`` when its time was up."""
     message: str = ""
     """What the verb said when it was refused or failed."""
     probe: Mapping[str, Any] = field(default_factory=dict)
@@ -197,8 +207,8 @@ class Workshop:
             return (self.run(cell.source) / "results.json").is_file()
         return (self.study(cell.source) / "study.toml").is_file()
 
-    def measured(self, cell: Cell, limit: float) -> Measurement:
-        """One run, stopped after `limit` seconds."""
+    def measured(self, cell: Cell, limit: float, remaining: float) -> Measurement:
+        """One run, stopped after `limit` seconds of CPU time and `remaining` seconds in all."""
         if cell.verb == "fit" and cell.source is not None:  # a fit that is stopped leaves nothing behind
             (self.run(cell.source) / "results.json").unlink(missing_ok=True)
         place = self.folder / "probe.json"
@@ -208,7 +218,7 @@ class Workshop:
         threads = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}
         environment = os.environ | threads | {"PYTHONPATH": str(self.root)}
         before = yardstick()
-        spent, code, said, problem = observed(command, environment, self.root, limit)
+        spent, code, said, problem = observed(command, environment, self.root, limit, remaining)
         around = (before + yardstick()) / 2
         outcome = {0: "done", 2: "refused", None: "stopped"}.get(code, "failed")
         if outcome == "done" and cell.verb == "simulate" and cell.source is not None:
@@ -229,19 +239,26 @@ def options_of(verb: str) -> str:
 
 
 def observed(
-    command: Sequence[str], environment: Mapping[str, str], folder: Path, limit: float
+    command: Sequence[str], environment: Mapping[str, str], folder: Path, limit: float, remaining: float
 ) -> tuple[tuple[float, float], int | None, str, str]:
-    """Wall and CPU seconds of a command with what it started, its exit code (None: it was stopped after
-    `limit` seconds), and what it wrote."""
-    begin = time.perf_counter()
+    """Wall and CPU seconds of a command with what it started, its exit code (None: it was stopped, after
+    `limit` seconds of CPU time or `remaining` seconds), and what it wrote."""
+    begin, most = time.perf_counter(), int(np.ceil(min(limit, 1e6)))
     with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as problems:
-        process = subprocess.Popen(command, env=dict(environment), cwd=folder, stdout=out, stderr=problems)
+        process = subprocess.Popen(
+            command,
+            env=dict(environment),
+            cwd=folder,
+            stdout=out,
+            stderr=problems,
+            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (most, most)),
+        )
         stopped = False
         while True:
             ended, status, used = os.wait4(process.pid, 0 if stopped else os.WNOHANG)
             if ended:
                 break
-            if time.perf_counter() - begin > limit:
+            if time.perf_counter() - begin > remaining:
                 process.terminate()  # its workers end with it
                 stopped = True
             else:
@@ -251,6 +268,7 @@ def observed(
         for file in (out, problems):
             file.seek(0)
         spent = wall, used.ru_utime + used.ru_stime
+        stopped = stopped or code in (-signal.SIGXCPU, -signal.SIGKILL)
         return spent, None if stopped else code, out.read(), problems.read()
 
 
@@ -298,6 +316,7 @@ def row_of(cell: Cell, runs: Sequence[Measurement], fits: Sequence[Measurement])
             "plants": counts["plants"],
             "plants_with_slopes": counts["plants_with_slopes"],
             "likelihood_share": counts["likelihood_s"] / counts["process_s"],
+            "likelihood_share_of_sampling": share_of_sampling(counts["stages"]),
             "stages": counts["stages"],
             "not_watched": counts["missing"],
         }
@@ -306,17 +325,30 @@ def row_of(cell: Cell, runs: Sequence[Measurement], fits: Sequence[Measurement])
     return row
 
 
+def share_of_sampling(stages: Mapping[str, Sequence[float]]) -> float | None:
+    """Share of the likelihood in the time that sampling takes; None for a verb that does not sample."""
+    sampling = np.array([stages[name] for name in SAMPLING if name in stages])
+    return float(sampling[:, 1].sum() / sampling.sum()) if sampling.size else None
+
+
 def measured(
-    folder: Path, *, quick: bool, jobs: int = 1, seconds: float = np.inf, against: Path | None = None
+    folder: Path,
+    *,
+    quick: bool,
+    jobs: int = 1,
+    seconds: float = np.inf,
+    against: Path | None = None,
+    only: tuple[Sequence[str], Sequence[str]] = ((), ()),
 ) -> dict[str, Any]:
     """A row per verb and study, and with `against`, another checkout of the package, ratios to it.
 
+    `only` names verbs and studies that are wanted, all where there are none; what needs a fit needs it named.
     Checkouts take turns run by run, cells round by round. In a quick run, with one round and `seconds` for
     all of it, a cell that takes long is stopped and counts as at least what it took.
     """
     rounds, limit = (1, 40.0) if quick else (3, 3600.0)
-    studies = SOURCES if quick else sources()
-    todo = cells(studies)
+    studies = SOURCES if quick and not only[1] else sources()
+    todo = [cell for cell in cells(studies) if wanted(cell, *only)]
     shops = [Workshop(folder / "this", jobs=jobs, quick=quick)]
     if against is not None:
         shops.append(replace(shops[0], folder=folder / "other", root=against))
@@ -329,10 +361,10 @@ def measured(
                 remaining = end - time.perf_counter()
                 if not shop.ready(cell):
                     left_out[cell.place] = "its fit was not finished" if cell.verb in ON_FIT else "no study"
-                elif remaining < min(3.0, limit):
+                elif remaining < 3.0:
                     left_out[cell.place] = "no time in a quick run"
                 else:
-                    one = shop.measured(cell, min(limit, remaining))
+                    one = shop.measured(cell, limit, remaining)
                     own.setdefault(cell.place, []).append(one)
                     print(f"{' '.join(cell.place)}: {one.cpu:.1f} CPU s, {one.outcome}", file=sys.stderr)
     rows = []

@@ -55,7 +55,8 @@ def test_three_lines_are_a_study(tmp_path):
     assert [record.name for record in study.fit] == ["again", "step"]
     assert study.held_out == ()
     assert study.drive_axes == study.response_axes == (Axis("x", "rad"),)
-    assert (study.model, study.noise, study.sampler) == (ModelSettings(), NoiseSettings(), SamplerSettings())
+    model = ModelSettings(share="paper", delay="shared")
+    assert (study.model, study.noise, study.sampler) == (model, NoiseSettings(), SamplerSettings())
     assert dict(study.priors) == {}
     assert study.stages == ("fit", "rival")
     expected = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in os.listdir(folder)}
@@ -383,7 +384,7 @@ def test_a_study_is_locked_and_can_be_sent_to_another_process(tmp_path):
 
 def test_a_study_made_by_hand_is_checked_too(tmp_path):
     (record,) = load_study(folder_of(tmp_path, "")).fit
-    assert Study("mine", None, "ms", 0, (record,)).model == ModelSettings()
+    assert Study("mine", None, "ms", 0, (record,)).model == ModelSettings().for_plant(1, 1)
     with pytest.raises(InputError, match="record 'step' is in ms"):
         Study("mine", None, "s", 0, (record,))
     with pytest.raises(InputError, match="2 records are named 'step'"):

@@ -86,23 +86,33 @@ def test_delays_follow_their_own_setting(share, delay, delays):
 
 
 def test_one_drive_to_two_responses_and_two_to_one():
-    fan = Layout.of((X,), (X, Y), ModelSettings())
+    fan = Layout.of((X,), (X, Y), ModelSettings(share="paper"))
     assert names(fan) == ("direct", "cross")
     assert fan.element_of == ((0,), (1,))
     assert fan.path_name(1, 0) == "y_x"
     assert fan.response_name(0) == "x"
-    funnel = Layout.of((X, Y), (Y,), ModelSettings())
+    funnel = Layout.of((X, Y), (Y,), ModelSettings(share="paper"))
     assert names(funnel) == ("cross", "direct")
     assert funnel.element_of == ((0, 1),)
     assert funnel.path_name(0, 1) == "y_y"
     assert funnel.response_name(0) == ""
 
 
+@pytest.mark.parametrize(("drives", "responses"), [((X,), (X, Y)), ((X, Y), (Y,))])
+def test_paths_of_a_plant_that_is_not_square_share_nothing_unless_stated(drives, responses):
+    own = Layout.of(drives, responses, ModelSettings())
+    assert len(own.elements) == len(own.delays) == 2
+    terms = Layout.of(drives, responses, ModelSettings(terms={"direct": 2, "cross": 1}))
+    assert {slot.name: slot.terms for slot in terms.elements} == {"direct": 2, "cross": 1}
+    stated = Layout.of(drives, responses, ModelSettings(share="all", delay="shared"))
+    assert (len(stated.elements), len(stated.delays)) == (1, 1)
+
+
 def test_one_kind_of_path_needs_no_name():
     """A drive that is no response axis, by name, next to one that is neither."""
     layout = Layout.of((X, Y), (X,), ModelSettings(share="all"))
     assert names(layout) == ("",)
-    only_cross = Layout.of((X,), (Y, Axis("x", "V")), ModelSettings())
+    only_cross = Layout.of((X,), (Y, Axis("x", "V")), ModelSettings(share="paper"))
     assert names(only_cross) == ("cross", "direct")
 
 

@@ -233,6 +233,18 @@ def test_every_verb_is_measured_on_every_study_and_after_what_it_needs():
             assert source.campaign.is_file()
 
 
+def test_cells_asked_for_come_with_what_makes_their_study():
+    cells = [cell.place for cell in verbs.cells(verbs.SOURCES) if verbs.wanted(cell, ("fit",), ("rich",))]
+    assert cells == [("simulate", "rich"), ("fit", "rich")]
+    assert all(verbs.wanted(cell, (), ()) for cell in verbs.cells(verbs.SOURCES))
+
+
+def test_share_of_the_likelihood_in_sampling():
+    stages = {"search": [1.0, 2.0], "walkers": [0.0, 1.0], "page": [9.0, 9.0]}
+    assert verbs.share_of_sampling(stages) == 0.75
+    assert verbs.share_of_sampling({"page": [9.0, 9.0]}) is None
+
+
 def test_measured_records_are_added_where_there_are_any(tmp_path, monkeypatch):
     monkeypatch.setenv("LCOPA_BAYES_DATA", str(tmp_path))
     assert verbs.sources() == verbs.SOURCES
@@ -244,7 +256,7 @@ def test_measured_records_are_added_where_there_are_any(tmp_path, monkeypatch):
 def test_a_cell_is_run_measured_and_its_study_completed(tmp_path):
     source = verbs.SOURCES[1]
     shop = verbs.Workshop(tmp_path, quick=True)
-    one = shop.measured(verbs.Cell("simulate", source), limit=120.0)
+    one = shop.measured(verbs.Cell("simulate", source), 120.0, np.inf)
     assert (one.outcome, one.message) == ("done", "")
     assert one.wall > 0 < one.cpu
     assert one.probe["peak_MB"] > 20
@@ -266,11 +278,13 @@ def test_a_verb_that_is_refused_or_stopped_says_so(tmp_path):
     shop = verbs.Workshop(tmp_path)
     (tmp_path / "studies" / "correlated").mkdir(parents=True)
     (tmp_path / "studies" / "correlated" / "study.toml").write_text("[nothing]\n")
-    refused = shop.measured(verbs.Cell("look", verbs.SOURCES[1]), limit=60.0)
+    refused = shop.measured(verbs.Cell("look", verbs.SOURCES[1]), 60.0, np.inf)
     assert refused.outcome == "refused"
     assert "nothing" in refused.message
-    stopped = shop.measured(verbs.Cell("optics", None), limit=0.05)
-    assert (stopped.outcome, stopped.probe) == ("stopped", {})
+    late = shop.measured(verbs.Cell("optics", None), 60.0, 0.05)
+    stopped = shop.measured(verbs.Cell("optics", None), 1.0, np.inf)
+    assert (late.outcome, stopped.outcome, stopped.probe) == ("stopped", "stopped", {})
+    assert late.cpu < 0.5 < stopped.cpu < 2.0
     row = verbs.row_of(verbs.Cell("optics", None), [stopped], [])
     assert (row["runs"], row["cpu_s_at_least"]) == (0, stopped.cpu)
 
