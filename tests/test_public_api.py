@@ -298,7 +298,7 @@ def test_a_design_and_a_loop_read_back_hold_drive_and_study(design, loop, tmp_pa
 
 
 def test_a_study_its_records_and_a_drive_show_what_they_hold_and_not_their_numbers():
-    assert repr(ON) == "Record('on', u [V], y [rad], 26 rows from -0.5 to 11.5 ms)"
+    assert repr(ON) == "Record('on', drive u [V], response y [rad], 26 rows from -0.5 to 11.5 ms)"
     assert repr(small()) == f"Study('small', fit=[{ON!r}], held_out=[{OFF!r}])"
     assert repr(lb.Drive.steps(u=[(0, 1.57), (20, 0)])) == "Drive('drive', u, 2 rows from 0 to 20)"
 

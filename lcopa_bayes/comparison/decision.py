@@ -168,7 +168,7 @@ def _agreement(evident: Row | None, predictive: Row | None, usable: Sequence[Row
     last = min((row for row in usable if row["elpd"] is not None), key=lambda row: row["elpd"])
     worst = " and predicts worst of all" if last is evident else ""
     return False, (
-        f"Fit and prediction disagree: {evident['name']} has the evidence{worst}, but {best['name']} "
+        f"Fit and prediction disagree: {evident['name']} has the highest evidence{worst}, but {best['name']} "
         f"predicts what was left out better by {lost}. The models leave something out that both notice "
         "differently."
     )
@@ -194,7 +194,7 @@ def _why(
     richer = [row for row in usable if row["parameters"] > preferred["parameters"]]
     others = [row for row in usable if row is not preferred and row not in richer]
     parts = [f"{row['name']}, with more parameters, gains {gain}" for row, gain in _gains(richer, preferred)]
-    parts += [f"{row['name']} has {gain}" for row, gain in _gains(others, preferred)]
+    parts += [f"{row['name']} differs by {gain}" for row, gain in _gains(others, preferred)]
     word = "suffices" if richer else "is preferred"
     return f"{name} {word}: in log evidence {'; '.join(parts)}. {sentence}"
 

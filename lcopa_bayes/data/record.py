@@ -101,7 +101,10 @@ class Record:
 
     def __repr__(self) -> str:
         """What it holds, without the numbers."""
-        axes = ", ".join(f"{one.name} [{one.unit}]" for one in (*self.drive_axes, *self.response_axes))
+        axes = ", ".join(
+            f"{role} " + " ".join(f"{one.name} [{one.unit}]" for one in axes)
+            for role, axes in (("drive", self.drive_axes), ("response", self.response_axes))
+        )
         span = f"{self.time[0]:.6g} to {self.time[-1]:.6g} {self.time_unit}"
         return f"Record({self.name!r}, {axes}, {self.time.size} rows from {span})"
 

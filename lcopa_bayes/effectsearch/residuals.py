@@ -141,7 +141,8 @@ def _by_amplitude(pooled: _Axis, unit: str) -> list[View]:
         error = 1.0 / np.sqrt(count)
         p = float(stats.chi2.sf(((y / error) ** 2).sum(), max(y.size, 1)))
         goes = "goes with the amplitude" if p < _SEEN else "does not go with the amplitude"
-        said = f"the {name} {goes} (p = {p:.1g}, samples taken as independent)"
+        chance = f"p = {p:.1g}" if p > 0 else "p < 1e-300"
+        said = f"the {name} {goes} ({chance}, samples taken as independent)"
         across = f"size of the deflection [{unit}]"
         out.append(View(name, pooled.name, across, "mean over noise [-]", x, y, error, said))
     return out

@@ -81,19 +81,22 @@ class Confirmation:
         """Result of the simulation."""
         count = self.winner.errors.shape[0]
         achieved = (
-            f"{self.where}, {count} simulated records and fits each: the worst standard deviation achieved "
-            f"is {self.factor:.3g} times ({100 * LEVEL:g} %: {self.lower:.3g} to {self.upper:.3g}) smaller "
-            "than after the plain step"
+            f"over {count} simulated records of each drive, the worst standard deviation of a fit is "
+            f"{self.factor:.3g} times ({100 * LEVEL:g} %: {self.lower:.3g} to {self.upper:.3g}) smaller than "
+            "after the plain step"
         )
         promised = (
-            f"{self.expected:.3g} promised there" if isfinite(self.expected) else "the step promises none"
+            f"the bounds promise {self.expected:.3g}"
+            if isfinite(self.expected)
+            else "the bounds promise none after the step"
         )
         held = int(self.step.at_bound[:, self.among].any(axis=1).sum())
         bound = (
-            f"; {held} of {count} fits after the step lean on the end of a prior, so that its scatter is "
-            "smaller than the data alone would leave it"
+            f" {held} of {count} fits after the step lie at the end of a prior, which makes their scatter "
+            "smaller than that of the data alone."
         ) * (held > 0)
-        return f"{'confirmed' if self.confirmed else 'not confirmed'}: {achieved} ({promised}){bound}"
+        word = "Confirmed" if self.confirmed else "Not confirmed"
+        return f"{word} {self.where}: {achieved}; {promised}.{bound}"
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; infinite ones are None."""
@@ -168,7 +171,7 @@ def confirmed(design: Design, *, jobs: int = 1, replicas: int = REPLICAS) -> dic
     bounds can be believed if they can anywhere, and whether every trial agrees."""
     trials = confirm(design, jobs=jobs, replicas=replicas)
     sentence = (
-        "; ".join(one.sentence for one in trials) or "nothing to confirm: no drive beats the plain step"
+        " ".join(one.sentence for one in trials) or "Nothing to confirm: no drive beats the plain step."
     )
     return {
         "confirmed": {

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lcopa_bayes.report.formatting import NONE, ends, figures, sentence
+from lcopa_bayes.report.formatting import NONE, ends, figures
 from lcopa_bayes.report.page import write_graded
 from lcopa_bayes.report.section import Drawing, Section, Table
 from lcopa_bayes.report.theme import BAND, HELD_OUT, INK, grid, label, plain, svg_of
@@ -131,7 +131,7 @@ def _confirmed(results: Mapping[str, Any]) -> Section:
         )
         for trial in trials
     )
-    text = tuple(sentence(trial["sentence"]) for trial in trials)
+    text = tuple(trial["sentence"] for trial in trials)
     return Section("Confirmation", text, tables=tables)
 
 

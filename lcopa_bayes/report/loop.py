@@ -83,8 +83,8 @@ def _effects(results: Mapping[str, Any]) -> Section:
 def _errors(results: Mapping[str, Any]) -> Section:
     before, after = results["before"], results["after"]
     text = (
-        f"Held-out records were predicted by {results['unseen_by']}. Pointwise 90 % bands hold "
-        f"{percent(before['held_out_coverage_90'])} of their samples before and "
+        f"Unseen samples: {results['unseen_by']}. Pointwise 90 % bands hold "
+        f"{percent(before['held_out_coverage_90'])} of them before and "
         f"{percent(after['held_out_coverage_90'])} after; log evidence "
         f"{figures(before['log_evidence'], 6)} before and {figures(after['log_evidence'], 6)} after "
         "(Laplace approximation, noise held at its estimate)."
@@ -210,9 +210,8 @@ def _bars(results: Mapping[str, Any]) -> Section:
     top = listed[0]
     above = int((values > evidence["threshold"]).sum())
     caption = (
-        f"Of {len(evidence['classes'])} classes {above} exceed the level that chance reaches (dashed); the "
-        "largest is "
-        f"{top['name']}. Linear below 10 nat, logarithmic above."
+        f"Of {len(evidence['classes'])} effects {above} exceed the level that chance reaches (dashed); the "
+        f"largest is {top['name']}. Linear below 10 nat, logarithmic above."
     )
     return Section("Evidence", (), (Drawing("loop_evidence", svg_of(figure), caption),))
 

@@ -134,8 +134,8 @@ def _unpredicted(held_out: Sequence[Band]) -> Iterator[Limitation]:
         yield Limitation(
             "tentative",
             f"intervals hold only if it is harmless that the model predicts {worst.record}, axis "
-            f"{worst.axis}, worse than it claims: {100 * worst.coverage(LEVELS[1]):.0f} % of this held-out "
-            f"record are in the {100 * LEVELS[1]:.0f} % band ({_p(min(adjusted))})",
+            f"{worst.axis}, worse than it claims: {100 * worst.coverage(LEVELS[1]):.0f} % of the samples of "
+            f"this held-out record are in the {100 * LEVELS[1]:.0f} % band ({_p(min(adjusted))})",
             _ADD,
         )
 

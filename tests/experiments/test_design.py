@@ -241,6 +241,10 @@ def test_the_winner_beats_the_step_as_promised_in_simulation(one):
         assert (share < 30.0).all()
     told = confirmed(made, replicas=4)["confirmed"]
     assert json.dumps(told, allow_nan=False)
+    begun = {"Confirmed" if one["confirmed"] else "Not confirmed" for one in told["trials"]}
+    said = [one["sentence"] for one in told["trials"]]
+    assert all(one.startswith(tuple(begun)) and one.endswith(".") for one in said)
+    assert told["sentence"] == " ".join(said)
 
 
 def test_a_sum_is_recognised_at_draws_of_the_prior_under_drives_that_change_often():

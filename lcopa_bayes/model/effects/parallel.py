@@ -16,7 +16,7 @@ from lcopa_bayes.model.effects.effect import Card, Coefficient, ParallelEffect, 
 from lcopa_bayes.model.layout import Layout
 
 _MANY = 64
-"""Changes above which a convolution is worth while [-]."""
+"""Changes and samples above which a convolution is worth while [-]."""
 _ROUNDING = 1e-4
 """How far printed times may lie from an even grid [periods]."""
 
@@ -27,10 +27,11 @@ def summed(
     """``sum_k jumps_k shape(t - t_k - delay)``, (samples,); shape is 0 before 0.
 
     Many changes under evenly spaced samples are one convolution: a change between two samples is then shared
-    by them, which is of second order in the sampling period and exact for changes at samples. Samples fewer
-    than the changes are too coarse for that, and are summed one change at a time.
+    by them, which is of second order in the sampling period and exact for changes at samples. Changes that
+    follow each other faster than the samples are summed one at a time: for them the samples are too coarse.
+    Changes may begin long before the first sample, as where a transient was not read.
     """
-    if _MANY < drive.times.size <= times.size and _even(times):
+    if min(drive.times.size, times.size) > _MANY and _even(times) and _slower(drive.times, times):
         return _convolved(times, drive.times, delay, jumps, shape)
     out = np.zeros(times.size)
     for at, jump in zip(drive.times + delay, jumps, strict=True):
@@ -44,6 +45,12 @@ def _even(times: Vector) -> bool:
     """Whether samples are evenly spaced."""
     even = np.linspace(times[0], times[-1], times.size)
     return bool(np.abs(times - even).max() < _ROUNDING * (times[-1] - times[0]) / (times.size - 1))
+
+
+def _slower(changes: Vector, times: Vector) -> bool:
+    """Whether changes follow each other no faster, on average, than samples."""
+    apart, period = np.ptp(changes) / (changes.size - 1), np.ptp(times) / (times.size - 1)
+    return bool(apart >= period * (1 - _ROUNDING))
 
 
 def _convolved(
