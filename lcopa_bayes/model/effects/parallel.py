@@ -73,7 +73,7 @@ def _convolved(
     dense = np.zeros(max(int(below[-1]) + 2, size) - begin)
     np.add.at(dense, below - begin, jumps * (1 - (place - below)))
     np.add.at(dense, below + 1 - begin, jumps * (place - below))
-    lags = np.arange(dense.size) * period - delay
+    lags: Vector = np.arange(dense.size, dtype=float) * period - delay
     kernel = np.zeros(lags.size)
     kernel[lags >= 0] = shape(lags[lags >= 0])
     return np.asarray(fftconvolve(kernel, dense)[-begin : size - begin])
