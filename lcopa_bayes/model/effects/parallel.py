@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import ceil
 from types import MappingProxyType
 from typing import ClassVar, Self, final
 
@@ -21,7 +22,7 @@ _ROUNDING = 1e-4
 """How far printed times may lie from an even grid [periods]."""
 
 _SPARSE = 10
-"""Places of a grid per sample above which it is not worth filling [-]."""
+"""Places of a grid per sample, or per place of it of a finer one, above which it is not worth filling [-]."""
 
 
 def summed(
@@ -30,15 +31,17 @@ def summed(
     """``sum_k jumps_k shape(t - t_k - delay)``, (samples,); shape is 0 before 0.
 
     Many changes under samples of an even grid, some of which may be missing, are one convolution: a change
-    between two places of the grid is then shared by them, which is of second order in the sampling period
-    and exact for changes at samples. Changes that follow each other faster are summed one at a time: for them
-    the grid is too coarse. Changes may begin long before the first sample, as where a transient was not read.
+    between two places of the grid is then shared by them, which is of second order in its period and exact
+    for changes at samples. Under changes that follow each other faster the grid is as many times finer.
+    Changes may begin long before the first sample, as where a transient was not read.
     """
     if min(drive.times.size, times.size) > _MANY and (grid := _grid(times)) is not None:
         places, period = grid
-        if np.ptp(drive.times) >= period * (1 - _ROUNDING) * (drive.times.size - 1):
-            dense = _convolved(times[0], period, int(places[-1]) + 1, drive.times, delay, jumps, shape)
-            return np.asarray(dense[places])
+        finer = ceil(period * (1 - _ROUNDING) * (drive.times.size - 1) / np.ptp(drive.times))
+        if finer <= _SPARSE:
+            size = finer * int(places[-1]) + 1
+            dense = _convolved(times[0], period / finer, size, drive.times, delay, jumps, shape)
+            return np.asarray(dense[finer * places])
     out = np.zeros(times.size)
     for at, jump in zip(drive.times + delay, jumps, strict=True):
         if jump != 0.0:
