@@ -128,17 +128,11 @@ class Replication:
         """All that is ranked: free parameters, step responses, joint log likelihood."""
         table, study = self.problem.posterior.table, self.problem.study
         out = [Quantity(row.name, "parameter", row.unit) for row in table.rows if row.free]
-        for i, response in enumerate(table.layout.responses):
-            for j, drive in enumerate(table.layout.drives):
-                path = table.layout.path_name(i, j) or response.name
-                out += [
-                    Quantity(
-                        f"step_response[{path}] at {at:.3g} {study.time_unit}",
-                        "step response",
-                        f"{response.unit}/{drive.unit}",
-                    )
-                    for at in self.step_times
-                ]
+        out += [
+            Quantity(f"step_response[{path.name}] at {at:.3g} {study.time_unit}", "step response", path.unit)
+            for path in table.layout.paths
+            for at in self.step_times
+        ]
         return (*out, Quantity("log_likelihood", "log likelihood", "nat"))
 
     def attempt(self, number: int) -> Outcome | Failure:

@@ -71,9 +71,7 @@ class Level:
 
 def level_of(table: ParameterTable, values: Matrix, axis: int, part: Part, samples: Samples) -> Level:
     """Level of an axis under draws (draws, rows) of what is known when a part is predicted."""
-    places = {
-        table.rows[k].place.second: k for k in table.of_kind("offset") if table.rows[k].place.first == axis
-    }
+    places = table.offsets(axis)
     if not places:
         return Level(np.zeros(len(values)), "no level in the model")
     if -1 in places:

@@ -53,7 +53,7 @@ UNKNOWN = "-"
 @dataclass(frozen=True)
 class Mapped:
     """Columns as a user names them, by header, by header without its unit or by number, each perhaps behind a
-    new name, as in ``heater [%]=Column B``; empty where the tables are to tell."""
+    new name, as in ``heater [%]=Column B``; empty: recognised from the tables."""
 
     time: str = ""
     drives: tuple[str, ...] = ()
@@ -61,9 +61,9 @@ class Mapped:
     time_unit: str = ""
     """Unit of a numeric time column whose header names none."""
     decimal: str = ""
-    """Decimal sign, ``.`` or ``,``; empty where the numbers are to tell."""
+    """Decimal sign, ``.`` or ``,``; empty: recognised from the numbers."""
     time_format: str = ""
-    """Format of time stamps, as of `datetime.strptime`; empty where they are to tell."""
+    """Format of time stamps, as of `datetime.strptime`; empty: recognised from them."""
 
 
 @final
@@ -248,7 +248,7 @@ def _time_columns(
     alone = named if len(named) == 1 else []
     both = [name for name in named if name in rising] or alone or rising or named
     if len(both) != 1:
-        what = "can tell the time: " + ", ".join(map(repr, both)) if both else "increases from row to row"
+        what = "may hold the time: " + ", ".join(map(repr, both)) if both else "increases from row to row"
         raise InputError(
             f"{where}: {'several columns' if both else 'no column'} {what}; name it with --time, one of "
             + ", ".join(repr(name) for name in columns)
@@ -295,7 +295,7 @@ def _roles(
     lacking = [role for role, each in roles.items() if not each]
     refuse_if(
         [
-            f"{table.path}: no column can be told to be a {role}; name one with --{role}, one of "
+            f"{table.path}: no column is recognised as a {role}; name one with --{role}, one of "
             + ", ".join(repr(name) for name in columns if name not in taken)
             for role in lacking
         ]

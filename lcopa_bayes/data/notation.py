@@ -27,7 +27,7 @@ _DAY = 86_400.0
 @final
 @dataclass(frozen=True)
 class Sign:
-    """A decimal sign, or why it cannot be told."""
+    """A decimal sign, or why it is ambiguous."""
 
     sign: str = "."
     problem: str = ""

@@ -209,16 +209,11 @@ def _functions(draws: Draws, span: float, time_unit: str) -> list[Estimate]:
 def _slopes(draws: Draws, curves: StepCurves, time_unit: str) -> list[Estimate]:
     """Steepest slope of the step response of every path, over the thousandth part of the record."""
     layout, step, out = draws.table.layout, float(curves.time[0]), []
-    for i, response in enumerate(layout.responses):
-        for j, drive in enumerate(layout.drives):
-            curve = curves.normalised[curves.curve_of[i][j]]
-            steepest = np.diff(curve, axis=1, prepend=0.0).max(axis=1) / step
-            path = layout.path_name(i, j) or response.name
-            unit = f"{response.unit}/{drive.unit}/{time_unit}"
-            slope = curves.gains[:, i, j] * steepest
-            out.append(
-                Estimate.of(f"steepest_slope[{path}]", unit, slope, ess=draws.ess, grade=draws.grade.level)
-            )
+    for i, j, path, unit in layout.paths:
+        curve = curves.normalised[curves.curve_of[i][j]]
+        steepest = np.diff(curve, axis=1, prepend=0.0).max(axis=1) / step
+        slope, name = curves.gains[:, i, j] * steepest, f"steepest_slope[{path}]"
+        out.append(Estimate.of(name, f"{unit}/{time_unit}", slope, ess=draws.ess, grade=draws.grade.level))
     return out
 
 

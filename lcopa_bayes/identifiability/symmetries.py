@@ -219,12 +219,9 @@ def _round(entries: Vector) -> tuple[float, ...]:
 def exchanges(table: ParameterTable) -> tuple[Symmetry, ...]:
     """Pairs of terms of an element that have equal priors: the denominator is their sum in any order."""
     out = []
-    for element, slot in enumerate(table.layout.elements):
-        for a, b in combinations(range(slot.terms if table.exchangeable[element] else 0), 2):
-            first, second = (
-                tuple(table.names[table.at(kind, element, term)] for kind in ("time", "order"))
-                for term in (a, b)
-            )
+    for terms, exchangeable in zip(table.terms, table.exchangeable, strict=True):
+        for pair in combinations(zip(*terms, strict=True) if exchangeable else (), 2):
+            first, second = (tuple(table.names[k] for k in term) for term in pair)
             sentence = (
                 f"({', '.join(first)}) and ({', '.join(second)}) are interchangeable; with "
                 "decreasing orders each plant is counted once"

@@ -10,6 +10,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.parallel import keep_freed_memory
 from lcopa_bayes.data.record import Driven, Record
 from lcopa_bayes.data.settings import EffectsSettings
 from lcopa_bayes.data.study import Study
@@ -80,6 +81,7 @@ class Problem:
 
 def problem_of(study: Study) -> Problem:
     """Posterior of a study; InputError when model, effects, priors and records do not fit together."""
+    keep_freed_memory()  # what follows evaluates many responses, wherever it is called from
     layout = Layout.of(study.drive_axes, study.response_axes, study.model)
     scales = Scales.of(study.fit)
     kinds, ranges, table = table_of(study, layout, scales)

@@ -90,11 +90,9 @@ class Conditional:
     def elements(self) -> tuple[Element, ...]:
         """All elements."""
         table, sampled, out, first = self.posterior.table, self.posterior.sampled, [], 0
-        for e, slot in enumerate(table.layout.elements):
-            orders = tuple(table.at("order", e, i) for i in range(slot.terms))
-            times = tuple(table.at("time", e, i) for i in range(slot.terms))
-            free = tuple(i for i in range(slot.terms) if times[i] in sampled)
-            out.append(Element(orders, times, free, first))
+        for times, orders in table.terms:
+            free = tuple(i for i, time in enumerate(times) if time in sampled)
+            out.append(Element(tuple(orders), tuple(times), free, first))
             first += len(free)
         return tuple(out)
 

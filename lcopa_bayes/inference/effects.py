@@ -14,7 +14,6 @@ Samples an axis misses are filled too: choose with ``samples[r].axes[a].index``.
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -31,7 +30,7 @@ from lcopa_bayes.model.effects.effect import Coefficient, Effect, Ranges
 from lcopa_bayes.model.effects.jacobian import coefficient_slopes, plant_slopes
 from lcopa_bayes.model.effects.passage import Plant
 from lcopa_bayes.model.effects.scales import ranges_of
-from lcopa_bayes.model.effects.simulator import Simulator
+from lcopa_bayes.model.effects.simulator import Latest, Simulator
 from lcopa_bayes.model.forward import ForwardModel
 
 _STEP = 1e-4
@@ -101,7 +100,7 @@ class Effected:
     def over(self, model: ForwardModel, samples: Sequence[Samples], epochs: Vector) -> Effected:
         """The same plant and effects over records held out; their offsets are left out."""
         times = tuple(one.times for one in samples)
-        simulator = replace(self.simulator, model=model, times=times, epochs=epochs, still=OrderedDict())
+        simulator = replace(self.simulator, model=model, times=times, epochs=epochs, still=Latest())
         return replace(
             self, simulator=simulator, records=tuple(one.record.name for one in samples), offsets=None
         )

@@ -11,7 +11,7 @@ from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.noise import LOG_2PI, GaussianNoise
 from lcopa_bayes.inference.posterior import Posterior
 
-_PORTION = 32
+_PORTION = 64
 """Parameter sets expanded at once."""
 
 

@@ -76,11 +76,8 @@ class LeastSquares:
         """
         low, high = (ends.copy() for ends in self.bounds)
         table = self.posterior.table
-        for element, slot in enumerate(table.layout.elements):
-            if table.exchangeable[element]:
-                continue
-            columns = [table.at("order", element, term) for term in range(slot.terms)]
-            for upper, lower in pairwise(columns):
+        for terms, exchangeable in zip(table.terms, table.exchangeable, strict=True):
+            for upper, lower in () if exchangeable else pairwise(terms.orders):
                 free = table.rows[upper].free, table.rows[lower].free
                 wall = values[upper] if not free[0] else values[lower]
                 wall = (values[upper] + values[lower]) / 2 if all(free) else wall

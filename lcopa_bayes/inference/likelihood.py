@@ -177,9 +177,8 @@ class Landscape:
             residual, jacobian = residual * weight, jacobian * weight[:, None]
         values = least.values(x, template)
         walls, steep = [], []
-        for element, slot in enumerate(table.layout.elements):
-            orders = [table.at("order", element, term) for term in range(slot.terms)]
-            for upper, lower in pairwise(orders):
+        for terms in table.terms:
+            for upper, lower in pairwise(terms.orders):
                 excess, row = values[lower] - values[upper], np.zeros(len(least.columns))
                 for k, sign in ((upper, -1.0), (lower, 1.0)):
                     if excess > 0 and k in least.columns:

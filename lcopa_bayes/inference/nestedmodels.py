@@ -157,33 +157,26 @@ class _Lift:
         return True
 
     def _elements(self, values: Matrix, out: Matrix) -> bool:
-        for element, slot in enumerate(self.large.layout.elements):
+        for element, (own_times, own_orders) in enumerate(self.large.terms):
             source = self._slot("element_of", element)
             if source is None:
                 return False
-            count = self.small.layout.elements[source].terms
-            times = values[:, [self.small.at("time", source, k) for k in range(count)]]
-            orders = values[:, [self.small.at("order", source, k) for k in range(count)]]
-            rows = [self.large.at("order", element, k) for k in range(slot.terms)]
-            fixed = [k for k in rows if not self.large.rows[k].free]
-            if count > slot.terms or (fixed and len(fixed) < slot.terms):
+            times, orders = (values[:, columns] for columns in self.small.terms[source])
+            fixed = sum(not self.large.rows[k].free for k in own_orders)
+            if times.shape[1] > len(own_times) or 0 < fixed < len(own_orders):
                 return False
-            put = self._fixed(times, orders, element, rows) if fixed else self._free(times, orders, element)
+            put = self._fixed(times, orders, element) if fixed else self._free(times, orders, element)
             if put is None:
                 return False
-            for k in range(slot.terms):
-                out[:, self.large.at("time", element, k)] = put[0][:, k]
-                out[:, rows[k]] = put[1][:, k]
+            out[:, own_times], out[:, own_orders] = put
         return True
 
-    def _fixed(
-        self, times: Matrix, orders: Matrix, element: int, rows: list[int]
-    ) -> tuple[Matrix, Matrix] | None:
+    def _fixed(self, times: Matrix, orders: Matrix, element: int) -> tuple[Matrix, Matrix] | None:
         """Terms of fixed orders: each of the smaller's finds its own, the rest are too fast to be seen."""
-        held = [self.large.rows[k].value for k in rows]
+        held = [self.large.rows[k].value for k in self.large.terms[element].orders]
         if np.ptp(orders, axis=0).any() or Counter(orders[0].tolist()) - Counter(held):
             return None
-        out = np.stack([self._fast(element, k, len(times)) for k in range(len(rows))], axis=1)
+        out = np.stack([self._fast(element, k, len(times)) for k in range(len(held))], axis=1)
         left = list(range(len(held)))
         for k, order in enumerate(orders[0]):
             place = next(p for p in left if held[p] == order)
@@ -212,10 +205,9 @@ class _Lift:
         return times, orders
 
     def _fast(self, element: int, term: int, n: int) -> Vector:
-        row = self.large.rows[self.large.at("time", element, term)]
+        row, order = (self.large.rows[columns[term]] for columns in self.large.terms[element])
         if row.prior is None:
             return np.full(n, row.value)
-        order = self.large.rows[self.large.at("order", element, term)]
         if not order.free and order.value > 1.0 and self.large.resolution > 0:
             return np.asarray(self.large.resolution * np.exp(0.5 * self.rng.random(n)))
         return np.asarray(row.prior.frozen.ppf(self.rng.uniform(*_FAST, n)), dtype=float)

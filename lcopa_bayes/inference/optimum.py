@@ -45,8 +45,11 @@ class Optimum:
     """Log posterior density of the sampled coordinates there [nat]."""
 
 
-def find_optima(posterior: Posterior, rng: np.random.Generator, *, starts: int = 12) -> tuple[Optimum, ...]:
-    """Local optima from the best of many prior draws, best first, duplicates removed.
+def find_optima(
+    posterior: Posterior, rng: np.random.Generator, *, starts: int = 12, near: Sequence[Vector] = ()
+) -> tuple[Optimum, ...]:
+    """Local optima from the best of many prior draws, best first, duplicates removed; `near` are further
+    table values, (rows,), looked at like draws.
 
     Screening and a first solve treat the residual as nearly white; a second solve uses the noise model with
     its parameters estimated from the first residual. With effects the plant alone is searched first, and its
@@ -57,6 +60,7 @@ def find_optima(posterior: Posterior, rng: np.random.Generator, *, starts: int =
         alone = find_optima(posterior.without_effects, rng, starts=starts)
         return _kept(posterior, _descended(posterior, _near(posterior, effect_starts(posterior, alone, rng))))
     drawn = table.draw(_SCREENED, rng)
+    drawn[: len(near)] = np.array(near).reshape(-1, len(table.rows))
     for axis, scale in enumerate(_spread(posterior)):
         for name, value in posterior.noise.nearly_white(0.05 * scale).items():
             if table.rows[table.at(name, axis)].free:
@@ -65,7 +69,7 @@ def find_optima(posterior: Posterior, rng: np.random.Generator, *, starts: int =
     if np.isnan(likelihood).any():
         posterior.log_density(posterior.coordinates(drawn[np.isnan(likelihood)]))  # raises and says where
     chosen = drawn[np.argsort(-likelihood, kind="stable")]
-    return _kept(posterior, _descended(posterior, distinct(posterior, chosen, starts)))
+    return _kept(posterior, _descended(posterior, _distinct(posterior, chosen, starts)))
 
 
 def again(posterior: Posterior, optima: Sequence[Optimum]) -> tuple[Optimum, ...]:
@@ -134,7 +138,7 @@ def _spread(posterior: Posterior) -> list[float]:
     return [float(values.std()) or 1.0 for values in pooled]
 
 
-def distinct(posterior: Posterior, ranked: Matrix, count: int) -> list[Vector]:
+def _distinct(posterior: Posterior, ranked: Matrix, count: int) -> list[Vector]:
     """The first `count` rows that differ from each other."""
     kept: list[Vector] = []
     for values in ranked:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import lgamma, log
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -27,6 +27,18 @@ _ORDERED_DRAWS = 200_000
 """Prior draws that measure how much mass an unexchangeable prior has where orders decrease."""
 _LEAST_ORDERED = 1e-3
 """Below this mass the share is not measured to 7 % and draws are rejected for ever [-]."""
+
+
+class Terms(NamedTuple):
+    """Positions of the parameters of an element, by term."""
+
+    times: list[int]
+    orders: list[int]
+
+    @property
+    def every(self) -> list[int]:
+        """All of them, in table order."""
+        return sorted(self.times + self.orders)
 
 
 @final
@@ -59,28 +71,25 @@ class ParameterTable:
         return {(row.kind, *row.place): k for k, row in enumerate(self.rows)}
 
     @cached_property
-    def _columns(self) -> list[tuple[list[int], list[int]]]:
-        """Columns of times and orders of each element."""
-        return [
-            (
-                [self.at("time", e, k) for k in range(slot.terms)],
-                [self.at("order", e, k) for k in range(slot.terms)],
-            )
+    def terms(self) -> tuple[Terms, ...]:
+        """Positions of the terms of each element."""
+        return tuple(
+            Terms(*([self.at(kind, e, k) for k in range(slot.terms)] for kind in ("time", "order")))
             for e, slot in enumerate(self.layout.elements)
-        ]
+        )
 
     def shaping(self, unit: int) -> list[int]:
         """Positions of what shapes a unit response, in the order of its slopes (`ForwardModel.unit_slopes`):
         times and orders of its element, and its delay."""
         element, delay, _ = self.layout.units[unit]
-        times, orders = self._columns[element]
+        times, orders = self.terms[element]
         return [*times, *orders, self.at("delay", delay)]
 
     @cached_property
     def exchangeable(self) -> tuple[bool, ...]:
         """Per element: whether its terms have equal priors, so that they are sampled in any order."""
         out = []
-        for times, orders in self._columns:
+        for times, orders in self.terms:
             priors = [(self.rows[t].prior, self.rows[o].prior) for t, o in zip(times, orders, strict=True)]
             free = all(t is not None and o is not None for t, o in priors)
             alike = all(str(pair) == str(priors[0]) and pair == priors[0] for pair in priors)
@@ -91,7 +100,7 @@ class ParameterTable:
     def log_support(self) -> float:
         """Log of 1 / (prior mass where orders decrease and terms are resolved), summed over elements."""
         total = 0.0
-        for (times, orders), exchangeable in zip(self._columns, self.exchangeable, strict=True):
+        for (times, orders), exchangeable in zip(self.terms, self.exchangeable, strict=True):
             if exchangeable or sum(self.rows[k].free for k in orders) <= (len(orders) == 1):
                 masses = [self._resolved_mass(t, o) for t, o in zip(times, orders, strict=True)]
                 total += (lgamma(len(orders) + 1) if exchangeable else 0.0) - sum(map(log, masses))
@@ -107,7 +116,7 @@ class ParameterTable:
     @cached_property
     def limited(self) -> tuple[tuple[int, int], ...]:
         """Positions of time and order of every term that must be resolved."""
-        pairs = (pair for times, orders in self._columns for pair in zip(times, orders, strict=True))
+        pairs = (pair for times, orders in self.terms for pair in zip(times, orders, strict=True))
         return tuple((t, o) for t, o in pairs if self._limited(t, o))
 
     def _resolved_mass(self, time: int, order: int) -> float:
@@ -158,7 +167,7 @@ class ParameterTable:
         """
         out = values.copy()
         source = np.tile(np.arange(len(self.rows)), (values.shape[0], 1))
-        for (times, orders), exchangeable in zip(self._columns, self.exchangeable, strict=True):
+        for (times, orders), exchangeable in zip(self.terms, self.exchangeable, strict=True):
             if not (exchangeable or every):
                 continue
             rank = np.argsort(-values[:, orders], axis=1, kind="stable")
@@ -172,8 +181,8 @@ class ParameterTable:
         """What the forward model needs, from canonical values (batch, rows)."""
         delays = [self.at("delay", k) for k in range(len(self.layout.delays))]
         return Dynamics(
-            tuple(values[:, times] for times, _ in self._columns),
-            tuple(values[:, orders] for _, orders in self._columns),
+            tuple(values[:, times] for times, _ in self.terms),
+            tuple(values[:, orders] for _, orders in self.terms),
             values[:, delays],
         )
 
@@ -199,17 +208,28 @@ class ParameterTable:
             for i, row in enumerate(layout.element_of)
         )
 
+    def offsets(self, response: int) -> Mapping[int, int]:
+        """Positions of the offsets of a response axis by fit record; -1 is that of all records."""
+        return self._offsets[response]
+
+    @cached_property
+    def _offsets(self) -> list[dict[int, int]]:
+        rows = [(k, self.rows[k].place) for k in self.of_kind("offset")]
+        return [
+            {place.second: k for k, place in rows if place.first == i}
+            for i in range(len(self.layout.responses))
+        ]
+
     def offset(self, values: Matrix, response: int, record: int) -> Vector:
         """Offset of a response axis on a fit record, (batch,) [response unit]; 0 when the model has none."""
-        for second in (-1, record):
-            if ("offset", response, second) in self._positions:
-                return values[:, self.at("offset", response, second)]
-        return np.zeros(values.shape[0])
+        known = self.offsets(response)
+        place = known.get(-1, known.get(record))
+        return np.zeros(values.shape[0]) if place is None else values[:, place]
 
     def supported(self, values: Matrix) -> Flags:
         """Whether the orders of every element decrease and its terms are resolved, (batch,)."""
         out = self._resolved(values)
-        for _, orders in self._columns:
+        for _, orders in self.terms:
             out &= np.all(np.diff(values[:, orders], axis=1) <= 0, axis=1)
         return out
 

@@ -21,7 +21,7 @@ from lcopa_bayes.model.forward import ForwardModel
 
 Units: TypeAlias = "Array | Simulated"
 """Responses of one record that linear parameters scale."""
-_PORTION = 64
+_PORTION = 128
 """Parameter sets evaluated at once: what one portion holds stays in the processor's cache."""
 
 

@@ -21,9 +21,10 @@ from lcopa_bayes.model.superposition import Phase, Superposition, blocks_of, pha
 if TYPE_CHECKING:
     from lcopa_bayes.model.effects.declared import Declared
 
-_CELLS = 3 << 13
-"""Plants times blocks times viscous terms evaluated at once. Larger temporaries go back to the operating
-system after every operation and come back as page faults: 64 plants took 1.6 times as long."""
+_CELLS = 3 << 15
+"""Plants times blocks times viscous terms evaluated at once: fastest where `core.parallel.keep_freed_memory`
+has been called. Elsewhere larger temporaries come back as page faults after every operation, and a quarter of
+it were better."""
 _ABREAST = 8
 """Portions are multiples of this: transforms of so many series run in one vector register."""
 

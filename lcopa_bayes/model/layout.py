@@ -29,6 +29,17 @@ class Unit(NamedTuple):
     drive: int
 
 
+class PathSlot(NamedTuple):
+    """A path from a drive to a response."""
+
+    response: int
+    drive: int
+    name: str
+    """``<response>_<drive>``, or the response's name when the plant has one path."""
+    unit: str
+    """Of its gain [response unit per drive unit]."""
+
+
 @final
 @dataclass(frozen=True)
 class Layout:
@@ -83,6 +94,15 @@ class Layout:
             [Unit(self.element_of[i][j], self.delay_of[i][j], j) for j in range(len(self.drives))]
             for i in range(len(self.responses))
         ]
+
+    @cached_property
+    def paths(self) -> tuple[PathSlot, ...]:
+        """All paths, by response and drive."""
+        return tuple(
+            PathSlot(i, j, self.path_name(i, j) or response.name, f"{response.unit}/{drive.unit}")
+            for i, response in enumerate(self.responses)
+            for j, drive in enumerate(self.drives)
+        )
 
     def own_response(self, drive: int) -> int | None:
         """The response axis that a drive is meant to move; None when there is none."""

@@ -64,9 +64,8 @@ def _values(posterior: Posterior, model: TransferPath) -> Vector:
     table = posterior.table
     out = np.zeros(len(table.rows))
     out[table.at("gain", 0)] = model.steady
-    for k, (time, order) in enumerate(zip(model.times, model.orders, strict=True)):
-        out[table.at("time", 0, k)] = time
-        out[table.at("order", 0, k)] = order
+    times, orders = table.terms[0]
+    out[times], out[orders] = model.times, model.orders
     out[table.at("delay", 0)] = model.delay
     out[table.at("sigma", 0)] = 1.0
     return out

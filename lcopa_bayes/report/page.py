@@ -16,20 +16,21 @@ from lcopa_bayes.core.files import writable_folder, write_text
 from lcopa_bayes.report.formatting import stopped
 from lcopa_bayes.report.savedrun import load_run
 from lcopa_bayes.report.section import Drawing, Section
-from lcopa_bayes.report.sections import parameters, records, responses, sampling
+from lcopa_bayes.report.sections import overview, parameters, records, responses, sampling
 from lcopa_bayes.report.theme import inlined, look
 from lcopa_bayes.results.stored import stored_values
 
 _SECTIONS = (
-    records.data,
-    records.residuals,
+    overview.overview,
     parameters.estimates,
-    parameters.pairs,
-    parameters.traces,
     responses.steps,
     responses.frequency,
+    records.data,
+    records.residuals,
+    parameters.pairs,
     parameters.priors,
     parameters.sensitivity,
+    parameters.traces,
     sampling.evidence,
     sampling.cross_check,
     sampling.provenance,

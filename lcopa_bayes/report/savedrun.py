@@ -49,9 +49,9 @@ _CHECK_TABLES: Mapping[str, tuple[str, ...]] = {
 }
 """The same of a run that was checked by a second method."""
 _RESULTS = (
-    *("study", "verdict", "grade", "grade_reason", "time_unit", "parameters", "fixed", "held_out"),
-    *("fit_scores", "step_metrics", "residual_tests", "sampler"),
-    *("modes", "sensitivity", "cross_check"),
+    *("study", "verdict", "overview", "grade", "grade_reason", "time_unit"),
+    *("parameters", "fixed", "held_out", "fit_scores", "step_metrics", "residual_tests"),
+    *("sampler", "modes", "sensitivity", "cross_check"),
 )
 _PROVENANCE = ("command", "seed", "inputs_sha256", "python", "versions")
 

@@ -175,32 +175,30 @@ def frequency_response(
     reached, _ = transfer_function(table, values, searched)
     gains, layout = table.gains(values), table.layout
     paths = []
-    for i, response in enumerate(layout.responses):
-        for j, drive in enumerate(layout.drives):
-            name = layout.path_name(i, j) or response.name
-            log_gain = Bands.of(np.log(np.maximum(magnitude[i, j], np.finfo(float).tiny)))
-            negative = float(np.mean(gains[:, i, j] < 0))
-            either = min(negative, 1 - negative) > _SIGN
-            wide = _bandwidth(searched, reached[i, j], np.abs(gains[:, i, j]))
-            paths.append(
-                PathResponse(
-                    name,
-                    f"{response.unit}/{drive.unit}",
-                    Bands(np.exp(log_gain.pointwise), np.exp(log_gain.simultaneous)),
-                    Bands.of(np.degrees(phase[i, j])),
-                    Estimate.of(
-                        f"bandwidth[{name}]",
-                        f"1/{time_unit}",
-                        wide,
-                        ess=draws.ess,
-                        grade=draws.grade.level,
-                    ),
-                    f"the sign of the gain is open: {100 * negative:.0f} % of draws are negative, and the "
-                    "phase has two values 180 deg apart"
-                    if either
-                    else "",
-                )
+    for i, j, name, unit in layout.paths:
+        log_gain = Bands.of(np.log(np.maximum(magnitude[i, j], np.finfo(float).tiny)))
+        negative = float(np.mean(gains[:, i, j] < 0))
+        either = min(negative, 1 - negative) > _SIGN
+        wide = _bandwidth(searched, reached[i, j], np.abs(gains[:, i, j]))
+        paths.append(
+            PathResponse(
+                name,
+                unit,
+                Bands(np.exp(log_gain.pointwise), np.exp(log_gain.simultaneous)),
+                Bands.of(np.degrees(phase[i, j])),
+                Estimate.of(
+                    f"bandwidth[{name}]",
+                    f"1/{time_unit}",
+                    wide,
+                    ess=draws.ess,
+                    grade=draws.grade.level,
+                ),
+                f"the sign of the gain is open: {100 * negative:.0f} % of draws are negative, and the "
+                "phase has two values 180 deg apart"
+                if either
+                else "",
             )
+        )
     outside = []
     if table.effects is not None:
         names = ", ".join(kind.card.name for kind in table.effects.kinds)

@@ -35,7 +35,7 @@ def inventory(study: Study) -> dict[str, Any]:
     """
     problem, obstacles = problem_of(study), unmet(study)
     rows = problem.posterior.table.rows
-    told = [*_of_plant(problem), *_of_model(problem)]
+    sentences = [*_of_plant(problem), *_of_model(problem)]
     verdict = f"To mend before a fit: {'; '.join(obstacles)}." if obstacles else "The records can be fitted."
     return plain(
         {
@@ -45,7 +45,7 @@ def inventory(study: Study) -> dict[str, Any]:
             "grade": "unusable" if obstacles else "reliable",
             "grade_reason": verdict,
             "problems": obstacles,
-            "sentences": told,
+            "sentences": sentences,
             "records": [
                 *(_record(one, problem, held_out=False) for one in study.fit),
                 *(_record(one, problem, held_out=True) for one in study.held_out),

@@ -304,10 +304,7 @@ def _level(
     An offset per record is taken from one of `records`, those that rest as the drive does: of these the
     level at rest is measured, of others it hangs on a gain times the difference.
     """
-    table = draws.table
-    places = {
-        table.rows[k].place.second: k for k in table.of_kind("offset") if table.rows[k].place.first == axis
-    }
+    places = draws.table.offsets(axis)
     if level == "zero" or not places:
         return np.zeros(values.shape[0]), "no offset"
     if -1 in places:

@@ -254,13 +254,13 @@ def offset_draws(
     rng: np.random.Generator,
 ) -> tuple[Vector, str, int]:
     """Offset of a record for each draw, where it comes from, and from how many samples of the record."""
-    places = {(table.rows[k].place.first, table.rows[k].place.second): k for k in table.of_kind("offset")}
+    places = table.offsets(axis)
     if not places:
         return np.zeros(values.shape[0]), "no offset", 0
-    if (axis, -1) in places:
-        return values[:, places[axis, -1]], "shared with the fit records", 0
+    if -1 in places:
+        return values[:, places[-1]], "shared with the fit records", 0
     if not held_out:
-        return values[:, places[axis, r]], "fitted", 0
+        return values[:, places[r]], "fitted", 0
     used, source = record.level_samples(axis)
     offset = _given(record.axes[axis], used, response, noise, table, values, axis, rng)
     return offset, source, int(used.sum())

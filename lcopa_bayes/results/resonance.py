@@ -73,8 +73,8 @@ def unresolved(draws: Draws, period: float) -> tuple[Resonance, ...]:
         if share >= SHARE:
             own = tuple(
                 row.name
-                for row in rows
-                if (row.kind in ("time", "order") and row.place.first == number)
+                for k, row in enumerate(rows)
+                if k in draws.table.terms[number].every
                 or (row.kind == "gain" and layout.element_of[row.place.first][row.place.second] == number)
             )
             out.append(Resonance(slot.name, own, share, float(2 * np.pi / np.median(at[undamped]))))

@@ -137,11 +137,8 @@ def too_fast(draws: Draws, curves: StepCurves, period: float) -> list[Limitation
         k = _curve_of(table.layout, curves, unit)
         reached = curves.normalised[k] / curves.normalised[k][:, -1:]
         rise = _difference(crossing(curves.time, reached, 0.9), crossing(curves.time, reached, 0.1))
-        names = tuple(
-            row.name
-            for row in table.rows
-            if row.free and row.kind in ("time", "order") and row.place.first == unit.element
-        )
+        terms = table.terms[unit.element]
+        names = tuple(table.names[k] for k in terms.every if table.rows[k].free)
         if names and float(np.mean(rise < period)) >= _HALF and all(names != one.parameters for one in out):
             out.append(
                 Limitation(
@@ -201,9 +198,7 @@ def path_metrics(draws: Draws, *, span: float, time_unit: str, path: str | None 
     """
     if not 0 < span < np.inf:
         raise InputError(f"`span` must be a positive time [{time_unit}]; got {span!r}")
-    layout = draws.table.layout
-    places = np.ndindex(len(layout.responses), len(layout.drives))
-    paths = [layout.path_name(i, j) or layout.responses[i].name for i, j in places]
+    paths = [one.name for one in draws.table.layout.paths]
     if path is not None and path not in paths:
         raise InputError(f"the plant has no path {path!r}{nearest(path, paths)}")
     metrics = step_metrics(draws, step_curves(draws, span), time_unit=time_unit)
@@ -247,28 +242,26 @@ def metrics_of(table: ParameterTable, curves: StepCurves, *, time_unit: str) -> 
     def add(name: str, unit: str, values: Vector, note: str = "") -> None:
         out.append(Metric(name, unit, values, note))
 
-    for i, response in enumerate(layout.responses):
-        for j, drive in enumerate(layout.drives):
-            k = curves.curve_of[i][j]
-            curve, whole = curves.normalised[k], np.concatenate((curves.normalised[k], later[k]), axis=1)
-            gain, unit = curves.gains[:, i, j], f"{response.unit}/{drive.unit}"
-            path = layout.path_name(i, j) or response.name
-            low, high = crossing(curves.time, curve, 0.1), crossing(curves.time, curve, 0.9)
-            settled = settling(time, whole, _SETTLED, until=end)
-            unsettled = float(np.mean(np.isinf(settled)))
-            note = (
-                f"{100 * unsettled:.0f} % of draws have not settled to {100 * _SETTLED:.0f} % of steady "
-                "state by the end of the record"
-                if unsettled > 0.05
-                else ""
-            )
-            add(f"rise_10_90[{path}]", time_unit, _difference(high, low), note)
-            add(f"delay[{path}]", time_unit, curves.delays[:, layout.delay_of[i][j]])
-            add(f"settling_2[{path}]", time_unit, settled, note)
-            add(f"settling_5[{path}]", time_unit, settling(time, whole, 0.05, until=end), note)
-            add(f"overshoot[{path}]", "-", np.maximum(whole.max(axis=1) - 1.0, 0.0))
-            add(f"value_at_end[{path}]", unit, gain * curve[:, -1])
-            add(f"steady_state[{path}]", unit, gain, note)
+    for i, j, path, unit in layout.paths:
+        k = curves.curve_of[i][j]
+        curve, whole = curves.normalised[k], np.concatenate((curves.normalised[k], later[k]), axis=1)
+        gain = curves.gains[:, i, j]
+        low, high = crossing(curves.time, curve, 0.1), crossing(curves.time, curve, 0.9)
+        settled = settling(time, whole, _SETTLED, until=end)
+        unsettled = float(np.mean(np.isinf(settled)))
+        note = (
+            f"{100 * unsettled:.0f} % of draws have not settled to {100 * _SETTLED:.0f} % of steady "
+            "state by the end of the record"
+            if unsettled > 0.05
+            else ""
+        )
+        add(f"rise_10_90[{path}]", time_unit, _difference(high, low), note)
+        add(f"delay[{path}]", time_unit, curves.delays[:, layout.delay_of[i][j]])
+        add(f"settling_2[{path}]", time_unit, settled, note)
+        add(f"settling_5[{path}]", time_unit, settling(time, whole, 0.05, until=end), note)
+        add(f"overshoot[{path}]", "-", np.maximum(whole.max(axis=1) - 1.0, 0.0))
+        add(f"value_at_end[{path}]", unit, gain * curve[:, -1])
+        add(f"steady_state[{path}]", unit, gain, note)
     out.extend(_crosstalk(layout, curves))
     return out
 

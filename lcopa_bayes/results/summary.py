@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.results.overview import overview
 from lcopa_bayes.results.residuals import WHITE_P
 from lcopa_bayes.results.steps import share_unsettled
 from lcopa_bayes.sampling.convergence import Grade, shares_grade
@@ -70,6 +71,7 @@ def results(fit: Fit) -> dict[str, Any]:
         {
             "study": fit.study.name,
             "verdict": verdict(fit),
+            "overview": overview(fit),
             "grade": grade.level,
             "grade_reason": grade.reason,
             "limitations": [one.as_json() for one in fit.draws.limitations],

@@ -101,19 +101,14 @@ def _of_residuals(
 
 def _step_response(fit: Fit) -> pd.DataFrame:
     layout, curves, frames = fit.draws.table.layout, fit.curves, []
-    for i, response in enumerate(layout.responses):
-        for j, drive in enumerate(layout.drives):
-            response_curve = curves.gains[:, i, j, None] * curves.normalised[curves.curve_of[i][j]]
-            rows = np.quantile(response_curve, QUANTILES, axis=0)
-            steady = np.quantile(curves.gains[:, i, j], (0.05, 0.5, 0.95))
-            columns = {
-                "path": layout.path_name(i, j) or response.name,
-                "unit": f"{response.unit}/{drive.unit}",
-                "time": curves.time,
-            }
-            columns |= {f"response_{q}": row for q, row in zip(QUANTILE_NAMES, rows, strict=True)}
-            columns |= {f"steady_{q}": v for q, v in zip(("05", "50", "95"), steady, strict=True)}
-            frames.append(pd.DataFrame(columns))
+    for i, j, path, unit in layout.paths:
+        response_curve = curves.gains[:, i, j, None] * curves.normalised[curves.curve_of[i][j]]
+        rows = np.quantile(response_curve, QUANTILES, axis=0)
+        steady = np.quantile(curves.gains[:, i, j], (0.05, 0.5, 0.95))
+        columns = {"path": path, "unit": unit, "time": curves.time}
+        columns |= {f"response_{q}": row for q, row in zip(QUANTILE_NAMES, rows, strict=True)}
+        columns |= {f"steady_{q}": v for q, v in zip(("05", "50", "95"), steady, strict=True)}
+        frames.append(pd.DataFrame(columns))
     return pd.concat(frames, ignore_index=True)
 
 

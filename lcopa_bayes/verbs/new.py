@@ -141,12 +141,12 @@ def new(
 
     Parameters: `folder`, where records and `study.toml` are written; `files` and `held_out`, tables to fit
     and to predict alone: text of any separator, encoding and decimal sign, or workbooks, of which `sheet`
-    names the sheet; `overwrite`, replace files that are there. Tables share their headers. What headers and
-    data do not tell is stated: `time`, `drives` and `responses`, columns by header, by header without its
+    names the sheet; `overwrite`, replace files that are there. Tables share their headers. What is ambiguous
+    in headers and data is stated: `time`, `drives` and `responses`, columns by header, by header without its
     unit or by number, each perhaps with a new name, as in "heater [%]=Column B"; `time_unit` of a numeric
     time column, `decimal`, the decimal sign, and `time_format` of time stamps, as of `datetime.strptime`.
 
-    InputError with everything that cannot be read or told apart; then nothing is written.
+    InputError with everything that cannot be read or is ambiguous; then nothing is written.
     """
     folder = Path(folder)
     fitted = [Path(files)] if isinstance(files, Path | str) else [Path(one) for one in files]

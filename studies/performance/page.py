@@ -114,7 +114,7 @@ def sampled(comparison: Mapping[str, Any]) -> list[str]:
 def verbs(result: Mapping[str, Any]) -> list[str]:
     head = (
         *("study", "verb", "wall s", "CPU s", "yardsticks", "of its fit", "peak MB", "plants simulated"),
-        *("share of likelihood", "draws", "plants per draw", "grade"),
+        *("share of likelihood", "of sampling", "draws", "plants per draw", "grade"),
     )
     lines = []
     for row in sorted(result["rows"], key=lambda row: order(result, row)):
@@ -138,6 +138,7 @@ def verbs(result: Mapping[str, Any]) -> list[str]:
                 spread(row["peak_MB"]),
                 row.get("plants"),
                 row.get("likelihood_share"),
+                row.get("likelihood_share_of_sampling"),
                 row.get("smallest_ess"),
                 row.get("plants_per_draw"),
                 row.get("grade"),
@@ -147,7 +148,8 @@ def verbs(result: Mapping[str, Any]) -> list[str]:
         f"Every verb by the command line, with `--jobs {result['jobs']}`, from a fresh process to its page. "
         "The yardstick is a fixed piece of array work timed before and after each run; counted in it, times "
         "can be compared between machines. `report`, `predict`, `audit` and `design` begin with the finished "
-        "fit. The likelihood is densities, their expansions and responses."
+        "fit. The likelihood is densities, their expansions and responses; its share is that of the whole "
+        "verb, and of the time in which it samples."
     )
     parts = ["## Verbs", said, table(head, lines), left_out(result)]
     return [*filter(None, parts), "![CPU time of every verb](verbs.svg)", *stages(result)]

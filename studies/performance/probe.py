@@ -71,6 +71,8 @@ STAGES = {
     "lcopa_bayes.report.pages": {"write_page_of": "page"},
 }
 """Stage of each function, by the module that calls it."""
+SAMPLING = ("search and draws", "search", "walkers")
+"""Stages that sample."""
 
 
 class Probe:

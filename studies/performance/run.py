@@ -1,7 +1,8 @@
 """Speed of the package: whole verbs, forward responses, samplers, each against what else does the same.
 
     python studies/performance/run.py [--quick] [--json] [--out FOLDER] [--parts forward samplers verbs]
-        [--seconds S] [--machine WORDS] [--before RESULTS.json] [--against CHECKOUT] [--jobs N]
+        [--verbs VERB ...] [--studies STUDY ...] [--jobs N] [--seconds S] [--machine WORDS]
+        [--before RESULTS.json] [--against CHECKOUT]
 
 The full study takes many hours and wants a quiet machine; `--quick` takes five minutes at most and shows
 orders of magnitude. Libraries that are compared come with `pip install '.[performance]'`; one that is missing
@@ -58,7 +59,12 @@ def measured(options: argparse.Namespace, folder: Path) -> dict[str, Any]:
     if "verbs" in options.parts:
         remaining = end - time.perf_counter()
         out["verbs"] = verbs.measured(
-            folder, quick=options.quick, jobs=options.jobs, seconds=remaining, against=options.against
+            folder,
+            quick=options.quick,
+            jobs=options.jobs,
+            seconds=remaining,
+            against=options.against,
+            only=(options.verbs, options.studies),
         )
     stored: dict[str, Any] = plain(out)
     return stored
@@ -80,6 +86,8 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print the results as one JSON object")
     parser.add_argument("--out", type=Path, help="folder for report, figures and results.json")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS)
+    parser.add_argument("--verbs", nargs="+", default=(), help="of the part `verbs`, only these")
+    parser.add_argument("--studies", nargs="+", default=(), help="of the part `verbs`, only these")
     parser.add_argument("--seconds", type=float, help=f"wall time (default of a quick run: {QUICK:g})")
     parser.add_argument("--machine", help="what it runs on and what else runs there, in words")
     parser.add_argument("--before", type=Path, help="results.json of an earlier run, to compare verbs with")

@@ -26,13 +26,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from comparison import Spread, ratio
+from probe import SAMPLING
 
 from lcopa_bayes.cli import VERBS
 
 HERE = Path(__file__).parent
 STUDIES = HERE.parent
 ROOT = STUDIES.parent
-MEASURED = ("lcd_panel_p_from000_to153", "hair_dryer", "tclab_2x2")
+MEASURED = ("lcd_panel_p_from000_to153", "hair_dryer", "heating_system", "tclab_2x2")
 """Studies of measured records that are added where there are such records."""
 CANDIDATES = ("fractional-1", "fractional-2", "first-order", "second-order")
 REPLICAS = {True: "2", False: "20"}
@@ -111,6 +112,13 @@ def cells(sources: Sequence[Source]) -> list[Cell]:
     alone = [Cell(verb, None) for verb in WITHOUT_STUDY]
     fits = [Cell("fit", each) for each in harder]
     return simulated + easy + alone + fits + [Cell(verb, each) for each in harder for verb in rest]
+
+
+def wanted(cell: Cell, verbs: Sequence[str], studies: Sequence[str]) -> bool:
+    """Whether a cell is among those asked for; what makes a study is."""
+    verb, study = cell.place
+    of_study = not studies or study in studies
+    return of_study and (not verbs or verb in verbs or verb == "simulate")
 
 
 @dataclass(frozen=True)
@@ -308,6 +316,7 @@ def row_of(cell: Cell, runs: Sequence[Measurement], fits: Sequence[Measurement])
             "plants": counts["plants"],
             "plants_with_slopes": counts["plants_with_slopes"],
             "likelihood_share": counts["likelihood_s"] / counts["process_s"],
+            "likelihood_share_of_sampling": share_of_sampling(counts["stages"]),
             "stages": counts["stages"],
             "not_watched": counts["missing"],
         }
@@ -316,17 +325,30 @@ def row_of(cell: Cell, runs: Sequence[Measurement], fits: Sequence[Measurement])
     return row
 
 
+def share_of_sampling(stages: Mapping[str, Sequence[float]]) -> float | None:
+    """Share of the likelihood in the time that sampling takes; None for a verb that does not sample."""
+    sampling = np.array([stages[name] for name in SAMPLING if name in stages])
+    return float(sampling[:, 1].sum() / sampling.sum()) if sampling.size else None
+
+
 def measured(
-    folder: Path, *, quick: bool, jobs: int = 1, seconds: float = np.inf, against: Path | None = None
+    folder: Path,
+    *,
+    quick: bool,
+    jobs: int = 1,
+    seconds: float = np.inf,
+    against: Path | None = None,
+    only: tuple[Sequence[str], Sequence[str]] = ((), ()),
 ) -> dict[str, Any]:
     """A row per verb and study, and with `against`, another checkout of the package, ratios to it.
 
+    `only` names verbs and studies that are wanted, all where there are none; what needs a fit needs it named.
     Checkouts take turns run by run, cells round by round. In a quick run, with one round and `seconds` for
     all of it, a cell that takes long is stopped and counts as at least what it took.
     """
     rounds, limit = (1, 40.0) if quick else (3, 3600.0)
-    studies = SOURCES if quick else sources()
-    todo = cells(studies)
+    studies = SOURCES if quick and not only[1] else sources()
+    todo = [cell for cell in cells(studies) if wanted(cell, *only)]
     shops = [Workshop(folder / "this", jobs=jobs, quick=quick)]
     if against is not None:
         shops.append(replace(shops[0], folder=folder / "other", root=against))

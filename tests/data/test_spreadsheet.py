@@ -1,10 +1,11 @@
-"""Tables as people save them: any notation is read back, and what cannot be told is asked for."""
+"""Tables as people save them: any notation is read back, and what is ambiguous is asked for."""
 
 from __future__ import annotations
 
 import csv
 import datetime
 import io
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -174,7 +175,7 @@ def test_columns_are_meant_by_header_by_name_and_by_number():
         (["1,234"], ""),
     ],
 )
-def test_the_decimal_sign_is_told_by_the_numbers_or_asked_for(cells, sign, tmp_path):
+def test_the_decimal_sign_is_recognised_or_asked_for(cells, sign, tmp_path):
     path = tmp_path / "x.csv"
     path.write_text("a;b\n" + "\n".join(f"1;{cell}" for cell in cells))
     known = decimal_sign(read_spreadsheet(path))
@@ -188,7 +189,7 @@ def test_numbers_in_foreign_notation():
     assert_array_equal(numbers(["1,234.5", "1e-3", "inf", "nan"], "."), [1234.5, 1e-3, np.nan, np.nan])
 
 
-def test_roles_are_told_by_words_then_by_data_and_may_be_stated(tmp_path):
+def test_roles_follow_words_then_data_and_may_be_stated(tmp_path):
     path = table(tmp_path / "x.csv", ("t [ms]", "channel 1", "channel 2"))
     out = convert([read_spreadsheet(path)], Mapped())
     assert [axis.name for axis in out.records[0].drive_axes] == ["channel_1"]
@@ -218,12 +219,12 @@ def test_a_drive_is_constant_in_a_dark_record_and_logged_only_when_it_changes(tm
 
 
 BROKEN = {
-    "Time [s],Clock [s],u,y\n1,1,0,0\n2,2,1,1\n3,3,1,2": "several columns can tell the time",
+    "Time [s],Clock [s],u,y\n1,1,0,0\n2,2,1,1\n3,3,1,2": "several columns may hold the time",
     "a,u,y\n3,0,0\n2,1,1\n3,1,0": "no column increases from row to row",
     "Time,u,y\n1,0,0\n2,1,1\n3,1,2": "has no unit; state it with --time-unit",
     "Time [fortnight],u,y\n1,0,0\n2,1,1\n3,1,2": "'fortnight', which is not known",
     "Time [s],u,y\n0,1,0,2,0,3\n0,2,0,2,0,3\n0,3,0,2,0,3": "decimals are written with commas",
-    "Time [s],y\n0,1.2\n1,1.3\n2,1.1\n3,1.2\n4,1.9": "no column can be told to be a drive",
+    "Time [s],y\n0,1.2\n1,1.3\n2,1.1\n3,1.2\n4,1.9": "no column is recognised as a drive",
     "Time [s],u,y\n0,0,1\n1,1,2\n1,1,3": "does not come after",
     "Time [s],u,y\n0,0,1\n1,1,2\n2,1,oops\n3,1,4": "line 4, column 'y': 'oops' is not a number of y",
     "Time [s],u,y\n0,,1\n1,1,2\n2,0,3\n3,1,4": "first row has no value of the drive 'u'",
@@ -235,7 +236,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize(("text", "message"), BROKEN.items(), ids=BROKEN.values())
-def test_what_cannot_be_told_is_asked_for(text, message, tmp_path):
+def test_what_is_ambiguous_is_asked_for(text, message, tmp_path):
     (tmp_path / "x.csv").write_text(text)
     with pytest.raises(InputError, match=message):
         read(tmp_path / "x.csv")
@@ -265,3 +266,33 @@ def test_what_is_no_table_is_refused(content, tmp_path):
             read_spreadsheet(tmp_path / f"x{suffix}")
     with pytest.raises(InputError, match=r"no such file; did you mean 'x.csv'"):
         read_spreadsheet(tmp_path / "xx.csv")
+
+
+CELLS = st.one_of(
+    st.floats(allow_nan=True, allow_infinity=True).map(str),
+    st.integers(-1000, 1000).map(str),
+    st.sampled_from(
+        ["", "NaN", "1,5", "1.234,5", "2026-01-02", "03.04.2026 10:00", "10:00:01", "-", "#REF!", "x"]
+    ),
+    st.text(max_size=6),
+)
+
+
+@given(
+    header=st.lists(
+        st.one_of(st.text(max_size=8), st.sampled_from(["t [s]", "u", "y", "Time", "u"])), max_size=5
+    ),
+    rows=st.lists(st.lists(CELLS, max_size=5), max_size=8),
+    separator=st.sampled_from(",;\t|"),
+    content=st.none() | st.binary(max_size=200),
+)
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_table_is_read_or_refused_in_words(header, rows, separator, content, tmp_path):
+    path = tmp_path / "x.csv"
+    if content is None:
+        text = "\n".join(separator.join(cells) for cells in [header, *rows])
+        path.write_text(text, encoding="utf-8", errors="replace")
+    else:
+        path.write_bytes(content)
+    with suppress(InputError):
+        assert read(path).time.size >= 2

@@ -120,6 +120,13 @@ def results_of() -> dict:
     return {
         "study": "bench & co",
         "verdict": "Something was learned.",
+        "overview": {
+            "plant": ["y / <i>odd$name$ = 1.2 rad/V exp(-3 s) / (1 + (1.8 s)^0.8)"],
+            "answers": [
+                {"question": "What is missing?", "answer": "<i>odd$name$ & co.", "section": "Residuals"},
+                {"question": "What next?", "answer": "Measure again.", "section": ""},
+            ],
+        },
         "grade": "tentative",
         "grade_reason": "too few draws of time_1",
         "time_unit": "ms",
@@ -204,16 +211,18 @@ def test_verdict_stands_on_top_coloured_and_in_words(html):
 def test_sections_come_in_the_order_of_reading(html):
     titles = re.findall(r"<h2>(.*?)</h2>", html)
     assert titles == [
-        *("Data and bands", "Residuals", "Parameters", "Pairs of parameters", "Traces", "Step responses"),
-        "Frequency response",
-        *(
-            "Priors and posteriors",
-            "Prior sensitivity",
-            "Evidence",
-            "Second method",
-            "Sampler and provenance",
-        ),
+        *("Summary", "Parameters", "Step responses", "Frequency response", "Data and bands", "Residuals"),
+        *("Pairs of parameters", "Priors and posteriors", "Prior sensitivity", "Traces", "Evidence"),
+        *("Second method", "Sampler and provenance"),
     ]
+
+
+def test_the_answers_come_first_with_links(html):
+    first = html[html.index('<section id="summary">') : html.index("</section>")]
+    assert "<strong>What is missing?</strong> &lt;i&gt;odd$name$ &amp; co." in first
+    assert '<a href="#residuals">Residuals</a>' in first
+    assert first.count("<a ") == 1
+    assert "y / &lt;i&gt;odd$name$ = 1.2 rad/V" in first
 
 
 def test_every_parameter_has_its_unit_interval_and_grade(html):

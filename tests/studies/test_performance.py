@@ -233,6 +233,18 @@ def test_every_verb_is_measured_on_every_study_and_after_what_it_needs():
             assert source.campaign.is_file()
 
 
+def test_cells_asked_for_come_with_what_makes_their_study():
+    cells = [cell.place for cell in verbs.cells(verbs.SOURCES) if verbs.wanted(cell, ("fit",), ("rich",))]
+    assert cells == [("simulate", "rich"), ("fit", "rich")]
+    assert all(verbs.wanted(cell, (), ()) for cell in verbs.cells(verbs.SOURCES))
+
+
+def test_share_of_the_likelihood_in_sampling():
+    stages = {"search": [1.0, 2.0], "walkers": [0.0, 1.0], "page": [9.0, 9.0]}
+    assert verbs.share_of_sampling(stages) == 0.75
+    assert verbs.share_of_sampling({"page": [9.0, 9.0]}) is None
+
+
 def test_measured_records_are_added_where_there_are_any(tmp_path, monkeypatch):
     monkeypatch.setenv("LCOPA_BAYES_DATA", str(tmp_path))
     assert verbs.sources() == verbs.SOURCES

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import final
+from typing import TypeVar, final
 
 import numpy as np
 
@@ -27,8 +27,23 @@ from lcopa_bayes.model.forward import ForwardModel, StepResponses
 
 UPSTREAM = (DriveEffect, ElementEffect, ForceEffect, SensorEffect)
 """Places before the reading."""
-_KEPT = 3
-"""Simulations kept, so that what acts after the plant is evaluated without simulating it again."""
+
+_Value = TypeVar("_Value")
+
+
+@final
+class Latest(OrderedDict[bytes, _Value]):
+    """The three values used last, so that what acts after the plant is evaluated without simulating it
+    again."""
+
+    def get_or(self, key: bytes, made: Callable[[], _Value]) -> _Value:
+        """The value of a key, made when it is not kept."""
+        if key not in self:
+            self[key] = made()
+        self.move_to_end(key)
+        while len(self) > 3:
+            self.popitem(last=False)
+        return self[key]
 
 
 @final
@@ -46,15 +61,15 @@ class Simulator:
     """Place of each record in the campaign, (records,), -1/2 to 1/2 [-]."""
     times: tuple[Vector, ...]
     """Sample times of each record [time unit]."""
-    step_responses: OrderedDict[bytes, StepResponses] = field(default_factory=OrderedDict)
+    step_responses: Latest[StepResponses] = field(default_factory=Latest)
     """Step responses of the latest plants; shared with simulators of other effects, for most
     simulations differ in the commands alone."""
-    still: OrderedDict[bytes, list[Moved]] = field(default_factory=OrderedDict)
+    still: Latest[list[Moved]] = field(default_factory=Latest)
     """The latest plants up to their reading where nothing acts before it; shared likewise."""
 
     @cached_property
-    def _kept(self) -> OrderedDict[bytes, list[Moved]]:
-        return OrderedDict()
+    def _kept(self) -> Latest[list[Moved]]:
+        return Latest()
 
     @cached_property
     def _slices(self) -> list[slice]:
@@ -114,32 +129,17 @@ class Simulator:
         """
         parts = [psi[self._slices[e]] for e, f in enumerate(self.effects) if isinstance(f, UPSTREAM)]
         acts = any(part.any() for part in parts)
-        kept = self._kept if acts else self.still
         own = b"".join(part.tobytes() for part in parts) if acts else id(self.ranges).to_bytes(8)
         key = plant.key + own  # what is kept holds its ranges, so that no others have their identity
-        if key in kept:
-            kept.move_to_end(key)
-        else:
-            acting = self._bending(psi)
-            scenes = self.scenes(plant, psi)
-            model = self.driven(scenes)
-            moved = (
-                passed(model, scenes, plant, [self._acting(acting, psi, r) for r in range(len(scenes))])
-                if any(acting)
-                else linear(model, scenes, plant, self._known(plant))
-            )
-            kept[key] = moved
-            while len(kept) > _KEPT:
-                kept.popitem(last=False)
-        return kept[key]
+        return (self._kept if acts else self.still).get_or(key, lambda: self._simulated(plant, psi))
 
-    def _known(self, plant: Plant) -> StepResponses:
-        """Step responses of a plant's elements."""
-        own = self.step_responses.setdefault(plant.elements, {})
-        self.step_responses.move_to_end(plant.elements)
-        while len(self.step_responses) > _KEPT:
-            self.step_responses.popitem(last=False)
-        return own
+    def _simulated(self, plant: Plant, psi: Vector) -> list[Moved]:
+        acting = self._bending(psi)
+        scenes = self.scenes(plant, psi)
+        model = self.driven(scenes)
+        if any(acting):
+            return passed(model, scenes, plant, [self._acting(acting, psi, r) for r in range(len(scenes))])
+        return linear(model, scenes, plant, self.step_responses.get_or(plant.elements, dict))
 
     def _bending(self, psi: Vector) -> list[bool]:
         """Of each effect, whether it acts between commands and reading."""
