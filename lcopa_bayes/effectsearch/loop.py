@@ -100,15 +100,20 @@ class Loop:
             name = state.model.names[k]
             return next(one for one in self.draws.estimates() if one.name == name).as_json()
         name, unit = unit_of(state.model, k)
-        middle, sd = float(state.optimum.x[k]), float(np.sqrt(state.covariance[k, k]))
+        x, width = state.optimum.x, np.zeros(state.optimum.x.size)
+        width[k] = Z90 * np.sqrt(state.covariance[k, k])
+        # coordinates are logarithms of some parameters: ends are those of the interval on that scale
+        lower, middle, upper = (
+            float(state.model.values(at)[state.model.columns[k]]) for at in (x - width, x, x + width)
+        )
         return {
             "name": name,
             "value": middle,
             "unit": unit,
             "mean": middle,
-            "sd": sd,
-            "lower": middle - Z90 * sd,
-            "upper": middle + Z90 * sd,
+            "sd": (upper - lower) / (2 * Z90),
+            "lower": lower,
+            "upper": upper,
             "level": LEVEL,
             "interval": "Laplace",
             "ess": None,

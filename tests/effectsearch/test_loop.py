@@ -127,6 +127,17 @@ def test_what_leaves_is_plain_json_with_grades(bent):
     assert any("odd_curvature" in line for line in words(told))
 
 
+def test_parameters_without_draws_are_values_and_not_coordinates(clean):
+    """A time was printed as its logarithm, 1.2 ms where the viscosity of 3 makes it 3.39 ms."""
+    printed = {row["name"]: row for row in results(clean)["parameters"]}
+    time = 3.0 ** (1 / 0.9)
+    for name, truth in (("gain", 1.0), ("time_1", time), ("order_1", 0.9), ("delay", 1.0)):
+        row = printed[name]
+        assert row["lower"] < row["value"] < row["upper"]
+        assert row["lower"] - 2 * row["sd"] < truth < row["upper"] + 2 * row["sd"]
+        assert row["upper"] - row["lower"] < 0.5 * truth
+
+
 def test_parameters_biased_by_the_effect_are_listed(bent):
     assert "gain" in {row["name"] for row in results(bent)["moved"]}
 
