@@ -91,8 +91,8 @@ def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: boo
             if named >= gain and not gain + _named(wider, library, rng, draws) > named + _GAIN:
                 break
             said = (
-                f"The base model has {terms} viscous terms: one more than {terms - 1} is worth {gain:.0f} "
-                "nat, with the effects that each leaves to be named."
+                f"The base model has {terms} viscous terms instead of {terms - 1}: the last one is worth "
+                f"{gain:.0f} nat, and explains more, alone or beside an effect, than an effect in its place."
             )
         base = wider._replace(sentence=f"{base.sentence} {said}".strip())
     return base
