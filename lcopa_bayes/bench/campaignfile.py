@@ -29,7 +29,6 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
@@ -44,7 +43,7 @@ from lcopa_bayes.bench.device import PAPER_DEVICE, Device
 from lcopa_bayes.bench.inversion import unsuited
 from lcopa_bayes.bench.undeclared import UndeclaredPlan
 from lcopa_bayes.core.errors import InputError, nearest
-from lcopa_bayes.core.files import writable_folder, write_text, writing
+from lcopa_bayes.core.files import read_tables, writable_folder, write_text, writing
 from lcopa_bayes.core.rules import FLAG, Rule, is_number, whole
 from lcopa_bayes.data.record import Axis, Record, save_record
 from lcopa_bayes.model.path import TransferPath
@@ -105,15 +104,7 @@ class Plan:
 
 def load_plan(path: Path) -> Plan | UndeclaredPlan:
     """Read a campaign file; InputError with everything wrong in it."""
-    try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: is not valid TOML: {error}") from None
-    problems = [
-        f"{path}: unknown table [{key}]{nearest(key, _TABLES)}" for key in tables if key not in _TABLES
-    ]
+    tables, problems = read_tables(path, _TABLES)
     heading = tables.get("campaign", {})
     problems += _wrong(f"{path}: [campaign]", heading, _HEADING)
     problems += [

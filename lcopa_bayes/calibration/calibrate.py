@@ -8,13 +8,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import final
 
-from tqdm import tqdm
-
 from lcopa_bayes.calibration.replica import ENGINES, Engine, Failure, Outcome, Replication
 from lcopa_bayes.calibration.store import Store
 from lcopa_bayes.calibration.truths import Stated, Truths, truths_around, truths_stated
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.core.rules import whole, word_of
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
@@ -89,8 +88,8 @@ def calibrate(
         failures: list[Failure] = []
         grades = Counter(outcome.grade for outcome in done.values())
         missing = [number for number in range(replicas) if number not in done]
-        with tqdm(
-            total=replicas, initial=len(done), unit="replica", disable=quiet, desc="calibrating"
+        with Progress(
+            total=replicas, initial=len(done), unit="replica", quiet=quiet, desc="calibrating"
         ) as bar:
             for outcome in crew.finished(_attempt, missing, replication.lost) if missing else ():
                 if isinstance(outcome, Failure):

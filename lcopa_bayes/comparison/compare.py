@@ -7,8 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from lcopa_bayes.comparison.candidatefit import Contender, contender
 from lcopa_bayes.comparison.candidates import Candidate
 from lcopa_bayes.comparison.containment import Check
@@ -16,6 +14,7 @@ from lcopa_bayes.comparison.judgement import judged
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.files import writable_folder
 from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.inference.assembly import problem_of
 
 
@@ -46,7 +45,7 @@ def compare(
         own = None if place is None else writable_folder(place / folder_name(one.name))
         tasks.append(contender(one, own, quick=quick, resume=resume))
     cards: dict[str, Mapping[str, Any]] = {}
-    with tqdm(total=len(tasks), unit="candidate", disable=quiet, desc="comparing") as bar:
+    with Progress(total=len(tasks), unit="candidate", quiet=quiet, desc="comparing") as bar:
         for values in _performed(tasks, jobs):
             cards[str(values["name"])] = values
             bar.update()

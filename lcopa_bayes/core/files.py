@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Files that appear whole or not at all, and files of tables."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ import json
 import os
 import re
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+import tomllib
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from io import FileIO, RawIOBase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.core.estimate import plain
 
 if TYPE_CHECKING:
@@ -170,3 +171,21 @@ def writable_folder(path: Path) -> Path:
             "choose another with --out"
         ) from None
     return path
+
+
+def read_tables(path: Path, known: Collection[str]) -> tuple[dict[str, Any], list[str]]:
+    """Tables of a TOML file, and what is wrong with their names; InputError when it cannot be read."""
+    if not path.exists():
+        beside = (one.name for one in path.parent.glob("*.toml"))
+        raise InputError(f"{path}: no such file{nearest(path.name, beside)}")
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        tables = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        end = f"at line {text.count(chr(10)) + 1}, the end of the file"
+        why = str(error).replace("at end of document", end)
+        raise InputError(f"{path}: is not valid TOML: {why}") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as UTF-8 text ({error})") from error
+    wrong = [f"{path}: unknown table [{key}]{nearest(key, known)}" for key in tables if key not in known]
+    return tables, wrong

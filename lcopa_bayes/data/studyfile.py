@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, final
+from typing import final
 
-from lcopa_bayes.core.errors import InputError, nearest, refuse_if
+from lcopa_bayes.core.errors import InputError, refuse_if
+from lcopa_bayes.core.files import read_tables
 from lcopa_bayes.data.cells import SUFFIXES
 from lcopa_bayes.data.record import Record, load_record
 from lcopa_bayes.data.settings import CandidateSettings, CompareSettings, HeadingSettings, RecordsSettings
@@ -44,21 +44,6 @@ def _hashes(paths: Iterable[Path]) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
 
 
-def _document(path: Path) -> dict[str, Any]:
-    if not path.exists():
-        beside = (one.name for one in path.parent.glob("*.toml"))
-        raise InputError(f"{path}: no such file{nearest(path.name, beside)}")
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        end = f"at line {text.count(chr(10)) + 1}, the end of the file"
-        why = str(error).replace("at end of document", end)
-        raise InputError(f"{path}: is not valid TOML: {why}") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as UTF-8 text ({error})") from error
-
-
 @final
 class BrokenStudyError(InputError):
     """A study file with problems whose plant and records can be used: more may be wrong with these."""
@@ -69,8 +54,7 @@ class BrokenStudyError(InputError):
 
 
 def _from_file(path: Path, held_out: list[Path]) -> Study:
-    document, folder = _document(path), path.parent
-    problems = _unknown_tables(document, path, _TABLES)
+    (document, problems), folder = read_tables(path, _TABLES), path.parent
 
     def where(name: str) -> str:
         return f"{path}, [{name}]"
@@ -113,10 +97,6 @@ def tables_in(folder: Path) -> list[Path]:
     return [file for file in sorted(folder.glob("[!.]*")) if file.suffix.lower() in SUFFIXES]
 
 
-def _unknown_tables(document: Mapping[str, object], path: Path, known: Sequence[str]) -> list[str]:
-    return [f"{path}: unknown table [{key}]{nearest(key, known)}" for key in document if key not in known]
-
-
 def load_study(source: Path | Sequence[Path], *, held_out: Sequence[Path] = ()) -> Study:
     """The study in the folder or study file `source`, or one of default settings made from record files.
 
@@ -156,8 +136,7 @@ def load_candidates(path: Path) -> tuple[tuple[str, ...] | None, tuple[Candidate
 
     InputError with all that is wrong.
     """
-    document = _document(path)
-    problems = _unknown_tables(document, path, ("compare", "candidates"))
+    document, problems = read_tables(path, ("compare", "candidates"))
     chosen = settings_from(CompareSettings, document.get("compare", {}), f"{path}, [compare]", problems)
     described = candidate_settings(document.get("candidates", []), f"{path}, [[candidates]]", problems)
     if not document:

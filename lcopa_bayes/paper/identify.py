@@ -7,11 +7,11 @@ from typing import Any, final
 
 import numpy as np
 from threadpoolctl import threadpool_limits
-from tqdm import tqdm
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.model.path import Normalisation, TransferPath
 from lcopa_bayes.paper.equation import equation_rmse, least_squares, output_rmse
@@ -83,11 +83,11 @@ def identify(
     paths = scannable(study, plan)
     plan = _within_study(plan or Scan(), study)
     if jobs <= 1 or len(paths) == 1:
-        with tqdm(total=0, unit="candidate", disable=quiet) as bar:
+        with Progress(total=0, unit="candidate", desc="searching", quiet=quiet) as bar:
             return tuple(_identify(study, data, plan, bar) for data in paths)
     with workers((study, plan), jobs=min(jobs, len(paths))) as crew:
         identified = crew.each(_identified, paths)
-        return tuple(tqdm(identified, total=len(paths), unit="path", disable=quiet))
+        return tuple(Progress(identified, total=len(paths), unit="path", desc="identifying", quiet=quiet))
 
 
 def _identified(shared: tuple[Study, Scan], data: PathData) -> Identification:
@@ -129,7 +129,7 @@ def _within_study(plan: Scan, study: Study) -> Scan:
     return replace(plan, orders=tuple(Interval(order, order) for order in distinct))
 
 
-def _identify(study: Study, data: PathData, plan: Scan, bar: tqdm[Any] | None = None) -> Identification:
+def _identify(study: Study, data: PathData, plan: Scan, bar: Progress | None = None) -> Identification:
     with threadpool_limits(1):
         fixed, whole = study.model.orders != "free", integer_orders(data.terms)
         rigid = replace(plan, orders=tuple(Interval(order, order) for order in whole))

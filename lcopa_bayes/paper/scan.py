@@ -14,9 +14,9 @@ from functools import cached_property
 from typing import final
 
 import numpy as np
-from tqdm import tqdm
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
+from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.model.blockpulses import integration_weights, lower_toeplitz
 from lcopa_bayes.model.path import Normalisation, TransferPath
 from lcopa_bayes.model.powerseries import Circle, Spectrum
@@ -109,7 +109,7 @@ def evaluate(
     records: Sequence[Blocks],
     candidates: Candidates,
     normalisation: Normalisation,
-    bar: tqdm[None] | None = None,
+    bar: Progress | None = None,
 ) -> Evaluated:
     """Least squares and output error of every candidate.
 
@@ -209,7 +209,7 @@ def scan(
     plan: Scan,
     *,
     normalisation: Normalisation = Normalisation.STIFFNESS,
-    bar: tqdm[None] | None = None,
+    bar: Progress | None = None,
 ) -> Scanned:
     """Scan the intervals, then refine around the best candidate, the least output error winning.
 

@@ -16,10 +16,10 @@ import numpy as np
 from dynesty import NestedSampler
 from dynesty.internal_samplers import InternalSampler, SamplerArgument, SamplerReturn
 from scipy.special import logsumexp
-from tqdm import tqdm
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
 from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.constrainedwalk import Walk
@@ -91,7 +91,7 @@ def nested(posterior: Posterior, plan: NestedPlan, *, jobs: int = 1, quiet: bool
     """
     *seeds, last = np.random.SeedSequence(plan.seed, spawn_key=(2_000,)).spawn(plan.runs + 1)
     runs, evaluations = [], 0
-    with tqdm(total=plan.runs, unit="run", disable=quiet, desc="nested sampling") as bar:
+    with Progress(total=plan.runs, unit="run", quiet=quiet, desc="nested sampling") as bar:
         for strands, spent in _performed(posterior, plan, seeds, min(jobs, plan.runs)):
             runs.append(strands)
             evaluations += spent

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from math import ceil
 from pathlib import Path
-from typing import Any, final
+from typing import final
 
 import numpy as np
-from tqdm import tqdm
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix
 from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.data.settings import Method
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.chainfile import Chain, load_chain, save_chain
@@ -178,7 +178,7 @@ def sample(
     searched = plan.method == "auto" and applies(posterior)
     with (
         workers(posterior, jobs=jobs) as crew,
-        tqdm(total=rounds, initial=done, unit="round", disable=quiet, desc="from the prior") as bar,
+        Progress(total=rounds, initial=done, unit="round", quiet=quiet, desc="from the prior") as bar,
     ):
         if not ensembles:
             seeds = np.random.SeedSequence(plan.seed).spawn(plan.ensembles)
@@ -239,7 +239,7 @@ def _store(chain_file: Path | None, chain: Chain, fingerprint: str) -> None:
         save_chain(chain_file, chain, fingerprint)
 
 
-def finished(posterior: Posterior, run: Run, bar: tqdm[Any] | None = None) -> bool:
+def finished(posterior: Posterior, run: Run, bar: Progress | None = None) -> bool:
     """Whether every sampled parameter agrees between ensembles and has its effective sample size, and the
     shares of its modes have.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import datetime
 import io
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -265,3 +266,33 @@ def test_what_is_no_table_is_refused(content, tmp_path):
             read_spreadsheet(tmp_path / f"x{suffix}")
     with pytest.raises(InputError, match=r"no such file; did you mean 'x.csv'"):
         read_spreadsheet(tmp_path / "xx.csv")
+
+
+CELLS = st.one_of(
+    st.floats(allow_nan=True, allow_infinity=True).map(str),
+    st.integers(-1000, 1000).map(str),
+    st.sampled_from(
+        ["", "NaN", "1,5", "1.234,5", "2026-01-02", "03.04.2026 10:00", "10:00:01", "-", "#REF!", "x"]
+    ),
+    st.text(max_size=6),
+)
+
+
+@given(
+    header=st.lists(
+        st.one_of(st.text(max_size=8), st.sampled_from(["t [s]", "u", "y", "Time", "u"])), max_size=5
+    ),
+    rows=st.lists(st.lists(CELLS, max_size=5), max_size=8),
+    separator=st.sampled_from(",;\t|"),
+    content=st.none() | st.binary(max_size=200),
+)
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_table_is_read_or_refused_in_words(header, rows, separator, content, tmp_path):
+    path = tmp_path / "x.csv"
+    if content is None:
+        text = "\n".join(separator.join(cells) for cells in [header, *rows])
+        path.write_text(text, encoding="utf-8", errors="replace")
+    else:
+        path.write_bytes(content)
+    with suppress(InputError):
+        assert read(path).time.size >= 2
