@@ -39,7 +39,8 @@ class ExtendedModel:
     """Whether the plant's tangents are those with the effects in place; otherwise those of the plant alone,
     fifty times cheaper and good enough to descend with."""
     loose: frozenset[str] = frozenset()
-    """Internal constants that are coordinates too, ``<effect>.<constant>``; the others are held."""
+    """Internal constants that are coordinates too if they have a prior, ``<effect>.<constant>``; the others
+    are held."""
 
     def at_scales(self, x: Vector, taken: Mapping[str, float]) -> ExtendedModel:
         """With the scales of effects taken from the base fit at `x`; `taken` gives each record's place in the
@@ -210,11 +211,11 @@ class ExtendedModel:
     def held(self, x: Vector) -> tuple[ExtendedModel, Vector]:
         """The model with its `loose` constants held at those of coordinates, and the other coordinates."""
         table, values = self.posterior.table, self.values(x)
+        free = {table.names[k]: float(values[k]) for k in self.columns if table.rows[k].kind in CONSTANTS}
         effects: list[Effect] = []
         for effect in self.effects:
-            full = {name: f"{effect.name}.{name}" for name in effect.constants}
-            loose = {name: each for name, each in full.items() if each in self.loose}
-            moved = {name: float(values[table.names.index(each)]) for name, each in loose.items()}
+            own = {name: f"{effect.name}.{name}" for name in effect.constants}
+            moved = {name: free[full] for name, full in own.items() if full in free}
             effects.append(replace(effect, **moved))
         fixed = [p for p, k in enumerate(self.columns) if table.rows[k].kind not in CONSTANTS]
         return replace(self.having(*effects), loose=frozenset()), x[fixed]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, final
 
@@ -21,7 +21,7 @@ from lcopa_bayes.effectsearch.trace import LEVEL
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.effects import Placed
 from lcopa_bayes.inference.kinds import CONSTANTS
-from lcopa_bayes.model.effects.effect import Effect
+from lcopa_bayes.model.effects.effect import Effect, Ranges
 
 SIGNIFICANT = 2.7e-3
 """Two-sided p-value of three standard deviations [-]."""
@@ -206,12 +206,15 @@ def freed(
     They are parameters like any other of the descent, which uses the plant's own tangents; those that a fit
     holds by default stay.
     """
-    rows = model.posterior.table.rows
-    loose = frozenset(
-        row.name for row in rows if row.kind == "constant" and row.name.partition(".")[0] in names
-    )
-    wide = replace(model, exact=False, loose=loose)
-    if not any(rows[k].kind in CONSTANTS for k in wide.columns):
+    # a phase of commands moves them from sample to sample: no slope says where it should be
+    held = {effect.name for effect in model.effects if effect.card.place == "drive"}
+    loose = set()
+    for row in model.posterior.table.rows:
+        own = row.name.partition(".")[0]
+        if row.kind in CONSTANTS and own in names and not (row.kind == "fraction" and own in held):
+            loose.add(row.name)
+    wide = replace(model, exact=False, loose=frozenset(loose))
+    if len(wide.columns) == len(model.columns):
         return model, x
     best = Regression(replace(model, exact=False), whitening).cost(x)
     try:
@@ -238,14 +241,16 @@ def _likely(
         return model, x
     cost = Regression(model, whitening).cost(x)
     for k, effect in enumerate(model.effects):
-        listed = effect.grid(model.effected.ranges)
-        for name in _constants_of(effect) if effect.name in names else ():
-            here = getattr(effect, name)
-            values = np.array([getattr(one, name) for one in listed])
-            near = float(values[np.argmin(np.abs(values - here))])
-            back = _replaced(model, k, name, near)
+        if effect.name not in names:
+            continue
+        moved = _on_grid(effect, model.effected.ranges)
+        tried = [moved] if moved else []
+        if len(moved) > 1:
+            tried += [{name: value} for name, value in moved.items()]
+        for own in tried:
+            back = _replaced(model, k, own)
             fit = Regression(back, whitening)
-            if near == here or not fit.cost(x) < cost + _HOPELESS:
+            if not fit.cost(x) < cost + _HOPELESS:
                 continue
             there, _ = fit.reached(x, most=_BACK, gain=_SLIGHT)
             if fit.cost(there) < cost + LEVEL:
@@ -253,17 +258,23 @@ def _likely(
     return model, x
 
 
-def _replaced(model: ExtendedModel, effect: int, name: str, value: float) -> ExtendedModel:
-    """The model with one constant of one effect at another value."""
+def _on_grid(effect: Effect, ranges: Ranges) -> dict[str, float]:
+    """The constants of an effect that lie off its grid, at the nearest value there."""
+    listed = effect.grid(ranges)
+    out = {}
+    for name, here in effect.constants.items():
+        values = np.array([float(getattr(one, name)) for one in listed])
+        near = float(values[np.argmin(np.abs(values - here))])
+        if isinstance(here, float) and near != here:
+            out[name] = near
+    return out
+
+
+def _replaced(model: ExtendedModel, effect: int, constants: Mapping[str, float]) -> ExtendedModel:
+    """The model with constants of one effect at other values."""
     effects: list[Any] = list(model.effects)
-    effects[effect] = replace(effects[effect], **{name: value})
+    effects[effect] = replace(effects[effect], **constants)
     return model.having(*effects)
-
-
-def _constants_of(effect: Effect) -> list[str]:
-    """Names of the internal constants that are real numbers."""
-    listed = [field.name for field in fields(effect)]
-    return [name for name in listed if isinstance(getattr(effect, name), float)]
 
 
 def _with_room(

@@ -72,6 +72,11 @@ def test_a_ripple_that_goes_on_at_rest_is_a_vibration():
     assert [effect.name for effect in found.effects] == ["vibration"]
     assert found.rounds[0].refits[0].resting
     assert found.verdict.kind == "disturbance"
+    # a parameter of the refit: the frequencies that were traced lie further away
+    traced = [one.effect.frequency for one in found.trace.of("vibration").signatures]
+    error = abs(found.effects[0].constants["frequency"] - 0.23)
+    assert error < 2e-4
+    assert min(abs(one - 0.23) for one in traced) > 4 * error
 
 
 def test_a_ripple_of_the_deflection_is_no_vibration():
