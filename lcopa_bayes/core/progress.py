@@ -39,7 +39,7 @@ class Progress(tqdm):  # type: ignore[type-arg]
         """Name what is being done."""
         if not self._plain:
             super().set_description(desc, refresh)
-        elif desc != self.desc:  # the line has a colon of its own
+        elif not self.disable and desc != self.desc:  # the line has a colon of its own
             self._due = 0.0
             self.set_description_str(desc, refresh)
 

@@ -24,6 +24,9 @@ _SHRINK = 0.1
 """Least factor by which a share changes in one step of the descent [-]."""
 _DAMPING = (1e-2, 1e-9, 1e6)
 """Damping of the descent at the start, least and most, relative to the curvature [-]."""
+_GAIN, _FREE = 0.02, 1.0
+"""Gain that a step promises below which there is no further one [nat], and largest damping at which that
+shows an optimum [-]."""
 _QUARTERS = (0.1587, 0.8413)
 """Quantiles of a prior one standard deviation apart from the middle, were it normal."""
 
@@ -239,21 +242,28 @@ class Conditional:
         )
 
     def descended(self, values: Matrix, steps: int) -> tuple[Expanded, Vector]:
-        """Expansions about the optima near table values, after so many steps of Levenberg and Marquardt; and
-        what they maximise: log likelihood and normal priors as wide as the priors, (batch,) [nat]."""
+        """Expansions about the optima near table values, after Levenberg and Marquardt's steps, so many at
+        most and until one gains nothing; and what they maximise: log likelihood and normal priors as wide as
+        the priors, (batch,) [nat]."""
         at = self.expanded(values)
         level, gradient, information = self._objective(at)
-        damping = np.full(len(values), _DAMPING[0])
+        damping, moving = np.full(len(values), _DAMPING[0]), np.arange(len(values))
         for _ in range(steps):
-            proposed, exists = self.values(self._stepped(at, gradient, information, damping), at.values)
-            proposed[~exists] = at.values[~exists]
+            here, slope = Expanded(*(part[moving] for part in at)), gradient[moving]
+            x = self._stepped(here, slope, information[moving], damping[moving])
+            arrived = (np.abs(slope * (x - here.x)).sum(axis=1) < _GAIN) & (damping[moving] <= _FREE)
+            moving, x, before = moving[~arrived], x[~arrived], here.values[~arrived]
+            if not moving.size:
+                break
+            proposed, exists = self.values(x, before)
+            proposed[~exists] = before[~exists]
             new = self.expanded(proposed)
             reached, *slopes = self._objective(new)
             finite = np.isfinite(new.gradient).all(axis=1) & np.isfinite(new.information).all(axis=(1, 2))
-            better = exists & finite & (reached > level)
+            better = exists & finite & (reached > level[moving])
             for old, now in zip((*at, level, gradient, information), (*new, reached, *slopes), strict=True):
-                old[better] = now[better]
-            damping = np.clip(np.where(better, 0.1, 10.0) * damping, *_DAMPING[1:])
+                old[moving[better]] = now[better]
+            damping[moving] = np.clip(np.where(better, 0.1, 10.0) * damping[moving], *_DAMPING[1:])
         return at, level
 
     def uncertainty(self, at: Expanded) -> Matrix:

@@ -28,9 +28,9 @@ from lcopa_bayes.model.effects.effect import (
     Scene,
     UnstableError,
 )
-from lcopa_bayes.model.effects.passage import Moved, Passage, Plant, Spectra, deflections
+from lcopa_bayes.model.effects.passage import Moved, Passage, Plant, Spectra
 from lcopa_bayes.model.effects.simulator import Simulator
-from lcopa_bayes.model.forward import ForwardModel
+from lcopa_bayes.model.forward import ForwardModel, deflections
 
 
 class Simulated(NamedTuple):
@@ -152,7 +152,7 @@ class Simulation:
             own = self.effects(row)
             if simulator is None or own != effects:
                 effects, simulator = own, self.simulator(own)
-            units = None if shared is None else [each[:, b] for each in shared]
+            units = None if shared is None else [each[:, b : b + 1] for each in shared]
             try:
                 self._one(simulator, row, units, b, out)
             except UnstableError:
@@ -212,10 +212,7 @@ class Simulation:
             scene, experiment = simulator.scene(r, self.plant(values[0])), self.model.experiments[r]
             change, failures = Passage(layout, experiment, scene, gains, dynamics, forces, spectra).change()
             bounded[list(failures)] = False
-            for i, row in enumerate(layout.unit_of):
-                for j, unit in enumerate(row):
-                    out[r].base[i] += gains[:, i, j, None] * (scene.rest[j] + units[unit])
-            out[r].base[...] += change
+            out[r].base[...] = deflections(layout, scene.rest, gains, units) + change
         if len(forces) < len(declared.kinds):
             for b in np.flatnonzero(bounded).tolist():
                 simulator = self.simulator(self.effects(values[b]))
@@ -279,13 +276,13 @@ class Simulation:
         return still
 
     def _one(
-        self, simulator: Simulator, row: Vector, units: list[Matrix] | None, b: int, out: list[Simulated]
+        self, simulator: Simulator, row: Vector, units: list[Array] | None, b: int, out: list[Simulated]
     ) -> None:
         """Write one plant's responses."""
         plant, psi = self.plant(row), self.psi(self._without_scaled(row))
         if units is None and not self.declared.bending:
             driven = simulator.driven(simulator.scenes(plant, psi))
-            units = [each[:, 0] for each in driven.unit_responses(plant.dynamics)]
+            units = driven.unit_responses(plant.dynamics)
         if not self.declared.affine:
             for record, y in zip(out, self._read(simulator, plant, psi, units), strict=True):
                 record.base[:, b] = y.T
@@ -308,14 +305,14 @@ class Simulation:
         self._added(simulator, plant, b, out)
 
     def _read(
-        self, simulator: Simulator, plant: Plant, psi: Vector, units: list[Matrix] | None
+        self, simulator: Simulator, plant: Plant, psi: Vector, units: list[Array] | None
     ) -> list[Matrix]:
         """Deflections of one plant as read, per record (samples, axes)."""
         if units is None:
             return simulator.finished(simulator.moved(plant, psi), psi)
         scenes = simulator.scenes(plant, psi)
         moved = [
-            Moved(scene, deflections(self.table.layout, scene, plant.gains, each))
+            Moved(scene, deflections(self.table.layout, scene.rest, plant.gains[None], each)[:, 0].T)
             for scene, each in zip(scenes, units, strict=True)
         ]
         return simulator.finished(moved, psi)

@@ -245,6 +245,19 @@ class ForwardModel:
         return out
 
 
+def deflections(layout: Layout, rest: Vector, gains: Array, units: Array) -> Array:
+    """Deflections of linear plants on a record, (axes, batch, samples) [response unit].
+
+    Parameters: rest of the drives, (drives,); gains, (batch, responses, drives); unit responses, (units,
+    batch, samples).
+    """
+    out = np.zeros((len(layout.responses), *units.shape[1:]))
+    for i, row in enumerate(layout.unit_of):
+        for j, unit in enumerate(row):
+            out[i] += gains[:, i, j, None] * (rest[j] + units[unit])
+    return out
+
+
 def forward_model(
     layout: Layout,
     records: Sequence[Driven],

@@ -15,7 +15,7 @@ from lcopa_bayes.inference.noise import GaussianNoise, Noise
 from lcopa_bayes.inference.observations import Observed, Samples
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.simulation import Simulation
-from lcopa_bayes.model.forward import ForwardModel
+from lcopa_bayes.model.forward import ForwardModel, deflections
 from lcopa_bayes.results.bands import LEVELS, POINTWISE, Bands, named
 from lcopa_bayes.sampling.draws import Draws
 
@@ -114,15 +114,11 @@ def responses(table: ParameterTable, model: ForwardModel, values: Matrix) -> lis
     """
     if model.effects is not None:
         return Simulation(table, model).responses(values)
-    gains, layout, out = table.gains(values), table.layout, []
-    unit_responses = model.unit_responses(table.dynamics(values))
-    for experiment, units in zip(model.experiments, unit_responses, strict=True):
-        total = np.zeros((len(layout.responses), values.shape[0], units.shape[2]))
-        for i, row in enumerate(layout.unit_of):
-            for j, unit in enumerate(row):
-                total[i] += gains[:, i, j, None] * (experiment.rest[j] + units[unit])
-        out.append(total)
-    return out
+    gains, units = table.gains(values), model.unit_responses(table.dynamics(values))
+    return [
+        deflections(table.layout, experiment.rest, gains, own)
+        for experiment, own in zip(model.experiments, units, strict=True)
+    ]
 
 
 def bands(

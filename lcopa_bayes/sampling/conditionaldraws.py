@@ -10,7 +10,7 @@ proper weight (Naesseth, Lindsten and Schön 2015, Nested sequential Monte Carlo
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
@@ -21,6 +21,7 @@ from scipy.special import logsumexp
 
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.inference.conditional import Conditional, Element, Expanded
+from lcopa_bayes.inference.posterior import Posterior
 
 _WIDER = 1.1
 """Standard deviation of the Gaussians drawn from, over those of the expansion [-]."""
@@ -62,7 +63,7 @@ def kept(conditional: Conditional, at: Expanded, tries: int, rng: np.random.Gene
     coordinates = np.full((batch * tries, posterior.dimension), np.nan)
     prior = np.full(batch * tries, -np.inf)
     if usable.size:
-        inside = np.flatnonzero(_inside(conditional, values[usable]))
+        inside = np.flatnonzero(in_domain(posterior, conditional.columns, values[usable]))
         usable = usable[inside]
         coordinates[usable] = posterior.coordinates(values[usable])
         prior[usable] = posterior.log_prior(coordinates[usable])
@@ -86,11 +87,11 @@ def kept(conditional: Conditional, at: Expanded, tries: int, rng: np.random.Gene
     )
 
 
-def _inside(conditional: Conditional, values: Matrix) -> Flags:
-    """Whether values lie in the domains of the coordinates, (batch,)."""
+def in_domain(posterior: Posterior, columns: Sequence[int], values: Matrix) -> Flags:
+    """Whether table values lie in the domains of the rows `columns`, (batch,)."""
     out = np.ones(len(values), dtype=bool)
-    for k in conditional.columns:
-        low, high = conditional.posterior.table.rows[k].domain
+    for k in columns:
+        low, high = posterior.table.rows[k].domain
         out &= (values[:, k] > low) & (values[:, k] < high)
     return out
 

@@ -98,13 +98,13 @@ def importance(
     chart = Chart.of(posterior)
     chosen = weighty(optima)
     proposal = core = around(posterior, chart, chosen, rng)
-    seen = Seen((), (), ())
+    seen = Seen()
     for effort in plan.efforts:
         if seen.proposals and len(core.means) < _MOST:
             core = split(core, rng)
         for _ in range(effort.rounds):
             y = proposal.draw(effort.learning, rng)
-            seen = seen.joined(proposal, y, charted_density(posterior, chart, y, mapped))
+            seen = seen.joined(proposal, len(y), y, charted_density(posterior, chart, y, mapped))
             log_weights = seen.log_weights()
             if np.isneginf(log_weights).all():
                 break
@@ -117,7 +117,7 @@ def importance(
         weighted = _weighed(posterior, chart, y, density, density - proposal.log_density(y))
         if weighted.good(plan.wanted):
             break
-        seen = seen.joined(proposal, y, density)
+        seen = seen.joined(proposal, len(y), y, density)
     spent = sum(map(len, seen.points)) + (len(y) if weighted.good(plan.wanted) else 0)
     return replace(weighted, modes=len(chosen), evaluations=spent)
 

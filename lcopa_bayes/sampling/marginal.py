@@ -6,15 +6,17 @@ follow, and a narrow mode may hold a tenth of the mass. Given them the rest is n
 the optimum of the rest, give a map of the marginal posterior that omits no region; a mixture fitted to the
 weighted points is the next proposal, and so on (Cornuet, Marin, Mira and Robert 2012, Scand. J. Statist. 39).
 Draws of a last proposal, which knows nothing of them, give the result: their weights are those of whole
-parameter sets, exact whatever the approximations that led to the proposal.
+parameter sets, exact whatever the approximations that led to the proposal. It is the last one once it covers
+all points that were ever seen, and none of its draws is taken away, however many are needed: to stop where
+draws look good would take a mode that was not met for none.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import ceil
-from typing import NamedTuple, TypeAlias, final
+from typing import NamedTuple, final
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -22,24 +24,30 @@ from scipy.special import logsumexp
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
 from lcopa_bayes.core.parallel import Workers
-from lcopa_bayes.inference.conditional import Conditional, screened
+from lcopa_bayes.core.progress import Progress
+from lcopa_bayes.inference.conditional import Conditional
 from lcopa_bayes.inference.leastsquares import LeastSquares
+from lcopa_bayes.inference.optimum import Optimum, again, find_optima
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.sampling.conditionaldraws import kept
 from lcopa_bayes.sampling.ensemble import Ensemble, advance
 from lcopa_bayes.sampling.importanceweights import effective, usable_k
 from lcopa_bayes.sampling.mixture import Mixture, spread_evenly
 from lcopa_bayes.sampling.mixturemoves import learned
-from lcopa_bayes.sampling.outer import Outer, PriorOrders, conditional_of
-from lcopa_bayes.sampling.proposal import Seen, clustered, tempered
+from lcopa_bayes.sampling.outer import Draw, Optima, Outer, PriorOrders
+from lcopa_bayes.sampling.proposal import (
+    Blend,
+    Proposal,
+    Seen,
+    adapted,
+    clustered,
+    paraboloid,
+    tempered,
+    weighty,
+)
 from lcopa_bayes.sampling.weighted import Weighted, resampled
 
-_PILOT = 256
+_PILOT = 128
 """Points from the prior at which delays and noise are estimated."""
-_SCREENED, _DESCENT, _CORRECTION = 16, 8, 4
-"""Prior draws that give a start; steps of a descent from one, and of one that begins at a neighbour."""
-_WARM = 2
-"""Steps of a descent from a neighbour once there are many."""
 _NEIGHBOURS = 6
 """Nearest points among which that of the best optimum gives the start."""
 _PICKED, _HOPELESS = 16, 60.0
@@ -55,15 +63,24 @@ _TRIES = (64, 256)
 """Draws of the rest per point, least and most: more where few of them count."""
 _EFFECTIVE_TRIES = 5.0
 """Effective draws among them that are aimed at."""
-_ROUNDS, _LARGER = 20, 6
-"""Most rounds, and most of them that are larger than for learning."""
-_HELPFUL, _GROWTH = 0.1, 4
-"""Effective draws per draw from which the next round may be larger, and by how many times [-]."""
-_MOST = 10.0
-"""Most points of a round over the effective draws wanted [-]."""
+_OPTIMA, _AGAIN = 2, 4
+"""Starts of the search for optima, and descents from those that have a mass."""
+_AROUND, _WIDER = 0.3, 2.5
+"""Share of the first proposal around optima, and widening of half of it [-]."""
+_ROUNDS, _FAILURES = 18, 3
+"""Most rounds that improve the proposal, and most times that draws of it do not give what is wanted."""
+_HELPFUL = 0.1
+"""Effective draws per draw, by the last round and by all points, from which a proposal is the last [-]."""
+_FEW, _SINGLE = 20.0, (0.2, 0.6)
+"""Effective draws of all points below which these say little of the shape of a posterior, and share of a
+single normal mode where they are more and fewer [-]."""
+_FIRST, _WALKED = 0.1, 0.3
+"""Shares of the first proposal in all others, and of where walkers went in the last one [-]."""
+_MOST = 24.0
+"""Most draws of the last proposal over the effective draws wanted [-]."""
 _VISITED = 6_000
 """Most points that a first proposal is learned from."""
-_TEACHING, _WALKERS, _WALK = 3_000, 256, (20, 5)
+_TEACHING, _WALKERS, _WALK = 3_000, 128, (20, 5)
 """Draws that the moves of walkers are learned from, walkers, and draws kept of each and steps per draw."""
 _LOOKED_AT, _HEAVIER = 1_000, 1.5
 """Points of theirs that are weighted, and factor on the expected mean weight that shows a missed region."""
@@ -95,70 +112,20 @@ class _Point(NamedTuple):
 
 
 @final
-@dataclass(frozen=True)
-class _Optimum:
-    """Task: optimum of the rest from `starts`, or from the best of prior draws where these are None."""
-
-    steps: int
-    pilot: bool = False
-    """Whether delays are fitted in any case."""
-
-    def __call__(
-        self, posterior: Posterior, task: tuple[Matrix, Matrix | None, np.random.SeedSequence]
-    ) -> tuple[Matrix, Vector, Matrix]:
-        """Table values, objective and widths of the coordinates in their natural scale."""
-        values, starts, seed = task
-        conditional = Conditional(posterior, delays=True) if self.pilot else conditional_of(posterior)
-        if starts is None:
-            values = screened(conditional, values, _SCREENED, np.random.default_rng(seed))
-        else:
-            values = values.copy()
-            values[:, conditional.columns] = starts[:, conditional.columns]
-        at, objective = conditional.descended(values, self.steps)
-        return at.values, objective, conditional.uncertainty(at)
-
-
-@final
-@dataclass(frozen=True)
-class _Draw:
-    """Task: optimum of the rest from `starts`, and a draw of it."""
-
-    steps: int
-    tries: int
-
-    def __call__(
-        self, posterior: Posterior, task: tuple[Matrix, Matrix, np.random.SeedSequence]
-    ) -> tuple[Matrix, Vector, Matrix, Vector, Vector, Vector]:
-        """`_Point` without its `y`."""
-        values, starts, seed = task
-        conditional = conditional_of(posterior)
-        values = values.copy()
-        values[:, conditional.columns] = starts[:, conditional.columns]
-        at, objective = conditional.descended(values, self.steps)
-        draw = kept(conditional, at, self.tries, np.random.default_rng(seed))
-        exists = np.isfinite(draw.log_likelihood)
-        density, marginal = np.full(len(values), -np.inf), np.full(len(values), -np.inf)
-        z = draw.coordinates[exists]
-        density[exists] = posterior.log_density(z)
-        error = density[exists] - posterior.log_prior(z) - draw.log_likelihood[exists]
-        marginal[exists] = error + draw.log_evidence[exists]
-        return at.values, objective, draw.coordinates, density, marginal, draw.efficiency
-
-
-Proposal: TypeAlias = "Mixture | PriorOrders"
-
-
-@final
 class Search:
-    """Points, proposals and weights of a search; deterministic given its arguments and what it is asked."""
+    """Points, proposals and weights of a search; deterministic given its arguments and what it is asked.
 
-    def __init__(self, posterior: Posterior, seed: int, crew: Workers[Posterior]) -> None:
+    `bar` counts points and names what is being done.
+    """
+
+    def __init__(self, posterior: Posterior, seed: int, crew: Workers[Posterior], bar: Progress) -> None:
         self.posterior = posterior
+        self._bar = bar
         self.outer = Outer(posterior)
         self._crew = crew
         self._seeds = np.random.SeedSequence(seed, spawn_key=(7_000,))
         self._rng = np.random.default_rng(self._seeds.spawn(1)[0])
-        self._seen = Seen((), (), ())
+        self._seen = Seen()
         self._points: list[_Point] = []
 
     def run(self, wanted: float) -> Weighted | None:
@@ -189,35 +156,64 @@ class Search:
             out.append((z[chosen], density[chosen]))
         return out
 
-    def _improved(self, proposal: Proposal, starts: Matrix, wanted: float) -> Weighted | None:
-        """The same from a proposal, whose points begin at the nearest of the table values `starts`."""
-        count, larger = _LEARNING, 0
+    def _improved(self, first: Proposal, starts: Matrix, wanted: float) -> Weighted | None:
+        """The same from a first proposal, whose points begin at the nearest of the table values `starts`."""
+        proposal, count, failed = first, _LEARNING * self._difficulty, 0
         for number in range(_ROUNDS):
-            weighted = self._round(proposal, count, starts if number == 0 else None)
-            if weighted is None:
+            self._bar.set_description(f"searching for modes, round {number + 1}")
+            own = self._round(proposal, count, starts if number == 0 else None)
+            log_weights = self._seen.log_weights() if own is not None else np.empty(0)
+            if own is None or not np.isfinite(log_weights).any():
                 return None
+            proposal = self._adapted(first, log_weights)
+            share = self._seen.efficiency(proposal, log_weights)
+            if min(own.ess / count, share) >= _HELPFUL:
+                weighted = self._last(proposal, log_weights, share, wanted)
+                if weighted is not None:
+                    return weighted
+                failed += 1
+                if failed == _FAILURES:
+                    return None
+                proposal = self._adapted(first, self._seen.log_weights())
+            count = _LEARNING
+        return None
+
+    @property
+    def _difficulty(self) -> int:
+        """Orders that a first round explores, at most three [-]."""
+        orders = int(np.count_nonzero(self.outer.orders))
+        return orders if 1 <= orders <= 3 else 1
+
+    def _adapted(self, first: Proposal, log_weights: Vector) -> Proposal:
+        """A proposal fitted to all points, in part the first one: what it reached stays in reach."""
+        y, density = (np.concatenate(each) for each in (self._seen.points, self._seen.log_densities))
+        own, single = adapted(y, log_weights, int(self._rng.integers(2**31))), paraboloid(y, density)
+        if single is not None:
+            few = effective(log_weights - logsumexp(log_weights)) < _FEW
+            own = own.blended(single, _SINGLE[int(few)])
+        return Blend(own, first, _FIRST)
+
+    def _last(self, proposal: Proposal, log_weights: Vector, share: float, wanted: float) -> Weighted | None:
+        """Draws of a proposal that knows nothing of them, as many as are needed; None where these are too
+        many, or walkers go where it hardly draws from."""
+        self._bar.set_description("looking for missed modes")
+        walked = self._walked(log_weights)
+        self._bar.set_description("drawing from the posterior")
+        y = spread_evenly(walked, _VISITED)
+        visited = clustered(y, np.zeros(len(y)), int(self._rng.integers(2**31)))
+        proposal, before, count = Blend(proposal, visited, _WALKED), len(self._points), 0
+        needed = _SPARE * wanted / share
+        while count < needed <= _MOST * wanted:
+            # an error that few draws tell is taken larger, so that what is needed falls as they come
+            more = max(_LEARNING, ceil(min(needed, 2 * count) if count else needed) - count)
+            if self._round(proposal, more, None) is None:
+                return None
+            count += more
+            weighted = self._weighted(self._points[before:], proposal, count)
             worth = weighted.smallest_ess(self._rng) if weighted.ess > 2.0 else 0.0
-            enough = worth >= wanted and weighted.pareto_k <= usable_k(weighted.count)
-            walked = self._walked(weighted) if count > _LEARNING or enough else None
-            if enough and walked is not None and not self._misses(proposal, weighted, walked):
-                return weighted
-            larger += count > _LEARNING
-            if larger == _LARGER:
-                return None
-            log_weights = self._seen.log_weights()
-            if not np.isfinite(log_weights).any():
-                return None
-            proposal = clustered(
-                np.concatenate(self._seen.points), log_weights, int(self._rng.integers(2**31))
-            )
-            if walked is not None:
-                y = spread_evenly(walked, _VISITED)
-                own = clustered(y, np.zeros(len(y)), int(self._rng.integers(2**31)))
-                proposal = proposal.blended(own, 0.5)
-            # a larger round only where the proposal is close to the posterior
-            needed = int(min(_SPARE * count / max(worth, 1.0), _MOST) * wanted)
-            more = min(needed, _GROWTH * count) if weighted.ess >= _HELPFUL * count else 0
-            count = max(_LEARNING, more)
+            if worth >= wanted and weighted.pareto_k <= usable_k(count):
+                return None if self._misses(proposal, weighted, walked) else weighted
+            needed = max(_SPARE * count * wanted / max(worth, 1.0), count + 1.0)
         return None
 
     def _round(self, proposal: Proposal, count: int, starts: Matrix | None) -> Weighted | None:
@@ -230,15 +226,21 @@ class Search:
             return None
         point = self._evaluated(y[usable], values[usable], starts)
         self._points.append(point)
-        self._seen = self._seen.joined(proposal, point.y, point.log_marginal)
-        raw = self._seen.last_weights()
-        exists = np.isfinite(raw)
-        kept_draws = point.coordinates[exists], point.log_density[exists], raw[exists]
-        return Weighted.of(self.posterior, *kept_draws, count, smooth=False)
+        self._seen = self._seen.joined(proposal, count, point.y, point.log_marginal)
+        return self._weighted([point], proposal, count)
 
-    def _walked(self, weighted: Weighted) -> Matrix:
+    def _weighted(self, points: Sequence[_Point], proposal: Proposal, count: int) -> Weighted:
+        """Points as draws of a proposal, out of `count`."""
+        z = np.concatenate([one.coordinates for one in points])
+        density = np.concatenate([one.log_density for one in points])
+        raw = np.concatenate([one.log_marginal - proposal.log_density(one.y) for one in points])
+        exists = np.isfinite(raw)
+        return Weighted.of(self.posterior, z[exists], density[exists], raw[exists], count, smooth=False)
+
+    def _walked(self, log_weights: Vector) -> Matrix:
         """Where emcee goes from draws of equal weight, (points, size): into what no draw has met."""
-        z = weighted.coordinates[weighted.resampled(_TEACHING, self._rng)]
+        known = np.concatenate([point.coordinates for point in self._points])
+        z = known[resampled(log_weights, _TEACHING, self._rng)]
         mixture = learned(self.posterior, [z[None]], int(self._rng.integers(2**31)))
         walkers = max(_WALKERS, 2 * self.posterior.dimension + 2)
         seed = np.random.SeedSequence(int(self._rng.integers(2**31)))
@@ -261,37 +263,40 @@ class Search:
             known = np.concatenate([point.y for point in self._points])
             optima = np.concatenate([point.values for point in self._points])
             objective = np.concatenate([point.objective for point in self._points])
-            begin, steps = optima[_best_near(y, known, objective)], _WARM
+            begin = optima[_best_near(y, known, objective)]
         else:
             begin = starts[_nearest(y, self.outer.y(starts), 1)[:, 0]]
-            begin, objective, _ = self._done(_Optimum(_DESCENT), values, begin)
-            begin, steps = begin[_best_near(y, y, objective)], _CORRECTION
+            begin, objective, _ = self._done(Optima(), values, begin)
+            begin = begin[_best_near(y, y, objective)]
         efficiency = [float(np.median(point.efficiency)) for point in self._points[-1:]]
         tries = int(np.clip(_EFFECTIVE_TRIES / max(*efficiency, 1e-3), *_TRIES)) if efficiency else _TRIES[0]
-        optimum, level, z, density, marginal, share = self._done(_Draw(steps, tries), values, begin)
+        optimum, level, z, density, marginal, share = self._done(Draw(tries), values, begin)
         marginal += self.posterior.table.log_permutations
         return _Point(y, optimum, level, z, density, marginal, share)
 
-    def _done(self, task: _Optimum | _Draw, values: Matrix, starts: Matrix | None) -> list[Matrix]:
+    def _done(self, task: Optima | Draw, values: Matrix, starts: Matrix | None) -> list[Matrix]:
         """A task for all points, by the workers."""
         count = max(1, ceil(len(values) / _TASK))
         begins: Sequence[Matrix | None] = [None] * count if starts is None else np.array_split(starts, count)
         tasks = zip(np.array_split(values, count), begins, self._seeds.spawn(count), strict=True)
-        parts = list(self._crew.each(task, list(tasks)))  # type: ignore[arg-type]
+        parts = []
+        for part in self._crew.each(task, list(tasks)):  # type: ignore[arg-type]
+            parts.append(part)
+            self._bar.update(len(part[0]))
         return [np.concatenate(each) for each in zip(*parts, strict=True)]
 
     def _first(self) -> tuple[Proposal, Matrix]:
         """A proposal from the prior of the orders and estimates of delays and noise; optima to start from."""
         outer, posterior = self.outer, self.posterior
         values = self._nearly_white(posterior.table.draw(_PILOT, self._rng))
-        pilot = _Optimum(_DESCENT, pilot=True)
+        pilot = Optima(pilot=True)
         values, objective, _ = self._done(pilot, values, None)
         if outer.orders.any():
             orders = outer.y(values)[:, outer.orders]
             begin = values[_best_near(orders, orders, objective)]
-            values, objective, _ = self._done(replace(pilot, steps=_CORRECTION), values, begin)
+            values, objective, _ = self._done(pilot, values, begin)
         if outer.orders.all():
-            return PriorOrders(outer, None), values
+            return self._with_optima(PriorOrders(outer, None), values)
         weights = tempered(objective, _PICKED)
         chosen = values[np.unique(self._rng.choice(len(values), _PICKED, p=weights))]
         for _ in range(2):
@@ -314,7 +319,24 @@ class Search:
             np.concatenate([at, at.mean(axis=0)[None]]),
             np.concatenate([[np.diag(one) for one in width], [np.diag(spread)]]),
         )
-        return (PriorOrders(outer, rest) if outer.orders.any() else rest), np.concatenate([values, chosen])
+        return self._with_optima(
+            PriorOrders(outer, rest) if outer.orders.any() else rest, np.concatenate([values, chosen])
+        )
+
+    def _with_optima(self, proposal: Proposal, values: Matrix) -> tuple[Proposal, Matrix]:
+        """A proposal, in part around least-squares optima, and points to start from with these."""
+        optima: Sequence[Optimum] = weighty(find_optima(self.posterior, self._rng, starts=_OPTIMA))
+        if not optima:
+            return proposal, values
+        for _ in range(_AGAIN):  # plant and correlated noise, found in turn, draw each other along
+            optima = again(self.posterior, optima)
+        places = self.outer.places
+        shapes = [one.covariance[np.ix_(places, places)] for one in optima]
+        factors = [np.linalg.cholesky(one + 1e-9 * np.diag(np.diag(one))) for one in shapes]
+        known = np.array([one.values for one in optima])
+        around = Mixture(np.full(len(optima), 1 / len(optima)), self.outer.y(known), np.array(factors))
+        wider = replace(around, factors=_WIDER * around.factors)
+        return Blend(proposal, around.blended(wider, 0.5), _AROUND), np.concatenate([values, known])
 
     def _nearly_white(self, values: Matrix) -> Matrix:
         """With noise of a twentieth of the responses' spread where it is free."""

@@ -1,4 +1,5 @@
-"""The parameters that a search draws first: orders, noise, and delays under correlated noise."""
+"""The parameters that a search draws first, orders, noise, and delays under correlated noise; and the tasks
+that find the rest given these."""
 
 from __future__ import annotations
 
@@ -9,9 +10,14 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Flags, Index, Matrix, Vector
-from lcopa_bayes.inference.conditional import Conditional
+from lcopa_bayes.inference.conditional import Conditional, screened
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.sampling.conditionaldraws import in_domain, kept
 from lcopa_bayes.sampling.mixture import Mixture
+
+_SCREENED, _DESCENT = 16, 12
+"""Prior draws that give a start, and most steps of a descent: a draw of a point that is short of its optimum
+has hardly any weight, and a narrow mode whose points are stays unseen."""
 
 
 def conditional_of(posterior: Posterior) -> Conditional:
@@ -64,10 +70,7 @@ class Outer:
 
     def inside(self, values: Matrix) -> Flags:
         """Whether table values lie inside the prior, orders decreasing."""
-        out: Flags = np.ones(len(values), dtype=bool)
-        for k in self.columns:
-            low, high = self.posterior.table.rows[k].domain
-            out &= (values[:, k] > low) & (values[:, k] < high)
+        out = in_domain(self.posterior, self.columns, values)
         for element in conditional_of(self.posterior).elements:
             out &= (np.diff(values[:, element.orders], axis=1) <= 0).all(axis=1)
         return out
@@ -103,3 +106,58 @@ class PriorOrders:
                 total += row.log_prior(values[:, k]) + (np.log(values[:, k]) if row.log_scale else 0.0)
         total += table.log_permutations
         return total if self.rest is None else total + self.rest.log_density(y[:, ~outer.orders])
+
+
+@final
+@dataclass(frozen=True)
+class Optima:
+    """Task: optimum of the rest from `starts`, or from the best of prior draws where these are None."""
+
+    pilot: bool = False
+    """Whether delays are fitted in any case."""
+
+    def __call__(
+        self, posterior: Posterior, task: tuple[Matrix, Matrix | None, np.random.SeedSequence]
+    ) -> tuple[Matrix, Vector, Matrix]:
+        """Table values, objective and widths of the coordinates in their natural scale."""
+        values, starts, seed = task
+        conditional = Conditional(posterior, delays=True) if self.pilot else conditional_of(posterior)
+        if starts is None:
+            values = screened(conditional, values, _SCREENED, np.random.default_rng(seed))
+        else:
+            values = _begun(conditional, values, starts)
+        at, objective = conditional.descended(values, _DESCENT)
+        return at.values, objective, conditional.uncertainty(at)
+
+
+@final
+@dataclass(frozen=True)
+class Draw:
+    """Task: optimum of the rest from `starts`, and a draw of it."""
+
+    tries: int
+    """Draws of the rest of which one is kept."""
+
+    def __call__(
+        self, posterior: Posterior, task: tuple[Matrix, Matrix, np.random.SeedSequence]
+    ) -> tuple[Matrix, Vector, Matrix, Vector, Vector, Vector]:
+        """Table values and objective of the optimum; coordinates and log density of the draw, log of the
+        marginal of prior times likelihood, permutations not counted, and efficiency."""
+        values, starts, seed = task
+        conditional = conditional_of(posterior)
+        at, objective = conditional.descended(_begun(conditional, values, starts), _DESCENT)
+        draw = kept(conditional, at, self.tries, np.random.default_rng(seed))
+        exists = np.isfinite(draw.log_likelihood)
+        density, marginal = np.full(len(values), -np.inf), np.full(len(values), -np.inf)
+        z = draw.coordinates[exists]
+        density[exists] = posterior.log_density(z)
+        error = density[exists] - posterior.log_prior(z) - draw.log_likelihood[exists]
+        marginal[exists] = error + draw.log_evidence[exists]
+        return at.values, objective, draw.coordinates, density, marginal, draw.efficiency
+
+
+def _begun(conditional: Conditional, values: Matrix, starts: Matrix) -> Matrix:
+    """Table values with what is integrated out as in `starts`."""
+    out = values.copy()
+    out[:, conditional.columns] = starts[:, conditional.columns]
+    return out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, final
@@ -9,6 +10,7 @@ from typing import Protocol, final
 import numpy as np
 from scipy.special import logsumexp
 from sklearn.cluster import KMeans
+from sklearn.exceptions import ConvergenceWarning
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.inference.optimum import Optimum
@@ -49,6 +51,12 @@ _EQUAL = 6
 """Largest weights for each dimension that are made equal (Koblents and Miguez 2015) [-]."""
 _LEVELLED, _WIDE = 0.3, 0.15
 """Share of such a proposal whose clusters have equal weights, and of one that is wider [-]."""
+_HEAVIEST, _NEAR, _SHARPENED = 12, 7, 0.4
+"""Heaviest draws that get a component of their own, draws for each dimension that give its width, and share
+of such components [-]."""
+_PER_COEFFICIENT, _NEARLY, _BEYOND = 4, 3.0, 2.0
+"""Least points for each coefficient of a quadratic [-], how far below the highest those lie, per dimension,
+that are used in any case [nat], and how far beyond their spread it may lead [-]."""
 
 
 def weighty(optima: Sequence[Optimum]) -> list[Optimum]:
@@ -58,7 +66,7 @@ def weighty(optima: Sequence[Optimum]) -> list[Optimum]:
     ]
     finite = [mass if np.isfinite(mass) else -np.inf for mass in masses]
     chosen = [o for o, mass in zip(optima, finite, strict=True) if mass >= max(finite) - _NEGLIGIBLE]
-    return chosen or [optima[0]]
+    return chosen or list(optima[:1])
 
 
 def around(
@@ -104,11 +112,36 @@ def _charted(posterior: Posterior, chart: Chart, z: Matrix) -> Matrix:
     return chart.usable(z[posterior.log_prior(z) > -np.inf])[1]
 
 
-class HasDensity(Protocol):
-    """A proposal whose density can be evaluated."""
+class Proposal(Protocol):
+    """A density that can be drawn from."""
+
+    def draw(self, count: int, rng: np.random.Generator, /) -> Matrix:
+        """Independent draws, (count, dimension)."""
 
     def log_density(self, points: Matrix, /) -> Vector:
         """Log density, (n,)."""
+
+
+@final
+@dataclass(frozen=True)
+class Blend:
+    """A proposal that is in part another."""
+
+    main: Proposal
+    other: Proposal
+    share: float
+    """Of the other [-]."""
+
+    def draw(self, count: int, rng: np.random.Generator) -> Matrix:
+        """Independent draws, (count, dimension), in random order."""
+        others = rng.binomial(count, self.share)
+        parts = self.main.draw(count - others, rng), self.other.draw(others, rng)
+        return np.asarray(rng.permutation(np.concatenate(parts)))
+
+    def log_density(self, points: Matrix) -> Vector:
+        """Log density, (n,)."""
+        both = self.main.log_density(points), self.other.log_density(points)
+        return np.asarray(np.logaddexp(np.log1p(-self.share) + both[0], np.log(self.share) + both[1]))
 
 
 @final
@@ -117,23 +150,40 @@ class Seen:
     """Draws of all proposals so far, weighted as draws of their mixture (Cornuet, Marin, Mira and Robert
     2012, Scand. J. Statist. 39)."""
 
-    proposals: tuple[HasDensity, ...]
-    points: tuple[Matrix, ...]
-    log_densities: tuple[Vector, ...]
+    proposals: tuple[Proposal, ...] = ()
+    counts: tuple[int, ...] = ()
+    """Draws of each, those without density included."""
+    points: tuple[Matrix, ...] = ()
+    log_densities: tuple[Vector, ...] = ()
 
-    def joined(self, proposal: HasDensity, y: Matrix, log_density: Vector) -> Seen:
-        """With the draws of another proposal."""
-        return Seen((*self.proposals, proposal), (*self.points, y), (*self.log_densities, log_density))
+    def joined(self, proposal: Proposal, count: int, y: Matrix, log_density: Vector) -> Seen:
+        """With the draws y of another proposal, those of `count` that may have a density."""
+        return Seen(
+            (*self.proposals, proposal),
+            (*self.counts, count),
+            (*self.points, y),
+            (*self.log_densities, log_density),
+        )
 
     def last_weights(self) -> Vector:
         """Of the last proposal's draws, as draws of it alone [nat]."""
         return np.asarray(self.log_densities[-1] - self.proposals[-1].log_density(self.points[-1]))
 
     def log_weights(self) -> Vector:
-        """Log density of each point, not normalised [nat]."""
+        """Log of the density of each point over that of the mixture of proposals [nat]; their mean over all
+        draws is that of the density's integral."""
         y = np.concatenate(self.points)
         each = np.array([proposal.log_density(y) for proposal in self.proposals])
-        return np.asarray(np.concatenate(self.log_densities) - logsumexp(each, axis=0))
+        shares = np.array(self.counts)[:, None] / sum(self.counts)
+        return np.asarray(np.concatenate(self.log_densities) - logsumexp(each, axis=0, b=shares))
+
+    def efficiency(self, proposal: Proposal, log_weights: Vector) -> float:
+        """Effective draws per draw of a proposal, by all points and their `log_weights` [-]: a region that it
+        hardly draws from shows if ever a point lay there."""
+        density = np.concatenate(self.log_densities)
+        ratio = density - proposal.log_density(np.concatenate(self.points))
+        total = logsumexp(log_weights)
+        return float(np.exp(2 * total - np.log(sum(self.counts)) - logsumexp(log_weights + ratio)))
 
 
 def fitted(core: Mixture, y: Matrix, log_weights: Vector) -> tuple[Mixture, Mixture]:
@@ -163,6 +213,57 @@ def clustered(y: Matrix, log_weights: Vector, seed: int) -> Mixture:
     core = cloud.maximised(cloud.clusters(count, seed), _CLUSTER_STEPS)
     wider = replace(core.levelled(), factors=_WIDER * core.factors).blended(cloud.around_all, 0.3)
     return core.blended(core.levelled(), _LEVELLED).blended(wider, _WIDE)
+
+
+def adapted(y: Matrix, log_weights: Vector, seed: int) -> Mixture:
+    """A proposal of clusters of weighted draws and of components at the heaviest draws, which the proposals
+    so far hardly cover (Raftery and Bao 2010, Biometrics 66)."""
+    return clustered(y, log_weights, seed).blended(_at_heaviest(y, log_weights), _SHARPENED)
+
+
+def _at_heaviest(y: Matrix, log_weights: Vector) -> Mixture:
+    """Components at the heaviest draws, none near another, each as wide as the draws nearest to it."""
+    weights = np.exp(log_weights - logsumexp(log_weights))
+    cloud = _Cloud.of(y, weights, _LEAST_SIZE)
+    y, open_to = cloud.y, cloud.weights.copy()
+    scaled = np.linalg.solve(np.linalg.cholesky(cloud.whole + cloud.floor), y.T).T
+    near, means, factors = _NEAR * y.shape[1], list[Vector](), list[Matrix]()
+    while len(means) < _HEAVIEST and open_to.any():
+        at = int(np.argmax(open_to))
+        chosen = np.argsort(((scaled - scaled[at]) ** 2).sum(axis=1), kind="stable")[:near]
+        own = cloud.weights[chosen]
+        own = 0.5 * (own / own.sum() + 1 / own.size)
+        apart = y[chosen] - y[at]
+        means.append(y[at])
+        factors.append(np.linalg.cholesky((own[:, None] * apart).T @ apart + cloud.floor))
+        open_to[chosen[: near // 2]] = 0.0
+    return Mixture(np.full(len(means), 1 / len(means)), np.array(means), np.array(factors))
+
+
+def paraboloid(y: Matrix, log_density: Vector) -> Mixture | None:
+    """A component with the mode and curvature of a quadratic fitted to the highest log densities: it moves
+    and turns towards a single mode where hardly a draw has any weight. None with too few points."""
+    size = y.shape[1]
+    first, second = np.triu_indices(size)
+    wanted = _PER_COEFFICIENT * (1 + size + first.size)
+    if np.count_nonzero(np.isfinite(log_density)) < wanted:
+        return None
+    near = np.count_nonzero(log_density > log_density.max() - _NEARLY * (1 + size))
+    best = np.argsort(-log_density, kind="stable")[: max(wanted, near)]
+    centre, scale = y[best].mean(axis=0), y[best].std(axis=0) + 1e-300
+    x, level = (y[best] - centre) / scale, log_density[best] - log_density[best[0]]
+    terms = np.column_stack([np.ones(best.size), x, x[:, first] * x[:, second]])
+    counted = 1.0 / (1.0 - level / size)  # far below the highest a density is not quadratic
+    fit = np.linalg.lstsq(counted[:, None] * terms, counted * level, rcond=None)[0]
+    curved = np.zeros((size, size))
+    curved[first, second] = fit[1 + size :]
+    steep, axes = np.linalg.eigh(-(curved + curved.T))
+    # no direction wider than the points, and no mode beyond them
+    spread = np.sqrt(((x @ axes) ** 2).mean(axis=0)) + 1e-150
+    precision = np.maximum(steep, 1.0 / (_BEYOND * spread) ** 2)
+    mode = np.clip(axes.T @ fit[1 : 1 + size] / precision, -_BEYOND * spread, _BEYOND * spread)
+    factor = np.linalg.cholesky((axes / precision) @ axes.T)
+    return Mixture(np.ones(1), (centre + scale * (axes @ mode))[None], (scale[:, None] * factor)[None])
 
 
 @final
@@ -199,7 +300,10 @@ class _Cloud:
         """A component for each of `count` clusters of the draws."""
         y, masses, means, factors = self.y, [], [], []
         scaled = y / np.sqrt(np.diag(self.floor))
-        labels = KMeans(count, n_init=3, random_state=seed).fit(scaled, sample_weight=self.weights).labels_
+        found = KMeans(count, n_init=3, random_state=seed)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConvergenceWarning)  # clusters without a draw are omitted below
+            labels = found.fit(scaled, sample_weight=self.weights).labels_
         for cluster in range(count):
             own = self.weights * (labels == cluster)
             if own.sum() > _NO_MASS:

@@ -38,6 +38,8 @@ def test_a_long_interval_keeps_a_log_short(capsys):
 
 def test_quiet_shows_nothing(at_once, capsys):
     with Progress(total=4, unit="round", desc="sampling", quiet=True) as bar:
+        bar.set_description("other")
+        bar.set_postfix(ess="12")
         bar.update(4)
     assert lines(capsys) == []
 

@@ -12,13 +12,14 @@ from scipy.special import logsumexp
 from small import TRUTH, Toy, problem, record
 
 from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.inference.conditional import Conditional, Expanded
-from lcopa_bayes.sampling import marginal
+from lcopa_bayes.sampling import marginal, outer
 from lcopa_bayes.sampling.conditionaldraws import Kept, kept
 from lcopa_bayes.sampling.marginal import Search
 from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.outer import Outer, PriorOrders, applies
-from lcopa_bayes.sampling.proposal import Seen, clustered, tempered
+from lcopa_bayes.sampling.proposal import Blend, Seen, adapted, clustered, paraboloid, tempered
 
 GAIN = {"gain": ("loguniform", {"a": 0.5, "b": 5.0})}
 PLAIN_GAIN = {"gain": ("gamma", {"a": 4.0, "scale": 0.5})}
@@ -85,13 +86,15 @@ def test_the_draw_kept_follows_the_conditional_posterior():
 
 def test_a_proposal_of_orders_from_their_prior_has_their_density(rng):
     posterior = problem(record(camera=1.0), terms=2).posterior
-    outer = Outer(posterior)
-    rest = Mixture(np.ones(1), np.zeros((1, np.sum(~outer.orders))), np.eye(np.sum(~outer.orders))[None])
-    proposal = PriorOrders(outer, rest)
+    searched = Outer(posterior)
+    rest = Mixture(
+        np.ones(1), np.zeros((1, np.sum(~searched.orders))), np.eye(np.sum(~searched.orders))[None]
+    )
+    proposal = PriorOrders(searched, rest)
     y = proposal.draw(4_000, rng)
-    orders = y[:, outer.orders]
+    orders = y[:, searched.orders]
     assert (np.diff(orders, axis=1) <= 0).all()
-    own = rest.log_density(y[:, ~outer.orders])
+    own = rest.log_density(y[:, ~searched.orders])
     # the two orders are uniform over half of a square of area 4
     assert_allclose(proposal.log_density(y) - own, -np.log(2.0), rtol=1e-12)
     assert abs(np.mean(orders[:, 0] < 1.0) - 0.25) < 4 * np.sqrt(0.25 * 0.75 / 4_000)
@@ -114,9 +117,9 @@ def search_of(log_density, seed: int) -> Search:
     toy = Toy(log_density, {"a": WIDE, "b": WIDE})
     search = Search.__new__(Search)
     search.posterior, search._rng = toy, np.random.default_rng(seed)
-    search._seen, search._points = Seen((), (), ()), []
+    search._seen, search._points, search._bar = Seen(), [], Progress(quiet=True)
     every = lambda y: np.ones(len(y), dtype=bool)  # noqa: E731
-    search.outer = SimpleNamespace(values=lambda y: y, y=lambda y: y, inside=every)
+    search.outer = SimpleNamespace(values=lambda y: y, y=lambda y: y, inside=every, orders=np.zeros(2))
     search._evaluated = lambda y, values, starts: marginal._Point(
         y, y, log_density(y), y, log_density(y), log_density(y), np.ones(len(y))
     )
@@ -141,14 +144,82 @@ def test_a_narrow_mode_beside_a_curved_valley_has_its_share():
     assert low < np.mean(np.square(evidence)) < high
 
 
-def test_a_search_gives_up_where_no_proposal_comes_near():
+def test_a_search_gives_up_where_no_proposal_comes_near(monkeypatch):
     """Spikes a thousand times narrower than what a round can find."""
+    monkeypatch.setattr(marginal, "_ROUNDS", 6)
 
     def spikes(y):
         return -0.5 * ((np.sin(500 * y[:, 0]) / 1e-3) ** 2 + (np.sin(500 * y[:, 1]) / 1e-3) ** 2)
 
     first = Mixture(np.ones(1), np.zeros((1, 2)), np.eye(2)[None])
     assert search_of(spikes, 1)._improved(first, np.empty((0, 2)), 500) is None
+
+
+def normal(mean: float, sd: float) -> Mixture:
+    """One component of two dimensions."""
+    return Mixture(np.ones(1), np.full((1, 2), mean), sd * np.eye(2)[None])
+
+
+def target(y):
+    """Log density of two independent normals, times 5."""
+    return np.log(5.0) + stats.norm(0.5, 1.0).logpdf(y).sum(axis=1)
+
+
+def test_draws_of_unequal_rounds_are_weighted_as_draws_of_their_mixture(rng):
+    """A narrow proposal drawn from twenty times as often does not take the mass of the other's region."""
+    seen = Seen()
+    for proposal, count in ((normal(0.0, 2.0), 2_000), (normal(-1.0, 0.5), 40_000)):
+        y = proposal.draw(count, rng)
+        seen = seen.joined(proposal, count, y, target(y))
+    raw = np.exp(seen.log_weights())
+    assert abs(raw.mean() - 5.0) < 4 * raw.std() / np.sqrt(raw.size)
+    weights, x = raw / raw.sum(), np.concatenate(seen.points)[:, 0]
+    mean = weights @ x
+    assert abs(mean - 0.5) < 4 * np.sqrt(weights**2 @ (x - mean) ** 2)
+    assert np.sqrt(weights**2 @ (x - mean) ** 2) < 0.04
+
+
+def test_a_proposal_is_as_efficient_as_draws_of_it_are(rng):
+    wide, own = normal(0.0, 3.0), normal(0.5, 1.0)
+    y = wide.draw(20_000, rng)
+    seen = Seen().joined(wide, 20_000, y, target(y))
+    drawn = own.draw(20_000, rng)
+    raw = target(drawn) - own.log_density(drawn)
+    by_draws = np.exp(2 * logsumexp(raw) - logsumexp(2 * raw)) / 20_000
+    assert seen.efficiency(own, seen.log_weights()) == pytest.approx(by_draws, rel=0.1)
+    # what it does not cover shows although no draw of it lies there
+    elsewhere = normal(-3.0, 0.3)
+    assert seen.efficiency(elsewhere, seen.log_weights()) < 0.01
+
+
+def test_a_blend_has_the_density_of_its_draws(rng):
+    blend = Blend(normal(0.0, 1.0), normal(6.0, 0.5), 0.25)
+    y = blend.draw(40_000, rng)
+    assert abs(np.mean(y[:, 0] > 3.5) - 0.25) < 0.015
+    raw = target(y) - blend.log_density(y)
+    assert abs(np.exp(raw).mean() - 5.0) < 4 * np.exp(raw).std() / 200
+
+
+def test_a_few_heavy_draws_far_from_all_others_are_covered(rng):
+    """As of a narrow mode met for the first time, after many draws of a wide one."""
+    y = np.concatenate([rng.standard_normal((4_000, 2)), [4.0, -1.5] + 0.1 * rng.standard_normal((3, 2))])
+    log_weights = np.log(np.append(np.full(4_000, 0.9 / 4_000), np.full(3, 0.1 / 3)))
+    there = y[-3:]
+    assert (adapted(y, log_weights, 1).log_density(there) > -5.0).all()
+    assert (clustered(y, log_weights, 1).log_density(there) < -7.0).all()
+
+
+def test_a_quadratic_finds_a_mode_that_no_draw_is_near(rng):
+    """From draws twenty standard deviations away: a little nearer each time, then exactly."""
+    mean, factor = np.array([3.0, -2.0]), np.array([[0.3, 0.0], [0.27, 0.1]])
+    log_density = lambda y: -0.5 * (np.linalg.solve(factor, (y - mean).T) ** 2).sum(axis=0)  # noqa: E731
+    y = 0.3 * rng.standard_normal((400, 2))
+    for _ in range(16):
+        single = paraboloid(y, log_density(y))
+        y = np.concatenate([y, single.draw(200, rng)])
+    assert_allclose(single.means[0], mean, atol=1e-6)
+    assert_allclose(single.factors[0] @ single.factors[0].T, factor @ factor.T, rtol=1e-6)
+    assert paraboloid(y[:20], log_density(y[:20])) is None
 
 
 def test_tempered_weights_have_the_effective_draws_wanted(rng):
@@ -165,7 +236,7 @@ def test_a_search_agrees_with_quadrature(seed):
     fixed = {key: TRUTH[key] for key in ("delay", "offset")} | {"sigma": 0.1, "time_1": TIMES["time_1"]}
     posterior = problem(record(camera=0.6, noise_sd=0.1), priors=fixed).posterior
     with workers(posterior) as crew:
-        weighted = Search(posterior, seed, crew).run(800)
+        weighted = Search(posterior, seed, crew, Progress(quiet=True)).run(800)
     assert weighted is not None
     place = posterior.sampled.index(posterior.table.at("order", 0))
     times, orders = np.linspace(np.log(0.4), np.log(5.0), 120), np.linspace(0.3, 1.6, 120)
@@ -206,9 +277,9 @@ def test_a_search_without_a_single_draw_gives_nothing(monkeypatch):
         size, least = conditional.posterior.dimension, np.full(len(at.values), -np.inf)
         return Kept(np.full((least.size, size), np.nan), least, least, np.zeros(least.size))
 
-    monkeypatch.setattr(marginal, "kept", none)
+    monkeypatch.setattr(outer, "kept", none)
     posterior = problem(record(camera=1.0), terms=1, priors={"sigma": 0.05}).posterior
     with workers(posterior) as crew:
-        search = Search(posterior, 1, crew)
+        search = Search(posterior, 1, crew, Progress(quiet=True))
         assert search.run(100.0) is None
         assert search.population(4, 10) == []

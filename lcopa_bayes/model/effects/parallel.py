@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import ceil
 from types import MappingProxyType
 from typing import ClassVar, Self, final
 
 import numpy as np
 from scipy.signal import fftconvolve
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.effects.effect import Card, Coefficient, ParallelEffect, Ranges, Scene, single
 from lcopa_bayes.model.layout import Layout
@@ -20,19 +21,27 @@ _MANY = 64
 _ROUNDING = 1e-4
 """How far printed times may lie from an even grid [periods]."""
 
+_SPARSE = 10
+"""Places of a grid per sample, or per place of it of a finer one, above which it is not worth filling [-]."""
+
 
 def summed(
     times: Vector, drive: AxisDrive, delay: float, jumps: Vector, shape: Callable[[Array], Array]
 ) -> Vector:
     """``sum_k jumps_k shape(t - t_k - delay)``, (samples,); shape is 0 before 0.
 
-    Many changes under evenly spaced samples are one convolution: a change between two samples is then shared
-    by them, which is of second order in the sampling period and exact for changes at samples. Changes that
-    follow each other faster than the samples are summed one at a time: for them the samples are too coarse.
+    Many changes under samples of an even grid, some of which may be missing, are one convolution: a change
+    between two places of the grid is then shared by them, which is of second order in its period and exact
+    for changes at samples. Under changes that follow each other faster the grid is as many times finer.
     Changes may begin long before the first sample, as where a transient was not read.
     """
-    if min(drive.times.size, times.size) > _MANY and _even(times) and _slower(drive.times, times):
-        return _convolved(times, drive.times, delay, jumps, shape)
+    if min(drive.times.size, times.size) > _MANY and (grid := _grid(times)) is not None:
+        places, period = grid
+        finer = ceil(period * (1 - _ROUNDING) * (drive.times.size - 1) / np.ptp(drive.times))
+        if finer <= _SPARSE:
+            size = finer * int(places[-1]) + 1
+            dense = _convolved(times[0], period / finer, size, drive.times, delay, jumps, shape)
+            return np.asarray(dense[finer * places])
     out = np.zeros(times.size)
     for at, jump in zip(drive.times + delay, jumps, strict=True):
         if jump != 0.0:
@@ -41,33 +50,36 @@ def summed(
     return out
 
 
-def _even(times: Vector) -> bool:
-    """Whether samples are evenly spaced."""
-    even = np.linspace(times[0], times[-1], times.size)
-    return bool(np.abs(times - even).max() < _ROUNDING * (times[-1] - times[0]) / (times.size - 1))
-
-
-def _slower(changes: Vector, times: Vector) -> bool:
-    """Whether changes follow each other no faster, on average, than samples."""
-    apart, period = np.ptp(changes) / (changes.size - 1), np.ptp(times) / (times.size - 1)
-    return bool(apart >= period * (1 - _ROUNDING))
+def _grid(times: Vector) -> tuple[Index, float] | None:
+    """Places of samples on an even grid that begins at the first, and its period; None where they lie on none
+    or fill little of it."""
+    places = np.round((times - times[0]) / np.median(np.diff(times))).astype(np.intp)
+    period = (times[-1] - times[0]) / max(int(places[-1]), 1)
+    even = np.abs(times - times[0] - period * places).max() < _ROUNDING * period
+    return (places, float(period)) if even and places[-1] <= _SPARSE * times.size else None
 
 
 def _convolved(
-    times: Vector, changes: Vector, delay: float, jumps: Vector, shape: Callable[[Array], Array]
+    start: float,
+    period: float,
+    size: int,
+    changes: Vector,
+    delay: float,
+    jumps: Vector,
+    shape: Callable[[Array], Array],
 ) -> Vector:
-    period = (times[-1] - times[0]) / (times.size - 1)
-    place = (changes - times[0]) / period
+    """The sum at ``start + period (0, 1, ..., size - 1)``, (size,)."""
+    place = (changes - start) / period
     place = np.where(np.abs(place - np.round(place)) < _ROUNDING, np.round(place), place)
     below = np.floor(place).astype(np.intp)
     begin = min(int(below[0]), 0)
-    dense = np.zeros(max(int(below[-1]) + 2, times.size) - begin)
+    dense = np.zeros(max(int(below[-1]) + 2, size) - begin)
     np.add.at(dense, below - begin, jumps * (1 - (place - below)))
     np.add.at(dense, below + 1 - begin, jumps * (place - below))
-    lags = np.arange(dense.size) * period - delay
+    lags: Vector = np.arange(dense.size, dtype=float) * period - delay
     kernel = np.zeros(lags.size)
     kernel[lags >= 0] = shape(lags[lags >= 0])
-    return np.asarray(fftconvolve(kernel, dense)[-begin : times.size - begin])
+    return np.asarray(fftconvolve(kernel, dense)[-begin : size - begin])
 
 
 def relaxing(time: float) -> Callable[[Array], Array]:

@@ -20,7 +20,7 @@ from lcopa_bayes.model.effects.effect import (
     SensorEffect,
     UnstableError,
 )
-from lcopa_bayes.model.forward import Dynamics, Experiment, ForwardModel, StepResponses
+from lcopa_bayes.model.forward import Dynamics, Experiment, ForwardModel, StepResponses, deflections
 from lcopa_bayes.model.layout import Layout
 from lcopa_bayes.model.powerseries import Spectrum
 from lcopa_bayes.model.transfer import transfer
@@ -74,18 +74,9 @@ def linear(
     """Every record of the linear plant, by the forward model; `known` as there."""
     responses = model.unit_responses(plant.dynamics, known)
     return [
-        Moved(scene, deflections(model.layout, scene, plant.gains, units[:, 0]))
+        Moved(scene, deflections(model.layout, scene.rest, plant.gains[None], units)[:, 0].T)
         for scene, units in zip(scenes, responses, strict=True)
     ]
-
-
-def deflections(layout: Layout, scene: Scene, gains: Matrix, units: Matrix) -> Matrix:
-    """Deflections of a linear plant, (samples, axes), from its unit responses, (units, samples)."""
-    rows = [
-        np.sum([gains[i, j] * (scene.rest[j] + units[unit]) for j, unit in enumerate(row)], axis=0)
-        for i, row in enumerate(layout.unit_of)
-    ]
-    return np.stack(rows, axis=1)
 
 
 def passed(

@@ -9,7 +9,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Index, Vector
 from lcopa_bayes.model.effects.effect import Ranges
 from lcopa_bayes.model.effects.passage import Plant
-from lcopa_bayes.model.forward import Experiment, ForwardModel
+from lcopa_bayes.model.forward import Experiment, ForwardModel, deflections
 from lcopa_bayes.model.layout import Layout
 from lcopa_bayes.model.powerseries import Circle
 from lcopa_bayes.model.transfer import transfer
@@ -37,9 +37,8 @@ def ranges_of(model: ForwardModel, plant: Plant, times: Sequence[Vector]) -> Ran
     units = model.unit_responses(plant.dynamics)
     response = np.zeros(len(model.layout.responses))
     for experiment, read in zip(model.experiments, units, strict=True):
-        for i, row in enumerate(model.layout.unit_of):
-            paths = [plant.gains[i, j] * (experiment.rest[j] + read[unit, 0]) for j, unit in enumerate(row)]
-            response[i] = max(response[i], np.abs(np.sum(paths, axis=0)).max())
+        moved = deflections(model.layout, experiment.rest, plant.gains[None], read)
+        response = np.maximum(response, np.abs(moved).max(axis=(1, 2)))
     held = np.abs(plant.gains[np.arange(direct.size), direct]) * drive[direct]
     if (held > 0).all():
         response = held * _of_unit(response / held, [axis.unit for axis in model.layout.responses])
