@@ -104,7 +104,8 @@ def _unexplained(remaining: Sequence[Residual], covered: Sequence[Coverage]) -> 
     adjusted = holm([one.p_white for one in remaining] + [one.p for one in covered])
     white, hold = adjusted[: len(remaining)], adjusted[len(remaining) :]
     count = f"corrected for {len(adjusted)} tests" if len(adjusted) > 1 else "one test"
-    if white and min(white) < WHITE_P:
+    coloured = bool(white) and min(white) < WHITE_P
+    if coloured:
         worst = remaining[int(np.argmin(white))]
         yield Limitation(
             "tentative",
@@ -121,7 +122,7 @@ def _unexplained(remaining: Sequence[Residual], covered: Sequence[Coverage]) -> 
             f"intervals hold only if the noise is right, which is {noise} than the residual: bands hold "
             f"{100 * off.share:.0f} % of {off.record}, axis {off.axis}, where {100 * LEVELS[1]:.0f} % are "
             f"due ({_p(min(hold))}, {count})",
-            "choose another [noise] kind, " + _ADD,
+            "choose another [noise] kind" + ("" if coloured else f", {_ADD}"),  # said once
         )
 
 

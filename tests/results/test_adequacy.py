@@ -112,6 +112,20 @@ def test_coverage_is_judged_by_the_independent_samples_there_are():
     assert small <= 40 * 0.05 + 4 * np.sqrt(40 * 0.05)
 
 
+def test_what_to_do_is_said_once_where_residual_and_bands_speak_against_a_model():
+    made = problem(measured(3, correlation=0.8), noise="white")
+    remedies = [one.remedy for one in found(made, about(made, sigma=0.4 * TRUTH["sigma"]))]
+    assert len(remedies) >= 2
+    assert sum("add terms" in remedy for remedy in set(remedies)) == 1
+    (alone,) = {one.remedy for one in found(problem(measured(2), noise="white"), wide())}
+    assert alone.startswith("choose another [noise] kind, add terms")
+
+
+def wide() -> Draws:
+    """Draws of more noise than a record has."""
+    return about(problem(measured(2), noise="white"), sigma=4.0 * TRUTH["sigma"])
+
+
 def unpredicted(seed: int, spread: float, **changes: float) -> tuple[Limitation, ...]:
     """Limitations by a held-out record alone."""
     made = problem(measured(seed), noise="white")
