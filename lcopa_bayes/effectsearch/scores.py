@@ -10,6 +10,7 @@ import numpy as np
 from scipy.stats import norm
 
 from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.estimate import LEVEL
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.crossvalidation import groups, shifts
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
@@ -25,15 +26,14 @@ from lcopa_bayes.model.effects.declared import Declared
 from lcopa_bayes.results.prediction import disturbances, named_rng, offset_draws, plant_draws
 from lcopa_bayes.sampling.draws import Draws
 
-LEVEL = 0.9
-"""Probability inside the bands [-]."""
 _DRAWS = 100
 """Draws about an optimum behind the prediction of a held-out record [-]."""
 _MOST = 400
 """The same of a sampled posterior, at most [-]."""
 _TRIES = 4
 """Draws for each of them within the support [-]."""
-_WIDTH = float(norm.ppf(0.5 + LEVEL / 2))
+WIDTH = float(norm.ppf(0.5 + LEVEL / 2))
+"""Half width of a central 90 % interval of a normal distribution [sd]."""
 
 
 @final
@@ -60,7 +60,7 @@ class Score:
     @property
     def half_width(self) -> Vector:
         """Half the width of the 90 % band with noise, (n,) [response unit]; NaN where no band is given."""
-        return np.asarray(_WIDTH * np.sqrt(self.variance + self.noise_sd**2))
+        return np.asarray(WIDTH * np.sqrt(self.variance + self.noise_sd**2))
 
     @property
     def rmse(self) -> float:
