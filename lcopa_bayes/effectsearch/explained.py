@@ -73,9 +73,3 @@ def coordinates_of(model: ExtendedModel, draws: Draws) -> Matrix:
     rows = model.posterior.table.rows
     columns = [(draws.column(rows[k].name), rows[k].log_scale) for k in model.columns]
     return np.stack([np.log(column) if log else column for column, log in columns], axis=1)
-
-
-def unit_of(model: ExtendedModel, k: int) -> tuple[str, str]:
-    """Name and unit of a coordinate (before any logarithm)."""
-    row = model.posterior.table.rows[model.columns[k]]
-    return row.name, row.unit

@@ -19,13 +19,12 @@ from lcopa_bayes.effectsearch.explained import (
     declarable,
     explained_draws,
     explained_study,
-    unit_of,
 )
 from lcopa_bayes.effectsearch.heldouteffects import missed, unseen_share
 from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
 from lcopa_bayes.effectsearch.outliers import Outlying, outlying
 from lcopa_bayes.effectsearch.rounds import CLEAR, SINGLE, Round, search
-from lcopa_bayes.effectsearch.scores import Score, State, fit_scores, held_out_scores, left_out_scores
+from lcopa_bayes.effectsearch.scores import WIDTH, Score, State, fit_scores, held_out_scores, left_out_scores
 from lcopa_bayes.effectsearch.terms import fitted_base
 from lcopa_bayes.effectsearch.trace import Trace
 from lcopa_bayes.effectsearch.verdict import ALONE, EXPLAINED, Findings, Verdict, beside, decide, widened
@@ -34,9 +33,6 @@ from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.effect import Effect
 from lcopa_bayes.sampling.convergence import Grade
 from lcopa_bayes.sampling.draws import Draws
-
-Z90 = 1.6448536269514722
-"""Half width of a central 90 % interval of a normal distribution [sd]."""
 
 
 @final
@@ -99,19 +95,15 @@ class Loop:
         if self.draws is not None:
             name = state.model.names[k]
             return next(one for one in self.draws.estimates() if one.name == name).as_json()
-        name, unit = unit_of(state.model, k)
-        x, width = state.optimum.x, np.zeros(state.optimum.x.size)
-        width[k] = Z90 * np.sqrt(state.covariance[k, k])
-        # coordinates are logarithms of some parameters: ends are those of the interval on that scale
-        lower, middle, upper = (
-            float(state.model.values(at)[state.model.columns[k]]) for at in (x - width, x, x + width)
-        )
+        row = state.model.posterior.table.rows[state.model.columns[k]]
+        x, sd = float(state.optimum.x[k]), float(np.sqrt(state.covariance[k, k]))
+        lower, middle, upper = row.value_at(x + sd * WIDTH * np.array([-1.0, 0.0, 1.0])).tolist()
         return {
-            "name": name,
+            "name": row.name,
             "value": middle,
-            "unit": unit,
+            "unit": row.unit,
             "mean": middle,
-            "sd": (upper - lower) / (2 * Z90),
+            "sd": sd * (middle if row.log_scale else 1.0),
             "lower": lower,
             "upper": upper,
             "level": LEVEL,

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.stats import norm
 
 from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.estimate import LEVEL
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.crossvalidation import groups, shifts
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
@@ -22,18 +23,18 @@ from lcopa_bayes.inference.noise import Noise, WhiteAR1
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.model.effects.declared import Declared
+from lcopa_bayes.model.effects.effect import UnstableError
 from lcopa_bayes.results.prediction import disturbances, named_rng, offset_draws, plant_draws
 from lcopa_bayes.sampling.draws import Draws
 
-LEVEL = 0.9
-"""Probability inside the bands [-]."""
 _DRAWS = 100
 """Draws about an optimum behind the prediction of a held-out record [-]."""
 _MOST = 400
 """The same of a sampled posterior, at most [-]."""
 _TRIES = 4
 """Draws for each of them within the support [-]."""
-_WIDTH = float(norm.ppf(0.5 + LEVEL / 2))
+WIDTH = float(norm.ppf(0.5 + LEVEL / 2))
+"""Half width of a central 90 % interval of a normal distribution [sd]."""
 
 
 @final
@@ -60,7 +61,7 @@ class Score:
     @property
     def half_width(self) -> Vector:
         """Half the width of the 90 % band with noise, (n,) [response unit]; NaN where no band is given."""
-        return np.asarray(_WIDTH * np.sqrt(self.variance + self.noise_sd**2))
+        return np.asarray(WIDTH * np.sqrt(self.variance + self.noise_sd**2))
 
     @property
     def rmse(self) -> float:
@@ -159,17 +160,23 @@ def held_out_scores(state: State, problem: Problem) -> list[Score]:
         rng, alone = named_rng(study.seed, record.record.name), model.only(r)
         values, plant = plant_draws(draws, alone)
         apart = disturbances(table, alone, values, plant, rng)
+        whole = plant if apart is None else plant + apart
+        bounded = np.isfinite(whole).all(axis=(0, 2))
+        if not bounded.any():
+            names = tuple(effect.name for effect in state.model.effects)
+            raise UnstableError(names, record.record.name, "no draw has a bounded response")
+        values, plant, whole = values[bounded], plant[:, bounded], whole[:, bounded]
         for axis, observed in enumerate(record.axes):
             if not observed.values.size:
                 continue
-            seen = plant[axis][:, observed.index]
-            seen = seen if apart is None else seen + apart[axis][:, observed.index]
+            seen = whole[axis][:, observed.index]
             level, source, _ = offset_draws(
                 table, values, axis, r, record, seen, noise, held_out=True, rng=rng
             )
-            total = seen + level[:, None]
             law = state.whitening.noise[axis]
-            mean, variance = total.mean(axis=0), total.var(axis=0)
+            # what differs from record to record is 0 on average
+            mean = plant[axis][:, observed.index].mean(axis=0) + level.mean()
+            variance = (seen + level[:, None]).var(axis=0)
             out.append(_score(state, record, axis, (mean, variance), law.sd, source, held_out=True))
     return out
 
@@ -184,8 +191,8 @@ def _laplace(state: State, seed: int) -> tuple[Draws, Noise]:
     x[:, free] += rng.multivariate_normal(np.zeros(free.size), covariance, len(x), method="eigh")
     low, high = model.bounds
     inside = ((x >= low) & (x <= high))[:, free].all(axis=1)
+    inside &= model.supported(x, every=False)
     x = np.concatenate([x[inside][:_DRAWS], optimum.x[None]])
-    x = x[model.supported(x, every=False)]
     table = model.posterior.table
     rows = [k for k, row in enumerate(table.rows) if not row.noise]
     values = np.array([model.values(each) for each in x])[:, rows]

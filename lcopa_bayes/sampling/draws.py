@@ -124,8 +124,7 @@ def gather(posterior: Posterior, run: Run) -> Draws:
     of the ensembles, thinned evenly."""
     if run.weighted is not None and run.chosen is not None:
         rng = np.random.default_rng(np.random.SeedSequence(run.plan.seed, spawn_key=(1_000,)))
-        draws = _resampled(posterior, run.weighted, run.chosen, rng, run.plan.target_ess)
-        return draws.limited(_by_weights_alone(tuple(modes.parameter for modes in draws.modes)))
+        return _resampled(posterior, run.weighted, run.chosen, rng, run.plan.target_ess)
     coordinates, log_density = run.kept()
     ensembles, walkers, count, _ = coordinates.shape
     stride = max(1, -(-ensembles * walkers * count // _MEASURED))
@@ -166,22 +165,6 @@ def _unconfirmed(parameters: tuple[str, ...]) -> tuple[Limitation, ...]:
             f"the shares of the modes of {', '.join(parameters)} changed during the run, and independent "
             "draws could not confirm them",
             "allow more steps, or fix parameters that the record does not determine, or narrow their priors",
-            parameters,
-        ),
-    )
-
-
-def _by_weights_alone(parameters: tuple[str, ...]) -> tuple[Limitation, ...]:
-    """Limitation of parameters with several modes whose shares importance draws alone give: what no draw came
-    near shows in no weight, and over seeds such shares were seen to lack a third of a narrow mode."""
-    if not parameters:
-        return ()
-    return (
-        Limitation(
-            "tentative",
-            f"the shares of the modes of {', '.join(parameters)} hold only if the importance draws came near "
-            "every part of each mode",
-            "compare the shares under another seed, or check them by nested sampling (--cross-check)",
             parameters,
         ),
     )

@@ -24,6 +24,7 @@ from scipy.special import logsumexp
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
 from lcopa_bayes.core.parallel import Workers
+from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.inference.conditional import Conditional
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.optimum import Optimum, again, find_optima
@@ -112,10 +113,14 @@ class _Point(NamedTuple):
 
 @final
 class Search:
-    """Points, proposals and weights of a search; deterministic given its arguments and what it is asked."""
+    """Points, proposals and weights of a search; deterministic given its arguments and what it is asked.
 
-    def __init__(self, posterior: Posterior, seed: int, crew: Workers[Posterior]) -> None:
+    `bar` counts points and names what is being done.
+    """
+
+    def __init__(self, posterior: Posterior, seed: int, crew: Workers[Posterior], bar: Progress) -> None:
         self.posterior = posterior
+        self._bar = bar
         self.outer = Outer(posterior)
         self._crew = crew
         self._seeds = np.random.SeedSequence(seed, spawn_key=(7_000,))
@@ -155,6 +160,7 @@ class Search:
         """The same from a first proposal, whose points begin at the nearest of the table values `starts`."""
         proposal, count, failed = first, _LEARNING * self._difficulty, 0
         for number in range(_ROUNDS):
+            self._bar.set_description(f"searching for modes, round {number + 1}")
             own = self._round(proposal, count, starts if number == 0 else None)
             log_weights = self._seen.log_weights() if own is not None else np.empty(0)
             if own is None or not np.isfinite(log_weights).any():
@@ -190,7 +196,9 @@ class Search:
     def _last(self, proposal: Proposal, log_weights: Vector, share: float, wanted: float) -> Weighted | None:
         """Draws of a proposal that knows nothing of them, as many as are needed; None where these are too
         many, or walkers go where it hardly draws from."""
+        self._bar.set_description("looking for missed modes")
         walked = self._walked(log_weights)
+        self._bar.set_description("drawing from the posterior")
         y = spread_evenly(walked, _VISITED)
         visited = clustered(y, np.zeros(len(y)), int(self._rng.integers(2**31)))
         proposal, before, count = Blend(proposal, visited, _WALKED), len(self._points), 0
@@ -271,7 +279,10 @@ class Search:
         count = max(1, ceil(len(values) / _TASK))
         begins: Sequence[Matrix | None] = [None] * count if starts is None else np.array_split(starts, count)
         tasks = zip(np.array_split(values, count), begins, self._seeds.spawn(count), strict=True)
-        parts = list(self._crew.each(task, list(tasks)))  # type: ignore[arg-type]
+        parts = []
+        for part in self._crew.each(task, list(tasks)):  # type: ignore[arg-type]
+            parts.append(part)
+            self._bar.update(len(part[0]))
         return [np.concatenate(each) for each in zip(*parts, strict=True)]
 
     def _first(self) -> tuple[Proposal, Matrix]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import ceil
 from pathlib import Path
@@ -127,7 +127,7 @@ class Run:
     @property
     def visited(self) -> Matrix:
         """Where the walkers of the ensembles have been in the last three fifths, (points, dimension)."""
-        coordinates = Run(self.ensembles, self.plan).kept()[0]
+        coordinates = replace(self, weighted=None).kept()[0]
         return coordinates.reshape(-1, coordinates.shape[-1])
 
     def kept(self) -> tuple[Array, Array]:
@@ -176,42 +176,48 @@ def sample(
     done = ensembles[0].steps // (_ROUND * plan.thin) if ensembles else 0
     wanted = _SURPLUS * plan.target_ess
     searched = plan.method == "auto" and applies(posterior)
-    with (
-        workers(posterior, jobs=jobs) as crew,
-        Progress(total=rounds, initial=done, unit="round", quiet=quiet, desc="from the prior") as bar,
-    ):
-        if not ensembles:
-            seeds = np.random.SeedSequence(plan.seed).spawn(plan.ensembles)
-            if searched and known is None:
-                search = Search(posterior, plan.seed, crew)
+    with workers(posterior, jobs=jobs) as crew:
+        seeds = np.random.SeedSequence(plan.seed).spawn(plan.ensembles)
+        if not ensembles and searched and known is None:
+            with _points(quiet) as bar:
+                search = Search(posterior, plan.seed, crew, bar)
                 weighted = search.run(wanted)
-                if weighted is not None:
-                    _store(chain_file, Chain((), weighted), fingerprint)
-                    return Run((), plan, weighted)
-                ensembles = _begun(search, plan, seeds)
+            if weighted is not None:
+                _store(chain_file, Chain((), weighted), fingerprint)
+                return Run((), plan, weighted)
+            ensembles = _begun(search, plan, seeds)
+        with Progress(total=rounds, initial=done, unit="round", quiet=quiet, desc="from the prior") as bar:
             ensembles = ensembles or tuple(crew.each(_Birth(plan.walkers), seeds))
-            _store(chain_file, Chain(ensembles), fingerprint)
-        bar.set_description("sampling")
-        mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
-        hardest = max(ensemble.tempering_moves for ensemble in ensembles)
-        least = max(_LEAST, round(_AS_LONG * hardest / (_ROUND * plan.thin)))
-        while True:
-            last = done >= rounds or (done >= least and finished(posterior, Run(ensembles, plan), bar))
-            filling = _filling(posterior, Run(ensembles, plan)) if searched and last else ()
-            if filling or (searched and not last and done >= _CONFIRMED_AFTER and due(done)):
-                visited = Run(ensembles, plan).visited
-                weighted = Search(posterior, plan.seed + done, crew).around(visited, wanted)
-                if weighted is not None:
-                    _store(chain_file, Chain(ensembles, weighted), fingerprint)
-                    return Run(ensembles, plan, weighted)
-            if last:
-                return Run(ensembles, plan, None, filling)
-            if due(done):
-                mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
-            ensembles = tuple(crew.each(_Round(plan.thin, mixture), ensembles))
-            done += 1
-            _store(chain_file, Chain(ensembles), fingerprint)
-            bar.update()
+            if not done:
+                _store(chain_file, Chain(ensembles), fingerprint)
+            bar.set_description("sampling")
+            mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
+            hardest = max(ensemble.tempering_moves for ensemble in ensembles)
+            least = max(_LEAST, round(_AS_LONG * hardest / (_ROUND * plan.thin)))
+            while True:
+                run = Run(ensembles, plan)
+                last = done >= rounds or (done >= least and finished(posterior, run, bar))
+                filling = _filling(posterior, run) if searched and last else ()
+                if filling or (searched and not last and done >= _CONFIRMED_AFTER and due(done)):
+                    with _points(quiet) as beside:
+                        search = Search(posterior, plan.seed + done, crew, beside)
+                        weighted = search.around(run.visited, wanted)
+                    if weighted is not None:
+                        _store(chain_file, Chain(ensembles, weighted), fingerprint)
+                        return replace(run, weighted=weighted)
+                if last:
+                    return replace(run, unconfirmed=filling)
+                if due(done):
+                    mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
+                ensembles = tuple(crew.each(_Round(plan.thin, mixture), ensembles))
+                done += 1
+                _store(chain_file, Chain(ensembles), fingerprint)
+                bar.update()
+
+
+def _points(quiet: bool) -> Progress:
+    """Progress of a search, which counts points."""
+    return Progress(total=0, unit="point", quiet=quiet, desc="searching for modes")
 
 
 def _begun(search: Search, plan: SamplePlan, seeds: Sequence[np.random.SeedSequence]) -> tuple[Ensemble, ...]:
@@ -228,7 +234,7 @@ def _filling(posterior: Posterior, run: Run) -> tuple[str, ...]:
     whole = _sampled_values(posterior, run, kept=False)
     return tuple(
         modes.parameter
-        for column, modes in enumerate(_sampled_modes(posterior, run))
+        for column, modes in enumerate(_sampled_modes(posterior, _sampled_values(posterior, run)))
         if modes.boundaries
         and any(abs(apart) > CERTAIN * error for apart, error, _ in drifts(whole[..., column]))
     )
@@ -246,7 +252,8 @@ def finished(posterior: Posterior, run: Run, bar: Progress | None = None) -> boo
     Walkers move a little further than a grade requires, so that the linear parameters, which are drawn
     afterwards, have too.
     """
-    qualities = sampled_qualities(posterior, run)
+    values = _sampled_values(posterior, run)
+    qualities = _qualities(posterior, values)
     if bar is not None:
         ess, rhat = float(np.min([q.ess for q in qualities])), float(np.max([q.rhat for q in qualities]))
         memory = float(np.max([q.memory for q in qualities]))
@@ -258,18 +265,18 @@ def finished(posterior: Posterior, run: Run, bar: Progress | None = None) -> boo
     good = all(q.grade(target).level == "reliable" and q.memory <= _MEMORY for q in qualities)
     return (
         good
-        and all(modes.ess >= target for modes in _sampled_modes(posterior, run))
-        and _settled(posterior, run)
+        and all(modes.ess >= target for modes in _sampled_modes(posterior, values))
+        and _settled(_sampled_values(posterior, run, kept=False), values)
     )
 
 
-def _settled(posterior: Posterior, run: Run) -> bool:
-    """Whether what drifts over the whole run with certainty shows no trend any more in what is kept of it.
+def _settled(whole: Array, kept: Array) -> bool:
+    """Whether what drifts over the whole run with certainty shows no trend any more in what is kept of it,
+    values (ensembles, walkers, draws, parameters).
 
     A mode that few walkers had reached at the start fills slowly and in all ensembles alike, so that neither
     their agreement nor the effective sample size of the kept draws shows how much is still missing.
     """
-    whole, kept = (_sampled_values(posterior, run, kept=part) for part in (False, True))
     for column in range(whole.shape[-1]):
         pairs = zip(drifts(whole[..., column]), drifts(kept[..., column]), strict=False)
         for (far, far_error, _), (near, near_error, _) in pairs:
@@ -280,13 +287,16 @@ def _settled(posterior: Posterior, run: Run) -> bool:
 
 def sampled_qualities(posterior: Posterior, run: Run) -> tuple[Quality, ...]:
     """Quality of the sampled parameters over the kept part of a run."""
-    names = [posterior.table.names[k] for k in posterior.sampled]
-    return qualities(names, _sampled_values(posterior, run))
+    return _qualities(posterior, _sampled_values(posterior, run))
 
 
-def _sampled_modes(posterior: Posterior, run: Run) -> Iterator[Modes]:
-    """Modes of the sampled parameters over the kept part of a run."""
-    values = _sampled_values(posterior, run)
+def _qualities(posterior: Posterior, values: Array) -> tuple[Quality, ...]:
+    """Quality of values of the sampled parameters, (ensembles, walkers, draws, parameters)."""
+    return qualities([posterior.table.names[k] for k in posterior.sampled], values)
+
+
+def _sampled_modes(posterior: Posterior, values: Array) -> Iterator[Modes]:
+    """Modes of values of the sampled parameters, (ensembles, walkers, draws, parameters)."""
     for column, k in enumerate(posterior.sampled):
         row = posterior.table.rows[k]
         yield modes_of(row.name, row.unit, values[..., column], log_scale=row.log_scale)

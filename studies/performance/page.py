@@ -24,8 +24,7 @@ def page(results: Mapping[str, Any], before: Mapping[str, Any] | None = None) ->
         parts += samplers(results["samplers"], results["settings"])
     if "verbs" in results:
         parts += verbs(results["verbs"])
-        if before is not None and "verbs" in before:
-            parts += changes(results["verbs"], before["verbs"])
+        parts += changes(results["verbs"], (before or {}).get("verbs", {"rows": ()}))
     return "\n\n".join(parts) + "\n"
 
 
@@ -191,13 +190,12 @@ def changes(result: Mapping[str, Any], before: Mapping[str, Any]) -> list[str]:
         a, b = old["yardsticks"]["median"], row["yardsticks"]["median"]
         lines.append([row["study"] or "(none)", row["verb"], a, b, a / b])
     head = ("study", "verb", "before", "after", "before over after")
-    said = "Before and after, CPU time counted in yardsticks:"
     beside = [
         [row["study"] or "(none)", row["verb"], spread(row["other_over_this"])]
         for row in result["rows"]
         if row.get("other_over_this")
     ]
-    out = [said, table(head, lines)] if lines else []
+    out = ["Before and after, CPU time counted in yardsticks:", table(head, lines)] if lines else []
     if beside:
         out += ["The other checkout over this one, in turn:", table(("study", "verb", "ratio"), beside)]
     return out

@@ -20,7 +20,7 @@ def save(figure: Figure, path: Path) -> None:
 
 def forward(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Time against the number of blocks, and against the error reached."""
-    figure = Figure(figsize=(9.6, 4.2), layout="constrained")
+    figure = Figure(figsize=(9.6, 4.8), layout="constrained")
     by_size, by_error = figure.subplots(1, 2)
     methods = list(dict.fromkeys(row["method"] for row in rows))
     for method, colour in zip(methods, COLOURS, strict=False):
@@ -38,7 +38,8 @@ def forward(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     by_size.set_xlabel("blocks [-]")
     by_error.set_xlabel("root mean square error [share of the steady response]")
     by_error.invert_xaxis()
-    by_size.legend(fontsize=7, frameon=False)
+    handles = by_size.get_legend_handles_labels()
+    figure.legend(*handles, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     save(figure, path)
 
 
@@ -57,6 +58,7 @@ def samplers(posteriors: Mapping[str, Mapping[str, Any]], path: Path) -> None:
             if row.get("shown_per_cpu_s") is not None:
                 panel.plot(row["shown_per_cpu_s"], height - 0.1, "D", color=COLOURS[2], ms=5)
         panel.set(xscale="log", xlabel="effective draws per CPU second", title=name)
+        panel.set_ylim(-0.6, len(rows) - 0.4)
         panel.set_yticks(range(len(rows)), [row["method"] for row in reversed(rows)])
         panel.grid(alpha=0.25, axis="x")
     panels[0].plot([], [], "o", color=COLOURS[0], label="stated")

@@ -17,6 +17,7 @@ from lcopa_bayes.data.studywriter import write_study
 from lcopa_bayes.effectsearch.explained import coordinates_of, explained_study
 from lcopa_bayes.effectsearch.loop import Loop, loop
 from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.model.effects.commands import OverdrivePulse
 from lcopa_bayes.model.effects.records import Vibration
 from lcopa_bayes.results.fit import Fit, fit
@@ -54,6 +55,19 @@ def test_it_agrees_with_the_descent_of_the_loop(bent: Loop):
     size = np.sqrt(np.diag(state.optimum.covariance)) / drawn.std(axis=0)
     assert size.min() > 0.7
     assert size.max() < 1.4
+
+
+def test_what_the_loop_descends_is_the_posterior_of_the_explained_study(bent: Loop):
+    """Two roads to the residual at one place: effects put beside a plant, or declared in a study."""
+    state, made = bent.after.state, problem_of(bent.study).posterior
+    assert bent.problem.refinement == 1
+    values = dict(zip(state.model.posterior.table.names, state.model.values(state.optimum.x), strict=True))
+    there = np.array([values.get(row.name, 1.0) for row in made.table.rows])
+    least = LeastSquares(made, held=state.whitening.held)
+    residual = least.misfit(least.coordinates(there), there)
+    own = state.model.least(state.whitening.held).misfit(state.optimum.x, state.model.template)
+    np.testing.assert_allclose(residual, own, atol=1e-9)
+    np.testing.assert_allclose(own[: made.size], -state.optimum.white, atol=1e-9)
 
 
 def test_the_truth_lies_within(again: Fit):

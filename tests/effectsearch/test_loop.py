@@ -85,6 +85,18 @@ def test_the_noise_is_measured_before_the_drive_moves(clean):
     assert noise.law.sd == pytest.approx(NOISE, rel=4 / np.sqrt(2 * noise.samples))
 
 
+def test_intervals_of_the_optimum_are_in_the_units_of_the_parameters(clean):
+    """A time constant of 3^(1 / 0.9) ms, found by its logarithm."""
+    model = clean.after.state.model
+    told = {one["name"]: one for one in (clean.estimate(k) for k in range(len(model.names)))}
+    for name, truth in (("gain", 1.0), ("time_1", 3.0 ** (1 / 0.9)), ("order_1", 0.9), ("delay", 1.0)):
+        one = told[name]
+        assert one["lower"] < one["value"] < one["upper"]
+        assert abs(one["value"] - truth) < 4 * one["sd"]
+        assert one["upper"] - one["lower"] == pytest.approx(2 * 1.645 * one["sd"], rel=0.02)
+    assert told["time_1"]["unit"] == "ms"
+
+
 def test_the_hidden_effect_is_named_and_its_size_recovered(bent):
     assert bent.verdict.kind == "explained"
     assert [effect.name for effect in bent.effects] == ["odd_curvature"]

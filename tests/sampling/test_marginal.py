@@ -12,6 +12,7 @@ from scipy.special import logsumexp
 from small import TRUTH, Toy, problem, record
 
 from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.inference.conditional import Conditional, Expanded
 from lcopa_bayes.sampling import marginal, outer
 from lcopa_bayes.sampling.conditionaldraws import Kept, kept
@@ -116,7 +117,7 @@ def search_of(log_density, seed: int) -> Search:
     toy = Toy(log_density, {"a": WIDE, "b": WIDE})
     search = Search.__new__(Search)
     search.posterior, search._rng = toy, np.random.default_rng(seed)
-    search._seen, search._points = Seen(), []
+    search._seen, search._points, search._bar = Seen(), [], Progress(quiet=True)
     every = lambda y: np.ones(len(y), dtype=bool)  # noqa: E731
     search.outer = SimpleNamespace(values=lambda y: y, y=lambda y: y, inside=every, orders=np.zeros(2))
     search._evaluated = lambda y, values, starts: marginal._Point(
@@ -235,7 +236,7 @@ def test_a_search_agrees_with_quadrature(seed):
     fixed = {key: TRUTH[key] for key in ("delay", "offset")} | {"sigma": 0.1, "time_1": TIMES["time_1"]}
     posterior = problem(record(camera=0.6, noise_sd=0.1), priors=fixed).posterior
     with workers(posterior) as crew:
-        weighted = Search(posterior, seed, crew).run(800)
+        weighted = Search(posterior, seed, crew, Progress(quiet=True)).run(800)
     assert weighted is not None
     place = posterior.sampled.index(posterior.table.at("order", 0))
     times, orders = np.linspace(np.log(0.4), np.log(5.0), 120), np.linspace(0.3, 1.6, 120)
@@ -279,6 +280,6 @@ def test_a_search_without_a_single_draw_gives_nothing(monkeypatch):
     monkeypatch.setattr(outer, "kept", none)
     posterior = problem(record(camera=1.0), terms=1, priors={"sigma": 0.05}).posterior
     with workers(posterior) as crew:
-        search = Search(posterior, 1, crew)
+        search = Search(posterior, 1, crew, Progress(quiet=True))
         assert search.run(100.0) is None
         assert search.population(4, 10) == []

@@ -361,4 +361,6 @@ def test_a_run_is_settled_once_a_mode_no_longer_fills(name):
         chain = (np.where(inside, 8.0, 0.0) + rng.standard_normal((400, 64)))[..., None]
         ensemble = ensemble_at(toy, chain[-1], child)
         ensembles.append(replace(ensemble, chain=chain, log_density=np.zeros((400, 64))))
-    assert sampler._settled(toy, Run(tuple(ensembles), plan())) == settled
+    run = Run(tuple(ensembles), plan())
+    whole, kept = (sampler._sampled_values(toy, run, kept=part) for part in (False, True))
+    assert sampler._settled(whole, kept) == settled
