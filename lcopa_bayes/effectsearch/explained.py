@@ -18,6 +18,7 @@ from lcopa_bayes.inference.noise import Noise
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.effect import Effect
 from lcopa_bayes.model.effects.records import Outliers
+from lcopa_bayes.results.discretisation import discretisation
 from lcopa_bayes.results.fit import plan_of, weighted_fit
 from lcopa_bayes.sampling.draws import Draws
 
@@ -61,11 +62,15 @@ def declarable(study: Study, effects: Sequence[Effect]) -> bool:
 
 
 def explained_draws(study: Study, *, jobs: int = 1, quick: bool = False) -> tuple[Draws, Noise] | None:
-    """Draws of an explained study, the same that a fit of it gives, and its noise; None where importance
-    sampling does not hold, and a fit takes ensembles from the prior."""
+    """Draws of an explained study, the same that a fit of it gives and limited by the width of its blocks as
+    there, and its noise; None where importance sampling does not hold, and a fit takes ensembles from the
+    prior."""
     problem = problem_of(study)
-    _, result = weighted_fit(problem, plan_of(problem, quick=False), jobs=jobs, quick=quick)
-    return None if result is None else (result[1], problem.posterior.noise)
+    problem, result = weighted_fit(problem, plan_of(problem, quick=False), jobs=jobs, quick=quick)
+    if result is None:
+        return None
+    draws = result[1]
+    return draws.limited(discretisation(problem, draws).limitations), problem.posterior.noise
 
 
 def coordinates_of(model: ExtendedModel, draws: Draws) -> Matrix:

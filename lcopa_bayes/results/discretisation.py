@@ -16,7 +16,7 @@ from typing import Any, final
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Flags, Matrix, Vector
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.optimum import Optimum, again, find_optima
@@ -59,12 +59,14 @@ class Discretisation:
 
     blocks: int
     """Blocks of all fit records together [-]."""
+    moved: tuple[str, ...] = ()
+    """Every parameter that moves by more than is negligible."""
 
     @property
     def negligible(self) -> bool:
         """Whether no parameter moves by more than `LARGEST`, a small error of measurement aside: a large one,
         as of draws of which few have weight on narrow blocks, excuses nothing."""
-        return abs(self.shift) - min(2 * self.error, LARGEST) <= LARGEST
+        return bool(_negligible(self.shift, self.error))
 
     @property
     def sentence(self) -> str:
@@ -88,6 +90,7 @@ class Discretisation:
                 "tentative" if abs(self.shift) < UNUSABLE else "unusable",
                 f"the width of the blocks moves {self.parameter} by {abs(self.shift):.2g} posterior sd",
                 "set [model] blocks to a larger number, or leave out the samples of the fastest onset",
+                self.moved,
             ),
         )
 
@@ -100,6 +103,7 @@ class Discretisation:
             "refinement": self.refinement,
             "blocks": self.blocks,
             "negligible": self.negligible,
+            "moved": list(self.moved),
         }
 
 
@@ -194,10 +198,17 @@ def discretisation(problem: Problem, draws: Draws) -> Discretisation:
     shifts = weights @ scaled * _REST
     errors = np.sqrt(np.mean(((weights * weights.size - 1.0)[:, None] * scaled) ** 2, axis=0) / weights.size)
     worst = int(np.abs(shifts).argmax())
+    names = [draws.table.names[k] for k in rows]
     return Discretisation(
-        draws.table.names[rows[worst]],
+        names[worst],
         float(shifts[worst]),
         float(errors[worst]),
         problem.refinement,
         _cells(problem),
+        tuple(names[k] for k in np.flatnonzero(~_negligible(shifts, errors))),
     )
+
+
+def _negligible(shift: Vector | float, error: Vector | float) -> Flags:
+    """Whether shifts are at most `LARGEST`, a small error of measurement aside [both in posterior sd]."""
+    return np.asarray(np.abs(shift) - np.minimum(2 * error, LARGEST) <= LARGEST)

@@ -82,6 +82,13 @@ def test_draws_move_as_the_optimum_does(rng):
     assert abs(actual) > 0.2
     assert found.shift == pytest.approx(actual, abs=0.03 + 3 * found.error)
     assert not found.negligible
+    # limited are those that a refit moves, and no others
+    shifts = np.abs(refit - x) / np.sqrt(np.diag(covariance))
+    names = [problem.posterior.table.names[k] for k in least.columns]
+    (limitation,) = found.limitations
+    for name, shift in zip(names, shifts, strict=True):
+        if abs(shift - LARGEST) > 0.1:
+            assert limitation.concerns(name) == (shift > LARGEST)
     assert discretisation(resolved(problem), draws).negligible
 
 
