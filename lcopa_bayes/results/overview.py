@@ -21,10 +21,14 @@ _AT_REST = 8
 
 
 def overview(fit: Fit) -> dict[str, Any]:
-    """The equation of the plant at the medians, line by line, and the answer to each question, with the
-    section of the page that has more."""
+    """The equation of the plant at the draw of highest density, line by line, and the answer to each
+    question, with the section of the page that has more.
+
+    Medians of a posterior with several modes make a plant that no record supports.
+    """
+    draws = fit.draws
     return {
-        "plant": plant(fit.draws.table, np.median(fit.draws.flat, axis=0)),
+        "plant": plant(draws.table, draws.flat[int(draws.log_density.argmax())]),
         "answers": [
             {"question": question, "answer": answer, "section": section}
             for question, answer, section in (
@@ -117,9 +121,12 @@ def _listed(names: Sequence[str]) -> str:
 
 def _missing(fit: Fit) -> str:
     reasons = [one.reason for one in fit.draws.limitations if one.level != "reliable"]
+    if fit.draws.modes:
+        names = _listed([one.parameter for one in fit.draws.modes])
+        reasons.append(f"the records leave several modes, of {names}")
     if not reasons:
         return "Nothing that the checks of the model against its records could see."
-    return "; ".join(dict.fromkeys(reasons)) + "."
+    return _joined(reasons)
 
 
 def _next(fit: Fit) -> str:
@@ -127,4 +134,10 @@ def _next(fit: Fit) -> str:
     if not fit.study.held_out:
         remedies.append("hold out a record (--held-out) to test the prediction")
     remedies.append("`audit` says what the records determine, `loop` what the model lacks")
-    return "; ".join(dict.fromkeys(remedies)) + "."
+    return _joined(remedies)
+
+
+def _joined(clauses: Sequence[str]) -> str:
+    """Clauses as one sentence, each once."""
+    text = "; ".join(dict.fromkeys(clauses))
+    return f"{text[0].upper()}{text[1:]}."

@@ -12,7 +12,7 @@ _ANSWER = Markup("<strong>{question}</strong> {answer}{link}")
 
 
 def overview(run: SavedRun) -> Section:
-    """The plant at the medians, and one sentence for each question a reader has."""
+    """The plant of highest density, and one sentence for each question a reader has."""
     values = run.results["overview"]
     answers = tuple(
         _ANSWER.format(
@@ -24,5 +24,5 @@ def overview(run: SavedRun) -> Section:
         )
         for one in values["answers"]
     )
-    unit = f"s: Laplace variable, 1/{run.time_unit}; times and delays in {run.time_unit}; medians."
+    unit = f"At the draw of highest density; s in 1/{run.time_unit}, times and delays in {run.time_unit}."
     return Section("Summary", answers, listing="\n".join([*values["plant"], unit]))
