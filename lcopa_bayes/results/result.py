@@ -64,7 +64,8 @@ class Result(ABC):
         return bool(stored == plain(self.to_json()))
 
     def __str__(self) -> str:
-        return f"{self.summary().to_string(index=False, float_format=shown)}\n\n{self.verdict}"
+        table = self.summary().to_string(index=False, float_format=shown, na_rep="")
+        return f"{table}\n\n{self.verdict}"
 
     def _repr_html_(self) -> str:
         from html import escape
