@@ -70,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     options = _parser(given).parse_args(given)
     try:
-        outcome = _outcome(options, ["lcopa-bayes", *given])
+        outcome = _outcome(options, [PROGRAM, *given])
     except InputError as error:
         return refused(error.problems, as_json=options.json)
     except FloatingPointError as error:  # a prior that reaches where the model cannot be computed
@@ -175,8 +175,9 @@ def _on_study(
         function = getattr(import_module(f"lcopa_bayes.verbs.{module}") if module else lcopa_bayes, verb)
         given = {key: getattr(options, key) for key in keys}
         given |= {key: of(options, source) for key, of in derived.items()}
+        given |= {"jobs": _jobs(options)} if hasattr(options, "jobs") else {}
         folder = _folder(options, source, *filter(None, [inside]))
-        return _reported(function(source, folder=folder, jobs=_jobs(options), **given), folder)
+        return _reported(function(source, folder=folder, **given), folder)
 
     return perform
 
@@ -213,19 +214,6 @@ def _explain(options: argparse.Namespace) -> Outcome:
     term = " ".join(options.term)
     text = lcopa_bayes.explain(term, runs=RUNS)
     return Outcome({"term": term, "text": text}, text)
-
-
-def _unsampled(verb: str) -> Callable[[argparse.Namespace], Outcome]:
-    """What runs a public function of a study that samples nothing."""
-
-    def perform(options: argparse.Namespace) -> Outcome:
-        from lcopa_bayes.verbs.sources import study_of
-
-        study = study_of(_source(options))
-        folder = _folder(options, study)
-        return _reported(getattr(lcopa_bayes, verb)(study, folder=folder), folder)
-
-    return perform
 
 
 def _predict(options: argparse.Namespace) -> Outcome:
@@ -310,9 +298,13 @@ _SAMPLING = ("resume", "quick", "quiet")
 """Options of every verb that samples."""
 VERBS: Mapping[str, Verb] = {
     "new": Verb("records and a study from spreadsheets and loggers' tables", choices.new, _new),
-    "check": Verb("what was understood of a study, without fitting it", choices.study, _unsampled("check")),
+    "check": Verb(
+        "what was understood of a study, without fitting it", choices.study, _on_study("check", anew=True)
+    ),
     "look": Verb(
-        "least squares and residual within seconds, before sampling", choices.study, _unsampled("look")
+        "least squares and residual within seconds, before sampling",
+        choices.study,
+        _on_study("look", anew=True),
     ),
     "run": Verb(
         "all stages the study names, then the report",

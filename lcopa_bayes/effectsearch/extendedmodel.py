@@ -20,7 +20,6 @@ from lcopa_bayes.model.effects.effect import Effect, ForceEffect
 
 _MERGED = 1e-6
 """Orders closer than this are at the end of their support [-]."""
-_NORMAL = ("norm", "halfnorm")
 _UNIT = np.array([1.0, 0.0, 0.0])
 """Noise of unit scale, as `WhiteAR1` takes it."""
 
@@ -41,15 +40,14 @@ class ExtendedModel:
     loose: frozenset[str] = frozenset()
     """Internal constants that are coordinates too if they have a prior, ``<effect>.<constant>``; the others
     are held."""
+    wider: Mapping[str, float] = field(default_factory=dict)
+    """Factor on the default prior sd of the coefficients of an effect, by its name, where it is not 1 [-]."""
 
     def at_scales(self, x: Vector, taken: Mapping[str, float]) -> ExtendedModel:
         """With the scales of effects taken from the base fit at `x`; `taken` gives each record's place in the
         campaign [-]."""
         epochs = np.array([taken[one.record.name] for one in self.plant.samples])
         return replace(self, scaled=effected(self.plant, self.values(x), (), epochs))
-
-    wider: Mapping[str, float] = field(default_factory=dict)
-    """Factor on the default prior sd of the coefficients of an effect, by its name, where it is not 1 [-]."""
 
     @property
     def effected(self) -> Effected:
@@ -129,12 +127,7 @@ class ExtendedModel:
             row = self.posterior.table.rows[k]
             assert row.prior is not None
             flat = (high - low) / np.sqrt(12) if np.isfinite(high - low) else float(row.prior.frozen.std())
-            if row.prior.dist not in _NORMAL or row.log_scale:
-                pair = np.nan, flat
-            elif row.prior.dist == "norm":
-                pair = float(row.prior.frozen.mean()), float(row.prior.frozen.std())
-            else:  # its density falls from its lower end
-                pair = row.prior.support[0], row.prior.parameters.get("scale", 1.0)
+            pair = (np.nan, flat) if row.log_scale else row.prior.normal or (np.nan, flat)
             centre.append(pair[0])
             spread.append(pair[1])
         return np.array(centre), np.array(spread)

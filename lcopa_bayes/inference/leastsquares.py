@@ -21,8 +21,6 @@ from lcopa_bayes.model.effects.effect import Effect, UnstableError
 
 _EDGE = 1e-6
 """Distance kept from the ends of a parameter's domain, relative to the domain or to 1."""
-_NORMAL = ("norm", "halfnorm")
-"""Priors whose logarithm is a square."""
 _EVALUATIONS = 30
 """Most responses with effects that a descent takes [-]."""
 _ENOUGH = 1e-7
@@ -225,11 +223,9 @@ class LeastSquares:
         rows, prior = [], []
         for k in self.columns:
             row = table.rows[k]
-            normal = row.prior is not None and row.prior.dist in _NORMAL and not row.log_scale
-            if row.prior is not None and normal:
-                mean, sd = row.prior.frozen.mean(), row.prior.frozen.std()
-                if row.prior.dist == "halfnorm":  # its density falls from its lower end
-                    mean, sd = row.prior.support[0], row.prior.parameters.get("scale", 1.0)
+            normal = row.prior.normal if row.prior is not None and not row.log_scale else None
+            if normal is not None:
+                mean, sd = normal
                 unit = np.zeros(len(table.rows))
                 unit[k] = 1 / sd
                 rows.append(unit)

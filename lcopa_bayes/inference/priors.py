@@ -67,6 +67,16 @@ class Prior:
         low, high = self.frozen.support()
         return float(low), float(high)
 
+    @property
+    def normal(self) -> tuple[float, float] | None:
+        """Mean and standard deviation of the square that the logarithm of the density is; None for another.
+        That of a half-normal density falls from its lower end."""
+        if self.dist == "norm":
+            return float(self.frozen.mean()), float(self.frozen.std())
+        if self.dist == "halfnorm":
+            return self.support[0], self.parameters.get("scale", 1.0)
+        return None
+
     def draw(self, size: int | tuple[int, ...], rng: np.random.Generator) -> Array:
         """Independent draws."""
         return np.asarray(self.frozen.rvs(size=size, random_state=rng), dtype=float)

@@ -22,8 +22,9 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.optimum import Optimum, find_optima
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.results.prediction import Band, bands
+from lcopa_bayes.results.prediction import Band, study_bands
 from lcopa_bayes.results.residuals import WHITE_P, Residual, residuals
+from lcopa_bayes.results.summary import fixed_values, scores
 from lcopa_bayes.results.tables import data_tables
 from lcopa_bayes.sampling.draws import Draws
 from lcopa_bayes.sampling.importanceweights import effective, smoothed
@@ -102,7 +103,6 @@ class FirstLook:
 
     def to_json(self) -> dict[str, Any]:
         """Every number as plain values."""
-        table = self.problem.posterior.table
         return plain(
             {
                 "study": self.problem.study.name,
@@ -113,13 +113,9 @@ class FirstLook:
                 "log_density": self.optimum.log_density,
                 "effective_share": self.share,
                 "parameters": [one.as_json() for one in self._estimates()],
-                "fixed": [
-                    {"name": row.name, "value": row.value, "unit": row.unit}
-                    for row in table.rows
-                    if not row.free
-                ],
-                "fit_scores": [band.score() for band in self.bands if not band.held_out],
-                "held_out": [band.score() for band in self.bands if band.held_out],
+                "fixed": fixed_values(self.problem.posterior.table),
+                "fit_scores": scores(self, held_out=False),
+                "held_out": scores(self, held_out=True),
                 "residual_tests": [one.test() for one in self.residuals],
             }
         )
@@ -155,22 +151,11 @@ def first_look(study: Study) -> FirstLook:
         )
     posterior = problem.posterior
     draws, share = _near(posterior, optima[0], rng)
-    shown = _bands(problem, draws)
+    shown = study_bands(problem, draws)
     same = np.tile(optima[0].values, (1, 4, 1))  # a simultaneous band needs four draws
     best = Draws(posterior.table, same, np.zeros((1, 4)), (), 1.0)
-    remaining = residuals(best, _bands(problem, best), posterior.noise, problem.scales.period)
+    remaining = residuals(best, study_bands(problem, best), posterior.noise, problem.scales.period)
     return FirstLook(problem, optima[0], draws, share, tuple(shown), tuple(remaining))
-
-
-def _bands(problem: Problem, draws: Draws) -> list[Band]:
-    """Of all records of a study, held-out ones last."""
-    posterior, study = problem.posterior, problem.study
-    noise, seed = posterior.noise, study.seed
-    shown = bands(draws, posterior.model, posterior.samples, noise, held_out=False, seed=seed)
-    if study.held_out:
-        samples, model = problem.simulated(study.held_out)
-        shown += bands(draws, model, samples, noise, held_out=True, seed=seed)
-    return shown
 
 
 def _near(posterior: Posterior, optimum: Optimum, rng: np.random.Generator) -> tuple[Draws, float]:

@@ -21,7 +21,7 @@ from lcopa_bayes.results.adequacy import limitations
 from lcopa_bayes.results.datatree import POSTERIOR, posterior_tree, save_tree
 from lcopa_bayes.results.discretisation import Discretisation, discretisation, resolved, resolved_optima
 from lcopa_bayes.results.frequency import FrequencyResponse, frequency_response
-from lcopa_bayes.results.prediction import Band, bands
+from lcopa_bayes.results.prediction import Band, study_bands
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.provenance import fingerprint, provenance
 from lcopa_bayes.results.residuals import Residual, residuals
@@ -171,12 +171,8 @@ def fit(
     width = discretisation(problem, draws)
     curves = step_curves(draws, problem.scales.span)
     draws = draws.limited([*width.limitations, *too_fast(draws, curves, problem.scales.period)])
-    noise, seed = problem.posterior.noise, plan.seed
-    shown = bands(draws, problem.posterior.model, problem.posterior.samples, noise, held_out=False, seed=seed)
-    if study.held_out:
-        samples, model = problem.simulated(study.held_out)
-        shown += bands(draws, model, samples, noise, held_out=True, seed=seed)
-    remaining = residuals(draws, shown, noise, problem.scales.period)
+    shown = study_bands(problem, draws)
+    remaining = residuals(draws, shown, problem.posterior.noise, problem.scales.period)
     draws = draws.limited(
         limitations(problem, draws, shown, remaining, np.random.default_rng([plan.seed, 4]))
     )

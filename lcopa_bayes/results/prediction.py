@@ -11,6 +11,7 @@ import pandas as pd
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.data.record import Axis
+from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.noise import GaussianNoise, Noise
 from lcopa_bayes.inference.observations import Observed, Samples
 from lcopa_bayes.inference.parameters import ParameterTable
@@ -140,6 +141,17 @@ def bands(
     """
     drawn = record_draws(draws, model, samples, noise, held_out=held_out, seed=seed)
     return [band_of(*one) for one in drawn]
+
+
+def study_bands(problem: Problem, draws: Draws) -> list[Band]:
+    """`bands` of all records of a study, held-out ones last."""
+    posterior, study = problem.posterior, problem.study
+    noise, seed = posterior.noise, study.seed
+    shown = bands(draws, posterior.model, posterior.samples, noise, held_out=False, seed=seed)
+    if study.held_out:
+        samples, model = problem.simulated(study.held_out)
+        shown += bands(draws, model, samples, noise, held_out=True, seed=seed)
+    return shown
 
 
 def record_draws(

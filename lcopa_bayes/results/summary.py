@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.results.overview import overview
 from lcopa_bayes.results.residuals import WHITE_P
 from lcopa_bayes.results.steps import share_unsettled
 from lcopa_bayes.sampling.convergence import Grade, shares_grade
 
 if TYPE_CHECKING:
+    from lcopa_bayes.results.firstlook import FirstLook
     from lcopa_bayes.results.fit import Fit
 
 IMPORTANCE = "importance draws"
@@ -77,11 +79,7 @@ def results(fit: Fit) -> dict[str, Any]:
             "limitations": [one.as_json() for one in fit.draws.limitations],
             "time_unit": fit.study.time_unit,
             "parameters": parameters,
-            "fixed": [
-                {"name": row.name, "value": row.value, "unit": row.unit}
-                for row in fit.problem.posterior.table.rows
-                if not row.free
-            ],
+            "fixed": fixed_values(fit.problem.posterior.table),
             "log_evidence": fit.evidence.value if fit.evidence else None,
             "log_evidence_sd": fit.evidence.sd if fit.evidence else None,
             "log_evidence_by_ensemble": fit.evidence.by_ensemble if fit.evidence else (),
@@ -119,7 +117,12 @@ def residual_rms(fit: Fit) -> dict[str, float]:
     return {axis: float(np.sqrt(np.mean(squares))) for axis, squares in pooled.items()}
 
 
-def scores(fit: Fit, *, held_out: bool) -> list[dict[str, Any]]:
+def fixed_values(table: ParameterTable) -> list[dict[str, Any]]:
+    """Parameters that are not estimated."""
+    return [{"name": row.name, "value": row.value, "unit": row.unit} for row in table.rows if not row.free]
+
+
+def scores(fit: Fit | FirstLook, *, held_out: bool) -> list[dict[str, Any]]:
     """Error and coverage of every axis of the records that were held out, or of those fitted."""
     return [band.score() for band in fit.bands if band.held_out == held_out]
 
