@@ -57,7 +57,7 @@ STAGES = {
         "gather": "diagnostics",
         "evidence_of": "evidence",
         "discretisation": "refinement check",
-        "bands": "predictive bands",
+        "study_bands": "predictive bands",
         "step_curves": "diagnostics",
         "step_metrics": "diagnostics",
         "residuals": "diagnostics",
