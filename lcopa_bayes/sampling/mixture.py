@@ -13,7 +13,7 @@ from scipy.special import gammaln, logsumexp
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.mixture import GaussianMixture
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 
 _COMPONENTS = 20
 """Most components of a mixture."""
@@ -71,6 +71,10 @@ class Mixture:
             np.concatenate([self.means, other.means]),
             np.concatenate([self.factors, other.factors]),
         )
+
+    def of(self, columns: Index) -> Mixture:
+        """Of some columns alone, those of a diagonal mixture."""
+        return Mixture(self.weights, self.means[:, columns], self.factors[:, columns[:, None], columns])
 
     @property
     def dimension(self) -> int:

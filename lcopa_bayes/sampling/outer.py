@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from math import lgamma
 from typing import final
 
 import numpy as np
@@ -13,11 +14,15 @@ from lcopa_bayes.core.arrays import Flags, Index, Matrix, Vector
 from lcopa_bayes.inference.conditional import Conditional, screened
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.conditionaldraws import in_domain, kept
+from lcopa_bayes.sampling.ensemble import Ensemble, advance
 from lcopa_bayes.sampling.mixture import Mixture
 
 _SCREENED, _DESCENT = 16, 12
 """Prior draws that give a start, and most steps of a descent: a draw of a point that is short of its optimum
 has hardly any weight, and a narrow mode whose points are stays unseen."""
+
+_WALK = (20, 5)
+"""Draws kept of each walker, and steps per draw."""
 
 
 def conditional_of(posterior: Posterior) -> Conditional:
@@ -58,6 +63,21 @@ class Outer:
         rows = self.posterior.table.rows
         return np.array([rows[k].kind == "order" for k in self.columns], dtype=bool)
 
+    @cached_property
+    def groups(self) -> tuple[Index, ...]:
+        """Columns that a posterior binds to each other more than to the rest: orders and delays of an
+        element, noise of an axis, delays of several elements."""
+        table, keys = self.posterior.table, list[tuple[str, int]]()
+        users = {(unit.delay, unit.element) for unit in table.layout.units}
+        for k in self.columns:
+            row, first = table.rows[k], table.rows[k].place.first
+            elements = [element for delay, element in users if delay == first]
+            if row.kind == "delay" and len(elements) == 1:
+                keys.append(("order", elements[0]))
+            else:
+                keys.append(("noise" if row.noise else row.kind, first))
+        return tuple(np.flatnonzero([key == one for key in keys]) for one in dict.fromkeys(keys))
+
     def values(self, y: Matrix) -> Matrix:
         """Table values, (batch, rows), exchangeable orders decreasing; NaN for what is not searched."""
         z = np.full((len(y), self.posterior.dimension), np.nan)
@@ -79,33 +99,42 @@ class Outer:
 @final
 @dataclass(frozen=True, eq=False)
 class PriorOrders:
-    """A proposal: orders from their prior, the rest from a mixture, None where there is no rest."""
+    """A proposal of a group: orders of its element from their prior, the rest from a mixture."""
 
     outer: Outer
+    group: Index
+    """Columns."""
     rest: Mixture | None
+    """None where there are orders alone."""
+
+    @cached_property
+    def _orders(self) -> Flags:
+        return self.outer.orders[self.group]
 
     def draw(self, count: int, rng: np.random.Generator) -> Matrix:
         """Points (count, size), exchangeable orders decreasing."""
-        outer, out = self.outer, np.empty((count, len(self.outer.columns)))
-        for column, k in enumerate(outer.columns):
-            if outer.orders[column]:
-                row = outer.posterior.table.rows[k]
-                drawn = row.draw(count, rng)
-                out[:, column] = np.log(drawn) if row.log_scale else drawn
+        outer, out = self.outer, np.full((count, len(self.outer.columns)), np.nan)
+        for column in self.group[self._orders]:
+            row = outer.posterior.table.rows[outer.columns[column]]
+            drawn = row.draw(count, rng)
+            out[:, column] = np.log(drawn) if row.log_scale else drawn
         if self.rest is not None:
-            out[:, ~outer.orders] = self.rest.draw(count, rng)
-        return outer.y(outer.values(out))
+            out[:, self.group[~self._orders]] = self.rest.draw(count, rng)
+        return np.asarray(outer.y(outer.values(out))[:, self.group])
 
     def log_density(self, y: Matrix) -> Vector:
         """Log density of points, exchangeable orders decreasing, (n,)."""
-        outer, table = self.outer, self.outer.posterior.table
-        values, total = outer.values(y), np.zeros(len(y))
-        for k, order in zip(outer.columns, outer.orders, strict=True):
-            if order:
-                row = table.rows[k]
-                total += row.log_prior(values[:, k]) + (np.log(values[:, k]) if row.log_scale else 0.0)
-        total += table.log_permutations
-        return total if self.rest is None else total + self.rest.log_density(y[:, ~outer.orders])
+        outer, table, total = self.outer, self.outer.posterior.table, np.zeros(len(y))
+        full = np.full((len(y), len(outer.columns)), np.nan)
+        full[:, self.group] = y
+        values = outer.values(full)
+        for column in self.group[self._orders]:
+            k = outer.columns[column]
+            row = table.rows[k]
+            total += row.log_prior(values[:, k]) + (np.log(values[:, k]) if row.log_scale else 0.0)
+        if self._orders.any() and table.exchangeable[row.place.first]:
+            total += lgamma(np.count_nonzero(self._orders) + 1)
+        return total if self.rest is None else total + self.rest.log_density(y[:, ~self._orders])
 
 
 @final
@@ -154,6 +183,22 @@ class Draw:
         error = density[exists] - posterior.log_prior(z) - draw.log_likelihood[exists]
         marginal[exists] = error + draw.log_evidence[exists]
         return at.values, objective, draw.coordinates, density, marginal, draw.efficiency
+
+
+@final
+@dataclass(frozen=True)
+class Walk:
+    """Task: where walkers of emcee go from their positions (walkers, dimension), (points, dimension)."""
+
+    mixture: Mixture
+    """That moves follow."""
+
+    def __call__(self, posterior: Posterior, task: tuple[Matrix, np.random.SeedSequence]) -> Matrix:
+        """Points of the second half of the walk."""
+        position, seed = task
+        begin = Ensemble.started(position, posterior.log_density(position), position, seed)
+        chain = advance(posterior, begin, *_WALK, self.mixture).chain
+        return np.asarray(chain[len(chain) // 2 :].reshape(-1, position.shape[1]))
 
 
 def _begun(conditional: Conditional, values: Matrix, starts: Matrix) -> Matrix:

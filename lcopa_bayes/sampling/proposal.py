@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol, final
 
 import numpy as np
@@ -12,7 +12,7 @@ from scipy.special import logsumexp
 from sklearn.cluster import KMeans
 from sklearn.exceptions import ConvergenceWarning
 
-from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Index, Matrix, Vector
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.coordinates import Chart
@@ -47,10 +47,11 @@ _CLUSTERS, _PER_CLUSTER, _CLUSTER_STEPS = 20, 20, 15
 """Most clusters of a proposal, effective draws per dimension for each of them, and steps that improve it."""
 _LEAST_SIZE = 1e-4
 """Least variance of a cluster along every coordinate, over that of the weighted draws [-]."""
-_EQUAL = 6
-"""Largest weights for each dimension that are made equal (Koblents and Miguez 2015) [-]."""
-_LEVELLED, _WIDE = 0.3, 0.15
-"""Share of such a proposal whose clusters have equal weights, and of one that is wider [-]."""
+_EQUAL = 6, 2
+"""Largest weights for each dimension that are made equal (Koblents and Miguez 2015), while draws are few and
+once they are settled [-]."""
+_LEVELLED, _WIDE = (0.3, 0.1), (0.15, 0.1)
+"""Share of such a proposal whose clusters have equal weights, and of one that is wider, likewise [-]."""
 _HEAVIEST, _NEAR, _SHARPENED = 12, 7, 0.4
 """Heaviest draws that get a component of their own, draws for each dimension that give its width, and share
 of such components [-]."""
@@ -146,6 +147,29 @@ class Blend:
 
 @final
 @dataclass(frozen=True)
+class Product:
+    """A proposal of independent groups of coordinates, each with its own: where a posterior nearly divides
+    so, far fewer components cover it."""
+
+    groups: tuple[Index, ...]
+    """Columns of each, all of them together."""
+    proposals: tuple[Proposal, ...]
+
+    def draw(self, count: int, rng: np.random.Generator) -> Matrix:
+        """Independent draws, (count, dimension)."""
+        out = np.empty((count, sum(len(group) for group in self.groups)))
+        for group, proposal in zip(self.groups, self.proposals, strict=True):
+            out[:, group] = proposal.draw(count, rng)
+        return out
+
+    def log_density(self, points: Matrix) -> Vector:
+        """Log density, (n,)."""
+        parts = zip(self.groups, self.proposals, strict=True)
+        return np.asarray(sum(proposal.log_density(points[:, group]) for group, proposal in parts))
+
+
+@final
+@dataclass(frozen=True, eq=False)
 class Seen:
     """Draws of all proposals so far, weighted as draws of their mixture (Cornuet, Marin, Mira and Robert
     2012, Scand. J. Statist. 39)."""
@@ -155,27 +179,35 @@ class Seen:
     """Draws of each, those without density included."""
     points: tuple[Matrix, ...] = ()
     log_densities: tuple[Vector, ...] = ()
+    by_proposal: Matrix = field(default_factory=lambda: np.empty((0, 0)))
+    """Log density of every proposal at all points, (proposals, points) [nat]."""
 
     def joined(self, proposal: Proposal, count: int, y: Matrix, log_density: Vector) -> Seen:
         """With the draws y of another proposal, those of `count` that may have a density."""
+        points = (*self.points, y)
+        known = np.array([one.log_density(y) for one in self.proposals]).reshape(-1, len(y))
+        by_proposal = np.vstack(
+            [np.hstack([self.by_proposal, known]), proposal.log_density(np.concatenate(points))]
+        )
         return Seen(
             (*self.proposals, proposal),
             (*self.counts, count),
-            (*self.points, y),
+            points,
             (*self.log_densities, log_density),
+            by_proposal,
         )
 
     def last_weights(self) -> Vector:
         """Of the last proposal's draws, as draws of it alone [nat]."""
-        return np.asarray(self.log_densities[-1] - self.proposals[-1].log_density(self.points[-1]))
+        return np.asarray(self.log_densities[-1] - self.by_proposal[-1, -len(self.points[-1]) :])
 
-    def log_weights(self) -> Vector:
-        """Log of the density of each point over that of the mixture of proposals [nat]; their mean over all
-        draws is that of the density's integral."""
-        y = np.concatenate(self.points)
-        each = np.array([proposal.log_density(y) for proposal in self.proposals])
-        shares = np.array(self.counts)[:, None] / sum(self.counts)
-        return np.asarray(np.concatenate(self.log_densities) - logsumexp(each, axis=0, b=shares))
+    def log_weights(self, since: int = 0) -> Vector:
+        """Log of the density of each point of the proposals `since` one over that of their mixture [nat]; the
+        mean over all their draws is that of the density's integral."""
+        shares = np.array(self.counts[since:])[:, None] / sum(self.counts[since:])
+        first = sum(map(len, self.points[:since]))
+        mixture = logsumexp(self.by_proposal[since:, first:], axis=0, b=shares)
+        return np.asarray(np.concatenate(self.log_densities[since:]) - mixture)
 
     def efficiency(self, proposal: Proposal, log_weights: Vector) -> float:
         """Effective draws per draw of a proposal, by all points and their `log_weights` [-]: a region that it
@@ -200,19 +232,21 @@ def fitted(core: Mixture, y: Matrix, log_weights: Vector) -> tuple[Mixture, Mixt
     return core, core.blended(wider.blended(cloud.around_all, 0.5), _DEFENSIVE)
 
 
-def clustered(y: Matrix, log_weights: Vector, seed: int) -> Mixture:
+def clustered(y: Matrix, log_weights: Vector, seed: int, *, settled: bool = False) -> Mixture:
     """A proposal of clusters of weighted draws (n, dimension), improved by expectation maximisation; in part
-    with equal weights, so that a small mode is drawn from often enough, and in part wider."""
+    with equal weights, so that a small mode is drawn from often enough, and in part wider: less of both where
+    the draws are `settled`, known to cover what they were drawn for."""
+    equals, levelled, wide = (own[int(settled)] for own in (_EQUAL, _LEVELLED, _WIDE))
     weights = tempered(log_weights, min(_PER_CLUSTER * y.shape[1], 0.25 * log_weights.size))
     # the largest weights made equal: a cluster around one draw would cover nothing of what it stands for
-    equal = min(_EQUAL * y.shape[1], np.count_nonzero(weights))
+    equal = min(equals * y.shape[1], np.count_nonzero(weights))
     weights = np.minimum(weights, np.partition(weights, -equal)[-equal])
     weights /= weights.sum()
     count = int(np.clip(1 / (weights @ weights) / (_PER_CLUSTER * y.shape[1]), 1, _CLUSTERS))
     cloud = _Cloud.of(y, weights, _LEAST_SIZE)
     core = cloud.maximised(cloud.clusters(count, seed), _CLUSTER_STEPS)
     wider = replace(core.levelled(), factors=_WIDER * core.factors).blended(cloud.around_all, 0.3)
-    return core.blended(core.levelled(), _LEVELLED).blended(wider, _WIDE)
+    return core.blended(core.levelled(), levelled).blended(wider, wide)
 
 
 def adapted(y: Matrix, log_weights: Vector, seed: int) -> Mixture:
@@ -262,7 +296,9 @@ def paraboloid(y: Matrix, log_density: Vector) -> Mixture | None:
     spread = np.sqrt(((x @ axes) ** 2).mean(axis=0)) + 1e-150
     precision = np.maximum(steep, 1.0 / (_BEYOND * spread) ** 2)
     mode = np.clip(axes.T @ fit[1 : 1 + size] / precision, -_BEYOND * spread, _BEYOND * spread)
-    factor = np.linalg.cholesky((axes / precision) @ axes.T)
+    # the Cholesky factor of the covariance, also where its digits do not suffice to factorise it
+    upper = np.asarray(np.linalg.qr((axes / np.sqrt(precision)).T, mode="r"))
+    factor = upper.T * np.sign(np.diag(upper))
     return Mixture(np.ones(1), (centre + scale * (axes @ mode))[None], (scale[:, None] * factor)[None])
 
 
@@ -300,7 +336,7 @@ class _Cloud:
         """A component for each of `count` clusters of the draws."""
         y, masses, means, factors = self.y, [], [], []
         scaled = y / np.sqrt(np.diag(self.floor))
-        found = KMeans(count, n_init=3, random_state=seed)
+        found = KMeans(count, n_init=1, random_state=seed)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ConvergenceWarning)  # clusters without a draw are omitted below
             labels = found.fit(scaled, sample_weight=self.weights).labels_

@@ -43,9 +43,6 @@ _TREND = 2.0
 [-]: there chance is the less likely reason, and to go on costs little."""
 _THIN = 5
 """Steps per kept draw unless the study says otherwise."""
-_CONFIRMED_AFTER = 16
-"""Rounds before importance draws around where the ensembles have been are tried while these go on [-]: one
-trial costs as much as ten rounds."""
 _TRAIL = 1_500
 """Draws per ensemble that the first mixture is learned from, where a search gave them."""
 _DELIVERED = 500
@@ -158,9 +155,9 @@ def sample(
 ) -> Run:
     """Sample a posterior, as the plan allows by importance draws from a search over orders, delays and noise
     (`marginal`). Where their weights do not converge, rounds of emcee go on from the points of the search;
-    importance draws around where the walkers have been are tried again where the rounds are many, or a mode
-    filled during them. Populations tempered from the prior begin where no search is possible, or the plan
-    asks for ensembles.
+    importance draws around where the walkers have been are tried where a mode filled during them, unless the
+    search came nowhere near the posterior. Populations tempered from the prior begin where it did not, where
+    none is possible, or where the plan asks for ensembles.
 
     The draws depend on the arguments alone, not on `jobs` nor on interruptions: with `resume`, a run killed
     at any moment continues from the last complete round in `chain_file`. `starts`, table values (starts,
@@ -198,7 +195,7 @@ def sample(
                 run = Run(ensembles, plan)
                 last = done >= rounds or (done >= least and finished(posterior, run, bar))
                 filling = _filling(posterior, run) if searched and last else ()
-                if filling or (searched and not last and done >= _CONFIRMED_AFTER and due(done)):
+                if filling and (known is not None or not hardest):
                     with _points(quiet) as beside:
                         search = Search(posterior, plan.seed + done, crew, beside)
                         weighted = search.around(run.visited, wanted)
