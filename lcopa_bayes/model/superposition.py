@@ -216,7 +216,7 @@ class Superposition:
     def _reads(
         self, response: StepResponse, origins: Matrix, lattice: Lattice, key: tuple[int, int], kind: Kind
     ) -> list[_Read]:
-        """The step response at the place that the samples have in a block, for every phase (phases, batch)."""
+        """The step response at the place that the samples have in a block, for each of (phases, batch)."""
         places = [
             (*key, kind, lattice.step, lattice.exposure, round(float(place) / _SAME_PHASE) % _PLACES)
             for place in origins[:, 0] % 1.0
