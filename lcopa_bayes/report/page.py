@@ -16,7 +16,7 @@ from lcopa_bayes.core.files import writable_folder, write_text
 from lcopa_bayes.report.formatting import stopped
 from lcopa_bayes.report.savedrun import load_run
 from lcopa_bayes.report.section import Drawing, Section
-from lcopa_bayes.report.sections import overview, parameters, records, responses, sampling
+from lcopa_bayes.report.sections import overview, pairs, parameters, records, responses, sampling
 from lcopa_bayes.report.theme import inlined, look
 from lcopa_bayes.results.stored import stored_values
 
@@ -27,7 +27,7 @@ _SECTIONS = (
     responses.frequency,
     records.data,
     records.residuals,
-    parameters.pairs,
+    pairs.pairs,
     parameters.priors,
     parameters.sensitivity,
     parameters.traces,
