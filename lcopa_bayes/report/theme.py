@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, Locator, LogLocator, MaxNLocator, NullFormatter, NullLocator
+from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 INK = "#1a1a1a"
 SEEN = "#1a1a1a"
@@ -85,22 +85,18 @@ def grid(count: int, *, columns: int, height: float) -> tuple[Figure, Sequence[A
     return figure, list(panels[:count])
 
 
-def locator_of(low: float, high: float, *, log: bool, most: int) -> Locator:
-    """Places of about `most` ticks: round numbers, or powers of ten where a logarithmic axis spans many."""
-    if not log or high <= 5.0 * low:
-        return MaxNLocator(most, steps=[1, 2, 5, 10])
-    return LogLocator(subs=(1, 2, 5)) if high < _DECADES * low else LogLocator(numticks=4)
-
-
 def _log_ticks(axis: Axis) -> None:
     """Ticks of a logarithmic axis: round numbers when it spans few decades, else powers of ten."""
     low, high = axis.get_view_interval()
-    axis.set_major_locator(locator_of(low, high, log=True, most=4))
     few = high < _DECADES * low
+    if few:
+        wide = high > 5.0 * low
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)) if wide else MaxNLocator(4, steps=[1, 2, 5, 10]))
+        axis.set_minor_locator(NullLocator())
+    else:
+        axis.set_major_locator(LogLocator(numticks=4))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}" if few else _power(value)))
     axis.set_minor_formatter(NullFormatter())
-    if few:
-        axis.set_minor_locator(NullLocator())
 
 
 def _power(value: float) -> str:
@@ -134,7 +130,7 @@ def svg_of(figure: Figure) -> str:
     """The figure as SVG without dates or links to software, its coordinates to a hundredth of a point."""
     for panel in figure.axes:
         for axis in (panel.xaxis, panel.yaxis):
-            if axis.get_scale() == "log":
+            if axis.get_scale() == "log" and isinstance(axis.get_major_formatter(), LogFormatter):
                 _log_ticks(axis)
     out = io.StringIO()
     # not `savefig`, which draws all of a figure with a layout once more, unseen
