@@ -13,10 +13,11 @@ from markupsafe import Markup
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.files import writable_folder, write_text
+from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.report.formatting import stopped
-from lcopa_bayes.report.savedrun import load_run
+from lcopa_bayes.report.savedrun import SavedRun, load_run
 from lcopa_bayes.report.section import Drawing, Section
-from lcopa_bayes.report.sections import overview, parameters, records, responses, sampling
+from lcopa_bayes.report.sections import overview, pairs, parameters, records, responses, sampling
 from lcopa_bayes.report.theme import inlined, look
 from lcopa_bayes.results.stored import stored_values
 
@@ -27,7 +28,7 @@ _SECTIONS = (
     responses.frequency,
     records.data,
     records.residuals,
-    parameters.pairs,
+    pairs.pairs,
     parameters.priors,
     parameters.sensitivity,
     parameters.traces,
@@ -64,16 +65,23 @@ class Verdict:
         return cls(str(values["grade"]), stopped(sentence), "" if reason in sentence else reason)
 
 
-def write_report(folder: Path) -> Path:
+def write_report(folder: Path, *, jobs: int = 1) -> Path:
     """Draw the report of a run folder: `figures/*.svg` and `report.html`, whose path is returned.
 
-    Reads only the folder and calculates nothing; the same folder gives the same bytes. InputError when a
+    Reads only the folder and calculates nothing; the same folder gives the same bytes, whatever `jobs`
+    [processes]. InputError when a
     file of the folder is missing or cannot be used.
     """
     run = load_run(folder)
-    with look():
-        sections = [compose(run) for compose in _SECTIONS]
+    with workers(run, jobs=jobs) as crew:
+        sections = list(crew.each(_drawn, range(len(_SECTIONS))))
     return write_page(folder, str(run.results["study"]), sections, Verdict.of(run.results))
+
+
+def _drawn(run: SavedRun, number: int) -> Section:
+    """A section of the report."""
+    with look():
+        return _SECTIONS[number](run)
 
 
 def write_graded(

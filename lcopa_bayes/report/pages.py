@@ -32,9 +32,10 @@ _PAGES: Mapping[str, Callable[[Path], Path]] = {
 }
 
 
-def write_page_of(verb: str, folder: Path) -> Path:
+def write_page_of(verb: str, folder: Path, *, jobs: int = 1) -> Path:
     """Draw the page of a verb's result from the files of its run folder alone; returns its path.
 
+    The figures of a fit, the most of any page, are drawn in `jobs` processes.
     InputError when a file is missing or cannot be used.
     """
-    return _PAGES[verb](folder)
+    return write_report(folder, jobs=jobs) if verb == "fit" else _PAGES[verb](folder)

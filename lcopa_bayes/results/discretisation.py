@@ -113,23 +113,28 @@ def resolved(problem: Problem, optima: Sequence[Optimum] | None = None) -> Probl
     The same problem gives the same blocks; see `narrowed`. `optima` are its own, best first, where they are
     known already.
     """
-    rng = np.random.default_rng([problem.study.seed, 6])
     with threadpool_limits(1):  # matrices are small: more threads only wait for each other
         if optima is None:
-            optima = find_optima(problem.posterior, rng, starts=_STARTS)
+            optima = optima_of(problem)
         if not optima:
             return problem
         best = optima[0].values
         return narrowed(problem, lambda each: optimum_shift(each, best))
 
 
-def resolved_optima(problem: Problem, *, starts: int) -> tuple[Problem, tuple[Optimum, ...]]:
-    """`resolved`, and the optima there: with effects a search from the prior is too dear to be made twice."""
-    rng = np.random.default_rng([problem.study.seed, 6])
+def optima_of(problem: Problem, *, starts: int = _STARTS) -> tuple[Optimum, ...]:
+    """Least-squares optima of a study, best first: what the first look, the width of the blocks and sampling
+    begin with. The same problem gives the same optima."""
     with threadpool_limits(1):
-        optima = find_optima(problem.posterior, rng, starts=starts)
-        narrow = resolved(problem, optima)
-        return narrow, optima if narrow is problem else again(narrow.posterior, optima)
+        rng = np.random.default_rng([problem.study.seed, 6])
+        return find_optima(problem.posterior, rng, starts=starts)
+
+
+def resolved_optima(problem: Problem, optima: Sequence[Optimum]) -> tuple[Problem, tuple[Optimum, ...]]:
+    """`resolved`, and the optima there."""
+    narrow = resolved(problem, optima)
+    with threadpool_limits(1):
+        return narrow, tuple(optima) if narrow is problem else again(narrow.posterior, optima)
 
 
 def narrowed(problem: Problem, shift: Callable[[Problem], float]) -> Problem:

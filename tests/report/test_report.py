@@ -24,7 +24,7 @@ from lcopa_bayes.report.decimation import extremes
 from lcopa_bayes.report.formatting import NOT_REACHED, figures, interval, sentence, stopped, to_spread
 from lcopa_bayes.report.savedrun import load_run
 from lcopa_bayes.report.section import Column, Drawing, Section, Table
-from lcopa_bayes.report.sections import parameters, records, responses, sampling
+from lcopa_bayes.report.sections import pairs, parameters, records, responses, sampling
 from lcopa_bayes.report.theme import inlined
 from lcopa_bayes.sampling.modes import Modes
 
@@ -430,7 +430,7 @@ def test_intervals_and_significant_digits():
 
 def test_interesting_parameters_come_first_and_the_rest_is_named(tmp_path):
     names = ["sigma", "gain_a", "offset", "delay", "gate_1", "order_1", "time_2", "time_1"]
-    assert parameters.ranked(names) == [
+    assert pairs.ranked(names) == [
         "time_2",
         "time_1",
         "order_1",

@@ -1,4 +1,4 @@
-"""Parameters: table, corner plot, traces, priors and what decides each of them."""
+"""Parameters: table, traces, priors and what decides each of them."""
 
 from __future__ import annotations
 
@@ -7,16 +7,13 @@ from collections.abc import Callable, Mapping, Sequence
 from itertools import cycle
 from typing import Any
 
-import corner
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from lcopa_bayes.inference import defaultpriors
 from lcopa_bayes.report.formatting import NONE, figures, interval, percent, to_spread, with_error
 from lcopa_bayes.report.savedrun import SavedRun
-from lcopa_bayes.report.section import Drawing, Section, Table, paged
+from lcopa_bayes.report.section import Section, Table, paged
 from lcopa_bayes.report.theme import (
     BAND,
     CYCLE,
@@ -24,22 +21,11 @@ from lcopa_bayes.report.theme import (
     grid,
     label,
     legend_above,
-    log_ticks,
-    plain,
     svg_of,
 )
 
 _PER_FIGURE = 12
 """Parameters on one figure of traces or of priors."""
-_IN_CORNER = 10
-"""Parameters on one corner plot."""
-_KINDS = ("time", "order", "delay", "gain")
-"""Kinds of parameters that are shown first; of the rest, noise and offsets come last."""
-_LAST = ("offset", "sigma", "rho", "nu")
-_LABELS = 0.47
-"""Distance of an axis label from its panel [in]."""
-_MIDDLE = 0.995
-"""Share of the draws that each axis of the corner plot spans [-]."""
 _BINS = 30
 _MOST_SENSITIVE = 20
 """Sensitivities shown; the others are in the table of the run folder."""
@@ -124,74 +110,6 @@ def _ess(row: Mapping[str, Any]) -> str:
     return figures(row["ess"]) if (row["ess"] or 0) < 100 else f"{row['ess']:.0f}"
 
 
-def ranked(names: list[str]) -> list[str]:
-    """Names by interest: times, orders, delays, gains, anything else, offsets, noise; ties in their order."""
-
-    def rank(name: str) -> int:
-        kind = name.split("_")[0]
-        if kind in _KINDS:
-            return _KINDS.index(kind)
-        return len(_KINDS) + (1 + _LAST.index(kind) if kind in _LAST else 0)
-
-    return sorted(names, key=rank)
-
-
-def pairs(run: SavedRun) -> Section:
-    """Corner plot of the most interesting free parameters."""
-    moving = [name for name in run.units if np.ptp(run.draws[name]) > 0]
-    shown, left_out = ranked(moving)[:_IN_CORNER], ranked(moving)[_IN_CORNER:]
-    if not shown:
-        return Section("Pairs of parameters", ("No free parameter has draws that vary.",))
-    caption = (
-        "Contours, smoothed, hold about 50 and 90 % of the draws of a pair; dashed "
-        f"lines mark the 5, 50 and 95 % quantiles; each axis spans {100 * _MIDDLE:g} % of the draws."
-    )
-    rest = f" Not shown for lack of space: {', '.join(left_out)}." if left_out else ""
-    return Section("Pairs of parameters", drawings=(Drawing("corner", _corner(run, shown), caption + rest),))
-
-
-def _corner(run: SavedRun, names: list[str]) -> str:
-    values = np.stack([run.draws[name].ravel() for name in names], axis=1)
-    scales = ["log" if run.spans_decades(name) else "linear" for name in names]
-    side = min(9.6, max(3.4, 1.15 * len(names) + 0.9))
-    figure = Figure(figsize=(side, side))
-    small = len(names) > 5
-    corner.corner(
-        values,
-        fig=figure,
-        range=[_MIDDLE] * len(names),
-        axes_scale=scales,
-        bins=24,
-        smooth=1.0,
-        levels=(0.5, 0.9),
-        quantiles=(0.05, 0.5, 0.95),
-        color=BAND,
-        labels=[f"{plain(name)}\n[{plain(run.units[name])}]" for name in names],
-        label_kwargs={"fontsize": 7.5 if small else 8.5},
-        labelpad=max(0.05, _LABELS * len(names) / (side - 1.0) - 0.3),
-        max_n_ticks=3 if small else 4,
-        plot_density=False,
-        data_kwargs={"ms": 1.2, "alpha": 0.25},
-        hist_kwargs={"lw": 0.9},
-        contour_kwargs={"linewidths": 0.9},
-    )
-    for k, panel in enumerate(figure.axes):
-        row, column = divmod(k, len(names))
-        if row == len(names) - 1 and panel.get_xscale() == "log":
-            log_ticks(panel.xaxis, *panel.get_xlim())
-        if 0 == column < row and panel.get_yscale() == "log":
-            log_ticks(panel.yaxis, *panel.get_ylim())
-        if column < row or row == column == len(names) - 1:
-            panel.tick_params(labelrotation=45)
-        panel.tick_params(labelsize=6.5 if small else 7.5, length=2)
-        for line in panel.lines:
-            line.set_linewidth(0.8)
-    figure.align_labels()
-    room = 0.95 / side
-    figure.subplots_adjust(left=room, bottom=room, right=0.99, top=0.99)
-    return svg_of(figure)
-
-
 def traces(run: SavedRun) -> Section:
     """Draws in their order, with ensembles, or batches, in colours and R-hat in the titles."""
     names = list(run.units)
@@ -214,10 +132,10 @@ def _traces(run: SavedRun, names: Sequence[str]) -> str:
     figure, panels = grid(len(names), columns=2, height=1.15)
     for panel, name in zip(panels, names, strict=True):
         for chain, colour in zip(run.draws[name], cycle(CYCLE), strict=False):
-            panel.plot(np.arange(chain.size), chain, color=colour, lw=0.4, alpha=0.8, rasterized=True)
+            panel.plot(np.arange(chain.size), chain, color=colour, lw=0.4, alpha=0.8)
+        panel.set_rasterization_zorder(2.01)  # one picture of all lines
         if run.spans_decades(name):
             panel.set_yscale("log")
-            log_ticks(panel.yaxis, *panel.get_ylim())
         shown = "not defined" if rhat[name] is None else f"{rhat[name]:.3f}"
         panel.set_title(f"{label(name, run.units[name])}   R-hat {shown}", fontsize=8)
         panel.margins(x=0.01)
@@ -277,13 +195,12 @@ def marginals(run: SavedRun, names: Sequence[str], draw: Callable[[Axes, SavedRu
     return svg_of(figure)
 
 
-def density_axis(panel: Axes, low: float, high: float, *, log: bool) -> None:
+def density_axis(panel: Axes, *, log: bool) -> None:
     """Scale and ticks of the axis of a density."""
     if log:
         panel.set_xscale("log")
-        log_ticks(panel.xaxis, low, high)
     else:
-        panel.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+        panel.locator_params(axis="x", nbins=4)
 
 
 def _prior(panel: Axes, run: SavedRun, name: str) -> None:
@@ -295,7 +212,7 @@ def _prior(panel: Axes, run: SavedRun, name: str) -> None:
     counts, edges = np.histogram(np.log(draws) if log else draws, bins=_BINS, density=True)
     panel.stairs(counts, np.exp(edges) if log else edges, fill=True, color=BAND, alpha=0.5, label="draws")
     panel.plot(x, height, color=HELD_OUT, label="prior")
-    density_axis(panel, float(x.min()), float(x.max()), log=log)
+    density_axis(panel, log=log)
 
 
 def sensitivity(run: SavedRun) -> Section:

@@ -13,7 +13,7 @@ from lcopa_bayes.report.decimation import draw_bands, draw_line
 from lcopa_bayes.report.formatting import NOT_REACHED, OPEN, figures, interval, to_spread
 from lcopa_bayes.report.savedrun import SavedRun
 from lcopa_bayes.report.section import Section, Table, paged
-from lcopa_bayes.report.theme import BAND, STEADY, grid, label, legend_above, log_ticks, plain, svg_of
+from lcopa_bayes.report.theme import BAND, STEADY, grid, label, legend_above, plain, svg_of
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
 
 _STEPS_PER_FIGURE, _BODE_PER_FIGURE = 6, 4
@@ -128,7 +128,6 @@ def _bode(run: SavedRun, table: pd.DataFrame, paths: Sequence[str]) -> str:
             panel.set(xscale="log", xlabel=f"frequency [cycles per {plain(run.time_unit)}]")
         if (rows[f"gain_{POINTWISE}_05"] > 0).all():
             gain.set_yscale("log")
-            log_ticks(gain.yaxis, *gain.get_ylim())
         gain.set(title=plain(path), ylabel=label("gain", rows["unit"].iloc[0]))
         phase.set_ylabel("phase [deg]")
         low = float(np.floor(rows[f"phase_{POINTWISE}_05"].min() / 90) * 90)
