@@ -11,6 +11,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.leastsquares import LeastSquares
+from lcopa_bayes.inference.poles import regressed
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.effects.effect import UnstableError
 
@@ -50,8 +51,8 @@ class Optimum:
 def find_optima(
     posterior: Posterior, rng: np.random.Generator, *, starts: int = 12, near: Sequence[Vector] = ()
 ) -> tuple[Optimum, ...]:
-    """Local optima from the best of many prior draws, best first, duplicates removed; `near` are further
-    table values, (rows,), looked at like draws.
+    """Local optima from the best of many prior draws and of poles from a regression, best first, duplicates
+    removed; `near` are further table values, (rows,), looked at like draws.
 
     Screening and a first solve treat the residual as nearly white; a second solve uses the noise model with
     its parameters estimated from the first residual. With effects the plant alone is searched first, and its
@@ -62,7 +63,7 @@ def find_optima(
         alone = find_optima(posterior.without_effects, rng, starts=starts)
         return _kept(posterior, _descended(posterior, _near(posterior, effect_starts(posterior, alone, rng))))
     drawn = table.draw(_SCREENED, rng)
-    drawn[: len(near)] = np.array(near).reshape(-1, len(table.rows))
+    drawn = np.vstack([*near, regressed(posterior, drawn), drawn])
     for axis, scale in enumerate(_spread(posterior)):
         for name, value in posterior.noise.nearly_white(0.05 * scale).items():
             if table.rows[table.at(name, axis)].free:
