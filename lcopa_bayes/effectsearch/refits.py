@@ -11,6 +11,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.effectsearch.basefit import renewed
 from lcopa_bayes.effectsearch.crossvalidation import groups, log_scores
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
@@ -136,7 +137,7 @@ class Refit:
         at = np.searchsorted(free, where)
         tangents = self.optimum.jacobian[:, free]
         information = self.optimum.information[np.ix_(free, free)]
-        gain = np.linalg.pinv(information, hermitian=True)[:, at]
+        gain = covariance_of(information)[:, at]
         held = information - tangents.T @ tangents  # what priors say
         noise = self.whitening.covariances(tangents @ gain, _PROCESSES)
         power = [psi @ np.linalg.solve(one + gain.T @ held @ gain, psi) for one in noise]
