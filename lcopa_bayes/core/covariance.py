@@ -26,7 +26,7 @@ def covariance_of(information: Array) -> Array:
 
 
 def root_of(covariance: Matrix) -> Matrix:
-    """A factor R with R R' the covariance (k, k), regular unless a variance is 0: ``mean + R z`` are draws."""
+    """A factor R with R R' the covariance (k, k), regular unless a variance is 0."""
     sd = np.sqrt(np.diag(covariance))
     scale = np.where(sd > 0.0, sd, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))

@@ -13,7 +13,7 @@ INFORMATION = TANGENTS.T @ TANGENTS
 
 @given(st.lists(st.integers(-40, 40), min_size=4, max_size=4))
 def test_units_scale_a_covariance(powers):
-    """Powers of two up to 1e12 to either side: `numpy.linalg.inv` of the matrix in good units is the truth."""
+    """Powers of two up to 1e12 to either side: the inverse in good units is the truth."""
     unit = np.exp2(np.array(powers))
     found = covariance_of(INFORMATION * np.outer(unit, unit))
     np.testing.assert_allclose(found * np.outer(unit, unit), np.linalg.inv(INFORMATION), rtol=1e-9)
