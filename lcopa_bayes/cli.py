@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, final
+from typing import TYPE_CHECKING, Any, Protocol
 
 import lcopa_bayes
 
@@ -43,7 +43,6 @@ Derived = Callable[[argparse.Namespace, Any], object]
 """An argument of a public function from the options and the study or fit."""
 
 
-@final
 @dataclass(frozen=True)
 class Outcome:
     """What a verb prints."""
@@ -54,7 +53,6 @@ class Outcome:
     """For a reader."""
 
 
-@final
 @dataclass(frozen=True)
 class Verb:
     """A verb of the command line."""

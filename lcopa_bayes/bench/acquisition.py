@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import inf, sqrt
-from typing import Annotated, final
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,7 +29,6 @@ _DEVIATIONS = Rule(
 _CORRELATION = Rule("a number between -1 and 1", lambda value: is_number(value) and -1 < value < 1)
 
 
-@final
 @dataclass(frozen=True)
 class Bench(Ruled):
     """How a device is driven and watched, with times in the unit of the device; InputError with all that is

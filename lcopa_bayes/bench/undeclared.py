@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import pi
 from types import ModuleType
-from typing import ClassVar, Literal, final
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -27,7 +27,6 @@ LARGEST = pi / 2
 """Largest drive of either axis [rad]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Schedule:
     """Drive of one record."""
@@ -130,7 +129,6 @@ OUTSIDE: dict[str, Maker] = _makers(unnamedeffects)
 """Effects that no catalogue contains."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Campaign:
     """Records of one device with hidden effects, and what only the evaluation may read."""
@@ -248,7 +246,6 @@ def shot_of(device: Device, epoch: float, rng: np.random.Generator) -> Shot:
     return Shot(epoch, drive, np.abs(np.diag(steady)) * drive, device.paths[0][0].delay, steady, rng)
 
 
-@final
 @dataclass(frozen=True)
 class UndeclaredPlan(Ruled):
     """A campaign file with a table ``[undeclared]``: effects by name, at sizes drawn from the seed.

@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import final
 
 from lcopa_bayes.calibration.replica import ENGINES, Engine, Failure, Outcome, Replication
 from lcopa_bayes.calibration.store import Store
@@ -25,7 +24,6 @@ ENOUGH = 400
 """Effective draws of a replica: a rank among so many is exact to 0.05, far below the scatter of ranks."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """Replicas of a study, in the order of their numbers."""

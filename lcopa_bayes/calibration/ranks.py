@@ -10,7 +10,7 @@ Vehtari 2022, Statistics and Computing 32). Both are computed exactly, not by si
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, final
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -119,7 +119,6 @@ LEVELS = (0.5, 0.9)
 """Probabilities inside the central intervals that are checked [-]."""
 
 
-@final
 @dataclass(frozen=True)
 class Coverage:
     """Coverage of the central interval of one quantity at one level."""

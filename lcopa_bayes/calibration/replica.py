@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, NamedTuple, final, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -57,7 +57,6 @@ class Quantity(NamedTuple):
     unit: str
 
 
-@final
 @dataclass(frozen=True)
 class Outcome:
     """What one replica gave; the tuples have one entry per quantity."""
@@ -90,7 +89,6 @@ class Outcome:
     """Whether the fit takes that shift for negligible."""
 
 
-@final
 @dataclass(frozen=True)
 class Failure:
     """A replica that could not be done."""
@@ -100,7 +98,6 @@ class Failure:
     error: str
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Replication:
     """How replicas of a study are made; replica k depends on the seed of `plan` and on k alone."""

@@ -6,7 +6,7 @@ import hashlib
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
 from lcopa_bayes.calibration.replica import Outcome, Replication
 from lcopa_bayes.core.errors import InputError
@@ -27,7 +27,6 @@ def store_fingerprint(replication: Replication) -> str:
     return hashlib.sha256(json.dumps(values).encode()).hexdigest()
 
 
-@final
 @dataclass(frozen=True)
 class Store:
     """Folder of outcomes that share a fingerprint."""

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import log
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -38,7 +38,6 @@ _CLIMBED = 4
 """Draws the maximum is sought from."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Criteria:
     """AIC and BIC, for those who want them: they ignore priors and confounded parameters."""
@@ -101,7 +100,6 @@ _VERSION = 4
 """Raised when what a card holds changes."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Contender:
     """A candidate and how it is to be fitted."""

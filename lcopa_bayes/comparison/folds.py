@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, final
+from typing import Literal
 
 import numpy as np
 
@@ -22,7 +22,6 @@ CUTS = (0.5, 0.625, 0.75, 0.875)
 """Shares of a single record that are known when what follows is predicted [-]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Part:
     """Samples predicted from others."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import hypot, log
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +24,6 @@ ERRORS = 2.0
 Row = Mapping[str, Any]
 
 
-@final
 @dataclass(frozen=True)
 class Gain:
     """What one candidate gains over another."""

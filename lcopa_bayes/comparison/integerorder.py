@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from math import log, sqrt
-from typing import Any, Literal, final
+from typing import Any, Literal
 
 import numpy as np
 
@@ -29,7 +29,6 @@ Answer = Literal["integer", "not an integer", "undecided"]
 Method = Literal["draws at the integer", "normal tail", "undefined"]
 
 
-@final
 @dataclass(frozen=True)
 class IntegerOrder:
     """What the draws say of one order."""

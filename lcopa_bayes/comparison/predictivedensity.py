@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal, final
+from typing import Any, Literal
 
 import numpy as np
 from scipy.special import logsumexp
@@ -37,7 +37,6 @@ _BEYOND = 3.0
 Method = Literal["exact", "importance weights", "refit"]
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Predicted:
     """Log predictive densities of the samples of one part, all axes."""
@@ -168,7 +167,6 @@ def _walkers(fit: Fit) -> Array:
     return fit.run.kept()[0][:, :, -1]
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class _Scored:
     """Densities of the samples of a part under weighted draws."""

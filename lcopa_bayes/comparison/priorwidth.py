@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from math import exp, log, sqrt
-from typing import Any, Literal, final
+from typing import Any, Literal
 
 import numpy as np
 from scipy.special import logsumexp
@@ -25,7 +25,6 @@ _WIDENED = frozenset({"gain", "time", "delay"})
 noise scale are alike in all candidates."""
 
 
-@final
 @dataclass(frozen=True)
 class Width:
     """Log evidence under other priors."""

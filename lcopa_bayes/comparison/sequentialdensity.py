@@ -14,7 +14,7 @@ costs a few nats, as many as its prior is wide, and no draw of it has to come ne
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, final
+from typing import Literal
 
 import numpy as np
 from scipy.special import logsumexp
@@ -59,7 +59,6 @@ def _resting(samples: Samples, axis: int) -> int:
     return samples.quiet(axis).values.size if np.isfinite(samples.first_change) else 0
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Level:
     """Level of one axis of a predicted record."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +16,6 @@ EQUAL_TAILED = "equal-tailed credible"
 """The kind of interval reported: as much probability below it as above."""
 
 
-@final
 @dataclass(frozen=True)
 class Estimate:
     """Posterior median and interval of one quantity."""

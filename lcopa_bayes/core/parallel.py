@@ -15,7 +15,7 @@ from importlib import import_module
 from multiprocessing import parent_process
 from multiprocessing.context import SpawnContext, SpawnProcess
 from threading import Thread
-from typing import Any, Generic, TypeVar, final
+from typing import Any, Generic, TypeVar
 
 from threadpoolctl import threadpool_limits
 
@@ -103,7 +103,6 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
-@final
 class _Here(Workers[S]):
     """This process."""
 
@@ -129,7 +128,6 @@ class _Here(Workers[S]):
             yield result
 
 
-@final
 class _Processes(Workers[S]):
     """Other processes on this machine."""
 
@@ -154,7 +152,6 @@ class _Processes(Workers[S]):
                 yield failed(futures[future], error)
 
 
-@final
 class _Cluster(Workers[S]):
     """The workers of a Dask scheduler."""
 
@@ -201,7 +198,6 @@ def _cluster(shared: S, address: str) -> Iterator[_Cluster[S]]:
         raise InputError(f"--dask {address}: the scheduler was lost ({error}); {_ADVICE}") from None
 
 
-@final
 class _Alone(Generic[T, R]):
     """Task: a function of the input alone."""
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import final
 
 import numpy as np
 
@@ -49,7 +48,6 @@ UNKNOWN = "-"
 """Unit of a column whose header names none."""
 
 
-@final
 @dataclass(frozen=True)
 class Mapped:
     """Columns as a user names them, by header, by header without its unit or by number, each perhaps behind a
@@ -66,7 +64,6 @@ class Mapped:
     """Format of time stamps, as of `datetime.strptime`; empty: recognised from them."""
 
 
-@final
 @dataclass(eq=False)
 class Converted:
     """Records of tables, and how these were read."""
@@ -76,7 +73,6 @@ class Converted:
     """What was taken for what, one sentence each."""
 
 
-@final
 @dataclass(frozen=True)
 class _Column:
     """A header: its words, its unit, and how its cells read in every table."""

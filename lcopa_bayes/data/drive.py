@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,7 +23,6 @@ from lcopa_bayes.core.units import TIME_UNITS, in_time_unit
 from lcopa_bayes.data.record import Axis, Columns, Driven
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class AxisDrive:
     """Deviation of a drive from its resting value, as a sequence of changes.
@@ -116,7 +114,6 @@ Units = str | Mapping[str, str] | None
 """One unit for all axes, one per axis by name, or none: those of the study."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Drive:
     """Values of every drive axis over time; InputError with all that is wrong with them.

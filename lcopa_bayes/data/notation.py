@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import final
 
 import numpy as np
 import pandas as pd
@@ -24,7 +23,6 @@ _FORMATS = (*(f"{date} {clock}" for date, clock in product(_DATES, _CLOCKS)), *_
 _DAY = 86_400.0
 
 
-@final
 @dataclass(frozen=True)
 class Sign:
     """A decimal sign, or why it is ambiguous."""

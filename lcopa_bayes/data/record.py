@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, TypeAlias, final
+from typing import Protocol, TypeAlias
 
 import numpy as np
 import pandas as pd
@@ -28,7 +28,6 @@ from lcopa_bayes.data.cells import FORM, SUFFIXES, CellTable, frame_cells, read_
 _ROLES = ("time", "drive", "response")
 
 
-@final
 @dataclass(frozen=True)
 class Axis:
     """One column of drive or response: a free name, which may hold underscores, and a free unit."""
@@ -55,7 +54,6 @@ class Driven(Protocol):
     def drive(self) -> Matrix: ...  # noqa: D102
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Record:
     """One experiment, sampled uniformly or not; arrays are finite, checked and read-only.
@@ -156,7 +154,6 @@ def _numbers(table: CellTable, column: int, *, missing: bool) -> Vector:
     return out
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Columns:
     """Columns of a record file by role."""

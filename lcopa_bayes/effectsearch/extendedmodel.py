@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import final
 
 import numpy as np
 
@@ -24,7 +23,6 @@ _UNIT = np.array([1.0, 0.0, 0.0])
 """Noise of unit scale, as `WhiteAR1` takes it."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class ExtendedModel:
     """A posterior with effects at the scales of a base fit, in the search coordinates of `LeastSquares`:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -49,7 +49,6 @@ _DELAYS = (-0.25, -0.1)
 """Shares of a delay by which it is also started earlier, for effects that act on the drive [-]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Refit:
     """The plant with a set of effects at its optimum."""

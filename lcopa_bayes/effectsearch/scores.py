@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 from scipy.stats import norm
@@ -37,7 +37,6 @@ WIDTH = float(norm.ppf(0.5 + LEVEL / 2))
 """Half width of a central 90 % interval of a normal distribution [sd]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Score:
     """One response axis of one record against its prediction."""
@@ -99,7 +98,6 @@ class Score:
         }
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class State:
     """A model at its optimum under its noise, and how wide its bands must be."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import final
 
 import numpy as np
 
@@ -20,7 +19,6 @@ _PER_LAW = 4
 _SEED = 7
 
 
-@final
 @dataclass(frozen=True)
 class Part:
     """Samples of one response axis of one record inside the stacked samples of all."""
@@ -52,7 +50,6 @@ def stacked(samples: Sequence[Samples], responses: Sequence[Array]) -> Matrix:
     )
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Whitening:
     """Noise of every axis applied to stacked samples; records are independent of each other."""

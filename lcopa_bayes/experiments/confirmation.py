@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import isfinite
 from operator import call
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -25,7 +25,6 @@ _RESAMPLED = 2000
 """Bootstrap samples behind the interval of a factor."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Achieved:
     """Estimates from independent records of one drive."""
@@ -45,7 +44,6 @@ class Achieved:
         return np.asarray(self.errors.std(axis=0, ddof=1))
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Confirmation:
     """Expected against achieved precision of the winner and the plain step at one draw of the posterior."""

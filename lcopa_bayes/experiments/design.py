@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import final
 
 import numpy as np
 
@@ -34,7 +33,6 @@ _PRIOR_POINTS = 12
 """Draws of the prior at which symmetries are looked for, besides those of the posterior."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Design:
     """Promises of every drive at every bench time tried."""

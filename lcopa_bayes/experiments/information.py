@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import ceil
-from typing import NamedTuple, final
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,7 +38,6 @@ class Prepared(NamedTuple):
     """Its readings, shared by all drives."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Bench:
     """A record of `time` [time unit], sampled every `period`, that is still to be taken.

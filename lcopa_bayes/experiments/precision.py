@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import final
 
 import numpy as np
 
@@ -20,7 +19,6 @@ _TOUCHED = 1e-6
 """Squared weight in a singular direction from which a parameter's variance is infinite [-]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Promise:
     """Cramer-Rao covariances of the plant's parameters after one drive of one length."""

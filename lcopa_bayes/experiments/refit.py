@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,7 +28,6 @@ _AT_BOUND = 1e-3
 """Closer to an end of the search than this, on its coordinate, an estimate leans on it."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Trial:
     """One record of one drive, with noise of its own, fitted."""
@@ -49,7 +47,6 @@ class Trial:
         return _errors(problem, again, result, values, self.names), _leaning(again, result, self.names)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class EffectedDevice:
     """A plant with effects, simulated by the model itself: no device of the virtual bench has them."""

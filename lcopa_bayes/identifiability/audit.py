@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -49,7 +49,6 @@ _TRIES = 3
 """... this many times at most."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Audit:
     """Identifiability of a fitted study."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 from scipy.stats import rankdata
@@ -29,7 +29,6 @@ LEVEL = 0.5
 """Width of an offset over the range of the response [-]."""
 
 
-@final
 @dataclass(frozen=True)
 class Tolerance:
     """Largest interval of an identified parameter."""
@@ -75,7 +74,6 @@ _STRAYING = 1000.0
 """A width relative to the median beyond this has no information [-]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Belief:
     """Posterior of one parameter beside its prior."""
@@ -106,7 +104,6 @@ class Belief:
         )
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Known:
     """A function of the parameters, by the posterior and by the prior."""

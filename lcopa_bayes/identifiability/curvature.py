@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from lcopa_bayes.inference.noise import Student
 from lcopa_bayes.inference.posterior import Posterior
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Sensitivities:
     """Derivatives of the samples, whitened by the noise model, at one set of values.
@@ -73,7 +72,6 @@ _SHOWN = 0.1
 """Weights of a direction that are named [-]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Curvature:
     """Local precision of the free plant parameters on their sampled scale."""

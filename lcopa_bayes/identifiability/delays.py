@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 from scipy.stats import norm
@@ -18,7 +18,6 @@ from lcopa_bayes.inference.likelihood import Landscape
 from lcopa_bayes.inference.parameters import ParameterTable
 
 
-@final
 @dataclass(frozen=True)
 class Separation:
     """Smallest difference of the delays of two paths that the records resolve."""
@@ -30,7 +29,6 @@ class Separation:
     where the records have no information about one of the two."""
 
 
-@final
 @dataclass(frozen=True)
 class Delays:
     """Delay separation at the maximum of the likelihood, every path given a delay of its own."""

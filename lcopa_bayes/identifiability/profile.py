@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2, t
@@ -39,7 +39,6 @@ _FAR = 3
 """Draws beyond the last point from which another mode is sought."""
 
 
-@final
 @dataclass(frozen=True)
 class Freedom:
     """Numbers of samples and of fitted parameters."""
@@ -71,7 +70,6 @@ class Freedom:
         return self.samples * float(np.log1p(t.ppf((1 + level) / 2, degrees) ** 2 / degrees))
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Profile:
     """Largest likelihood at each value of one parameter.

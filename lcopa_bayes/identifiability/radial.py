@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -18,7 +18,6 @@ _WEIGHT = 10.0
 """Standardised residual of a point that stays at the maximum: far above what the data object [-]."""
 
 
-@final
 @dataclass(frozen=True)
 class Radial:
     """Result of the radial test (Kreutz 2018, Bioinformatics 34)."""

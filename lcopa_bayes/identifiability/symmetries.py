@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import combinations
-from typing import Any, Literal, final
+from typing import Any, Literal
 
 import numpy as np
 
@@ -33,7 +33,6 @@ _NOTHING = 1e-10
 """Relative change of the responses below which a parameter has no effect [-]."""
 
 
-@final
 @dataclass(frozen=True)
 class Symmetry:
     """Parameters that can make up for each other exactly."""
@@ -50,7 +49,6 @@ class Symmetry:
         return plain(asdict(self))
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Structure:
     """What the model and the drives leave open before any noise."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, final
+from typing import Any, Literal
 
 import numpy as np
 
@@ -30,7 +30,6 @@ _APART = 3.0
 """Factor between local and profile widths from which they disagree [-]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Finding:
     """Verdict of one parameter with its evidence."""

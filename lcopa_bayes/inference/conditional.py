@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, final
+from typing import NamedTuple
 
 import numpy as np
 
@@ -65,7 +65,6 @@ class Expanded(NamedTuple):
     """Derivatives of the natural coordinates in the coordinates, (batch, size, size)."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Conditional:
     """Coordinates of what a posterior has beside orders, delays and noise."""

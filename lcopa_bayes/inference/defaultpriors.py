@@ -44,7 +44,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import final
 
 import numpy as np
 
@@ -65,7 +64,6 @@ _BEYOND = 1.5
 """Factor by which correlated noise in motion exceeds the limit at rest at most [-]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Scales:
     """What the default priors are derived from."""

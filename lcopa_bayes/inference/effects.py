@@ -17,7 +17,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import final
 
 import numpy as np
 
@@ -37,7 +36,6 @@ _STEP = 1e-4
 """Step of a constant, over its value or, where it lies between 0 and 1, over 1 [-]."""
 
 
-@final
 @dataclass(frozen=True)
 class Placed:
     """One entry of psi."""
@@ -51,7 +49,6 @@ class Placed:
     """Position of its record; None when it acts on all."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Effected:
     """Base model plus effects over a set of records."""

@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf
 from types import MappingProxyType
-from typing import Literal, final
+from typing import Literal
 
 from lcopa_bayes.core.arrays import Flags, Vector
 
 
-@final
 @dataclass(frozen=True)
 class Kind:
     """A kind of parameter."""

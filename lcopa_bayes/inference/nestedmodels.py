@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import final
 
 import numpy as np
 
@@ -44,7 +43,6 @@ def lifted(values: Matrix, small: Posterior, large: Posterior, rng: np.random.Ge
     return _Lift(small.table, large.table, small.noise.kind, large.noise.kind, rng)(values, large)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class _Lift:
     small: ParameterTable

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, ClassVar, final
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from scipy.linalg.lapack import dpttrf, dpttrs
@@ -85,7 +85,6 @@ class GaussianNoise(Noise):
         """Log innovation sd of each sample, broadcastable to (batch, n)."""
 
 
-@final
 class White(GaussianNoise):
     """Independent Gaussian samples."""
 
@@ -116,7 +115,6 @@ class White(GaussianNoise):
         return {"sigma": sd}
 
 
-@final
 class AR1(GaussianNoise):
     """Gaussian samples whose correlation over a gap of g sampling periods is ``rho**g``.
 
@@ -173,7 +171,6 @@ class AR1(GaussianNoise):
         return link, scales
 
 
-@final
 class WhiteAR1(GaussianNoise):
     """White measurement noise plus a correlated part that is Gaussian and stationary.
 
@@ -277,7 +274,6 @@ class WhiteAR1(GaussianNoise):
         return link, variances, lower
 
 
-@final
 class Student(Noise):
     """Independent Student-t samples: scale `sigma`, `nu` degrees of freedom."""
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import final
 
 import numpy as np
 
@@ -16,7 +15,6 @@ BEFORE_DRIVE = "samples before the drive acts"
 """Source of an offset."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Observed:
     """Samples of one response axis in one record."""
@@ -37,7 +35,6 @@ class Observed:
         return slice(first, last) if last - first == self.index.size else self.index
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Samples:
     """All samples of one record."""

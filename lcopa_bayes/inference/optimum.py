@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import final
 
 import numpy as np
 
@@ -32,7 +31,6 @@ _HARDLY = 1e-2
 """Size of a coefficient that cannot be negative where it should vanish [prior scale]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Optimum:
     """A local least-squares solution."""

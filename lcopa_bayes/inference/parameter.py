@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from math import inf, log
-from typing import NamedTuple, final
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import expit, log_expit, logit
@@ -29,7 +29,6 @@ class Place(NamedTuple):
     second: int
 
 
-@final
 @dataclass(frozen=True)
 class Parameter:
     """One number of the model."""

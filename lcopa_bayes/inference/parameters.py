@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import lgamma, log
-from typing import NamedTuple, final
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,7 +41,6 @@ class Terms(NamedTuple):
         return sorted(self.times + self.orders)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class ParameterTable:
     """All parameters of a posterior; arrays of values have one column per row of the table."""

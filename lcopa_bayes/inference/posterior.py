@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeAlias, final
+from typing import TypeAlias
 
 import numpy as np
 from scipy.special import expit, log_expit, logit
@@ -25,7 +25,6 @@ _PORTION = 128
 """Parameter sets evaluated at once: what one portion holds stays in the processor's cache."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Posterior:
     """Log density of the sampled coordinates, a batch at a time.
@@ -296,7 +295,6 @@ class Posterior:
         return replace(self, table=table, model=self.model.plain, surrogate=None)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
     """Linear parameters that are integrated out: ``y = X b + white noise`` for a batch of X.

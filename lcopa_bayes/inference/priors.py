@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from math import log, pi
 from types import MappingProxyType
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -37,7 +37,6 @@ _CLOSED_PARAMETERS = {"uniform": {"loc", "scale"}, "loguniform": {"a", "b"}, "no
 """Closed forms are ten times faster than scipy's general path and tested against it."""
 
 
-@final
 @dataclass(frozen=True)
 class Prior:
     """A proper density of one parameter."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import final
 
 import numpy as np
 from scipy.special import expit
@@ -29,7 +28,6 @@ _CELLS = 2_000_000
 """Samples times parameter sets that are whitened at once [-]."""
 
 
-@final
 @dataclass(frozen=True)
 class QuietNoise:
     """Noise of one response axis as its samples at rest give it."""
@@ -44,7 +42,6 @@ class QuietNoise:
     """97.5 % limit of the correlated part's standard deviation [response unit]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class PlausibleNoise:
     """Posterior of `WhiteAR1` given pieces of it, over a grid of shares and correlations.

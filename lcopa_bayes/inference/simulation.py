@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple, final
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,7 +44,6 @@ class Simulated(NamedTuple):
     """Plants that have a bounded response, (batch,); the others are 0 throughout."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Simulation:
     """The model of a table with the effects of a forward model."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, final
+from typing import NamedTuple
 
 from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.data.record import Axis
@@ -40,7 +40,6 @@ class PathSlot(NamedTuple):
     """Of its gain [response unit per drive unit]."""
 
 
-@final
 @dataclass(frozen=True)
 class Layout:
     """Axes of a plant and the slots its paths take their element and delay from."""

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +25,6 @@ _WRAP = 1e-13
 """r^length: weight of the coefficients that wrap around [-]."""
 
 
-@final
 @dataclass(frozen=True)
 class Circle:
     """Evaluation points for series of `n` coefficients."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, final
+from typing import Literal
 
 import numpy as np
 
@@ -74,7 +74,6 @@ def taps(theta: Array, kind: Kind) -> Array:
     return out
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class StepResponse:
     """Unit step responses of a batch of elements and, as further rows, their derivatives.

@@ -8,7 +8,6 @@ the circle and spoil up to four digits of every block. Their differences do not 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import final
 
 import numpy as np
 
@@ -17,7 +16,6 @@ from lcopa_bayes.model.blockpulses import integration_weights, integration_weigh
 from lcopa_bayes.model.powerseries import Circle, Spectrum
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class TransferSlopes:
     """Derivatives of a transfer function on the circle, one entry per viscous term."""

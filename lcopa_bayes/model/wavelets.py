@@ -22,7 +22,7 @@ import timeit
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import NamedTuple, final
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -33,7 +33,6 @@ from lcopa_bayes.model.blockpulses import integration_matrix
 from lcopa_bayes.model.path import TransferPath
 
 
-@final
 @dataclass(frozen=True)
 class WaveletBasis:
     """The constant and the wavelets of Eq. 37 with m = 1 on levels 1..K, N = 2^K functions in all.

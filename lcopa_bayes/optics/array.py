@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import pi
-from typing import Annotated, final
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +19,6 @@ _ROUNDING = 4 * float(np.finfo(float).eps)
 """A direction cosine beyond 1 by no more than this [-] is end-fire within rounding."""
 
 
-@final
 @dataclass(frozen=True)
 class LinearArray(Ruled):
     """Equally spaced elements in a row; InputError for an impossible array, all problems at once."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 from math import pi, sqrt
-from typing import Annotated, final
+from typing import Annotated
 
 from lcopa_bayes.core.rules import POSITIVE, Ruled
 from lcopa_bayes.model.literature import PAPER, StatedOptics
@@ -28,7 +28,6 @@ class Field(Enum):
     """Constant displacement ``D``, ``dV/dz = D / (eps + deps sin^2 th)``, which integrates to V."""
 
 
-@final
 @dataclass(frozen=True)
 class Cell(Ruled):
     """Nematic of positive dielectric anisotropy between parallel plates; InputError for anything else."""

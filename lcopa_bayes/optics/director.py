@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import isfinite, pi, sqrt
-from typing import NamedTuple, final
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
@@ -36,7 +36,6 @@ class NotConverged(RuntimeError):  # noqa: N818 - a state of the iteration, name
         )
 
 
-@final
 @dataclass(frozen=True)
 class Profile:
     """Equilibrium tilt across the cell at one voltage."""

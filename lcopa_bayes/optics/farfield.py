@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import pi
-from typing import final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -58,7 +57,6 @@ def intensity(array: LinearArray, u: ArrayLike, step: float) -> Array:
     return np.asarray(array_factor(array, u, step) ** 2 * element_factor(array, u) / main)
 
 
-@final
 @dataclass(frozen=True)
 class LinearPatterns:
     """Patterns of one linear array steered to several targets: the data of Fig. 3."""
@@ -71,7 +69,6 @@ class LinearPatterns:
     """(m, n) [-], 1 at each target."""
 
 
-@final
 @dataclass(frozen=True)
 class PlanarPattern:
     """Pattern of a square array: the data of one panel of Fig. 5."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import asin, ceil, floor, nan, pi
-from typing import final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,7 +20,6 @@ _PER_LOBE = 16
 """Samples per lobe width ``lambda / (N d)`` [-] in a search; refinement follows."""
 
 
-@final
 @dataclass(frozen=True)
 class Lobe:
     """A direction in which all elements add in phase."""

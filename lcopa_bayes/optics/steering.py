@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import asin, isfinite, pi, sin
-from typing import final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -44,7 +43,6 @@ def largest_linearisation_error(array: LinearArray, phase_limit: float) -> float
     return float(np.abs(linearisation_error(array, [0.0, phase_limit])).max())
 
 
-@final
 @dataclass(frozen=True)
 class GeometryCheck:
     """Whether one pitch agrees with both the simulation and the experiment (claim S4)."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import inf, nextafter, pi
-from typing import final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,7 +16,6 @@ from lcopa_bayes.optics.checks import finite
 from lcopa_bayes.optics.director import CELLS, equilibrium
 
 
-@final
 @dataclass(frozen=True)
 class DirectorCurve:
     """Equilibria of one cell over a range of voltages: the data of Figs. 10 and 11."""
@@ -56,7 +54,6 @@ def director_curve(
     return DirectorCurve(field, volts, profiles[0].position, tilt, mean)
 
 
-@final
 @dataclass(frozen=True)
 class TiltLaw:
     """Two straight branches, ``low u`` below the knee and ``high (u - origin) + start`` from it on."""
@@ -112,7 +109,6 @@ def best_law(curve: DirectorCurve, optics: StatedOptics = PAPER.optics) -> TiltL
     return TiltLaw(low, float(high), float(start), knee, knee, limit)
 
 
-@final
 @dataclass(frozen=True)
 class FitQuality:
     """How a law follows the solved mean tilt over a range of voltages."""
@@ -162,7 +158,6 @@ def fit_quality(curve: DirectorCurve, law: TiltLaw, lower: float, upper: float) 
     )
 
 
-@final
 @dataclass(frozen=True)
 class TiltLawCheck:
     """Numbers behind claim S1; each tuple runs over `RANGES`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -21,7 +21,6 @@ from lcopa_bayes.paper.paths import PathData, path_data
 from lcopa_bayes.paper.scan import Scanned, scan
 
 
-@final
 @dataclass(frozen=True)
 class Identified:
     """A model of a path with its errors on the records it was identified from."""
@@ -40,7 +39,6 @@ class Identified:
     """Least output error among candidates of any sign, over blocks [response unit]."""
 
 
-@final
 @dataclass(frozen=True)
 class Identification:
     """One path of a study, identified by several methods from the same records."""

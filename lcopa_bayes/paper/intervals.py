@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 from math import isfinite
-from typing import NamedTuple, final
+from typing import NamedTuple
 
 import numpy as np
 
@@ -42,7 +42,6 @@ class Candidates(NamedTuple):
         return int(self.orders.shape[0] * self.delays.size)
 
 
-@final
 @dataclass(frozen=True)
 class Scan:
     """Intervals of a scan. InputError with all problems unless the fields are as they say."""

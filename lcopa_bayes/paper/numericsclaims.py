@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import final
 
 import numpy as np
 
@@ -73,7 +72,6 @@ def whole_blocks(stated: Stated, evidence: Evidence) -> Verdict:
     return Verdict(Kind.of(worst.largest_shift <= TOLERATED_SHIFT), worst.largest_shift, "sd", how)
 
 
-@final
 @dataclass(frozen=True)
 class DelayRounding:
     """Effect of rounding one delay to whole blocks on one record."""

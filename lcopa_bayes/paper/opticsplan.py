@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import pi
-from typing import Annotated, final
+from typing import Annotated
 
 from lcopa_bayes.core.rules import Rule, Ruled, is_number, whole, word_of
 from lcopa_bayes.model.literature import PAPER, StatedOptics
@@ -23,7 +23,6 @@ _VOLTS = Rule(
 )
 
 
-@final
 @dataclass(frozen=True)
 class OpticsPlan(Ruled):
     """Array, cell and what to look at, by default the paper's; InputError, all problems at once, for what

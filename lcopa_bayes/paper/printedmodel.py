@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import final
 
 import numpy as np
 
@@ -35,7 +34,6 @@ _LONG = 40.0
 _POINTS = 40001
 
 
-@final
 @dataclass(frozen=True)
 class PrintedModel:
     """The 2 x 2 model of Eq. 65 with the numbers of `stated`."""
@@ -91,7 +89,6 @@ class PrintedModel:
         return truth(single, camera, drive, duration=RECORD_LENGTH, name="printed model")
 
 
-@final
 @dataclass(frozen=True)
 class Rival:
     """The integer-order model that comes closest to the step response of Eq. 65."""

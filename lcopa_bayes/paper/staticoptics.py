@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from math import pi
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -23,7 +23,6 @@ from lcopa_bayes.paper.opticsplan import OpticsPlan
 _CHAIN_POINTS = 241
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class StaticOptics:
     """All that the verb reports and draws."""

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
@@ -43,7 +43,6 @@ _ADVICE = {
 }
 
 
-@final
 @dataclass(frozen=True)
 class Verdict:
     """Grade, sentence and reason in the box at the top of a page."""

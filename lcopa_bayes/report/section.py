@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias, TypeVar, final
+from typing import Any, Literal, TypeAlias, TypeVar
 
 from lcopa_bayes.report.formatting import figures, percent
 
@@ -16,7 +16,6 @@ Cell: TypeAlias = str | Callable[[Row], str]
 T = TypeVar("T")
 
 
-@final
 @dataclass(frozen=True)
 class Column:
     """Heading of a table column and how its cells are set."""
@@ -25,7 +24,6 @@ class Column:
     kind: Kind = "text"
 
 
-@final
 @dataclass(frozen=True)
 class Table:
     """A table of cells that are already formatted; a cell of a `grade` column is one of the three grades."""
@@ -78,7 +76,6 @@ def _cell(row: Row, kind: Kind, cell: Cell) -> str:
     return figures(value) if value is None or (kind == "number" and isinstance(value, float)) else str(value)
 
 
-@final
 @dataclass(frozen=True)
 class Drawing:
     """A figure as SVG, with the stem of its file name and its caption."""
@@ -98,7 +95,6 @@ def paged(
     return tuple(Drawing(f"{stem}_{k:02d}", draw(part), caption) for k, part in enumerate(parts, start=1))
 
 
-@final
 @dataclass(frozen=True)
 class Section:
     """A titled part of the page, shown in the order text, figures, tables, listing."""

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import exp, inf, isfinite, log, sqrt
-from typing import final
 
 import numpy as np
 from scipy.stats import binom
@@ -63,7 +62,6 @@ def limitations(
     )
 
 
-@final
 @dataclass(frozen=True)
 class Coverage:
     """Samples of one axis of one record inside the 90 % band."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -43,7 +43,6 @@ _DRAWS = 400
 """Draws behind the measurement after sampling."""
 
 
-@final
 @dataclass(frozen=True)
 class Discretisation:
     """Shift of the posterior means by the width of the blocks."""

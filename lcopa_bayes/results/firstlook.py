@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -51,7 +51,6 @@ _TRIED = 20
 """Batches after which draws outside the prior are replaced no further."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class FirstLook:
     """Least squares of a study with a Gaussian about the best optimum."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from xarray import DataTree
@@ -46,7 +46,6 @@ _QUICK = 4
 """How many times fewer steps a quick fit takes."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Fit(Predictive):
     """A fitted study: draws of its posterior, what it predicts, and how far both can be trusted."""

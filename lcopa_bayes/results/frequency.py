@@ -5,7 +5,7 @@ At ``s = i 2 pi f`` (Ta et al. 2026, Eq. 31, stiffness divided out)."""
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -34,7 +34,6 @@ _SIGN = 0.05
 """Share of draws with a gain of the other sign from which the phase has two values [-]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class PathResponse:
     """Frequency response of one path."""
@@ -62,7 +61,6 @@ class PathResponse:
         return out | ({"note": self.note} if self.note else {})
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class FrequencyResponse:
     """Gain and phase of every path over frequency."""

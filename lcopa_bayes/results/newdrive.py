@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, final
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -46,7 +46,6 @@ _WEIGHTS = 100
 """Draws behind the median gain that weighs frequencies."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Prediction(Result):
     """Bands of every response axis under one drive."""

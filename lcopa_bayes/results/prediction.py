@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -30,7 +30,6 @@ _SWEEPS = 20
 """Sweeps after which a Gibbs chain of a level has forgotten its start [-]: 1e-6 of it remains at nu = 1."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Band:
     """Bands of one response axis of one record, at the record's sample times, or under a new drive."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 from scipy import signal, stats
@@ -22,7 +22,6 @@ WHITE_P = 0.01
 """Below this p-value the whitened residual is not white."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Residual:
     """Residual of one axis of one record at the posterior median response."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import final
 
 import numpy as np
 
@@ -28,7 +27,6 @@ _STEP = 0.01
 _DRAWS = 400
 
 
-@final
 @dataclass(frozen=True)
 class Resonance:
     """An undamped resonance of one element that the samples do not resolve."""

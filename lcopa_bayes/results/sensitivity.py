@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, final
+from typing import Any, Literal
 
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]
@@ -35,7 +35,6 @@ _RANK: dict[Diagnosis, int] = {
 }
 
 
-@final
 @dataclass(frozen=True)
 class Sensitivity:
     """How fast one parameter's posterior moves with the power of the prior and of the likelihood."""
@@ -154,7 +153,6 @@ def _note(prior: float, prior_error: float, likelihood: float, likelihood_error:
     return "; ".join(words)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class _Scale:
     """Sensitivity of all parameters to one density."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import ceil
-from typing import Any, Literal, final
+from typing import Any, Literal
 
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]
@@ -42,7 +42,6 @@ TENTATIVE_SHARES = 0.2
 _RANK: dict[Level, int] = {"reliable": 0, "tentative": 1, "unusable": 2}
 
 
-@final
 @dataclass(frozen=True)
 class Quality:
     """Convergence of one parameter's draws."""
@@ -127,7 +126,6 @@ class Quality:
         return f"{'; '.join(reasons)}; {steps}"
 
 
-@final
 @dataclass(frozen=True)
 class Grade:
     """A grade with the reason for it."""
@@ -141,7 +139,6 @@ class Grade:
         return max(grades, key=lambda grade: _RANK[grade.level])
 
 
-@final
 @dataclass(frozen=True)
 class Limitation:
     """A condition under which intervals hold and that the draws cannot check: no number it concerns is

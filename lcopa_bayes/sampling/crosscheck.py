@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 from scipy.stats import kstwobign, norm
@@ -26,7 +26,6 @@ _REMEDY = (
 )
 
 
-@final
 @dataclass(frozen=True)
 class Summary:
     """Marginal of a parameter by one method, in the parameter's unit."""
@@ -54,7 +53,6 @@ class Summary:
         return {"value": self.value} | interval | {"ess": self.ess}
 
 
-@final
 @dataclass(frozen=True)
 class Compared:
     """A parameter by both methods."""
@@ -73,7 +71,6 @@ class Compared:
     """Smallest distance that is called a disagreement [-]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class CrossCheck:
     """A run beside nested sampling of the same posterior."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import final
 
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]
@@ -38,7 +37,6 @@ _CHUNK = 128
 """Draws completed at a time."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Draws:
     """Draws of every row of the parameter table."""

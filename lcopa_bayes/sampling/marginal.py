@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from math import ceil
-from typing import NamedTuple, final
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -111,7 +111,6 @@ class _Point(NamedTuple):
     """Effective share of the draws tried [-]."""
 
 
-@final
 class Search:
     """Points, proposals and weights of a search; deterministic given its arguments and what it is asked.
 

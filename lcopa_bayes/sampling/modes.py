@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise
 from math import sqrt
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]
@@ -34,7 +34,6 @@ minima due to noise do not matter, as each has to be certain."""
 _COUNT = {2: "two", 3: "three", 4: "four"}
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Modes:
     """Modes of one parameter's marginal, in increasing order; a single mode without boundaries."""

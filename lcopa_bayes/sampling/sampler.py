@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from math import ceil
 from pathlib import Path
-from typing import final
 
 import numpy as np
 
@@ -56,7 +55,6 @@ _SURPLUS = 1.12
 """... and effective importance draws: 1.12 and 10 times as many are together worth 1.007 times as many."""
 
 
-@final
 @dataclass(frozen=True)
 class SamplePlan:
     """How long and how wide to sample."""
@@ -102,7 +100,6 @@ class SamplePlan:
         )
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Run:
     """What sampling gave."""
@@ -310,7 +307,6 @@ def _sampled_values(posterior: Posterior, run: Run, *, kept: bool = True) -> Arr
     return values.reshape(*coordinates.shape[:3], -1)
 
 
-@final
 @dataclass(frozen=True)
 class _Birth:
     """Task: a new ensemble of a seed."""
@@ -321,7 +317,6 @@ class _Birth:
         return Ensemble.tempered(posterior, self.walkers, _SWEEPS, seed)
 
 
-@final
 @dataclass(frozen=True)
 class _Round:
     """Task: an ensemble one round further."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
 
 import pandas as pd
 
@@ -21,7 +20,6 @@ from lcopa_bayes.results.stored import StoredResult
 from lcopa_bayes.verbs.sources import StudyLike, study_of
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class CalibrationResult(StoredResult):
     """Coverage and ranks of true values over simulated studies."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
 
 import pandas as pd
 
@@ -15,7 +14,6 @@ from lcopa_bayes.results.stored import StoredResult
 from lcopa_bayes.verbs.sources import StudyLike, study_of
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class CheckResult(StoredResult):
     """Axes, drives, sampling, noise at rest, onsets and priors of a study."""

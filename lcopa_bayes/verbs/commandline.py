@@ -8,7 +8,7 @@ import re
 import sys
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import NoReturn, final
+from typing import NoReturn
 
 from lcopa_bayes.core.errors import nearest
 
@@ -28,7 +28,6 @@ def refused(problems: Sequence[str], *, as_json: bool) -> int:
     return USAGE_ERROR
 
 
-@final
 class CommandParser(argparse.ArgumentParser):
     """A parser that names the nearest known word, and complains in JSON where JSON was asked for."""
 
@@ -51,7 +50,6 @@ class CommandParser(argparse.ArgumentParser):
         raise SystemExit(refused([message], as_json="--json" in self.given))
 
 
-@final
 class Version(argparse.Action):
     """Prints the version, which is looked up when it is asked for."""
 

@@ -7,7 +7,6 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import final
 
 import pandas as pd
 
@@ -25,7 +24,6 @@ from lcopa_bayes.results.stored import StoredResult
 from lcopa_bayes.verbs.sources import FitLike, study_of
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Comparison(StoredResult):
     """Candidates fitted to the same records, scored and decided."""

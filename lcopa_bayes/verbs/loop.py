@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import final
 
 import pandas as pd
 
@@ -27,7 +26,6 @@ EXPLAINED = "explained.toml"
 """File of the study with what a loop found."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class LoopResult(StoredResult):
     """What the model of a study lacks."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple, TypeAlias, final
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from scipy import fft
@@ -36,7 +36,6 @@ _SWEEPS = 100
 """Most sweeps of the iteration [-]: what they do not bring to rest is solved by dividing the record."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Plant:
     """One plant as numbers."""
@@ -109,7 +108,6 @@ def passed(
     return out
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Passage:
     """One record through one plant or many, with what acts between commands and reading.
@@ -220,7 +218,6 @@ class Passage:
         return (level.reshape(rest.shape) - rest).T, np.moveaxis(y, 1, 0), failures
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class _Forced:
     """Forces on the direct paths of plants, a row for every axis of every plant."""
