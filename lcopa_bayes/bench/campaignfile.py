@@ -37,9 +37,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from lcopa_bayes.bench.acquisition import PAPER_BENCH, Bench, simulate
 from lcopa_bayes.bench.command import Command, on_off, prbs, quiet, staircase, step
-from lcopa_bayes.bench.device import PAPER_DEVICE, Device
+from lcopa_bayes.bench.device import PAPER_BENCH, PAPER_DEVICE, Bench, Device, simulate
 from lcopa_bayes.bench.inversion import unsuited
 from lcopa_bayes.bench.undeclared import UndeclaredPlan
 from lcopa_bayes.core.errors import InputError, nearest

@@ -8,17 +8,19 @@ from typing import Any, Literal
 import numpy as np
 from scipy.special import logsumexp
 
-from lcopa_bayes.comparison.folds import Part, parts_of, predicted, without
 from lcopa_bayes.comparison.sequentialdensity import (
     LevelFrom,
+    Part,
     applies,
     known_before,
     level_of,
     linear_densities,
     log_densities,
+    parts_of,
+    predicted,
+    without,
 )
-from lcopa_bayes.core.arrays import Array, Matrix, Vector
-from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.arrays import Array, Matrix, Vector, plain
 from lcopa_bayes.inference.observations import Observed, Samples
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.forward import ForwardModel

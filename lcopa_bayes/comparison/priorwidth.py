@@ -9,10 +9,9 @@ from typing import Any, Literal
 import numpy as np
 from scipy.special import logsumexp
 
-from lcopa_bayes.core.estimate import plain
-from lcopa_bayes.inference.parameter import Parameter
+from lcopa_bayes.core.arrays import plain
+from lcopa_bayes.inference.parameter import Parameter, Prior
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.inference.priors import Prior
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.sampling.bridge import transferred
 from lcopa_bayes.sampling.evidence import evidence

@@ -14,8 +14,8 @@ from io import FileIO, RawIOBase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lcopa_bayes.core.arrays import plain
 from lcopa_bayes.core.errors import InputError, nearest
-from lcopa_bayes.core.estimate import plain
 
 if TYPE_CHECKING:
     import pandas as pd

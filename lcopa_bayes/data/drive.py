@@ -16,10 +16,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lcopa_bayes.core.arrays import Matrix, Vector, frozen
+from lcopa_bayes.core.arrays import TIME_UNITS, Matrix, Vector, frozen, in_time_unit
 from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.core.rules import rebuilt
-from lcopa_bayes.core.units import TIME_UNITS, in_time_unit
 from lcopa_bayes.data.record import Axis, Columns, Driven
 
 

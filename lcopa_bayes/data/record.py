@@ -18,11 +18,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from lcopa_bayes.core.arrays import Matrix, Vector, frozen
+from lcopa_bayes.core.arrays import TIME_UNITS, Matrix, Vector, frozen, in_time_unit
 from lcopa_bayes.core.errors import InputError, nearest, refuse_if
 from lcopa_bayes.core.files import write_whole
 from lcopa_bayes.core.rules import rebuilt
-from lcopa_bayes.core.units import TIME_UNITS, in_time_unit
 from lcopa_bayes.data.cells import FORM, SUFFIXES, CellTable, frame_cells, read_cells, refuse
 
 _ROLES = ("time", "drive", "response")

@@ -16,6 +16,7 @@ import numpy as np
 from scipy import stats
 from scipy.stats.distributions import rv_frozen
 
+from lcopa_bayes.core.arrays import TIME_UNITS
 from lcopa_bayes.core.errors import nearest
 from lcopa_bayes.core.rules import (
     FLAG,
@@ -28,7 +29,6 @@ from lcopa_bayes.core.rules import (
     whole,
     word_of,
 )
-from lcopa_bayes.core.units import TIME_UNITS
 
 Share: TypeAlias = Literal["paper", "all", "none"]
 """Which paths share an element."""

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from lcopa_bayes.core.arrays import in_time_unit
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.rules import rebuilt
-from lcopa_bayes.core.units import in_time_unit
 from lcopa_bayes.data.record import Axis, Record, RecordLike, records_of, several
 from lcopa_bayes.data.settings import (
     CandidateSettings,

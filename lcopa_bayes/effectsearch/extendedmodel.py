@@ -12,8 +12,8 @@ from lcopa_bayes.core.arrays import Flags, Matrix, Vector
 from lcopa_bayes.effectsearch.whitening import stacked
 from lcopa_bayes.inference.declared import with_effects
 from lcopa_bayes.inference.effects import Effected, Placed, effected
-from lcopa_bayes.inference.kinds import CONSTANTS
 from lcopa_bayes.inference.leastsquares import LeastSquares
+from lcopa_bayes.inference.parameter import CONSTANTS
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.effects.effect import Effect, ForceEffect
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from lcopa_bayes.core.arrays import LEVEL
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.core.estimate import LEVEL
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.basefit import BaseFit

@@ -20,7 +20,7 @@ from lcopa_bayes.effectsearch.signature import Scale
 from lcopa_bayes.effectsearch.trace import LEVEL
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.effects import Placed
-from lcopa_bayes.inference.kinds import CONSTANTS
+from lcopa_bayes.inference.parameter import CONSTANTS
 from lcopa_bayes.model.effects.effect import Effect, Ranges
 
 SIGNIFICANT = 2.7e-3

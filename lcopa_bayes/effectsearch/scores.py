@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import norm
 
-from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.core.estimate import LEVEL
+from lcopa_bayes.core.arrays import LEVEL, Matrix, Vector
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.crossvalidation import groups, shifts
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel

@@ -10,14 +10,12 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from lcopa_bayes.bench.acquisition import Bench as VirtualBench
-from lcopa_bayes.bench.acquisition import truth
-from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
-from lcopa_bayes.core.estimate import LEVEL, plain
+from lcopa_bayes.bench.device import Bench as VirtualBench
+from lcopa_bayes.bench.device import truth
+from lcopa_bayes.core.arrays import LEVEL, Array, Flags, Matrix, Vector, plain
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.experiments.design import LINEAR, Design
-from lcopa_bayes.experiments.information import Bench
-from lcopa_bayes.experiments.refit import Trial, device_of
+from lcopa_bayes.experiments.information import Bench, Trial, device_of
 
 REPLICAS = 12
 """Records simulated and fitted per drive."""

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import rankdata
 
-from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.core.estimate import Estimate, plain
+from lcopa_bayes.core.arrays import Estimate, Matrix, Vector, plain
 from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.likelihood import Landscape
 from lcopa_bayes.inference.parameter import Parameter

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2, t
 
-from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.core.estimate import LEVEL, plain
+from lcopa_bayes.core.arrays import LEVEL, Matrix, Vector, plain
 from lcopa_bayes.inference.likelihood import Landscape, Peak
 from lcopa_bayes.inference.posterior import Posterior
 

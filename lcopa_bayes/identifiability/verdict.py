@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from lcopa_bayes.core.estimate import LEVEL, plain
+from lcopa_bayes.core.arrays import LEVEL, plain
 from lcopa_bayes.identifiability.contraction import Belief, Tolerance
 from lcopa_bayes.identifiability.curvature import Curvature
 from lcopa_bayes.identifiability.profile import Profile

@@ -50,9 +50,8 @@ import numpy as np
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.data.drive import first_change
 from lcopa_bayes.data.record import Record
-from lcopa_bayes.inference.observations import Observed, Samples, sampling_period
-from lcopa_bayes.inference.priors import Prior
-from lcopa_bayes.inference.restnoise import QuietNoise, quiet_noise
+from lcopa_bayes.inference.observations import Observed, QuietNoise, Samples, quiet_noise, sampling_period
+from lcopa_bayes.inference.parameter import Prior
 
 _TIMES = 20.0
 """Correlation times of the noise that fit into a record at least [-]."""

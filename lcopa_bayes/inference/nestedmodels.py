@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lcopa_bayes.core.arrays import Flags, Matrix, Vector
-from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
+from lcopa_bayes.inference.parameter import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 

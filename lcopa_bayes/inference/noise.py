@@ -12,7 +12,7 @@ from scipy.special import gammaln
 from scipy.stats import t as student_t
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
-from lcopa_bayes.inference.priors import Prior
+from lcopa_bayes.inference.parameter import Prior
 
 if TYPE_CHECKING:
     from lcopa_bayes.inference.defaultpriors import Scales

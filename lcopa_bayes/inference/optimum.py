@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.leastsquares import LeastSquares
+from lcopa_bayes.inference.parameter import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.effects.effect import UnstableError
 

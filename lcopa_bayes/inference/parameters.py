@@ -14,10 +14,8 @@ from lcopa_bayes.core.arrays import Array, Flags, Index, Matrix, Vector
 from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.inference.defaultpriors import Scales
-from lcopa_bayes.inference.kinds import COEFFICIENTS, KINDS
 from lcopa_bayes.inference.noise import NOISES
-from lcopa_bayes.inference.parameter import Parameter, Place
-from lcopa_bayes.inference.priors import Prior
+from lcopa_bayes.inference.parameter import COEFFICIENTS, KINDS, Parameter, Place, Prior
 from lcopa_bayes.model.effects.declared import Declared
 from lcopa_bayes.model.forward import Dynamics
 from lcopa_bayes.model.layout import Layout

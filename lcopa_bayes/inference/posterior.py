@@ -11,10 +11,9 @@ import numpy as np
 from scipy.special import expit, log_expit, logit
 
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
-from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.noise import LOG_2PI, GaussianNoise, Noise
 from lcopa_bayes.inference.observations import Observed, Samples
-from lcopa_bayes.inference.parameter import Parameter
+from lcopa_bayes.inference.parameter import COEFFICIENTS, CONSTANTS, Parameter
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.simulation import Simulated, Simulation
 from lcopa_bayes.model.forward import ForwardModel

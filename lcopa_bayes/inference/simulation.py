@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Flags, Index, Matrix, Vector
-from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
+from lcopa_bayes.inference.parameter import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.model.effects.declared import Declared
 from lcopa_bayes.model.effects.effect import (

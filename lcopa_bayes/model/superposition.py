@@ -11,8 +11,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from lcopa_bayes.core.arrays import Array, Index, Vector
 from lcopa_bayes.data.drive import AxisDrive
+from lcopa_bayes.model.blockpulses import Circle, Spectrum
 from lcopa_bayes.model.grid import Lattice
-from lcopa_bayes.model.powerseries import Circle, Spectrum
 from lcopa_bayes.model.stepresponse import Kind, StepResponse
 
 SPARE = 5

@@ -8,12 +8,10 @@ from math import inf, nextafter, pi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
+from lcopa_bayes.core.arrays import Array, Matrix, Vector, finite, frozen
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.model.literature import PAPER, StatedOptics
-from lcopa_bayes.optics.cell import Cell, Field, paper_cell
-from lcopa_bayes.optics.checks import finite
-from lcopa_bayes.optics.director import CELLS, equilibrium
+from lcopa_bayes.optics.director import CELLS, Cell, Field, equilibrium, paper_cell
 
 
 @dataclass(frozen=True)

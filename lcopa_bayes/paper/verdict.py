@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, TypeAlias
 
-from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.arrays import plain
 from lcopa_bayes.model.literature import Stated
 
 

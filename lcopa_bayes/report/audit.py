@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from lcopa_bayes.report.formatting import NONE, ends, figures, percent, sentence
 from lcopa_bayes.report.page import write_graded
 from lcopa_bayes.report.savedrun import SavedRun, load_run
-from lcopa_bayes.report.section import Drawing, Section, Table, paged
+from lcopa_bayes.report.section import NONE, Drawing, Section, Table, ends, figures, paged, percent, sentence
 from lcopa_bayes.report.theme import (
     BAND,
     CYCLE,

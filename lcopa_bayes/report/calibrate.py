@@ -9,9 +9,18 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from lcopa_bayes.report.formatting import NONE, figures, percent, probability
 from lcopa_bayes.report.page import write_graded
-from lcopa_bayes.report.section import Cell, Drawing, Kind, Section, Table
+from lcopa_bayes.report.section import (
+    NONE,
+    Cell,
+    Drawing,
+    Kind,
+    Section,
+    Table,
+    figures,
+    percent,
+    probability,
+)
 from lcopa_bayes.report.theme import BAND, HELD_OUT, INK, NOISE, blank, grid, plain, svg_of
 
 _PER_FIGURE = 18

@@ -13,11 +13,30 @@ from matplotlib.ticker import MaxNLocator
 
 from lcopa_bayes.comparison.compare import folder_name
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.report.decimation import draw_band, draw_line
-from lcopa_bayes.report.formatting import NONE, figures, interval, percent, to_spread, with_error
 from lcopa_bayes.report.page import Verdict, write_graded
-from lcopa_bayes.report.section import Drawing, Section, Table
-from lcopa_bayes.report.theme import CYCLE, NOISE, blank, headed, label, legend_above, plain, svg_of
+from lcopa_bayes.report.section import (
+    NONE,
+    Drawing,
+    Section,
+    Table,
+    figures,
+    interval,
+    percent,
+    to_spread,
+    with_error,
+)
+from lcopa_bayes.report.theme import (
+    CYCLE,
+    NOISE,
+    blank,
+    draw_band,
+    draw_line,
+    headed,
+    label,
+    legend_above,
+    plain,
+    svg_of,
+)
 from lcopa_bayes.results.bands import POINTWISE
 
 _NEAR = 60.0

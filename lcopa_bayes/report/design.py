@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from lcopa_bayes.report.formatting import NONE, ends, figures
 from lcopa_bayes.report.page import write_graded
-from lcopa_bayes.report.section import Drawing, Section, Table
+from lcopa_bayes.report.section import NONE, Drawing, Section, Table, ends, figures
 from lcopa_bayes.report.theme import BAND, HELD_OUT, INK, grid, label, plain, svg_of
 
 _SPREAD = "median over draws of the posterior, 90 % of them in brackets"

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from lcopa_bayes.report.formatting import NONE, figures, interval, percent, stopped
 from lcopa_bayes.report.page import Verdict, write_graded
-from lcopa_bayes.report.section import Drawing, Section, Table
+from lcopa_bayes.report.section import NONE, Drawing, Section, Table, figures, interval, percent, stopped
 from lcopa_bayes.report.theme import BAND, HELD_OUT, NOISE, SEEN, blank, label, plain, svg_of
 from lcopa_bayes.results.stored import stored_values
 

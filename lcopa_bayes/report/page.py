@@ -13,15 +13,14 @@ from markupsafe import Markup
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.files import writable_folder, write_text
-from lcopa_bayes.report.formatting import stopped
 from lcopa_bayes.report.savedrun import load_run
-from lcopa_bayes.report.section import Drawing, Section
-from lcopa_bayes.report.sections import overview, parameters, records, responses, sampling
+from lcopa_bayes.report.section import Drawing, Section, stopped
+from lcopa_bayes.report.sections import parameters, records, responses, sampling
 from lcopa_bayes.report.theme import inlined, look
 from lcopa_bayes.results.stored import stored_values
 
 _SECTIONS = (
-    overview.overview,
+    parameters.overview,
     parameters.estimates,
     responses.steps,
     responses.frequency,

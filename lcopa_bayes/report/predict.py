@@ -10,13 +10,11 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.report.decimation import draw_line
-from lcopa_bayes.report.formatting import ends, figures
 from lcopa_bayes.report.page import write_graded
-from lcopa_bayes.report.section import Drawing, Section, Table, score_columns
+from lcopa_bayes.report.section import Drawing, Section, Table, ends, figures, score_columns
 from lcopa_bayes.report.sections.records import BANDS as RESPONSE
 from lcopa_bayes.report.sections.records import above_drives, draw_response
-from lcopa_bayes.report.theme import BAND, HELD_OUT, NOISE, legend_above, svg_of
+from lcopa_bayes.report.theme import BAND, HELD_OUT, NOISE, draw_line, legend_above, svg_of
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
 from lcopa_bayes.results.newdrive import BANDS, DRIVES
 from lcopa_bayes.results.stored import stored_values

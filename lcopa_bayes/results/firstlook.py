@@ -15,8 +15,8 @@ import numpy as np
 import pandas as pd
 from scipy.special import logsumexp
 
+from lcopa_bayes.core.arrays import Estimate, plain
 from lcopa_bayes.core.errors import InputError, refuse_if
-from lcopa_bayes.core.estimate import Estimate, plain
 from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from xarray import DataTree
 
-from lcopa_bayes.core.arrays import Matrix, digest_of
+from lcopa_bayes.core.arrays import Estimate, Matrix, digest_of
 from lcopa_bayes.core.errors import refuse_if
-from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.core.files import save_json, save_table, writable_folder, write_text, write_whole
 from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.data.study import Study
@@ -23,9 +22,8 @@ from lcopa_bayes.results.discretisation import Discretisation, discretisation, r
 from lcopa_bayes.results.frequency import FrequencyResponse, frequency_response
 from lcopa_bayes.results.prediction import Band, study_bands
 from lcopa_bayes.results.predictive import Predictive
-from lcopa_bayes.results.provenance import fingerprint, provenance
 from lcopa_bayes.results.residuals import Residual, residuals
-from lcopa_bayes.results.runfolder import add_origin, opened
+from lcopa_bayes.results.runfolder import add_origin, fingerprint, opened, provenance
 from lcopa_bayes.results.savedfit import NAME as SAVED
 from lcopa_bayes.results.savedfit import fit_to_json
 from lcopa_bayes.results.sensitivity import Sensitivity, sensitivity

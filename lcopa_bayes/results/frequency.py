@@ -11,11 +11,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
+from lcopa_bayes.core.arrays import Array, Estimate, Matrix, Vector, frozen, plain
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.core.estimate import Estimate, plain
 from lcopa_bayes.inference.parameters import ParameterTable
-from lcopa_bayes.model.transfer import denominator
+from lcopa_bayes.model.stepresponse import denominator
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS, Bands, named
 from lcopa_bayes.results.result import notebook_table
 from lcopa_bayes.sampling.draws import Draws

@@ -10,9 +10,8 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from lcopa_bayes.core.arrays import Array, Vector
+from lcopa_bayes.core.arrays import Array, Vector, plain
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import save_json, save_table, writable_folder
 from lcopa_bayes.data.drive import Drive, drive_of, first_change
 from lcopa_bayes.data.record import Record, load_columns, record_of
@@ -29,9 +28,8 @@ from lcopa_bayes.results.prediction import (
     named_rng,
     plant_draws,
 )
-from lcopa_bayes.results.provenance import digest, provenance
 from lcopa_bayes.results.result import Result
-from lcopa_bayes.results.runfolder import add_origin, opened
+from lcopa_bayes.results.runfolder import add_origin, digest, opened, provenance
 from lcopa_bayes.sampling.draws import Draws
 
 Level = Literal["fitted", "zero"]

@@ -9,8 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector
-from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.arrays import Array, Matrix, Vector, plain
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.convergence import Level
 from lcopa_bayes.sampling.draws import Draws

@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Estimate, Flags, Matrix, Vector
 from lcopa_bayes.core.errors import InputError, nearest
-from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.simulation import Simulation

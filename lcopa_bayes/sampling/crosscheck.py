@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import kstwobign, norm
 
-from lcopa_bayes.core.arrays import Vector
-from lcopa_bayes.core.estimate import EQUAL_TAILED, LEVEL, plain
+from lcopa_bayes.core.arrays import EQUAL_TAILED, LEVEL, Vector, plain
 from lcopa_bayes.sampling.convergence import Grade, Level, Limitation
 from lcopa_bayes.sampling.draws import Draws
 from lcopa_bayes.sampling.nested import Nested

@@ -9,8 +9,7 @@ from functools import cached_property
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 
-from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector, digest_of
-from lcopa_bayes.core.estimate import Estimate
+from lcopa_bayes.core.arrays import Array, Estimate, Index, Matrix, Vector, digest_of
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.convergence import (

@@ -23,8 +23,7 @@ from scipy.spatial import cKDTree
 from scipy.special import logsumexp
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
-from lcopa_bayes.core.parallel import Workers
-from lcopa_bayes.core.progress import Progress
+from lcopa_bayes.core.parallel import Progress, Workers
 from lcopa_bayes.inference.conditional import Conditional
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.optimum import Optimum, again, find_optima

@@ -12,8 +12,7 @@ import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 from scipy.ndimage import gaussian_filter1d
 
-from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector, frozen
-from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector, frozen, plain
 
 DEPTH = 0.5
 """The minimum between two modes is below this share of the lower of both [-] ..."""

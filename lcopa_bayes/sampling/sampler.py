@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix
-from lcopa_bayes.core.parallel import workers
-from lcopa_bayes.core.progress import Progress
+from lcopa_bayes.core.parallel import Progress, workers
 from lcopa_bayes.data.settings import Method
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.chainfile import Chain, load_chain, save_chain

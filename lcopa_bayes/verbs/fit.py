@@ -10,8 +10,7 @@ from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.fit import fit as sampled
 from lcopa_bayes.results.integerrival import integer_rival
 from lcopa_bayes.results.predictive import Predictive
-from lcopa_bayes.results.provenance import provenance
-from lcopa_bayes.results.runfolder import opened
+from lcopa_bayes.results.runfolder import opened, provenance
 from lcopa_bayes.verbs.look import look
 from lcopa_bayes.verbs.sources import FitLike, StudyLike, finished, study_of
 

@@ -25,19 +25,18 @@ from typing import Any
 
 import numpy as np
 
-from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import step
-from lcopa_bayes.bench.device import Device
+from lcopa_bayes.bench.device import Bench, Device, simulate
 from lcopa_bayes.calibration.calibrate import Calibration, calibrate
 from lcopa_bayes.calibration.ranks import LEVELS, Coverage
-from lcopa_bayes.calibration.summary import results
-from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.arrays import plain
 from lcopa_bayes.core.files import save_json, writable_folder, write_text
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.data.settings import ModelSettings, NoiseSettings, SamplerSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.model.path import TransferPath
 from lcopa_bayes.report.theme import BAND, HELD_OUT, NOISE, blank, look, svg_of
+from lcopa_bayes.verbs.calibrate import results
 
 CAMERA, DURATION, COMMAND = 0.2, 48.0, 2.0
 """Sampling period, length of the record, and time of the step [ms]."""

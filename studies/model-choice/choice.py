@@ -22,12 +22,11 @@ from typing import Any
 import numpy as np
 from scipy.stats import beta
 
-from lcopa_bayes.bench.acquisition import Bench, truth
 from lcopa_bayes.bench.command import staircase
-from lcopa_bayes.bench.device import Device
-from lcopa_bayes.calibration.simulation import measured
+from lcopa_bayes.bench.device import Bench, Device, truth
+from lcopa_bayes.calibration.replica import measured
+from lcopa_bayes.comparison.averaging import by_evidence, simplest
 from lcopa_bayes.comparison.candidates import candidates_of
-from lcopa_bayes.comparison.gains import by_evidence, simplest
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.files import writable_folder, write_text
 from lcopa_bayes.core.parallel import workers

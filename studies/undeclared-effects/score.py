@@ -24,9 +24,8 @@ from lcopa_bayes.bench.undeclared import NAMED, OUTSIDE
 from lcopa_bayes.core.files import writable_folder, write_text
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.effectsearch import candidates, rounds, trace, verdict
-from lcopa_bayes.report.formatting import figures
 from lcopa_bayes.report.page import Verdict, write_page
-from lcopa_bayes.report.section import Column, Section, Table
+from lcopa_bayes.report.section import Column, Section, Table, figures
 from lcopa_bayes.report.theme import look
 
 HERE = Path(__file__).parent

@@ -13,7 +13,7 @@ from small import TWO, problem, record
 from lcopa_bayes.bench.command import on_off, step
 from lcopa_bayes.cli import main
 from lcopa_bayes.data.record import save_record
-from lcopa_bayes.identifiability.delays import delays
+from lcopa_bayes.identifiability.curvature import delays
 from lcopa_bayes.paper.claims import judge
 from lcopa_bayes.paper.verdict import Evidence
 from lcopa_bayes.report.audit import _next

@@ -12,8 +12,8 @@ from numpy.testing import assert_allclose
 from scipy import stats
 
 from lcopa_bayes.data.settings import NoiseKind
-from lcopa_bayes.inference.kinds import KINDS
 from lcopa_bayes.inference.noise import AR1, NOISES, Student, White, WhiteAR1
+from lcopa_bayes.inference.parameter import KINDS
 
 gaps_lists = st.lists(st.floats(0.05, 20.0), min_size=1, max_size=12).map(np.array)
 sigmas = st.floats(1e-6, 1e3)

@@ -20,12 +20,21 @@ from hypothesis.extra.numpy import arrays
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.inference import defaultpriors
 from lcopa_bayes.report import write_page, write_report
-from lcopa_bayes.report.decimation import extremes
-from lcopa_bayes.report.formatting import NOT_REACHED, figures, interval, sentence, stopped, to_spread
 from lcopa_bayes.report.savedrun import load_run
-from lcopa_bayes.report.section import Column, Drawing, Section, Table
+from lcopa_bayes.report.section import (
+    NOT_REACHED,
+    Column,
+    Drawing,
+    Section,
+    Table,
+    figures,
+    interval,
+    sentence,
+    stopped,
+    to_spread,
+)
 from lcopa_bayes.report.sections import parameters, records, responses, sampling
-from lcopa_bayes.report.theme import inlined
+from lcopa_bayes.report.theme import extremes, inlined
 from lcopa_bayes.sampling.modes import Modes
 
 PARAMETERS = {

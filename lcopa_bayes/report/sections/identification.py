@@ -10,12 +10,21 @@ from typing import Any, TypeAlias
 import pandas as pd
 
 from lcopa_bayes.model.path import Normalisation
-from lcopa_bayes.paper.figures import KINDS
-from lcopa_bayes.paper.steptable import PRINTED
-from lcopa_bayes.report.decimation import draw_line, said
-from lcopa_bayes.report.formatting import NONE, OPEN, figures, interval
-from lcopa_bayes.report.section import Cell, Drawing, Kind, Section, Table
-from lcopa_bayes.report.theme import CYCLE, HELD_OUT, SEEN, STEADY, blank, label, legend_above, plain, svg_of
+from lcopa_bayes.paper.steptable import KINDS, PRINTED
+from lcopa_bayes.report.section import NONE, OPEN, Cell, Drawing, Kind, Section, Table, figures, interval
+from lcopa_bayes.report.theme import (
+    CYCLE,
+    HELD_OUT,
+    SEEN,
+    STEADY,
+    blank,
+    draw_line,
+    label,
+    legend_above,
+    plain,
+    said,
+    svg_of,
+)
 
 Values: TypeAlias = Mapping[str, Any]
 """A part of `identify.json`."""

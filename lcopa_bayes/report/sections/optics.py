@@ -7,10 +7,8 @@ import numpy as np
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.optics.tiltlaw import continuous_law, printed_law
 from lcopa_bayes.paper.staticoptics import StaticOptics
-from lcopa_bayes.report.decimation import extremes
-from lcopa_bayes.report.formatting import NONE, figures
-from lcopa_bayes.report.section import Drawing, Section, Table
-from lcopa_bayes.report.theme import CYCLE, HELD_OUT, STEADY, blank, grid, svg_of
+from lcopa_bayes.report.section import NONE, Drawing, Section, Table, figures
+from lcopa_bayes.report.theme import CYCLE, HELD_OUT, STEADY, blank, extremes, grid, svg_of
 
 _FLOOR = -50.0
 """Lowest intensity shown [dB]."""

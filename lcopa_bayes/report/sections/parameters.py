@@ -1,4 +1,7 @@
-"""Parameters: table, corner plot, traces, priors and what decides each of them."""
+"""Parameters: table, corner plot, traces, priors and what decides each of them.
+
+The answers that stand first on the page of a fit.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,25 @@ from typing import Any
 
 import corner
 import numpy as np
+from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from lcopa_bayes.inference import defaultpriors
-from lcopa_bayes.report.formatting import NONE, figures, interval, percent, to_spread, with_error
 from lcopa_bayes.report.savedrun import SavedRun
-from lcopa_bayes.report.section import Drawing, Section, Table, paged
+from lcopa_bayes.report.section import (
+    NONE,
+    Drawing,
+    Section,
+    Table,
+    figures,
+    interval,
+    paged,
+    percent,
+    to_spread,
+    with_error,
+)
 from lcopa_bayes.report.theme import (
     BAND,
     CYCLE,
@@ -28,6 +42,27 @@ from lcopa_bayes.report.theme import (
     plain,
     svg_of,
 )
+
+_LINK = Markup(' <a href="#{anchor}">{title}</a>')
+_ANSWER = Markup("<strong>{question}</strong> {answer}{link}")
+
+
+def overview(run: SavedRun) -> Section:
+    """The plant of highest density, and one sentence for each question a reader has."""
+    values = run.results["overview"]
+    answers = tuple(
+        _ANSWER.format(
+            question=one["question"],
+            answer=one["answer"],
+            link=_LINK.format(anchor=Section(one["section"]).anchor, title=one["section"])
+            if one["section"]
+            else "",
+        )
+        for one in values["answers"]
+    )
+    unit = f"At the draw of highest density; s in 1/{run.time_unit}, times and delays in {run.time_unit}."
+    return Section("Summary", answers, listing="\n".join([*values["plant"], unit]))
+
 
 _PER_FIGURE = 12
 """Parameters on one figure of traces or of priors."""

@@ -12,20 +12,22 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lcopa_bayes.core.arrays import Index, Vector
-from lcopa_bayes.report.decimation import draw_bands, draw_line, extremes, said
-from lcopa_bayes.report.formatting import figures, percent, probability
 from lcopa_bayes.report.savedrun import SavedRun
-from lcopa_bayes.report.section import Drawing, Section, Table, score_columns
+from lcopa_bayes.report.section import Drawing, Section, Table, figures, percent, probability, score_columns
 from lcopa_bayes.report.theme import (
     BAND,
     CYCLE,
     INK,
     NOISE,
     blank,
+    draw_bands,
+    draw_line,
+    extremes,
     headed,
     label,
     legend_above,
     plain,
+    said,
     svg_of,
 )
 from lcopa_bayes.results.bands import POINTWISE

@@ -9,11 +9,20 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from lcopa_bayes.report.decimation import draw_bands, draw_line
-from lcopa_bayes.report.formatting import NOT_REACHED, OPEN, figures, interval, to_spread
 from lcopa_bayes.report.savedrun import SavedRun
-from lcopa_bayes.report.section import Section, Table, paged
-from lcopa_bayes.report.theme import BAND, STEADY, grid, label, legend_above, log_ticks, plain, svg_of
+from lcopa_bayes.report.section import NOT_REACHED, OPEN, Section, Table, figures, interval, paged, to_spread
+from lcopa_bayes.report.theme import (
+    BAND,
+    STEADY,
+    draw_bands,
+    draw_line,
+    grid,
+    label,
+    legend_above,
+    log_ticks,
+    plain,
+    svg_of,
+)
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
 
 _STEPS_PER_FIGURE, _BODE_PER_FIGURE = 6, 4

@@ -9,9 +9,21 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from lcopa_bayes.report.formatting import NONE, figures, interval, percent, sentence, to_spread, with_error
 from lcopa_bayes.report.savedrun import SavedRun
-from lcopa_bayes.report.section import Cell, Kind, Section, Table, paged
+from lcopa_bayes.report.section import (
+    NONE,
+    Cell,
+    Kind,
+    Section,
+    Table,
+    figures,
+    interval,
+    paged,
+    percent,
+    sentence,
+    to_spread,
+    with_error,
+)
 from lcopa_bayes.report.sections.parameters import density_axis, marginals
 from lcopa_bayes.report.theme import BAND, HELD_OUT
 
