@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+import lcopa_bayes
 from lcopa_bayes.cli import main
 from lcopa_bayes.comparison.candidates import KNOWN, VARIANTS
 from lcopa_bayes.core.errors import InputError
@@ -256,3 +257,10 @@ def test_no_candidate_key_is_read_and_dropped(tmp_path):
     (tmp_path / "candidates.toml").write_text('[[candidates]]\nname = "a"\nimproper = ["gain"]\n')
     with pytest.raises(InputError, match="unknown key 'improper'"):
         load_candidates(tmp_path / "candidates.toml")
+
+
+def test_every_public_name_is_on_its_page():
+    listed = re.findall(
+        r"^\.\. auto\w+:: lcopa_bayes\.(\w+)$", (ROOT / "docs" / "api.md").read_text("utf-8"), re.M
+    )
+    assert sorted(listed) == lcopa_bayes.__all__

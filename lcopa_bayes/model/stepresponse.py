@@ -204,22 +204,22 @@ class StepResponse:
         """The same for the finer levels [blocks of the level]."""
         return _running(self.fine)
 
-    def on_lattice(self, theta: Vector, kind: Kind = "value") -> Array:
-        """Readings at ``k + theta``, k = 0 .. n - 3, (rows, batch, n - 2).
+    def on_lattice(self, theta: Matrix, kind: Kind = "value") -> Array:
+        """Readings at ``k + theta``, k = 0 .. n - 3, (rows, places, batch, n - 2).
 
-        Parameters: theta (batch,) in [0, 1) [blocks], one for each element.
+        Parameters: theta (places, batch) in [0, 1) [blocks], one column for each element.
         """
         n = self.coarse.shape[2] - _SIDE
-        weights = taps(theta, kind)
-        out = np.zeros((*self.coarse.shape[:2], n))
-        inner = out[:, :, _SIDE:]
+        weights = taps(theta, kind)[..., None]
+        out = np.zeros((self.coarse.shape[0], *theta.shape, n))
+        inner = out[..., _SIDE:]
+        coarse = self.coarse[:, None]
         for weight, shift in zip(weights, range(2 * _SIDE + 1), strict=True):
-            inner += weight[:, None] * self.coarse[:, :, shift : shift + n - _SIDE]
+            inner += weight * coarse[..., shift : shift + n - _SIDE]
         if kind == "integral":
-            inner += self._sums[:, :, _SIDE:n]
+            inner += self._sums[:, None, :, _SIDE:n]
         first = min(_NEAR, n)
-        near = theta[:, None] + np.arange(first)
-        out[:, :, :first] = self._near(near, kind)
+        out[..., :first] = self._near(theta[..., None] + np.arange(first), kind)
         return out
 
     def at(self, x: Matrix, kind: Kind = "value") -> Array:
@@ -253,10 +253,10 @@ class StepResponse:
         """Other responses of these elements, as block means alone, (rows, batch, n)."""
         return StepResponse(means, self.fine[:, :0], self.orders)
 
-    def _near(self, x: Matrix, kind: Kind) -> Array:
-        """Readings at positions below _NEAR, (rows, batch, positions)."""
-        elements = np.repeat(np.arange(x.shape[0]), x.shape[1])
-        return self._read_fine(elements, x.ravel(), kind).reshape(-1, *x.shape)
+    def _near(self, x: Array, kind: Kind) -> Array:
+        """Readings at positions below _NEAR, (places, batch, positions) -> (rows, *x.shape)."""
+        elements = np.broadcast_to(np.arange(x.shape[1])[:, None], x.shape)
+        return self._read_fine(elements.ravel(), x.ravel(), kind).reshape(-1, *x.shape)
 
     def _read_fine(self, element: Index, x: Vector, kind: Kind) -> Array:
         """Readings of single elements at positions below _NEAR, (rows, positions)."""

@@ -19,7 +19,8 @@ from lcopa_bayes.effectsearch.heldouteffects import Errors
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.noise import FEWEST, Law
 from lcopa_bayes.effectsearch.refits import SIGNIFICANT, Refit
-from lcopa_bayes.effectsearch.trace import threshold_of
+from lcopa_bayes.effectsearch.signature import Scale
+from lcopa_bayes.effectsearch.trace import Trace, Traced, against_chance, threshold_of
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.noise import WhiteAR1
 from lcopa_bayes.inference.observations import Observed, PlausibleNoise, Samples
@@ -270,3 +271,16 @@ def test_bent_campaigns_are_not_called_clean(rho, curvature):
         looped(campaign(records, seed, rho, curvature)).verdict.kind == "clean" for seed in range(100)
     )
     assert wrong <= 5
+
+
+def test_chance_is_drawn_until_the_threshold_is_clear_of_the_evidence():
+    """Few residuals decide what lies far from the threshold; near it all that are allowed are drawn."""
+    drawn = np.random.default_rng(3).gumbel(size=2000)
+    for largest, expected in ((60.0, 400), (-5.0, 400), (float(np.quantile(drawn, 0.99)), 2000)):
+        left = iter(np.split(drawn, 5))
+        found = (Traced(catalogue()["odd_curvature"].card, (None,), largest, 0),)
+        empty = Trace(found, 3.0, (3.0, 3.0), np.nan, 0, np.zeros(0), Scale(0.0, 1.0, np.ones(1)))
+        seen = against_chance(empty, lambda count, left=left: next(left)[:count], 2000)
+        assert seen.draws == expected
+        assert seen.p_value == (np.count_nonzero(drawn[:expected] >= largest) + 1) / (expected + 1)
+        assert seen.threshold == threshold_of(drawn[:expected])[0]

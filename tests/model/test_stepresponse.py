@@ -61,7 +61,7 @@ def test_reading_is_exact_for_quartics(theta):
 @pytest.mark.parametrize("theta", [1e-3, 0.01, 0.03, 0.1, 0.5, 0.97])
 def test_the_onset_is_read_as_it_is(element, theta):
     """Wherever the first sample falls after it: within 2e-4 of the step, a tenth of a noise of 0.2 %."""
-    read = solved(element).on_lattice(np.array([theta]))[0, 0]
+    read = solved(element).on_lattice(np.array([[theta]]))[0, 0, 0]
     time = STEP * (np.arange(read.size) + theta)
     assert np.abs(read - exact(element, time))[:12].max() < (2e-4 if element[1][0] < 0.7 else 5e-5)
 
@@ -70,7 +70,7 @@ def test_the_onset_is_read_as_it_is(element, theta):
 def test_the_integral_is_that_of_the_bench(element):
     response = solved(element)
     for theta in (0.02, 0.6):
-        read = response.on_lattice(np.array([theta]), "integral")[0, 0] * STEP
+        read = response.on_lattice(np.array([[theta]]), "integral")[0, 0, 0] * STEP
         time = STEP * (np.arange(read.size) + theta)
         assert np.abs(read - exact(element, time, integral=True)).max() < 4e-4
 
@@ -91,7 +91,7 @@ def test_errors_fall_with_the_square_of_the_width(element):
 def test_both_readings_agree(theta, element, slopes):
     response = solved(element, slopes=slopes)
     for kind in ("value", "integral", "slope"):
-        lattice = response.on_lattice(np.array([theta]), kind)
+        lattice = response.on_lattice(np.array([[theta]]), kind)[:, 0]
         x = np.arange(lattice.shape[2])[None] + theta
         assert_allclose(response.at(x, kind), lattice, rtol=1e-12, atol=1e-12)
 
