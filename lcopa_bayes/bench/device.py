@@ -20,7 +20,7 @@ from scipy.signal import lfilter
 from lcopa_bayes.bench.command import Command
 from lcopa_bayes.bench.inversion import unit_ramp, unit_step, unsuited
 from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.rules import POSITIVE, Rule, Ruled, is_number
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.model.literature import PAPER
@@ -168,8 +168,7 @@ class Device:
         problems += [problem for row in self.paths for path in row for problem in unsuited(path)]
         if len(self.offsets) != rows or not all(isfinite(offset) for offset in self.offsets):
             problems.append(f"one finite offset per response axis is needed; got {self.offsets}")
-        if problems:
-            raise InputError(problems)
+        refuse_if(problems)
 
     def response(self, command: Command, time: ArrayLike, *, exposure: float = 0.0) -> Matrix:
         """Responses to `command` at `time` [ms], (n, n_responses) [response unit].
@@ -188,8 +187,7 @@ class Device:
             )
         if not 0 <= exposure < inf:
             problems.append(f"an exposure must be at least 0 and finite; got {exposure}")
-        if problems:
-            raise InputError(problems)
+        refuse_if(problems)
         out = np.tile(np.array(self.offsets), (time.size, 1))
         jumps = command.jumps
         for i, row in enumerate(self.paths):

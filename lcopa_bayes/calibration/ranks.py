@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import stats
 
-from lcopa_bayes.core.arrays import Array, Index, Vector
+from lcopa_bayes.core.arrays import Array, Index, Vector, attributes
 
 SIMULTANEOUS = 0.95
 """Probability that all that one band is drawn for lies inside it [-]."""
@@ -164,12 +164,7 @@ class Coverage:
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
         return {
-            "parameter": self.parameter,
-            "kind": self.kind,
-            "level": self.level,
-            "observed": self.observed,
-            "lower": self.lower,
-            "upper": self.upper,
+            **attributes(self, "parameter", "kind", "level", "observed", "lower", "upper"),
             "band": BAND,
             "confidence": self.confidence,
             "within": self.holds,

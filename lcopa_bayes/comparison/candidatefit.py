@@ -22,7 +22,7 @@ from lcopa_bayes.comparison.averaging import quantiles
 from lcopa_bayes.comparison.candidates import Candidate
 from lcopa_bayes.comparison.predictivedensity import Predicted, predictions
 from lcopa_bayes.comparison.priorwidth import widths
-from lcopa_bayes.core.arrays import Estimate, Matrix, Vector, plain
+from lcopa_bayes.core.arrays import Estimate, Matrix, Vector, attributes, plain
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.files import save_json, save_table, writable_folder
 from lcopa_bayes.data.settings import SamplerSettings
@@ -175,10 +175,7 @@ class Criteria:
         return plain(
             {
                 "max_log_likelihood": self.log_likelihood,
-                "parameters": self.parameters,
-                "samples": self.samples,
-                "aic": self.aic,
-                "bic": self.bic,
+                **attributes(self, "parameters", "samples", "aic", "bic"),
             }
         )
 
@@ -315,11 +312,7 @@ def card(
     result = criteria(fitted, also)
     entries: dict[str, Any] = plain(
         {
-            "name": candidate.name,
-            "about": candidate.about,
-            "notes": candidate.notes,
-            "integer": candidate.integer,
-            "terms": candidate.terms,
+            **attributes(candidate, "name", "about", "notes", "integer", "terms"),
             "settings": settings_of(candidate.study),
             "time_unit": fitted.study.time_unit,
             "grade": grade.level,

@@ -20,7 +20,7 @@ from lcopa_bayes.comparison.sequentialdensity import (
     predicted,
     without,
 )
-from lcopa_bayes.core.arrays import Array, Matrix, Vector, plain
+from lcopa_bayes.core.arrays import Array, Matrix, Vector, attributes, plain
 from lcopa_bayes.inference.observations import Observed, Samples
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.forward import ForwardModel
@@ -94,12 +94,7 @@ class Predicted:
                 "samples": self.time.size,
                 "elpd": float(self.log_density.sum()),
                 "monte_carlo_sd": self.error,
-                "in_sample": self.in_sample,
-                "plausible": self.plausible,
-                "method": self.method,
-                "pareto_k": self.pareto_k,
-                "ess": self.ess,
-                "rhat": self.rhat,
+                **attributes(self, "in_sample", "plausible", "method", "pareto_k", "ess", "rhat"),
                 "level_from": list(dict.fromkeys(self.level_from)),
             }
         )

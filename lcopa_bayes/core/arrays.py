@@ -116,19 +116,9 @@ class Estimate:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; what is infinite or undefined is None."""
-        out: dict[str, Any] = {
-            "name": self.name,
-            "value": self.value,
-            "unit": self.unit,
-            "mean": self.mean,
-            "sd": self.sd,
-            "lower": self.lower,
-            "upper": self.upper,
-            "level": self.level,
-            "interval": self.interval,
-            "ess": self.ess,
-            "grade": self.grade,
-        }
+        out: dict[str, Any] = attributes(
+            self, "name", "value", "unit", "mean", "sd", "lower", "upper", "level", "interval", "ess", "grade"
+        )
         return plain(out | ({"note": self.note} if self.note else {}))
 
 
@@ -136,6 +126,11 @@ def quantile(values: Array, probability: float) -> Array:
     """Quantile along the first axis that does not interpolate between a finite and an infinite entry."""
     method = "linear" if np.isfinite(values).all() else "higher"
     return np.asarray(np.quantile(values, probability, axis=0, method=method))  # type: ignore[call-overload]
+
+
+def attributes(one: object, *names: str) -> dict[str, Any]:
+    """Some attributes of an object, by their names."""
+    return {name: getattr(one, name) for name in names}
 
 
 def plain(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import norm
 
-from lcopa_bayes.core.arrays import LEVEL, Matrix, Vector
+from lcopa_bayes.core.arrays import LEVEL, Matrix, Vector, attributes
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.crossvalidation import groups, shifts
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
@@ -83,10 +83,7 @@ class Score:
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
         return {
-            "record": self.record,
-            "axis": self.axis,
-            "unit": self.unit,
-            "held_out": self.held_out,
+            **attributes(self, "record", "axis", "unit", "held_out"),
             "samples": self.time.size,
             "rmse": self.rmse,
             "noise_sd": self.noise_sd,

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from lcopa_bayes.bench.device import Bench as VirtualBench
 from lcopa_bayes.bench.device import truth
-from lcopa_bayes.core.arrays import LEVEL, Array, Flags, Matrix, Vector, plain
+from lcopa_bayes.core.arrays import LEVEL, Array, Flags, Matrix, Vector, attributes, plain
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.experiments.design import LINEAR, Design
 from lcopa_bayes.experiments.information import Bench, Trial, device_of
@@ -98,9 +98,7 @@ class Confirmation:
         """Plain values; infinite ones are None."""
         return plain(
             {
-                "confirmed": self.confirmed,
-                "sentence": self.sentence,
-                "where": self.where,
+                **attributes(self, "confirmed", "sentence", "where"),
                 "replicas": self.winner.errors.shape[0],
                 "factor": {
                     "value": self.factor,

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.core.arrays import Matrix, Vector, plain
+from lcopa_bayes.core.arrays import Matrix, Vector, attributes, plain
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.identifiability.contraction import (
     Known,
@@ -192,9 +192,7 @@ class Audit:
 
 def _structure(structure: Structure) -> dict[str, Any]:
     return {
-        "parameters": structure.parameters,
-        "rank": structure.rank,
-        "certain": structure.certain,
+        **attributes(structure, "parameters", "rank", "certain"),
         "singular_values": structure.singular,
         "symmetries": [symmetry.as_json() for symmetry in structure.symmetries],
     }

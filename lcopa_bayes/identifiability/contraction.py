@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import rankdata
 
-from lcopa_bayes.core.arrays import Estimate, Matrix, Vector, plain
+from lcopa_bayes.core.arrays import Estimate, Matrix, Vector, attributes, plain
 from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.likelihood import Landscape
 from lcopa_bayes.inference.parameter import Parameter
@@ -116,11 +116,7 @@ class Known:
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
         fields: dict[str, Any] = self.estimate.as_json() | plain(
-            {
-                "relative_width": self.relative_width,
-                "prior_relative_width": self.prior_relative_width,
-                "verdict": self.verdict,
-            }
+            attributes(self, "relative_width", "prior_relative_width", "verdict")
         )
         return fields
 

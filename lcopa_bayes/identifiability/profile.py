@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2, t
 
-from lcopa_bayes.core.arrays import LEVEL, Matrix, Vector, plain
+from lcopa_bayes.core.arrays import LEVEL, Matrix, Vector, attributes, plain
 from lcopa_bayes.inference.likelihood import Landscape, Peak
 from lcopa_bayes.inference.posterior import Posterior
 
@@ -154,9 +154,7 @@ class Profile:
                 "searched": self.ends,
                 "nuisance_at_bound": self.at_bound,
                 "nuisance_moving": self.moving,
-                "parts": self.parts,
-                "values": self.values,
-                "fall": self.fall,
+                **attributes(self, "parts", "values", "fall"),
             }
         )
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Flags, Index, Matrix, Vector
-from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.core.errors import InputError, nearest, refuse_if
 from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.noise import NOISES
@@ -341,6 +341,5 @@ def _with_priors(
         value = np.nan if setting.fixed is None else setting.fixed
         out.append(replace(row, prior=prior, value=value, default=False))
         problems += out[-1].problems
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     return out

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.core.errors import nearest, refuse_if
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.data.settings import ModelSettings
 
@@ -160,6 +160,5 @@ def _terms(names: tuple[str, ...], model: ModelSettings) -> list[int]:
         for name in names
         if name not in model.terms
     ]
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     return [model.terms[name] for name in names]

@@ -8,7 +8,7 @@ from enum import Enum
 from math import inf, isfinite
 from typing import Self
 
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.errors import InputError, refuse_if
 
 _SAME = 1e-9
 """Orders closer than this are one term [-]."""
@@ -56,8 +56,7 @@ class TransferPath:
             problems.append(f"viscosities and stiffness must be finite, the stiffness not 0; got {self}")
         if not all(0 < order < inf for order in self.orders):
             problems.append(f"orders must be positive and finite; got {self.orders}")
-        if problems:
-            raise InputError(problems)
+        refuse_if(problems)
 
     @classmethod
     def of_times(

@@ -24,7 +24,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
 
 from lcopa_bayes.core.arrays import Matrix, Vector, finite, frozen
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.rules import POSITIVE, Rule, Ruled, is_number
 from lcopa_bayes.model.literature import PAPER, StatedOptics
 
@@ -257,5 +257,4 @@ def _check(cell: Cell, voltage: float, cells: int) -> None:
     elif isfinite(voltage) and voltage * _PER_LAYER * pi > cells * cell.threshold:
         need = int(np.ceil(voltage * _PER_LAYER * pi / cell.threshold))
         problems.append(f"{cells} cells are too few at {voltage:.6g} V; use at least {need}.")
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)

@@ -11,8 +11,8 @@ from typing import Any, Literal
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.core.arrays import Vector, plain
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.arrays import Vector, attributes, plain
+from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.parallel import Progress, workers
 from lcopa_bayes.data.settings import ModelSettings, NoiseSettings
 from lcopa_bayes.data.study import Study
@@ -166,8 +166,7 @@ def scannable(study: Study, plan: Scan | None = None) -> tuple[PathData, ...]:
             plan.first_round(data.terms, data.span, data.records[0].blocks.grid.step)
         except InputError as error:
             problems += [f"path {data.name}: {problem}" for problem in error.problems]
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     return paths
 
 
@@ -243,7 +242,7 @@ def _of_scan(method: str, data: PathData, scanned: Scanned) -> Identified:
 def results(study: Study, identified: tuple[Identification, ...], plan: Scan | None = None) -> dict[str, Any]:
     """Every number as plain JSON values; units beside them."""
     stiffness = (plan or Scan()).stiffness[0]
-    fields: dict[str, Any] = plain(
+    return plain(
         {
             "study": study.name,
             "time_unit": study.time_unit,
@@ -251,7 +250,6 @@ def results(study: Study, identified: tuple[Identification, ...], plan: Scan | N
             "paths": [_path(each, stiffness, study.time_unit) for each in identified],
         }
     )
-    return fields
 
 
 def _sentence(identified: Identification, time_unit: str) -> str:
@@ -295,9 +293,7 @@ def _model(identified: Identified, stiffness: float, time_unit: str) -> dict[str
         },
         "steady": model.steady,
         "physical": model.physical,
-        "equation_rmse": identified.equation_rmse,
-        "output_rmse": identified.output_rmse,
-        "candidates": identified.candidates,
+        **attributes(identified, "equation_rmse", "output_rmse", "candidates"),
         "physical_candidates": identified.physical,
         "unconstrained_output_rmse": identified.unconstrained_rmse,
     }

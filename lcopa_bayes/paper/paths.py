@@ -19,7 +19,7 @@ import numpy as np
 from scipy.special import gamma
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.errors import refuse_if
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
@@ -160,8 +160,7 @@ def path_data(study: Study) -> tuple[PathData, ...]:
                 if not any(np.any(each.blocks.response) for each in records):
                     problems.append(f"path {name}: the response never moves; leave its column out")
                 paths.append(PathData(i, j, name, response.unit, drive.unit, terms, records))
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     return tuple(paths)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, TypeAlias
 
-from lcopa_bayes.core.arrays import plain
+from lcopa_bayes.core.arrays import attributes, plain
 from lcopa_bayes.model.literature import Stated
 
 
@@ -82,15 +82,12 @@ class Judged:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        fields: dict[str, Any] = plain(
+        return plain(
             {
                 "id": self.claim.id,
                 "verdict": self.verdict.kind.value,
-                "number": self.verdict.number,
-                "unit": self.verdict.unit,
-                "how": self.verdict.how,
+                **attributes(self.verdict, "number", "unit", "how"),
                 "text": self.claim.text,
                 "source": self.claim.source,
             }
         )
-        return fields

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from lcopa_bayes.comparison.compare import folder_name
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.errors import refuse_if
 from lcopa_bayes.report.page import Verdict, write_graded
 from lcopa_bayes.report.section import (
     NONE,
@@ -72,8 +72,7 @@ def _curves(folder: Path, results: Mapping[str, Any]) -> dict[str, pd.DataFrame]
             out[str(row["name"])] = pd.read_csv(path, dtype={"record": str, "axis": str, "unit": str})
         except (OSError, ValueError) as error:
             problems.append(f"{path}: cannot be read ({error}); run `compare` again with --resume")
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     return out
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from lcopa_bayes.core.arrays import Matrix
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.results.bands import POINTWISE, QUANTILE_NAMES, SIMULTANEOUS
 from lcopa_bayes.results.datatree import posterior_draws
 from lcopa_bayes.results.runfolder import ORIGINS
@@ -130,8 +130,7 @@ def load_run(folder: Path) -> SavedRun:
             "both must come from the same run, so run `fit` again"
             for name in absent
         ]
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     return SavedRun(results, origin, tables, draws)
 
 

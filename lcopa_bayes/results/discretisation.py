@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.core.arrays import Flags, Matrix, Vector
+from lcopa_bayes.core.arrays import Flags, Matrix, Vector, attributes
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.optimum import Optimum, again, find_optima
@@ -99,9 +99,7 @@ class Discretisation:
             "parameter": self.parameter,
             "shift_sd": self.shift,
             "shift_error_sd": self.error,
-            "refinement": self.refinement,
-            "blocks": self.blocks,
-            "negligible": self.negligible,
+            **attributes(self, "refinement", "blocks", "negligible"),
             "moved": list(self.moved),
         }
 

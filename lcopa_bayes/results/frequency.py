@@ -54,9 +54,7 @@ class PathResponse:
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
         curves = {"gain": self.gain._asdict(), "phase_deg": self.phase._asdict()}
-        out: dict[str, Any] = plain(
-            {"path": self.path, "unit": self.unit, **curves, "bandwidth": self.bandwidth.as_json()}
-        )
+        out = plain({"path": self.path, "unit": self.unit, **curves, "bandwidth": self.bandwidth.as_json()})
         return out | ({"note": self.note} if self.note else {})
 
 
@@ -107,7 +105,7 @@ class FrequencyResponse:
 
     def to_json(self) -> dict[str, Any]:
         """Frequencies, bands and bandwidths as plain values."""
-        out: dict[str, Any] = plain(
+        return plain(
             {
                 "frequency": self.frequency,
                 "time_unit": self.time_unit,
@@ -117,7 +115,6 @@ class FrequencyResponse:
                 "draws": self.draws,
             }
         )
-        return out
 
     def _repr_html_(self) -> str:
         return notebook_table(self.summary())

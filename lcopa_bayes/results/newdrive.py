@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from lcopa_bayes.core.arrays import Array, Vector, plain
+from lcopa_bayes.core.arrays import Array, Vector, attributes, plain
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.files import save_json, save_table, writable_folder
 from lcopa_bayes.data.drive import Drive, drive_of, first_change
@@ -144,15 +144,11 @@ class Prediction(Result):
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, without the bands, which `table` holds."""
-        out: dict[str, Any] = plain(
+        return plain(
             {
                 "study": self.study,
                 "drive": self.driven.name,
-                "verdict": self.verdict,
-                "grade": self.grade,
-                "grade_reason": self.grade_reason,
-                "time_unit": self.time_unit,
-                "seed": self.seed,
+                **attributes(self, "verdict", "grade", "grade_reason", "time_unit", "seed"),
                 "measured": isinstance(self.driven, Record),
                 "kinds": [POINTWISE, SIMULTANEOUS],
                 "levels": [0.5, 0.9],
@@ -162,7 +158,6 @@ class Prediction(Result):
                 "scores": self.scores,
             }
         )
-        return out
 
     def save(self, folder: Path | str) -> Path:
         """Write `predict.json` and the tables of bands and drives into a folder; returns the folder.

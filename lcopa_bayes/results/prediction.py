@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Matrix, Vector, attributes
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.noise import GaussianNoise, Noise
@@ -63,14 +63,7 @@ class Band:
 
     def table(self) -> pd.DataFrame:
         """One row per time: what was observed, and the ends of the bands by kind [`unit`]."""
-        columns: dict[str, Any] = {
-            "record": self.record,
-            "axis": self.axis,
-            "unit": self.unit,
-            "held_out": self.held_out,
-            "time": self.time,
-            "observed": self.observed,
-        }
+        columns: dict[str, Any] = attributes(self, "record", "axis", "unit", "held_out", "time", "observed")
         columns |= named("plant", Bands(self.plant, self.plant_simultaneous))
         return pd.DataFrame(columns | named("noisy", Bands(self.noisy, self.noisy_simultaneous)))
 
@@ -92,17 +85,12 @@ class Band:
     def score(self) -> dict[str, Any]:
         """Error and coverage as plain values."""
         return {
-            "record": self.record,
-            "axis": self.axis,
-            "unit": self.unit,
-            "rmse": self.rmse,
+            **attributes(self, "record", "axis", "unit", "rmse"),
             "coverage_50": self.coverage(LEVELS[0]),
             "coverage_90": self.coverage(LEVELS[1]),
             "bands": POINTWISE,
             "samples": self.time.size,
-            "offset_from": self.offset_from,
-            "offset_samples": self.offset_samples,
-            "draws": self.draws,
+            **attributes(self, "offset_from", "offset_samples", "draws"),
         }
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy import signal, stats
 
-from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.arrays import Vector, attributes
 from lcopa_bayes.inference.noise import Noise
 from lcopa_bayes.results.prediction import Band
 from lcopa_bayes.sampling.draws import Draws
@@ -57,13 +57,7 @@ class Residual:
 
     def test(self) -> dict[str, Any]:
         """Size and test of whiteness as plain values."""
-        return {
-            "record": self.record,
-            "axis": self.axis,
-            "held_out": self.held_out,
-            "p_white": self.p_white,
-            "rms": self.rms,
-        }
+        return attributes(self, "record", "axis", "held_out", "p_white", "rms")
 
 
 def residuals(draws: Draws, bands: Sequence[Band], noise: Noise, period: float) -> list[Residual]:

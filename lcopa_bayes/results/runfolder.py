@@ -19,7 +19,7 @@ from typing import IO, Any, overload
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import plain
+from lcopa_bayes.core.arrays import attributes, plain
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.files import save_json, writable_folder, writing
 from lcopa_bayes.data.record import Record
@@ -172,9 +172,7 @@ _COMMAND: ContextVar[tuple[str, ...]] = ContextVar("_COMMAND", default=())
 def settings_of(study: Study) -> dict[str, Any]:
     """All settings of a study as plain values."""
     return {
-        "name": study.name,
-        "time_unit": study.time_unit,
-        "seed": study.seed,
+        **attributes(study, "name", "time_unit", "seed"),
         "fit": [record.name for record in study.fit],
         "held_out": [record.name for record in study.held_out],
         "model": _flat(study.model),

@@ -94,8 +94,7 @@ class StoredResult(Result):
 
 def origin_of(fit: Predictive, verb: str) -> dict[str, Any]:
     """Provenance of a result that rests on a fit."""
-    values: dict[str, Any] = plain(provenance(fit.study, verb) | {"draws_sha256": fit.draws.sha256})
-    return values
+    return plain(provenance(fit.study, verb) | {"draws_sha256": fit.draws.sha256})
 
 
 def stored_values(

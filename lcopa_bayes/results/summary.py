@@ -203,7 +203,7 @@ def results(fit: Fit) -> dict[str, Any]:
         | {"rhat": quality[estimate.name].rhat, "ess_between": quality[estimate.name].ess_between}
         for estimate in fit.draws.estimates()
     ]
-    values: dict[str, Any] = plain(
+    return plain(
         {
             "study": fit.study.name,
             "verdict": verdict(fit),
@@ -234,7 +234,6 @@ def results(fit: Fit) -> dict[str, Any]:
             "sampler": _sampler(fit),
         }
     )
-    return values
 
 
 def _evidence_grade(fit: Fit) -> str | None:

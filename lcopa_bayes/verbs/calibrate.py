@@ -19,7 +19,7 @@ from lcopa_bayes.calibration.calibrate import calibrate as calibrated
 from lcopa_bayes.calibration.ranks import LEVELS, SIMULTANEOUS, Coverage, bin_limits, corridor, p_uniform
 from lcopa_bayes.calibration.replica import ENGINES, RANKED, Engine, Outcome, Quantity
 from lcopa_bayes.calibration.truths import Stated, Truths
-from lcopa_bayes.core.arrays import plain
+from lcopa_bayes.core.arrays import attributes, plain
 from lcopa_bayes.results.discretisation import LARGEST
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.runfolder import opened, provenance
@@ -234,17 +234,11 @@ def tables(calibration: Calibration) -> dict[str, pd.DataFrame]:
         "replicas": pd.DataFrame(
             [
                 {
-                    "replica": o.replica,
-                    "seed": o.seed,
-                    "grade": o.grade,
+                    **attributes(o, "replica", "seed", "grade"),
                     "smallest_ess": o.ess,
                     "model_gap": o.gap,
                     "block_shift": o.shift,
-                    "resolved": o.resolved,
-                    "refinement": o.refinement,
-                    "engine": o.engine,
-                    "pareto_k": o.pareto_k,
-                    "seconds": o.seconds,
+                    **attributes(o, "resolved", "refinement", "engine", "pareto_k", "seconds"),
                 }
                 for o in calibration.outcomes
             ]
