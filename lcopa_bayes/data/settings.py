@@ -18,17 +18,7 @@ from scipy.stats.distributions import rv_frozen
 
 from lcopa_bayes.core.arrays import TIME_UNITS
 from lcopa_bayes.core.errors import nearest
-from lcopa_bayes.core.rules import (
-    FLAG,
-    FOLDER,
-    POSITIVE,
-    Rule,
-    Ruled,
-    is_number,
-    texts,
-    whole,
-    word_of,
-)
+from lcopa_bayes.core.rules import FLAG, FOLDER, POSITIVE, Rule, Ruled, is_number, texts, whole, word_of
 
 Share: TypeAlias = Literal["paper", "all", "none"]
 """Which paths share an element."""

@@ -77,12 +77,7 @@ def ratios(over: Vector, under: Vector) -> Vector:
 
 
 def promises(
-    bench: Bench,
-    drives: Sequence[Candidate],
-    draws: Matrix,
-    *,
-    repeats: int = 1,
-    prior: Vector | None = None,
+    bench: Bench, drives: Sequence[Candidate], draws: Matrix, *, repeats: int = 1, prior: Vector | None = None
 ) -> list[Promise]:
     """What each drive promises at draws (draws, rows) of table values.
 

@@ -59,13 +59,7 @@ class TransferPath:
         refuse_if(problems)
 
     @classmethod
-    def of_times(
-        cls,
-        gain: float,
-        delay: float,
-        times: Sequence[float],
-        orders: Sequence[float],
-    ) -> Self:
+    def of_times(cls, gain: float, delay: float, times: Sequence[float], orders: Sequence[float]) -> Self:
         """``gain exp(-delay s) / (1 + sum_i (T_i s)^order_i)``, the form in which a plant is fitted.
 
         Parameters: gain at rest [response unit per drive unit]; delay and times T_i [time unit]; orders [-].

@@ -157,13 +157,7 @@ class Superposition:
         return out
 
     def _add_anywhere(
-        self,
-        out: Array,
-        response: StepResponse,
-        phase: Phase,
-        lattice: Lattice,
-        delays: Vector,
-        kind: Kind,
+        self, out: Array, response: StepResponse, phase: Phase, lattice: Lattice, delays: Vector, kind: Kind
     ) -> None:
         """Add the response to one phase at sample times of any spacing."""
         x = (lattice.times - phase.time - delays[:, None]) / lattice.step

@@ -3,13 +3,7 @@
 from __future__ import annotations
 
 from lcopa_bayes.model.literature import PAPER, Stated
-from lcopa_bayes.paper import (
-    auditclaims,
-    comparisonclaims,
-    modelclaims,
-    numericsclaims,
-    opticsclaims,
-)
+from lcopa_bayes.paper import auditclaims, comparisonclaims, modelclaims, numericsclaims, opticsclaims
 from lcopa_bayes.paper.auditclaims import from_audit
 from lcopa_bayes.paper.comparisonclaims import from_comparison, jointly, uncompared
 from lcopa_bayes.paper.verdict import Claim, Evidence, Judged
@@ -90,10 +84,7 @@ CLAIMS: tuple[Claim, ...] = (
         ),
     ),
     Claim(
-        "M3",
-        "The identified model settles in 10 ms without overshoot.",
-        "Table 1",
-        modelclaims.settling_time,
+        "M3", "The identified model settles in 10 ms without overshoot.", "Table 1", modelclaims.settling_time
     ),
     Claim(
         "M4",

@@ -118,13 +118,7 @@ class Identification:
     @property
     def models(self) -> tuple[Identified, ...]:
         """All models, in the order of the fields."""
-        return (
-            self.scan,
-            self.scan_last_eta,
-            self.output_error,
-            self.integer,
-            self.integer_output_error,
-        )
+        return (self.scan, self.scan_last_eta, self.output_error, self.integer, self.integer_output_error)
 
 
 def identify(

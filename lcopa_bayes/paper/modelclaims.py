@@ -53,10 +53,7 @@ class PrintedModel:
     def steady(self, drive_x: float, drive_y: float) -> tuple[float, float]:
         """Responses at rest under phases [rad] held for ever, ``sum_j b_ij / k_ij u_j`` [rad]."""
         x, y = self.device.paths
-        return (
-            x[0].steady * drive_x + x[1].steady * drive_y,
-            y[0].steady * drive_x + y[1].steady * drive_y,
-        )
+        return (x[0].steady * drive_x + x[1].steady * drive_y, y[0].steady * drive_x + y[1].steady * drive_y)
 
     def at_end(self, drive_x: float, drive_y: float) -> tuple[float, float]:
         """Responses `RECORD_LENGTH` after a step of both phases [rad], from rest [rad]."""

@@ -12,18 +12,7 @@ from matplotlib.axes import Axes
 from lcopa_bayes.report.page import write_graded
 from lcopa_bayes.report.savedrun import SavedRun, load_run
 from lcopa_bayes.report.section import NONE, Drawing, Section, Table, ends, figures, paged, percent, sentence
-from lcopa_bayes.report.theme import (
-    BAND,
-    CYCLE,
-    HELD_OUT,
-    INK,
-    blank,
-    grid,
-    label,
-    log_ticks,
-    plain,
-    svg_of,
-)
+from lcopa_bayes.report.theme import BAND, CYCLE, HELD_OUT, INK, blank, grid, label, log_ticks, plain, svg_of
 
 _PER_FIGURE = 12
 _TOP = 6.0

@@ -45,7 +45,7 @@ TABLES: Mapping[str, tuple[str, ...]] = {
 }
 """Tables the report draws and the columns it needs of each."""
 _CHECK_TABLES: Mapping[str, tuple[str, ...]] = {
-    "cross_check_density": ("name", "log_scale", "left", "right", "ensembles", "nested"),
+    "cross_check_density": ("name", "log_scale", "left", "right", "ensembles", "nested")
 }
 """The same of a run that was checked by a second method."""
 _RESULTS = (

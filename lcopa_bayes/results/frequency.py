@@ -141,12 +141,7 @@ def transfer_function(table: ParameterTable, values: Matrix, frequency: Vector) 
 
 
 def frequency_response(
-    draws: Draws,
-    frequencies: ArrayLike | None = None,
-    *,
-    span: float,
-    period: float,
-    time_unit: str,
+    draws: Draws, frequencies: ArrayLike | None = None, *, span: float, period: float, time_unit: str
 ) -> FrequencyResponse:
     """Gain and phase of every path with pointwise and simultaneous 50 and 90 % bands.
 
@@ -181,11 +176,7 @@ def frequency_response(
                 Bands(np.exp(log_gain.pointwise), np.exp(log_gain.simultaneous)),
                 Bands.of(np.degrees(phase[i, j])),
                 Estimate.of(
-                    f"bandwidth[{name}]",
-                    f"1/{time_unit}",
-                    wide,
-                    ess=draws.ess,
-                    grade=draws.grade.level,
+                    f"bandwidth[{name}]", f"1/{time_unit}", wide, ess=draws.ess, grade=draws.grade.level
                 ),
                 f"the sign of the gain is open: {100 * negative:.0f} % of draws are negative, and the "
                 "phase has two values 180 deg apart"

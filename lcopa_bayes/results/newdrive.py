@@ -20,14 +20,7 @@ from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
 from lcopa_bayes.results.fittedrange import FittedRange, Outside
 from lcopa_bayes.results.frequency import transfer_function
-from lcopa_bayes.results.prediction import (
-    Band,
-    band_of,
-    bands,
-    disturbances,
-    named_rng,
-    plant_draws,
-)
+from lcopa_bayes.results.prediction import Band, band_of, bands, disturbances, named_rng, plant_draws
 from lcopa_bayes.results.result import Result
 from lcopa_bayes.results.runfolder import add_origin, digest, opened, provenance
 from lcopa_bayes.sampling.draws import Draws

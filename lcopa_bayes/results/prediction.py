@@ -110,13 +110,7 @@ def responses(table: ParameterTable, model: ForwardModel, values: Matrix) -> lis
 
 
 def bands(
-    draws: Draws,
-    model: ForwardModel,
-    samples: Sequence[Samples],
-    noise: Noise,
-    *,
-    held_out: bool,
-    seed: int,
+    draws: Draws, model: ForwardModel, samples: Sequence[Samples], noise: Noise, *, held_out: bool, seed: int
 ) -> list[Band]:
     """50 and 90 % bands of every axis of every record, for the plant alone and with noise.
 
@@ -142,13 +136,7 @@ def study_bands(problem: Problem, draws: Draws) -> list[Band]:
 
 
 def record_draws(
-    draws: Draws,
-    model: ForwardModel,
-    samples: Sequence[Samples],
-    noise: Noise,
-    *,
-    held_out: bool,
-    seed: int,
+    draws: Draws, model: ForwardModel, samples: Sequence[Samples], noise: Noise, *, held_out: bool, seed: int
 ) -> Iterator[tuple[tuple[str, Axis, bool], Vector, Vector, Matrix, Matrix, tuple[Vector, str, int]]]:
     """The draws behind `bands`, axis by axis of every record: arguments of `band_of`."""
     for r, record in enumerate(samples):

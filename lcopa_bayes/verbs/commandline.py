@@ -318,10 +318,7 @@ def optics(parser: argparse.ArgumentParser) -> None:
     plan = OpticsPlan()
     parser.add_argument("--out", type=Path, default=RUNS / "optics", help="folder for the page")
     parser.add_argument(
-        "--elements",
-        type=int,
-        default=plan.elements,
-        help="elements along an axis (default: the paper's 32)",
+        "--elements", type=int, default=plan.elements, help="elements along an axis (default: the paper's 32)"
     )
     parser.add_argument("--pitch", type=float, help="distance of elements [m] (default: 1.2 wavelengths)")
     parser.add_argument(

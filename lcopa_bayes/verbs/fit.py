@@ -43,13 +43,7 @@ def fit(
             page = look(wanted).report(place)
             print(f"first look: {page}", file=sys.stderr)
         fitted = sampled(
-            wanted,
-            jobs=jobs,
-            folder=place,
-            resume=resume,
-            quick=quick,
-            cross_check=cross_check,
-            quiet=quiet,
+            wanted, jobs=jobs, folder=place, resume=resume, quick=quick, cross_check=cross_check, quiet=quiet
         )
         if rival:
             fitted = replace(fitted, rival=integer_rival(fitted, jobs=jobs, quick=quick, quiet=quiet))
@@ -59,13 +53,7 @@ def fit(
 
 
 def basis(
-    source: FitLike,
-    *,
-    jobs: int,
-    folder: Path | str | None,
-    resume: bool,
-    quick: bool,
-    quiet: bool,
+    source: FitLike, *, jobs: int, folder: Path | str | None, resume: bool, quick: bool, quiet: bool
 ) -> Predictive:
     """The finished fit that is given or named, else the fit of the study that is; parameters as `fit`."""
     result = finished(source)

@@ -46,10 +46,7 @@ def sections(values: Values, samples: Sequence[pd.DataFrame]) -> list[Section]:
                 "scale of gain, viscosities and k is a convention: with k given as in Eq. 62, and with the "
                 "last viscosity 1 as in Eq. 65.",
             ),
-            tables=(
-                _errors(paths, time_unit),
-                *(_coefficients(paths, each.value) for each in Normalisation),
-            ),
+            tables=(_errors(paths, time_unit), *(_coefficients(paths, each.value) for each in Normalisation)),
         ),
         Section(
             "Records and models",

@@ -235,10 +235,7 @@ def _spectrum(panel: Axes, rows: pd.DataFrame, time_unit: str) -> None:
     at = _shown(power)
     panel.plot(frequency[at], power[at], color=BAND, lw=0.8)
     panel.set(
-        xscale="log",
-        yscale="log",
-        xlabel=label("frequency", f"1/{time_unit}"),
-        ylabel="power over white [-]",
+        xscale="log", yscale="log", xlabel=label("frequency", f"1/{time_unit}"), ylabel="power over white [-]"
     )
 
 
