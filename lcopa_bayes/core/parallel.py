@@ -10,11 +10,11 @@ import os
 import signal
 import sys
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import CancelledError, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from functools import partial
 from importlib import import_module
 from multiprocessing import parent_process
 from multiprocessing.context import SpawnContext, SpawnProcess
@@ -37,14 +37,18 @@ CONNECT = 5.0
 _ADVICE = "what was finished is stored; go on with --resume"
 
 
-class Workers(ABC, Generic[S]):
+class Workers(Generic[S]):
     """What does tasks `task(shared, one)`; the results do not depend on who it is."""
 
-    @abstractmethod
+    def __init__(self, submit: Callable[..., Any], as_finished: Callable[..., Iterator[Any]]) -> None:
+        """By what gives a task and its input to a worker, a future, and what gives futures as they finish."""
+        self._submit, self._as_finished = submit, as_finished
+
     def each(self, task: Callable[[S, T], R], inputs: Sequence[T]) -> Iterator[R]:
         """Results in the order of the inputs."""
+        futures = [self._submit(task, one) for one in inputs]
+        return (future.result() for future in futures)
 
-    @abstractmethod
     def finished(
         self,
         task: Callable[[S, T], R],
@@ -53,10 +57,28 @@ class Workers(ABC, Generic[S]):
     ) -> Iterator[R]:
         """Results in the order in which they are finished. Where a task ends in an error, on a cluster also
         where it is lost with its worker, `failed` gives its result; without it the error is raised."""
+        futures = {self._submit(task, one): one for one in inputs}
+        for future in self._as_finished(futures):
+            try:
+                result = future.result()
+            except (BrokenProcessPool, CancelledError):
+                raise
+            except Exception as error:
+                if failed is None:
+                    raise
+                result = failed(futures[future], error)
+            yield result
 
     def map(self, function: Callable[[T], R], inputs: Sequence[T]) -> Iterator[R]:
         """Results of a function that needs nothing shared, in the order of the inputs."""
         return self.each(_Alone(function), inputs)
+
+
+class _Later:
+    """A task of this process, done when its result is asked for."""
+
+    def __init__(self, task: Callable[[S, T], Any], shared: S, one: T) -> None:
+        self.result = partial(task, shared, one)
 
 
 @contextmanager
@@ -73,11 +95,11 @@ def workers(shared: S, *, jobs: int = 1, dask: str | None = None) -> Iterator[Wo
             yield cluster
     elif jobs <= 1:
         with threadpool_limits(1):
-            yield _Here(shared)
+            yield Workers(lambda task, one: _Later(task, shared, one), iter)
     else:
         pool = ProcessPoolExecutor(jobs, mp_context=_Context(), initializer=_take_up, initargs=(shared,))
         try:
-            yield _Processes(pool)
+            yield Workers(lambda task, one: pool.submit(_perform, task, one), as_completed)
         except BrokenProcessPool:
             raise InputError(
                 f"a worker process ended, perhaps for want of memory, or because it was given what the main "
@@ -108,83 +130,8 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
-class _Here(Workers[S]):
-    """This process."""
-
-    def __init__(self, shared: S) -> None:
-        self._shared = shared
-
-    def each(self, task: Callable[[S, T], R], inputs: Sequence[T]) -> Iterator[R]:
-        return (task(self._shared, one) for one in inputs)
-
-    def finished(
-        self,
-        task: Callable[[S, T], R],
-        inputs: Sequence[T],
-        failed: Callable[[T, BaseException], R] | None = None,
-    ) -> Iterator[R]:
-        for one in inputs:
-            try:
-                result = task(self._shared, one)
-            except Exception as error:
-                if failed is None:
-                    raise
-                result = failed(one, error)
-            yield result
-
-
-class _Processes(Workers[S]):
-    """Other processes on this machine."""
-
-    def __init__(self, pool: ProcessPoolExecutor) -> None:
-        self._pool = pool
-
-    def each(self, task: Callable[[S, T], R], inputs: Sequence[T]) -> Iterator[R]:
-        return self._pool.map(_perform, [task] * len(inputs), inputs)
-
-    def finished(
-        self,
-        task: Callable[[S, T], R],
-        inputs: Sequence[T],
-        failed: Callable[[T, BaseException], R] | None = None,
-    ) -> Iterator[R]:
-        futures = {self._pool.submit(_perform, task, one): one for one in inputs}
-        for future in as_completed(futures):
-            error = future.exception()
-            if error is None or failed is None or isinstance(error, BrokenProcessPool):
-                yield future.result()
-            else:
-                yield failed(futures[future], error)
-
-
-class _Cluster(Workers[S]):
-    """The workers of a Dask scheduler."""
-
-    def __init__(self, client: Any, shared: S) -> None:
-        # sent once; a worker that needs it takes it from another
-        self._client, self._shared = client, client.submit(_same, shared, pure=False)
-
-    def each(self, task: Callable[[S, T], R], inputs: Sequence[T]) -> Iterator[R]:
-        futures = [self._client.submit(task, self._shared, one, pure=False) for one in inputs]
-        return (future.result() for future in futures)
-
-    def finished(
-        self,
-        task: Callable[[S, T], R],
-        inputs: Sequence[T],
-        failed: Callable[[T, BaseException], R] | None = None,
-    ) -> Iterator[R]:
-        futures = {self._client.submit(task, self._shared, one, pure=False): one for one in inputs}
-        as_finished = import_module("distributed").as_completed
-        for future in as_finished(futures, loop=self._client.loop):
-            if future.status == "error" and failed is not None:
-                yield failed(futures[future], future.exception())
-            else:
-                yield future.result()
-
-
 @contextmanager
-def _cluster(shared: S, address: str) -> Iterator[_Cluster[S]]:
+def _cluster(shared: S, address: str) -> Iterator[Workers[S]]:
     try:
         distributed = import_module("distributed")
     except ImportError:
@@ -198,7 +145,12 @@ def _cluster(shared: S, address: str) -> Iterator[_Cluster[S]]:
         ) from None
     try:
         with client:
-            yield _Cluster(client, shared)
+            # sent once; a worker that needs it takes it from another
+            held = client.submit(_same, shared, pure=False)
+            yield Workers(
+                lambda task, one: client.submit(task, held, one, pure=False),
+                partial(distributed.as_completed, loop=client.loop),
+            )
     except distributed.client.FutureCancelledError as error:
         raise InputError(f"--dask {address}: the scheduler was lost ({error}); {_ADVICE}") from None
 
