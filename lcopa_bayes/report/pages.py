@@ -5,26 +5,61 @@ Pages about the paper, drawn from their run folders: static optics, identificati
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping
+from math import log10
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.inference import defaultpriors
+from lcopa_bayes.model.path import Normalisation
 from lcopa_bayes.paper.staticoptics import OpticsPlan, static_optics
+from lcopa_bayes.paper.steptable import KINDS, PRINTED
 from lcopa_bayes.report.audit import write_audit
 from lcopa_bayes.report.calibrate import write_calibration
 from lcopa_bayes.report.check import write_check, write_look
 from lcopa_bayes.report.compare import write_comparison
 from lcopa_bayes.report.design import write_design
+from lcopa_bayes.report.formatting import (
+    interval,
+)
 from lcopa_bayes.report.loop import write_loop
-from lcopa_bayes.report.page import write_page, write_report
+from lcopa_bayes.report.page import Drawings, write_graded
 from lcopa_bayes.report.predict import write_prediction
-from lcopa_bayes.report.section import Section, Table
-from lcopa_bayes.report.sections import claimfigures, identification, optics
-from lcopa_bayes.report.theme import look
+from lcopa_bayes.report.savedrun import load_run
+from lcopa_bayes.report.sections import (
+    claimfigures,
+    identification,
+    optics,
+    parameters,
+    records,
+    responses,
+    sampling,
+)
 from lcopa_bayes.results.stored import stored_values
+
+_PARTS = (records, parameters, responses, sampling)
+"""What draws the report of a fit."""
+
+
+def write_report(folder: Path) -> Path:
+    """Draw the report of a run folder: `figures/*.svg` and `report.html`, whose path is returned.
+
+    Reads only the folder and calculates nothing; the same folder gives the same bytes. InputError when a
+    file of the folder is missing or cannot be used.
+    """
+    run = load_run(folder)
+
+    def drawn(values: Mapping[str, Any]) -> Drawings:
+        return {key: one for part in _PARTS for key, one in part.drawn(run).items()}
+
+    rules = inspect.cleandoc(defaultpriors.__doc__ or "")
+    return write_graded(
+        folder, "fit", "", drawn, file="results.json", name="report.html", run=run, default_priors=rules
+    )
 
 
 def write_optics(folder: Path) -> Path:
@@ -37,9 +72,15 @@ def write_optics(folder: Path) -> Path:
         calculated = static_optics(OpticsPlan(**plan))
     except TypeError as error:
         raise InputError(f"{folder / 'optics.json'}: holds no plan ({error}); run `optics` again") from None
-    with look():
-        sections = optics.sections(calculated)
-    return write_page(folder, "Static optics of the array", sections, name="optics.html")
+    return write_graded(
+        folder,
+        "optics",
+        "Static optics of the array",
+        lambda values: optics.drawn(calculated),
+        box=None,
+        calculated=calculated,
+        decibel=lambda intensity: 10 * log10(intensity),
+    )
 
 
 def write_identification(folder: Path) -> Path:
@@ -52,9 +93,26 @@ def write_identification(folder: Path) -> Path:
         samples = [pd.read_csv(folder / entry["samples"]) for entry in values["records"]]
     except (OSError, ValueError) as error:
         raise InputError(f"{folder}: samples cannot be read ({error}); run `identify` again") from None
-    with look():
-        sections = identification.sections(values, samples)
-    return write_page(folder, f"{values['study']}: identification", sections, name="identify.html")
+
+    def drawn(values: Mapping[str, Any]) -> Drawings:
+        pairs = zip(values["records"], samples, strict=True)
+        return {"records": [identification.drawing(*pair, values["time_unit"]) for pair in pairs]}
+
+    def credible(one: Mapping[str, Any]) -> str:
+        lower, upper = one["lower"], one["upper"]
+        return interval(lower, upper, None if None in (lower, upper) else abs(upper - lower) / 4)
+
+    return write_graded(
+        folder,
+        "identify",
+        "identification",
+        drawn,
+        box=None,
+        normalisations=[one.value for one in Normalisation],
+        kinds=KINDS,
+        columns=PRINTED,
+        credible_interval=credible,
+    )
 
 
 def write_claims(folder: Path) -> Path:
@@ -62,30 +120,8 @@ def write_claims(folder: Path) -> Path:
 
     InputError when `claims.json` cannot be used.
     """
-    values = stored_values(folder, "claims", ("verdict", "claims"))
-    with look():
-        sections = [_verdicts(values), *claimfigures.sections()]
-    return write_page(folder, "Claims of the paper", sections, name="claims.html")
-
-
-def _verdicts(values: Mapping[str, Any]) -> Section:
-    """The table of claims."""
-    table = Table.of(
-        values["claims"],
-        ("id", "text", "id"),
-        ("claim", "prose", lambda row: f"{row['text']} ({row['source']})"),
-        ("verdict", "text", "verdict"),
-        ("number", "number", "number"),
-        ("unit", "text", "unit"),
-        ("how", "prose", "how"),
-    )
-    return Section(
-        "Verdicts",
-        (
-            f"{values['verdict']} A verdict follows from the printed numbers by the calculation beside it; "
-            "undecided means that data needed to decide it are missing.",
-        ),
-        tables=(table,),
+    return write_graded(
+        folder, "claims", "Claims of the paper", lambda values: {"claims": claimfigures.drawn()}, box=None
     )
 
 

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import matplotlib
 import numpy as np
@@ -21,6 +22,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 
 from lcopa_bayes.core.arrays import Index, Vector
 
+T = TypeVar("T")
 INK = "#1a1a1a"
 SEEN = "#1a1a1a"
 """Observations of records that were fitted."""
@@ -192,3 +194,22 @@ def said(size: int, *, most: int = MOST) -> str:
     if size <= most:
         return ""
     return f"Drawn through the extremes of short stretches: the record has {size} samples."
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A figure as SVG, with the stem of its file name and its caption."""
+
+    stem: str
+    svg: str
+    caption: str
+    mark: str = ""
+    """A word set before the caption that must not be overlooked, such as "held out"."""
+
+
+def paged(
+    stem: str, names: Sequence[T], most: int, draw: Callable[[Sequence[T]], str], caption: str
+) -> tuple[Drawing, ...]:
+    """Figures `<stem>_01` and so on, each of up to `most` of the `names`, as `draw` gives them."""
+    parts = [names[k : k + most] for k in range(0, len(names), most)]
+    return tuple(Drawing(f"{stem}_{k:02d}", draw(part), caption) for k, part in enumerate(parts, start=1))

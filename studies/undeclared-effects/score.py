@@ -25,8 +25,6 @@ from lcopa_bayes.core.files import writable_folder, write_text
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.effectsearch import candidates, rounds, trace, verdict
 from lcopa_bayes.report.page import Verdict, write_page
-from lcopa_bayes.report.section import Column, Section, Table, figures
-from lcopa_bayes.report.theme import look
 
 HERE = Path(__file__).parent
 FIRST_TEST_SEED = 1000
@@ -109,41 +107,18 @@ def main() -> None:
         "command": " ".join(["python", "studies/undeclared-effects/score.py", *sys.argv[1:]]),
     }
     write_text(options.out / "results.json", json.dumps(values, indent=1) + "\n")
-    with look():
-        path = write_page(
-            options.out, "Undeclared effects: the score sheet", sections(values), _verdict(values)
+    title = "Undeclared effects: the score sheet"
+    print(
+        write_page(
+            options.out,
+            HERE / "scoresheet.html",
+            title,
+            values,
+            {},
+            verdict=_verdict(values),
+            name="report.html",
         )
-    print(path)
-
-
-def sections(values: dict[str, Any]) -> list[Section]:
-    """Score sheet and tracing matrix."""
-    columns = (
-        *(Column("measure", "prose"), Column("found", "number"), Column("target", "number")),
-        *(Column("95 % interval or quartiles", "interval"), Column("campaigns", "number"), Column("reached")),
     )
-    rows = []
-    for line in values["sheet"]:
-        ends = [line["lower"], line["upper"]] if "lower" in line else line.get("quartiles", [None, None])
-        sign = {"most": "at most", "least": "at least", "within": "within"}[line["side"]]
-        reached = "–" if line["value"] is None else "yes" if line["reached"] else "no"  # noqa: RUF001
-        spread = " to ".join(figures(end, 2) for end in ends)
-        target = f"{sign} {line['target']}"
-        rows.append((line["measure"], figures(line["value"]), target, spread, str(line["trials"]), reached))
-    counts = tuple(
-        (hidden, ", ".join(f"{name} {count}" for name, count in said.items()))
-        for hidden, said in values["matrix"].items()
-    )
-    text = (
-        f"{values['campaigns']} campaigns from seed {values['seed']}, median "
-        f"{values['cpu_seconds_each']:.0f} s of one "
-        f"core each. Made again by: {values['command']}"
-    )
-    found = Table((Column("hidden", "code"), Column("put down to", "prose")), counts, "Counts of campaigns.")
-    return [
-        Section("Score sheet", (text,), (), (Table(columns, tuple(rows)),)),
-        Section("What was put down to what", (), (), (found,)),
-    ]
 
 
 def _verdict(values: dict[str, Any]) -> Verdict:

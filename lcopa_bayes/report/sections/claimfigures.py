@@ -26,15 +26,27 @@ from lcopa_bayes.paper.modelclaims import (
 from lcopa_bayes.paper.numericsclaims import delay_costs
 from lcopa_bayes.paper.opticsclaims import FAR_WEAKER, tilt_checks
 from lcopa_bayes.paper.paths import response_to
-from lcopa_bayes.report.section import Drawing, Section, figures
-from lcopa_bayes.report.theme import BAND, CYCLE, HELD_OUT, NOISE, STEADY, blank, legend_above, svg_of
+from lcopa_bayes.report.formatting import (
+    figures,
+)
+from lcopa_bayes.report.theme import (
+    BAND,
+    CYCLE,
+    HELD_OUT,
+    NOISE,
+    STEADY,
+    Drawing,
+    blank,
+    legend_above,
+    svg_of,
+)
 
 _SHOWN = 100.0
 """Time of the long panel [ms]."""
 
 
-def sections(stated: Stated = PAPER) -> list[Section]:
-    """One section for each family of claims."""
+def drawn(stated: Stated = PAPER) -> list[tuple[str, Drawing]]:
+    """A title and a figure for each family of claims."""
     rival, costs = integer_rival(stated), delay_costs(stated)
     shown = (
         (
@@ -76,10 +88,7 @@ def sections(stated: Stated = PAPER) -> list[Section]:
             "Section 2 and for the pitch that the measured step implies.",
         ),
     )
-    return [
-        Section(title, drawings=(Drawing(f"claim_{stem}", draw(stated), caption),))
-        for title, stem, draw, caption in shown
-    ]
+    return [(title, Drawing(f"claim_{stem}", draw(stated), caption)) for title, stem, draw, caption in shown]
 
 
 def _steady(stated: Stated) -> str:

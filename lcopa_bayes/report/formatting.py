@@ -1,0 +1,101 @@
+"""Numbers and names as the report prints them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import floor, isfinite, log10
+from typing import Any
+
+OPEN = "open"
+"""An end of an interval that no draw bounds."""
+NOT_REACHED = "open (not reached within the record)"
+"""The same for a time that the simulated response does not reach."""
+NONE = "–"  # noqa: RUF001
+"""An entry that is not defined."""
+_MINUS = "−"  # noqa: RUF001
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_PLAIN_FROM, _PLAIN_TO = 1e-3, 1e6
+"""Between these sizes numbers are printed without a power of ten."""
+
+
+def figures(value: float | None, count: int = 3) -> str:
+    """`value` to `count` significant digits; a dash when undefined."""
+    if value is None or not isfinite(value):
+        return NONE
+    if value == 0:
+        return "0"
+    return _printed(value, count - 1 - floor(log10(abs(float(f"{value:.{count - 1}e}")))))
+
+
+def to_spread(value: float | None, spread: float | None) -> str:
+    """`value` to the place of the second significant digit of `spread`, but no fewer than two digits.
+
+    Without a positive spread three significant digits are printed.
+    """
+    if value is None or not isfinite(value):
+        return NONE
+    if spread is None or not isfinite(spread) or spread <= 0:
+        return figures(value)
+    places = _place(spread)
+    if value != 0 and abs(value) > 1e-6 * spread:
+        places = max(places, _place(value))
+    return _printed(value, places)
+
+
+def interval(lower: float | None, upper: float | None, spread: float | None, *, nothing: str = OPEN) -> str:
+    """`lower to upper`; an undefined side is open, and `nothing` is said when both are."""
+    ends = [OPEN if end is None else to_spread(end, spread) for end in (lower, upper)]
+    return nothing if lower is None and upper is None else f"{ends[0]} to {ends[1]}"
+
+
+def ends(row: Mapping[str, Any]) -> str:
+    """The 90 % interval of an estimate, to the digits that its width allows."""
+    lower, upper = row["lower"], row["upper"]
+    return interval(lower, upper, None if lower is None or upper is None else abs(upper - lower) / 3.29)
+
+
+def percent(share: float | None) -> str:
+    """A share [-] as a percentage."""
+    return NONE if share is None else f"{100 * share:.0f} %"
+
+
+def probability(p: float) -> str:
+    """`p = ...` for a p-value [-]."""
+    return f"p\u00a0=\u00a0{figures(p, 2)}" if p > 0 else "p below the smallest number a computer holds"
+
+
+def with_error(value: float | None, error: float | None, places: int = 2, *, bare: bool = True) -> str:
+    """`value ± error` to so many decimals; without an error the value alone, unless that may not stand
+    `bare`."""
+    if value is None or (error is None and not bare):
+        return NONE
+    return f"{value:.{places}f}" if error is None else f"{value:.{places}f} ± {error:.{places}f}"
+
+
+def sentence(clause: str) -> str:
+    """A clause with a capital and a full stop."""
+    return stopped(f"{clause[0].upper()}{clause[1:]}")
+
+
+def stopped(clause: str) -> str:
+    """A clause that may begin with a name, with a full stop."""
+    return clause if clause.endswith((".", ":")) else f"{clause}."
+
+
+def _place(value: float) -> int:
+    """Decimal places that show two significant digits."""
+    return 1 - floor(log10(abs(float(f"{value:.1e}"))))
+
+
+def _printed(value: float, places: int) -> str:
+    size = abs(value)
+    if value != 0 and not _PLAIN_FROM <= size < _PLAIN_TO:
+        power = floor(log10(size))
+        mantissa = f"{value / 10.0**power:.{max(0, min(15, power + places))}f}"
+        if abs(float(mantissa)) >= 10:
+            power += 1
+            mantissa = f"{value / 10.0**power:.{max(0, min(15, power + places))}f}"
+        text = f"{mantissa}×10{str(power).translate(_RAISED)}"  # noqa: RUF001
+    else:
+        text = f"{round(value, places):.{max(0, places)}f}"
+    return text.replace("-", _MINUS)
