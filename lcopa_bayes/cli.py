@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
     from lcopa_bayes.verbs.sources import FitLike
 
 _CODES = "exit codes: 0 done, 2 the input cannot be used (nothing is written), 130 interrupted"
+_COLLECTED = (100_000, 20, 100)
+"""Thresholds of the garbage collector: modules and figures are hundreds of thousands of objects that stay,
+and to look through them again and again takes a sixth of the time of imports and pages."""
 INTERRUPTED = 130
 """Exit code after an interrupt from the keyboard."""
 PUBLISHED = Path("reports")
@@ -35,7 +39,7 @@ class Reported(Protocol):
     """A result with values and a page."""
 
     def to_json(self) -> dict[str, Any]: ...  # noqa: D102
-    def report(self, folder: Path | str) -> Path: ...  # noqa: D102
+    def report(self, folder: Path | str, *, jobs: int = 1) -> Path: ...  # noqa: D102
 
 
 Derived = Callable[[argparse.Namespace, Any], object]
@@ -66,6 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb; returns the exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     options = _parser(given).parse_args(given)
+    gc.set_threshold(*_COLLECTED)
     try:
         outcome = _outcome(options, [PROGRAM, *given])
     except InputError as error:
@@ -116,9 +121,9 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     return parser
 
 
-def _reported(result: Reported, folder: Path) -> Outcome:
-    """What a verb prints of a result, with the page it wrote."""
-    page = result.report(folder)
+def _reported(result: Reported, folder: Path, jobs: int = 1) -> Outcome:
+    """What a verb prints of a result, with the page it wrote in `jobs` processes."""
+    page = result.report(folder, jobs=jobs)
     return Outcome(result.to_json() | {"report": str(page)}, f"{result}\n\nreport: {page}")
 
 
@@ -149,9 +154,10 @@ def _folder(options: argparse.Namespace, source: FitLike, *inside: str) -> Path:
 
 
 def _jobs(options: argparse.Namespace) -> int:
+    """Processes to use: as asked for, but no more than there are processors."""
     from lcopa_bayes.core.parallel import cores
 
-    return options.jobs or cores()
+    return min(options.jobs or cores(), cores())
 
 
 def _on_study(
@@ -165,6 +171,11 @@ def _on_study(
     """
 
     def perform(options: argparse.Namespace) -> Outcome:
+        from lcopa_bayes.core.parallel import imported_ahead
+
+        jobs = _jobs(options) if hasattr(options, "jobs") else 1
+        if jobs > 1:
+            imported_ahead(f"lcopa_bayes.verbs.{module or verb}", "lcopa_bayes.report.pages")
         from lcopa_bayes.verbs.sources import study_of
 
         source = _source(options)
@@ -172,9 +183,9 @@ def _on_study(
         function = getattr(import_module(f"lcopa_bayes.verbs.{module}") if module else lcopa_bayes, verb)
         given = {key: getattr(options, key) for key in keys}
         given |= {key: of(options, source) for key, of in derived.items()}
-        given |= {"jobs": _jobs(options)} if hasattr(options, "jobs") else {}
+        given |= {"jobs": jobs} if hasattr(options, "jobs") else {}
         folder = _folder(options, source, *filter(None, [inside]))
-        return _reported(function(source, folder=folder, **given), folder)
+        return _reported(function(source, folder=folder, **given), folder, jobs)
 
     return perform
 

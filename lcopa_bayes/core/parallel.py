@@ -16,8 +16,8 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
-from multiprocessing import parent_process
-from multiprocessing.context import SpawnContext, SpawnProcess
+from multiprocessing import forkserver, parent_process
+from multiprocessing.context import BaseContext, SpawnContext, SpawnProcess
 from threading import Thread
 from typing import Any, Generic, TypeVar
 
@@ -97,7 +97,7 @@ def workers(shared: S, *, jobs: int = 1, dask: str | None = None) -> Iterator[Wo
         with threadpool_limits(1):
             yield Workers(lambda task, one: _Later(task, shared, one), iter)
     else:
-        pool = ProcessPoolExecutor(jobs, mp_context=_Context(), initializer=_take_up, initargs=(shared,))
+        pool = _pool(jobs, shared)
         try:
             yield Workers(lambda task, one: pool.submit(_perform, task, one), as_completed)
         except BrokenProcessPool:
@@ -107,6 +107,30 @@ def workers(shared: S, *, jobs: int = 1, dask: str | None = None) -> Iterator[Wo
             ) from None
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def meanwhile(
+    task: Callable[[T], R], one: T, finished: Callable[[R], None], *, jobs: int = 1
+) -> Iterator[None]:
+    """Do a task in a process of its own while what is within runs, or before it where `jobs` is 1; `finished`
+    takes its result at once. An error of the task is raised at the end."""
+    if jobs <= 1:
+        finished(task(one))
+        yield
+        return
+    with _pool(1, None) as pool:
+        future = pool.submit(task, one)
+        future.add_done_callback(lambda done: None if done.exception() else finished(done.result()))
+        yield
+        future.result()
+
+
+def _pool(jobs: int, shared: object) -> ProcessPoolExecutor:
+    """Processes of one thread each that share a value."""
+    package = __name__.partition(".")[0]
+    imported_ahead(*(name for name in sys.modules if name.startswith(f"{package}.")))
+    return ProcessPoolExecutor(jobs, mp_context=_CONTEXT, initializer=_take_up, initargs=(shared,))
 
 
 def keep_freed_memory() -> None:
@@ -169,24 +193,68 @@ def _same(shared: S) -> S:
     return shared
 
 
-class _Process(SpawnProcess):
-    """A process that does not import the main script: a script without a main guard would run in it anew."""
+@contextmanager
+def _main_hidden() -> Iterator[None]:
+    """Within it a process that is started does not import the main script: one without a main guard would run
+    in it anew."""
+    main = vars(sys.modules["__main__"])
+    seen: dict[str, Any] = {key: main.pop(key) for key in ("__spec__", "__file__") if key in main}
+    main["__spec__"] = None
+    try:
+        yield
+    finally:
+        main.update(seen)
+
+
+class _Spawned(SpawnProcess):
+    """A process of its own."""
 
     def start(self) -> None:
-        """Start it, with the main script out of sight meanwhile."""
-        main = vars(sys.modules["__main__"])
-        seen: dict[str, Any] = {key: main.pop(key) for key in ("__spec__", "__file__") if key in main}
-        main["__spec__"] = None
-        try:
+        """Start it."""
+        with _main_hidden():
             super().start()
+
+
+class _SpawnContext(SpawnContext):
+    """Starts workers as processes of their own."""
+
+    Process = _Spawned
+
+
+if sys.platform == "linux":  # elsewhere system libraries do not outlast a fork
+    from multiprocessing.context import ForkServerContext, ForkServerProcess
+
+    class _Forked(ForkServerProcess):
+        """A process forked from one that has imported what it needs."""
+
+        def start(self) -> None:
+            """Start it."""
+            with _main_hidden():
+                super().start()
+
+    class _ForkContext(ForkServerContext):
+        """Starts workers as forks of one process, which imports the package once for all of them."""
+
+        Process = _Forked
+
+    _CONTEXT: BaseContext = _ForkContext()
+else:
+    _CONTEXT = _SpawnContext()
+
+
+def imported_ahead(*modules: str) -> None:
+    """Let another process import these modules from now on, for workers that are started later to begin with.
+
+    Where workers are processes of their own, as on other systems than Linux, this does nothing.
+    """
+    if sys.platform == "linux":
+        forkserver.set_forkserver_preload(list(modules))
+        # an interrupt ends it without a word, even while it imports
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            forkserver.ensure_running()
         finally:
-            main.update(seen)
-
-
-class _Context(SpawnContext):
-    """How worker processes are started."""
-
-    Process = _Process
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
 
 _shared: Any = None
@@ -200,6 +268,8 @@ def _take_up(shared: object) -> None:
 
     keep_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # an interrupt ends a worker without a word
+    if sys.platform == "linux":
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     threadpool_limits(1)
     _shared = shared
     Thread(target=_end_with_parent, daemon=True).start()

@@ -10,6 +10,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.parameter import COEFFICIENTS, CONSTANTS
+from lcopa_bayes.inference.poles import regressed
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.effects.effect import UnstableError
 
@@ -19,6 +20,8 @@ _SAME = 1e-2
 """Optima closer than this in every sampled coordinate are one [natural log or parameter unit]."""
 _WEIGHTLESS = 30.0
 """Log density below the best from which an optimum has no weight [nat]."""
+_HOPELESS = 300.0
+"""The same of a start that slopes of the plant alone led to, which end some nats below the optimum [nat]."""
 _DISTINCT = 0.5
 """Starts closer than this in every sampled coordinate count as one [natural log or parameter unit]."""
 _PLANTS = 3
@@ -46,8 +49,8 @@ class Optimum:
 def find_optima(
     posterior: Posterior, rng: np.random.Generator, *, starts: int = 12, near: Sequence[Vector] = ()
 ) -> tuple[Optimum, ...]:
-    """Local optima from the best of many prior draws, best first, duplicates removed; `near` are further
-    table values, (rows,), looked at like draws.
+    """Local optima from the best of many prior draws and of poles from a regression, best first, duplicates
+    removed; `near` are further table values, (rows,), looked at like draws.
 
     Screening and a first solve treat the residual as nearly white; a second solve uses the noise model with
     its parameters estimated from the first residual. With effects the plant alone is searched first, and its
@@ -58,7 +61,7 @@ def find_optima(
         alone = find_optima(posterior.without_effects, rng, starts=starts)
         return _kept(posterior, _descended(posterior, _near(posterior, effect_starts(posterior, alone, rng))))
     drawn = table.draw(_SCREENED, rng)
-    drawn[: len(near)] = np.array(near).reshape(-1, len(table.rows))
+    drawn = np.vstack([*near, regressed(posterior, drawn), drawn])
     for axis, scale in enumerate(_spread(posterior)):
         for name, value in posterior.noise.nearly_white(0.05 * scale).items():
             if table.rows[table.at(name, axis)].free:
@@ -80,7 +83,7 @@ def again(posterior: Posterior, optima: Sequence[Optimum]) -> tuple[Optimum, ...
 
 def _near(posterior: Posterior, starts: Sequence[Vector]) -> list[Vector]:
     """Table values to which effects and plant descend by slopes of the plant alone, fifty times cheaper than
-    those with the effects in place; duplicates removed."""
+    those with the effects in place; duplicates removed, and those far below the best."""
     rough, kept = LeastSquares(posterior, exact=False), list[Vector]()
     for start in starts:
         values = posterior.complete(posterior.coordinates(start[None]), None)[0]
@@ -91,7 +94,9 @@ def _near(posterior: Posterior, starts: Sequence[Vector]) -> list[Vector]:
         here = posterior.coordinates(values[None])[0]
         if all(np.abs(here - posterior.coordinates(v[None])[0]).max() > _SAME for v in kept):
             kept.append(values)
-    return kept
+    density = [float(posterior.log_density(posterior.coordinates(v[None]))[0]) for v in kept]
+    best = max(density, default=0.0)
+    return [v for v, level in zip(kept, density, strict=True) if level >= best - _HOPELESS]
 
 
 def _descended(posterior: Posterior, starts: Sequence[Vector], *, rounds: int = 2) -> list[Optimum]:

@@ -18,7 +18,7 @@ the circle and spoil up to four digits of every block. Their differences do not 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -35,7 +35,7 @@ class TransferSlopes:
     log_times: tuple[Spectrum, ...]
     """In the logarithm of each time constant."""
     orders: tuple[Spectrum, ...]
-    """In each order."""
+    """In each order, where wanted."""
 
 
 def denominator(times: Matrix, orders: Matrix, angular: Vector) -> Spectrum:
@@ -68,14 +68,13 @@ def transfer(times: Array, orders: Matrix, circle: Circle, step: float) -> Spect
 
 
 def transfer_slopes(
-    times: Array, orders: Matrix, circle: Circle, step: float
+    times: Array, orders: Matrix, circle: Circle, step: float, *, in_orders: bool = True
 ) -> tuple[Spectrum, TransferSlopes]:
-    """`transfer` and its exact derivatives in every log time constant and order."""
+    """`transfer` and its exact derivatives in every log time constant and, unless `in_orders` is false, every
+    order."""
     top, denominator, integrals = _parts(times, orders, circle, step)
     value = top / denominator
     scale = _scale(times, orders, step)
-    logs = np.log(times / step)
-    log_times = [logs[..., i, None] for i in range(orders.shape[1])]
 
     def slope(order: Vector) -> Spectrum:
         return _differenced(integration_weights_slope(order, circle.n, 1.0), circle)
@@ -84,6 +83,10 @@ def transfer_slopes(
         -value * (orders[:, i, None] * scale[i]) * integral / denominator
         for i, integral in enumerate(integrals)
     )
+    if not in_orders:
+        return value, TransferSlopes(by_time, ())
+    logs = np.log(times / step)
+    log_times = [logs[..., i, None] for i in range(orders.shape[1])]
     by_order = []
     leading = slope(orders[:, 0]) * (1.0 - value) - value * scale[0] * log_times[0] * integrals[0]
     for i in range(1, orders.shape[1]):
@@ -122,7 +125,8 @@ def _differenced(weights: Matrix, circle: Circle) -> Spectrum:
 
 Kind = Literal["integral", "value", "slope"]
 """What is read: the running integral from the onset [blocks], the value, or the derivative [per block]."""
-
+Slopes = Literal["times", "all"] | None
+"""Derivatives beside a response: none, in the logarithms of the time constants, or in the orders too."""
 _RATIO = 4
 """Blocks of a level in one block of the next coarser level."""
 _LEVELS = 3
@@ -177,7 +181,7 @@ class StepResponse:
     """Unit step responses of a batch of elements and, as further rows, their derivatives.
 
     Times are counted in blocks from the onset. Rows: the response; with derivatives also one row per
-    logarithm of a time constant and one per order.
+    logarithm of a time constant and, where wanted, one per order.
     """
 
     coarse: Array
@@ -187,12 +191,8 @@ class StepResponse:
     onset is read from the coarse blocks."""
     orders: Vector
     """Leading order of each element, (batch,) [-]."""
-
-    @property
-    def _leading(self) -> int | None:
-        """Row of the derivative in the leading order."""
-        rows = self.coarse.shape[0]
-        return None if rows == 1 else 1 + (rows - 1) // 2
+    leading: int | None = None
+    """Row of the derivative in the leading order, if there is one."""
 
     @cached_property
     def _sums(self) -> Array:
@@ -243,15 +243,20 @@ class StepResponse:
         out[:, near[0], near[1]] = self._read_fine(near[0], x[near], kind)
         return out
 
+    @cached_property
+    def alone(self) -> StepResponse:
+        """The same without derivatives."""
+        return replace(self, coarse=self.coarse[:1], fine=self.fine[:1], leading=None)
+
     def first(self, n: int) -> StepResponse:
         """The first `n` blocks."""
         if n == self.coarse.shape[2]:
             return self
-        return StepResponse(self.coarse[:, :, :n], self.fine, self.orders)
+        return replace(self, coarse=self.coarse[:, :, :n])
 
     def beyond(self, means: Array) -> StepResponse:
         """Other responses of these elements, as block means alone, (rows, batch, n)."""
-        return StepResponse(means, self.fine[:, :0], self.orders)
+        return replace(self, coarse=means, fine=self.fine[:, :0])
 
     def _near(self, x: Array, kind: Kind) -> Array:
         """Readings at positions below _NEAR, (places, batch, positions) -> (rows, *x.shape)."""
@@ -301,8 +306,8 @@ class StepResponse:
         else:
             scale, by_order = growth, log
         response = edge * scale
-        if self._leading is not None:
-            response[self._leading] += edge[0] * scale * by_order
+        if self.leading is not None:
+            response[self.leading] += edge[0] * scale * by_order
         values[:, chosen] = np.where(after, response, 0.0)
 
 
@@ -316,12 +321,12 @@ _FINE_CIRCLE = Circle(_FINE)
 
 
 def step_response(
-    times: Matrix, orders: Matrix, circle: Circle, step: float, *, slopes: bool = False
+    times: Matrix, orders: Matrix, circle: Circle, step: float, *, slopes: Slopes = None
 ) -> StepResponse:
     """Step responses of ``1 / (1 + sum_i (T_i s)^order_i)`` on `circle.n` blocks of width `step`.
 
     Parameters: times [time unit] and orders [-], (batch, terms), orders not increasing along a row; step
-    [time unit]; with `slopes` the derivatives in every log time constant and order are rows too.
+    [time unit]; `slopes` are rows too: the derivatives in every log time constant, and in every order.
     Accuracy: second order in `step` away from the onset; see the module for the onset itself. What the
     blocks are too wide for, `transfer` says.
     """
@@ -331,7 +336,7 @@ def step_response(
     for level in range(_LEVELS - 2, -1, -1):
         _hand_over(fine[:, level + 1], fine[:, level])
     _hand_over(fine[:, 0], coarse)
-    return StepResponse(coarse, fine, orders[:, 0])
+    return StepResponse(coarse, fine, orders[:, 0], 1 + times.shape[-1] if slopes == "all" else None)
 
 
 def _hand_over(narrow: Array, wide: Array) -> None:
@@ -341,11 +346,11 @@ def _hand_over(narrow: Array, wide: Array) -> None:
     wide[..., :count] = parts.mean(axis=-1)
 
 
-def _means(times: Array, orders: Matrix, circle: Circle, *, slopes: bool) -> Array:
+def _means(times: Array, orders: Matrix, circle: Circle, *, slopes: Slopes) -> Array:
     """Block means of the step responses, (rows, ..., n); times in blocks."""
-    if not slopes:
+    if slopes is None:
         return _stepped(transfer(times, orders, circle, 1.0), circle)[None]
-    value, parts = transfer_slopes(times, orders, circle, 1.0)
+    value, parts = transfer_slopes(times, orders, circle, 1.0, in_orders=slopes == "all")
     return np.stack([_stepped(row, circle) for row in (value, *parts.log_times, *parts.orders)])
 
 

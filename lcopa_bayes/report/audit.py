@@ -20,7 +20,6 @@ from lcopa_bayes.report.theme import (
     blank,
     grid,
     label,
-    log_ticks,
     paged,
     plain,
     svg_of,
@@ -71,7 +70,6 @@ def _profile_page(rows: Sequence[Mapping[str, Any]], run: SavedRun) -> str:
         margin = 0.03
         if log:
             panel.set_xlim(low * (low / high) ** margin, high * (high / low) ** margin)
-            log_ticks(panel.xaxis, low, high)
         else:
             panel.set_xlim(low - margin * (high - low), high + margin * (high - low))
             panel.locator_params(axis="x", nbins=4)
@@ -129,11 +127,7 @@ def _pair(panel: Axes, run: SavedRun, a: str, b: str) -> None:
     x, y = (run.draws[name].ravel() for name in (a, b))
     step = max(1, x.size // _DOTS)
     panel.plot(x[::step], y[::step], ".", color=CYCLE[0], markersize=1.5, alpha=0.5, rasterized=False)
-    for name, axis, values, scale in (
-        (a, panel.xaxis, x, panel.set_xscale),
-        (b, panel.yaxis, y, panel.set_yscale),
-    ):
+    for name, scale in ((a, panel.set_xscale), (b, panel.set_yscale)):
         if run.spans_decades(name):
             scale("log")
-            log_ticks(axis, float(values.min()), float(values.max()))
     panel.set(xlabel=label(a, run.units[a]), ylabel=label(b, run.units[b]))

@@ -6,6 +6,7 @@ Pages about the paper, drawn from their run folders: static optics, identificati
 from __future__ import annotations
 
 import inspect
+from collections import ChainMap
 from collections.abc import Callable, Mapping
 from math import log10
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 import pandas as pd
 
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.inference import defaultpriors
 from lcopa_bayes.model.path import Normalisation
 from lcopa_bayes.paper.staticoptics import OpticsPlan, static_optics
@@ -29,37 +31,51 @@ from lcopa_bayes.report.formatting import (
 from lcopa_bayes.report.loop import write_loop
 from lcopa_bayes.report.page import Drawings, write_graded
 from lcopa_bayes.report.predict import write_prediction
-from lcopa_bayes.report.savedrun import load_run
+from lcopa_bayes.report.savedrun import SavedRun, load_run
 from lcopa_bayes.report.sections import (
     claimfigures,
     identification,
     optics,
+    pairs,
     parameters,
     records,
     responses,
     sampling,
 )
+from lcopa_bayes.report.theme import look
 from lcopa_bayes.results.stored import stored_values
 
-_PARTS = (records, parameters, responses, sampling)
+_PARTS = (pairs, parameters, records, responses, sampling)
 """What draws the report of a fit."""
 
 
-def write_report(folder: Path) -> Path:
+def write_report(folder: Path, *, jobs: int = 1) -> Path:
     """Draw the report of a run folder: `figures/*.svg` and `report.html`, whose path is returned.
 
-    Reads only the folder and calculates nothing; the same folder gives the same bytes. InputError when a
-    file of the folder is missing or cannot be used.
+    Reads only the folder and calculates nothing; the same folder gives the same bytes, whatever `jobs`
+    [processes]. InputError when a file of the folder is missing or cannot be used.
     """
     run = load_run(folder)
-
-    def drawn(values: Mapping[str, Any]) -> Drawings:
-        return {key: one for part in _PARTS for key, one in part.drawn(run).items()}
+    with workers(run, jobs=jobs) as crew:
+        parts = list(crew.each(_drawn, range(len(_PARTS))))
 
     rules = inspect.cleandoc(defaultpriors.__doc__ or "")
     return write_graded(
-        folder, "fit", "", drawn, file="results.json", name="report.html", run=run, default_priors=rules
+        folder,
+        "fit",
+        "",
+        lambda _: dict(ChainMap(*parts)),
+        file="results.json",
+        name="report.html",
+        run=run,
+        default_priors=rules,
     )
+
+
+def _drawn(run: SavedRun, number: int) -> dict[str, Any]:
+    """A part of the report."""
+    with look():
+        return dict(_PARTS[number].drawn(run))
 
 
 def write_optics(folder: Path) -> Path:
@@ -95,8 +111,8 @@ def write_identification(folder: Path) -> Path:
         raise InputError(f"{folder}: samples cannot be read ({error}); run `identify` again") from None
 
     def drawn(values: Mapping[str, Any]) -> Drawings:
-        pairs = zip(values["records"], samples, strict=True)
-        return {"records": [identification.drawing(*pair, values["time_unit"]) for pair in pairs]}
+        both = zip(values["records"], samples, strict=True)
+        return {"records": [identification.drawing(*one, values["time_unit"]) for one in both]}
 
     def credible(one: Mapping[str, Any]) -> str:
         lower, upper = one["lower"], one["upper"]
@@ -141,9 +157,10 @@ _PAGES: Mapping[str, Callable[[Path], Path]] = {
 }
 
 
-def write_page_of(verb: str, folder: Path) -> Path:
+def write_page_of(verb: str, folder: Path, *, jobs: int = 1) -> Path:
     """Draw the page of a verb's result from the files of its run folder alone; returns its path.
 
+    The figures of a fit, the most of any page, are drawn in `jobs` processes.
     InputError when a file is missing or cannot be used.
     """
-    return _PAGES[verb](folder)
+    return write_report(folder, jobs=jobs) if verb == "fit" else _PAGES[verb](folder)

@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from math import log10
 from typing import Any, TypeVar
 
 import matplotlib
@@ -17,8 +18,9 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
+from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 from lcopa_bayes.core.arrays import Index, Vector
 
@@ -35,6 +37,8 @@ CYCLE = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#7a6
 """Okabe and Ito 2008, distinguishable with any colour vision; yellow darkened."""
 WIDTH = 7.4
 """Width of a figure [in]."""
+_DECADES = 200.0
+"""Ratio of the ends of a logarithmic axis from which only powers of ten are marked [-]."""
 _LOOK: Mapping[Any, Any] = {
     "svg.hashsalt": "lcopa-bayes",
     "svg.fonttype": "path",
@@ -53,11 +57,14 @@ _LOOK: Mapping[Any, Any] = {
     "axes.linewidth": 0.7,
     "axes.formatter.useoffset": False,
     "lines.linewidth": 1.1,
+    "lines.color": CYCLE[0],  # a colour by its place in the cycle is looked up for every tick
+    "patch.facecolor": CYCLE[0],
     "figure.constrained_layout.w_pad": 0.07,
     "path.simplify": True,
     "savefig.dpi": 100,
     "figure.dpi": 100,
 }
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _COORDINATES = re.compile(r'\s(?:d|x|y)="[^"]*"')
 _LONG_DECIMALS = re.compile(r"(\.\d\d)\d+")
 _NO_METADATA = dict.fromkeys(("Date", "Creator", "Format", "Type"))
@@ -87,16 +94,23 @@ def grid(count: int, *, columns: int, height: float) -> tuple[Figure, Sequence[A
     return figure, list(panels[:count])
 
 
-def log_ticks(axis: Axis, low: float, high: float) -> None:
+def _log_ticks(axis: Axis) -> None:
     """Ticks of a logarithmic axis: round numbers when it spans few decades, else powers of ten."""
-    if high < 200.0 * low:
+    low, high = axis.get_view_interval()
+    few = high < _DECADES * low
+    if few:
         wide = high > 5.0 * low
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)) if wide else MaxNLocator(4, steps=[1, 2, 5, 10]))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axis.set_minor_locator(NullLocator())
     else:
         axis.set_major_locator(LogLocator(numticks=4))
-        axis.set_minor_formatter(NullFormatter())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}" if few else _power(value)))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _power(value: float) -> str:
+    """A power of ten in characters: matplotlib's own formulas take as long to set as the rest of a figure."""
+    return "10" + str(round(log10(value))).translate(_RAISED) if value > 0 else ""
 
 
 def legend_above(figure: Figure, panel: Axes, columns: int, **style: Any) -> None:
@@ -123,8 +137,13 @@ def label(name: str, unit: str) -> str:
 
 def svg_of(figure: Figure) -> str:
     """The figure as SVG without dates or links to software, its coordinates to a hundredth of a point."""
+    for panel in figure.axes:
+        for axis in (panel.xaxis, panel.yaxis):
+            if axis.get_scale() == "log" and isinstance(axis.get_major_formatter(), LogFormatter):
+                _log_ticks(axis)
     out = io.StringIO()
-    figure.savefig(out, format="svg", metadata=_NO_METADATA)
+    # not `savefig`, which draws all of a figure with a layout once more, unseen
+    FigureCanvasSVG(figure).print_svg(out, metadata=_NO_METADATA)  # type: ignore[no-untyped-call]
     return _COORDINATES.sub(lambda match: _LONG_DECIMALS.sub(r"\1", match[0]), out.getvalue())
 
 

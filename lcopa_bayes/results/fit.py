@@ -16,9 +16,11 @@ from lcopa_bayes.core.files import save_json, save_table, writable_folder, write
 from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.results.adequacy import limitations
 from lcopa_bayes.results.datatree import POSTERIOR, posterior_tree, save_tree
-from lcopa_bayes.results.discretisation import Discretisation, discretisation, resolved, resolved_optima
+from lcopa_bayes.results.discretisation import Discretisation, discretisation, optima_of, resolved_optima
+from lcopa_bayes.results.firstlook import FirstLook
 from lcopa_bayes.results.frequency import FrequencyResponse, frequency_response
 from lcopa_bayes.results.prediction import Band, study_bands
 from lcopa_bayes.results.predictive import Predictive
@@ -116,12 +118,13 @@ def fit(
     cross_check: bool = False,
     quiet: bool = True,
     starts: Matrix | None = None,
+    look: FirstLook | None = None,
 ) -> Fit:
     """Sample the posterior of a study and derive what it predicts.
 
     `starts`, table values (starts, rows), are modes known from elsewhere that sampling proposes too. A plant
     with effects is sampled by importance around its optima (`weightedrun`) where the method is "auto" and its
-    weights hold.
+    weights hold. A first `look` of the study spares the search for optima, and changes no number.
 
     With `folder`, sampling is stored there in `chain.h5` and `resume` goes on from it; the result is
     the same as without interruption. With `cross_check` the posterior is also sampled by nested sampling,
@@ -131,15 +134,16 @@ def fit(
     its records, these do not meet the requirements of a fit (`requirements`), or the folder cannot be written
     to; then nothing is written.
     """
-    refuse_if(unmet(study))
-    problem = problem_of(study)
+    if look is None:
+        refuse_if(unmet(study))
+    problem = look.problem if look else problem_of(study)
     if folder:
         writable_folder(folder)
-    plan, weighted_result = plan_of(problem, quick=quick), None
+    plan, weighted_result, optima = plan_of(problem, quick=quick), None, tuple[Optimum, ...]()
     if problem.posterior.simulation is not None and plan.method == "auto":
         problem, weighted_result = weighted_fit(problem, plan, jobs=jobs, quick=quick)
     else:
-        problem = resolved(problem)
+        problem, optima = resolved_optima(problem, look.optima if look else optima_of(problem))
     if weighted_result is not None:
         run, draws = weighted_result
     else:
@@ -152,6 +156,7 @@ def fit(
             resume=resume,
             quiet=quiet,
             starts=starts,
+            optima=optima,
         )
         draws = gather(problem.posterior, run)
     check = None
@@ -165,7 +170,7 @@ def fit(
             log_evidence_sd=weighed.sd if weighed else None,
         )
         draws = draws.limited(check.limitations(draws.grade))
-    width = discretisation(problem, draws)
+    width = discretisation(problem, draws, jobs=jobs)
     curves = step_curves(draws, problem.scales.span)
     draws = draws.limited([*width.limitations, *too_fast(draws, curves, problem.scales.period)])
     shown = study_bands(problem, draws)
@@ -199,7 +204,8 @@ def weighted_fit(
 ) -> tuple[Problem, tuple[Run, Draws] | None]:
     """A plant with effects on blocks as narrow as its records need, and weighted draws of it with their run;
     no draws where importance sampling does not hold."""
-    problem, optima = resolved_optima(problem, starts=QUICK_STARTS if quick else STARTS)
+    optima = optima_of(problem, starts=QUICK_STARTS if quick else STARTS)
+    problem, optima = resolved_optima(problem, optima)
     return problem, weighted_run(problem.posterior, plan, jobs=jobs, quick=quick, optima=optima)
 
 

@@ -45,14 +45,14 @@ class Result(ABC):
     def verdict(self) -> str:
         """The result in a sentence or a few."""
 
-    def report(self, folder: Path | str) -> Path:
+    def report(self, folder: Path | str, *, jobs: int = 1) -> Path:
         """Write the page of the result into a run folder, saving the result there first if it is not there
-        yet; returns the path of the page. InputError as `save`."""
+        yet, its figures in `jobs` processes; returns the path of the page. InputError as `save`."""
         folder = Path(folder)
         if not self.is_in(folder):
             self.save(folder)
         # pages read results, and results import no page: it is looked up when wanted
-        page: Path = import_module("lcopa_bayes.report.pages").write_page_of(self.verb, folder)
+        page: Path = import_module("lcopa_bayes.report.pages").write_page_of(self.verb, folder, jobs=jobs)
         return page
 
     def is_in(self, folder: Path) -> bool:

@@ -65,12 +65,13 @@ class StoredResult(Result):
             add_origin(path, self.verb, self.origin)
         return path
 
-    def report(self, folder: Path | str) -> Path:
+    def report(self, folder: Path | str, *, jobs: int = 1) -> Path:
         """Write the page of the result, and that of the fit it rests on, into a run folder, saving both there
-        first where they are not there yet; returns the path of the page. InputError as `save`."""
+        first where they are not there yet, figures in `jobs` processes; returns the path of the page.
+        InputError as `save`."""
         if self.fit is not None:
-            self.fit.report(folder)
-        return super().report(folder)
+            self.fit.report(folder, jobs=jobs)
+        return super().report(folder, jobs=jobs)
 
     @classmethod
     def load(cls: type[R], folder: Path) -> R:

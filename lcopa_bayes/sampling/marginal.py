@@ -113,11 +113,20 @@ class _Point(NamedTuple):
 class Search:
     """Points, proposals and weights of a search; deterministic given its arguments and what it is asked.
 
-    `bar` counts points and names what is being done.
+    `bar` counts points and names what is being done; `optima` are least-squares optima to begin with, by
+    default those of a few searches.
     """
 
-    def __init__(self, posterior: Posterior, seed: int, crew: Workers[Posterior], bar: Progress) -> None:
+    def __init__(
+        self,
+        posterior: Posterior,
+        seed: int,
+        crew: Workers[Posterior],
+        bar: Progress,
+        optima: Sequence[Optimum] = (),
+    ) -> None:
         self.posterior = posterior
+        self._optima = tuple(optima)
         self._bar = bar
         self.outer = Outer(posterior)
         self._crew = crew
@@ -323,7 +332,9 @@ class Search:
 
     def _with_optima(self, proposal: Proposal, values: Matrix) -> tuple[Proposal, Matrix]:
         """A proposal, in part around least-squares optima, and points to start from with these."""
-        optima: Sequence[Optimum] = weighty(find_optima(self.posterior, self._rng, starts=_OPTIMA))
+        optima: Sequence[Optimum] = weighty(
+            self._optima or find_optima(self.posterior, self._rng, starts=_OPTIMA)
+        )
         if not optima:
             return proposal, values
         for _ in range(_AGAIN):  # plant and correlated noise, found in turn, draw each other along

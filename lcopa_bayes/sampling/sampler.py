@@ -13,6 +13,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Array, Index, Matrix
 from lcopa_bayes.core.parallel import Progress, workers
 from lcopa_bayes.data.settings import Method
+from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.chainfile import Chain, load_chain, save_chain
 from lcopa_bayes.sampling.convergence import CERTAIN, Quality, drifts, qualities
@@ -151,6 +152,7 @@ def sample(
     resume: bool = False,
     quiet: bool = True,
     starts: Matrix | None = None,
+    optima: Sequence[Optimum] = (),
 ) -> Run:
     """Sample a posterior, as the plan allows by importance draws from a search over orders, delays and noise
     (`marginal`). Where their weights do not converge, rounds of emcee go on from the points of the search;
@@ -161,7 +163,7 @@ def sample(
     The draws depend on the arguments alone, not on `jobs` nor on interruptions: with `resume`, a run killed
     at any moment continues from the last complete round in `chain_file`. `starts`, table values (starts,
     rows), are modes known from elsewhere, which moves propose too (`knownmodes`); InputError when none lies
-    inside the prior.
+    inside the prior. `optima` are least-squares optima that a search begins with, by default its own.
     """
     known = None if starts is None else around(posterior, starts, plan.seed)
     stored = load_chain(chain_file, fingerprint) if resume and chain_file else Chain()
@@ -176,7 +178,7 @@ def sample(
         seeds = np.random.SeedSequence(plan.seed).spawn(plan.ensembles)
         if not ensembles and searched and known is None:
             with _points(quiet) as bar:
-                search = Search(posterior, plan.seed, crew, bar)
+                search = Search(posterior, plan.seed, crew, bar, optima)
                 weighted = search.run(wanted)
             if weighted is not None:
                 _store(chain_file, Chain((), weighted), fingerprint)

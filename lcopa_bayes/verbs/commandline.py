@@ -113,7 +113,7 @@ def study(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
 def parallel(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
     """Of verbs about a study that use several processes."""
     study(parser, out)
-    parser.add_argument("--jobs", type=_whole(1), help="processes (default: all cores)")
+    parser.add_argument("--jobs", type=_whole(1), help="processes, at most one per core (default: all cores)")
 
 
 def sampled(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import sys
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
+from lcopa_bayes.core.parallel import meanwhile
+from lcopa_bayes.results.firstlook import FirstLook, first_look
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.fit import fit as sampled
 from lcopa_bayes.results.integerrival import integer_rival
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.runfolder import opened, provenance
-from lcopa_bayes.verbs.look import look
+from lcopa_bayes.verbs.look import look_result
 from lcopa_bayes.verbs.sources import FitLike, StudyLike, finished, study_of
 
 
@@ -39,17 +43,37 @@ def fit(
     """
     wanted = study_of(study)
     with opened(folder, provenance(wanted, "fit")) as place:
+        seen: FirstLook | None = None
+        drawn: AbstractContextManager[None] = nullcontext()
         if place is not None and not (quiet or resume or wanted.effects.use):
-            page = look(wanted).report(place)
-            print(f"first look: {page}", file=sys.stderr)
-        fitted = sampled(
-            wanted, jobs=jobs, folder=place, resume=resume, quick=quick, cross_check=cross_check, quiet=quiet
-        )
+            seen = first_look(wanted)
+            look_result(seen).save(place)
+            drawn = meanwhile(_first_page, place, _announced, jobs=jobs)
+        with drawn:
+            fitted = sampled(
+                wanted,
+                jobs=jobs,
+                folder=place,
+                resume=resume,
+                quick=quick,
+                cross_check=cross_check,
+                quiet=quiet,
+                look=seen,
+            )
         if rival:
             fitted = replace(fitted, rival=integer_rival(fitted, jobs=jobs, quick=quick, quiet=quiet))
         if place is not None:
             fitted.save(place)
     return fitted
+
+
+def _first_page(place: Path) -> Path:
+    page: Path = import_module("lcopa_bayes.report.pages").write_page_of("look", place)
+    return page
+
+
+def _announced(page: Path) -> None:
+    print(f"first look: {page}", file=sys.stderr)
 
 
 def basis(

@@ -8,11 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from itertools import cycle
 
-import corner
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from lcopa_bayes.report.page import Drawings
 from lcopa_bayes.report.savedrun import SavedRun
@@ -20,33 +17,20 @@ from lcopa_bayes.report.theme import (
     BAND,
     CYCLE,
     HELD_OUT,
-    Drawing,
     grid,
     label,
     legend_above,
-    log_ticks,
     paged,
-    plain,
     svg_of,
 )
 
 _PER_FIGURE = 12
 """Parameters on one figure of traces or of priors."""
-_IN_CORNER = 10
-"""Parameters on one corner plot."""
-_KINDS = ("time", "order", "delay", "gain")
-"""Kinds of parameters that are shown first; of the rest, noise and offsets come last."""
-_LAST = ("offset", "sigma", "rho", "nu")
-_LABELS = 0.47
-"""Distance of an axis label from its panel [in]."""
-_MIDDLE = 0.995
-"""Share of the draws that each axis of the corner plot spans [-]."""
 _BINS = 30
 
 
 def drawn(run: SavedRun) -> Drawings:
-    """Traces of the draws, prior densities over their histograms, and the corner plot of the most interesting
-    parameters that vary."""
+    """Traces of the draws, and prior densities over their histograms."""
     names, density = list(run.units), run.tables["prior_density"]
     sets, draws = run.draws[names[0]].shape
     trace = (
@@ -63,76 +47,8 @@ def drawn(run: SavedRun) -> Drawings:
     return {
         "traces": paged("trace", names, _PER_FIGURE, lambda part: _traces(run, part), trace),
         "priors": paged("priors", own, _PER_FIGURE, lambda part: marginals(run, part, _prior), prior),
-        "pairs": _pairs(run),
         "prior_table": run.tables["priors"].to_dict("records"),
     }
-
-
-def ranked(names: list[str]) -> list[str]:
-    """Names by interest: times, orders, delays, gains, anything else, offsets, noise; ties in their order."""
-
-    def rank(name: str) -> int:
-        kind = name.split("_")[0]
-        if kind in _KINDS:
-            return _KINDS.index(kind)
-        return len(_KINDS) + (1 + _LAST.index(kind) if kind in _LAST else 0)
-
-    return sorted(names, key=rank)
-
-
-def _pairs(run: SavedRun) -> tuple[Drawing, ...]:
-    moving = ranked([name for name in run.units if np.ptp(run.draws[name]) > 0])
-    shown, left_out = moving[:_IN_CORNER], moving[_IN_CORNER:]
-    if not shown:
-        return ()
-    caption = (
-        "Contours, smoothed, hold about 50 and 90 % of the draws of a pair; dashed "
-        f"lines mark the 5, 50 and 95 % quantiles; each axis spans {100 * _MIDDLE:g} % of the draws."
-    )
-    rest = f" Not shown for lack of space: {', '.join(left_out)}." if left_out else ""
-    return (Drawing("corner", _corner(run, shown), caption + rest),)
-
-
-def _corner(run: SavedRun, names: list[str]) -> str:
-    values = np.stack([run.draws[name].ravel() for name in names], axis=1)
-    scales = ["log" if run.spans_decades(name) else "linear" for name in names]
-    side = min(9.6, max(3.4, 1.15 * len(names) + 0.9))
-    figure = Figure(figsize=(side, side))
-    small = len(names) > 5
-    corner.corner(
-        values,
-        fig=figure,
-        range=[_MIDDLE] * len(names),
-        axes_scale=scales,
-        bins=24,
-        smooth=1.0,
-        levels=(0.5, 0.9),
-        quantiles=(0.05, 0.5, 0.95),
-        color=BAND,
-        labels=[f"{plain(name)}\n[{plain(run.units[name])}]" for name in names],
-        label_kwargs={"fontsize": 7.5 if small else 8.5},
-        labelpad=max(0.05, _LABELS * len(names) / (side - 1.0) - 0.3),
-        max_n_ticks=3 if small else 4,
-        plot_density=False,
-        data_kwargs={"ms": 1.2, "alpha": 0.25},
-        hist_kwargs={"lw": 0.9},
-        contour_kwargs={"linewidths": 0.9},
-    )
-    for k, panel in enumerate(figure.axes):
-        row, column = divmod(k, len(names))
-        if row == len(names) - 1 and panel.get_xscale() == "log":
-            log_ticks(panel.xaxis, *panel.get_xlim())
-        if 0 == column < row and panel.get_yscale() == "log":
-            log_ticks(panel.yaxis, *panel.get_ylim())
-        if column < row or row == column == len(names) - 1:
-            panel.tick_params(labelrotation=45)
-        panel.tick_params(labelsize=6.5 if small else 7.5, length=2)
-        for line in panel.lines:
-            line.set_linewidth(0.8)
-    figure.align_labels()
-    room = 0.95 / side
-    figure.subplots_adjust(left=room, bottom=room, right=0.99, top=0.99)
-    return svg_of(figure)
 
 
 def _traces(run: SavedRun, names: Sequence[str]) -> str:
@@ -140,10 +56,10 @@ def _traces(run: SavedRun, names: Sequence[str]) -> str:
     figure, panels = grid(len(names), columns=2, height=1.15)
     for panel, name in zip(panels, names, strict=True):
         for chain, colour in zip(run.draws[name], cycle(CYCLE), strict=False):
-            panel.plot(np.arange(chain.size), chain, color=colour, lw=0.4, alpha=0.8, rasterized=True)
+            panel.plot(np.arange(chain.size), chain, color=colour, lw=0.4, alpha=0.8)
+        panel.set_rasterization_zorder(2.01)  # one picture of all lines
         if run.spans_decades(name):
             panel.set_yscale("log")
-            log_ticks(panel.yaxis, *panel.get_ylim())
         shown = "not defined" if rhat[name] is None else f"{rhat[name]:.3f}"
         panel.set_title(f"{label(name, run.units[name])}   R-hat {shown}", fontsize=8)
         panel.margins(x=0.01)
@@ -166,13 +82,12 @@ def marginals(run: SavedRun, names: Sequence[str], draw: Callable[[Axes, SavedRu
     return svg_of(figure)
 
 
-def density_axis(panel: Axes, low: float, high: float, *, log: bool) -> None:
+def density_axis(panel: Axes, *, log: bool) -> None:
     """Scale and ticks of the axis of a density."""
     if log:
         panel.set_xscale("log")
-        log_ticks(panel.xaxis, low, high)
     else:
-        panel.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+        panel.locator_params(axis="x", nbins=4)
 
 
 def _prior(panel: Axes, run: SavedRun, name: str) -> None:
@@ -184,4 +99,4 @@ def _prior(panel: Axes, run: SavedRun, name: str) -> None:
     counts, edges = np.histogram(np.log(draws) if log else draws, bins=_BINS, density=True)
     panel.stairs(counts, np.exp(edges) if log else edges, fill=True, color=BAND, alpha=0.5, label="draws")
     panel.plot(x, height, color=HELD_OUT, label="prior")
-    density_axis(panel, float(x.min()), float(x.max()), log=log)
+    density_axis(panel, log=log)

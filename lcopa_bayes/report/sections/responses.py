@@ -25,7 +25,6 @@ from lcopa_bayes.report.theme import (
     grid,
     label,
     legend_above,
-    log_ticks,
     paged,
     plain,
     svg_of,
@@ -136,7 +135,6 @@ def _bode(run: SavedRun, table: pd.DataFrame, paths: Sequence[str]) -> str:
             panel.set(xscale="log", xlabel=f"frequency [cycles per {plain(run.time_unit)}]")
         if (rows[f"gain_{POINTWISE}_05"] > 0).all():
             gain.set_yscale("log")
-            log_ticks(gain.yaxis, *gain.get_ylim())
         gain.set(title=plain(path), ylabel=label("gain", rows["unit"].iloc[0]))
         phase.set_ylabel("phase [deg]")
         low = float(np.floor(rows[f"phase_{POINTWISE}_05"].min() / 90) * 90)

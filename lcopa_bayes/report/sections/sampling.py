@@ -57,7 +57,7 @@ def _panel(panel: Axes, run: SavedRun, name: str) -> None:
     edges = np.append(own["left"].to_numpy(), own["right"].to_numpy()[-1])
     panel.stairs(own["ensembles"].to_numpy(), edges, fill=True, color=BAND, alpha=0.5, label="ensembles")
     panel.stairs(own["nested"].to_numpy(), edges, color=HELD_OUT, linewidth=1.1, label="nested sampling")
-    density_axis(panel, float(edges[0]), float(edges[-1]), log=bool(own["log_scale"].any()))
+    density_axis(panel, log=bool(own["log_scale"].any()))
 
 
 def _cell(key: str, value: Any) -> str:
