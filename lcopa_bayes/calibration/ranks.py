@@ -69,9 +69,9 @@ def corridor(replicas: int, values: int, level: float = SIMULTANEOUS) -> Limits:
     return _inside(tails, float(np.exp(low)))
 
 
-def bin_limits(replicas: int, bins: int, level: float = SIMULTANEOUS) -> tuple[int, int]:
+def bin_limits(replicas: int, bins: int) -> tuple[int, int]:
     """Limits on the counts of `bins` equal bins of uniform ranks, by Bonferroni's inequality."""
-    tail = (1 - level) / (2 * bins)
+    tail = (1 - SIMULTANEOUS) / (2 * bins)
     ends = stats.binom(replicas, 1 / bins)
     return int(ends.ppf(tail)), int(ends.ppf(1 - tail))
 

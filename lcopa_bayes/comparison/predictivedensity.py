@@ -235,8 +235,9 @@ class _Scored:
         return each, level.source, index[first:]
 
 
-def _error(every: Matrix, level: Vector, groups: int = 4) -> float:
+def _error(every: Matrix, level: Vector) -> float:
     """Standard error of the sum of log means by its spread over groups of draws."""
+    groups = 4
     if not every.shape[1]:
         return 0.0
     parts = np.array_split(np.arange(len(every)), groups)

@@ -183,9 +183,9 @@ class PlausibleNoise:
             portions = np.array_split(
                 np.arange(len(shapes)), max(1, len(shapes) * piece.values.size // _CELLS)
             )
-            told = [_about_own_level(piece, shapes[portion]) for portion in portions if portion.size]
-            level += np.concatenate([one[0] for one in told])
-            squares += np.concatenate([one[1] for one in told])
+            parts = [_about_own_level(piece, shapes[portion]) for portion in portions if portion.size]
+            level += np.concatenate([one[0] for one in parts])
+            squares += np.concatenate([one[1] for one in parts])
         weight = level - 0.5 * count * np.log(squares) + log_prior
         weight = np.exp(weight - weight.max())
         return cls(shapes, weight / weight.sum(), squares, count)

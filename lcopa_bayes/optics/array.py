@@ -157,13 +157,13 @@ class PlanarPattern:
     """(n, n) [-], 1 at the target, NaN outside the unit circle."""
 
 
-def steered_patterns(optics: StatedOptics = PAPER.optics, *, points: int = 4001) -> LinearPatterns:
+def steered_patterns(optics: StatedOptics = PAPER.optics) -> LinearPatterns:
     """Data of Fig. 3: the array of Section 2 with isotropic elements, steered to each printed target.
 
-    `optics` holds the printed numbers; `points` angles [-] from -pi/2 to pi/2.
+    `optics` holds the printed numbers; 4001 angles [rad] from -pi/2 to pi/2.
     """
     array = paper_array(optics)
-    angle = np.linspace(-pi / 2, pi / 2, points)
+    angle = np.linspace(-pi / 2, pi / 2, 4001)
     target = np.radians(optics.targets_1d_deg)
     rows = [intensity(array, np.sin(angle), float(array.phase_step(goal))) for goal in target]
     return LinearPatterns(angle, target, np.array(rows))

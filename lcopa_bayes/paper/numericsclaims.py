@@ -189,9 +189,9 @@ def wavelets(stated: Stated, evidence: Evidence) -> Verdict:
 
 
 @lru_cache(maxsize=4)
-def wavelet_cost(stated: Stated = PAPER, blocks: int = WAVELET_BLOCKS) -> FormCost:
+def wavelet_cost(stated: Stated) -> FormCost:
     """Both forms of the response of the direct path to the step of Fig. 13."""
-    return form_cost(stated.plant.xx, stated.records.step_drive, RECORD_LENGTH, blocks)
+    return form_cost(stated.plant.xx, stated.records.step_drive, RECORD_LENGTH, WAVELET_BLOCKS)
 
 
 def whole_blocks(stated: Stated, evidence: Evidence) -> Verdict:

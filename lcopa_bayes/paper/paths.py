@@ -309,10 +309,10 @@ def response_to(
     return read
 
 
-def output_rmse(records: Sequence[PathRecord], model: TransferPath, *, blocks: int | None = None) -> float:
+def output_rmse(records: Sequence[PathRecord], model: TransferPath) -> float:
     """Root mean square of response minus model over all samples (Eq. 64) [response unit]."""
     parts: list[Array] = []
-    for each, modelled in zip(records, responses(records, model, blocks=blocks), strict=True):
+    for each, modelled in zip(records, responses(records, model), strict=True):
         values = each.record.response[:, 0]
         parts.append(values[np.isfinite(values)] - modelled)
     return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))

@@ -79,9 +79,9 @@ def look() -> Iterator[None]:
         yield
 
 
-def blank(height: float, width: float = WIDTH) -> Figure:
-    """An empty figure of a height and width [in]."""
-    return Figure(figsize=(width, height), layout="constrained")
+def blank(height: float) -> Figure:
+    """An empty figure of a height [in]."""
+    return Figure(figsize=(WIDTH, height), layout="constrained")
 
 
 def grid(count: int, *, columns: int, height: float) -> tuple[Figure, Sequence[Axes]]:
@@ -172,7 +172,7 @@ def extremes(*curves: Vector, most: int = MOST) -> Index:
     size = curves[0].size
     if any(curve.size != size for curve in curves) or most < 2 * len(curves):
         raise ValueError(f"need curves of one length and room for 2 points of each; got {most} points")
-    if size <= most:
+    if size <= MOST:
         return np.arange(size)
     stretches = most // (2 * len(curves))
     edges = np.linspace(0, size, stretches + 1).astype(int)[:-1]
@@ -208,9 +208,9 @@ def draw_bands(
         draw_band(panel, x, lower, upper, color=colour, alpha=alpha, label=name)
 
 
-def said(size: int, *, most: int = MOST) -> str:
+def said(size: int) -> str:
     """A sentence for the caption when a record of `size` samples is longer than what is drawn."""
-    if size <= most:
+    if size <= MOST:
         return ""
     return f"Drawn through the extremes of short stretches: the record has {size} samples."
 

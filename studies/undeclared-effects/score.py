@@ -62,7 +62,7 @@ def tasks(options: argparse.Namespace) -> list[Task]:
 
 def frozen() -> dict[str, Any]:
     """Thresholds and targets; ends the run when the package's are others."""
-    told = tomllib.loads((HERE / "thresholds.toml").read_text(encoding="utf-8"))
+    frozen_values = tomllib.loads((HERE / "thresholds.toml").read_text(encoding="utf-8"))
     held = {
         "explained": verdict.EXPLAINED,
         "alone": verdict.ALONE,
@@ -76,15 +76,15 @@ def frozen() -> dict[str, Any]:
         "near": candidates.NEAR,
         "most_effects": rounds.MOST,
     }
-    wrong = [key for key in held if told["package"][key] != held[key]]
+    wrong = [key for key in held if frozen_values["package"][key] != held[key]]
     if wrong:
         sys.exit(f"thresholds.toml and the package differ in {', '.join(wrong)}: thresholds are frozen")
-    return told
+    return frozen_values
 
 
 def main() -> None:
     options = _options()
-    told = frozen()
+    frozen_values = frozen()
     if options.seed < FIRST_TEST_SEED and not options.trial:
         sys.exit(f"seeds below {FIRST_TEST_SEED} were used in development; give --trial to use one")
     listed = tasks(options)[:: options.every][: options.limit]
@@ -92,7 +92,7 @@ def main() -> None:
     with workers(folder, jobs=options.jobs) as crew:
         rows = list(tqdm(crew.finished(play, listed), total=len(listed), disable=options.quiet))
     rows.sort(key=lambda row: (row["kind"], row["effects"], row["seed"]))
-    lines = sheet(rows, told["targets"], told["package"]["seen"])
+    lines = sheet(rows, frozen_values["targets"], frozen_values["package"]["seen"])
     values = {
         "seed": options.seed,
         "campaigns": len(rows),
@@ -103,7 +103,7 @@ def main() -> None:
             [row[key] for key in ("kind", "effects", "seed", "crashed")] for row in rows if row["crashed"]
         ],
         "grades": [row["grade"] for row in rows if row.get("grade")],
-        "thresholds": told,
+        "thresholds": frozen_values,
         "command": " ".join(["python", "studies/undeclared-effects/score.py", *sys.argv[1:]]),
     }
     write_text(options.out / "results.json", json.dumps(values, indent=1) + "\n")
