@@ -201,16 +201,16 @@ class _Scored:
         every = np.concatenate(densities, axis=1) if densities else np.empty((len(values), 0))
         level = np.full(len(values), -np.log(len(values))) if log_weights is None else log_weights
         return Predicted(
-            self.part,
-            tuple(axes),
-            np.concatenate(times) if times else np.empty(0),
-            logsumexp(every + level[:, None], axis=0),
-            _error(every, level),
-            method,
-            k,
-            min(effective(level), ess if ess is not None else self.fit.draws.ess),
-            rhat,
-            tuple(sources),
+            part=self.part,
+            axis=tuple(axes),
+            time=np.concatenate(times) if times else np.empty(0),
+            log_density=logsumexp(every + level[:, None], axis=0),
+            error=_error(every, level),
+            method=method,
+            pareto_k=k,
+            ess=min(effective(level), ess if ess is not None else self.fit.draws.ess),
+            rhat=rhat,
+            level_from=tuple(sources),
         )
 
     def _axis(

@@ -112,7 +112,18 @@ class Estimate:
         tail = (1 - LEVEL) / 2
         lower, middle, upper = (float(quantile(draws, q)) for q in (tail, 0.5, 1 - tail))
         mean, sd = (float(draws.mean()), float(draws.std(ddof=1))) if finite else (np.nan, np.nan)
-        return cls(name, middle, unit, lower, upper, ess, grade, mean, sd, note=note)
+        return cls(
+            name=name,
+            value=middle,
+            unit=unit,
+            lower=lower,
+            upper=upper,
+            ess=ess,
+            grade=grade,
+            mean=mean,
+            sd=sd,
+            note=note,
+        )
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; what is infinite or undefined is None."""

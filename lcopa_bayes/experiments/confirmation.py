@@ -207,7 +207,17 @@ def _confirmed(design: Design, chosen: int, where: str, replicas: int, jobs: int
     factor, low, high = _factor(winner.errors, step.errors, design.determined, rng)
     columns = [design.fit.draws.table.names.index(name) for name in design.names]
     at = design.draws[chosen, columns]
-    return Confirmation(where, design.names, design.determined, at, winner, step, factor, low, high)
+    return Confirmation(
+        where=where,
+        names=design.names,
+        among=design.determined,
+        truth=at,
+        winner=winner,
+        step=step,
+        factor=factor,
+        lower=low,
+        upper=high,
+    )
 
 
 def _factor(

@@ -235,7 +235,17 @@ def audit(fit: Predictive, *, jobs: int = 1) -> Audit:
         for profile, belief, row in zip(profiles, believed, rows, strict=True)
     )
     apart = delays(fit.study, posterior.table, peak.values)
-    return Audit(fit, findings, symmetric, printed, curved, moved, known, apart, peak)
+    return Audit(
+        fit=fit,
+        findings=findings,
+        structure=symmetric,
+        printed=printed,
+        curvature=curved,
+        radial=moved,
+        known=known,
+        delays=apart,
+        peak=peak,
+    )
 
 
 def _points(landscape: Landscape, values: Iterable[Vector]) -> list[Sensitivities]:

@@ -165,13 +165,13 @@ def beliefs(
         order = [q for q in np.argsort(-np.abs(spearman[p])) if q != p and abs(spearman[p, q]) >= _COMPANION]
         out.append(
             Belief(
-                name,
-                float(1 - columns[:, p].var() / prior_sd[k] ** 2),
-                tuple(names[q] for q in order),
-                tuple(float(spearman[p, q]) for q in order),
-                modes.get(name, 1),
-                by_name.get(name),
-                estimates[name],
+                parameter=name,
+                contraction=float(1 - columns[:, p].var() / prior_sd[k] ** 2),
+                companions=tuple(names[q] for q in order),
+                correlations=tuple(float(spearman[p, q]) for q in order),
+                modes=modes.get(name, 1),
+                sensitivity=by_name.get(name),
+                estimate=estimates[name],
             )
         )
     return tuple(out)

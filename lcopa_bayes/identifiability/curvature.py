@@ -179,14 +179,14 @@ def curvature(landscape: Landscape, values: Vector, prior_sd: Vector) -> Curvatu
     eigenvalues, directions = _spectral(slopes * prior_sd[columns])
     least = float(singular[-1])
     return Curvature(
-        derivatives.names,
-        sd,
-        relative,
-        eigenvalues,
-        directions,
-        correlations,
-        overlap,
-        float(1 / np.sqrt(least)) if not blind[-1] else np.inf,
+        names=derivatives.names,
+        sd=sd,
+        relative_sd=relative,
+        eigenvalues=eigenvalues,
+        directions=directions,
+        correlations=correlations,
+        overlap=overlap,
+        collinearity=float(1 / np.sqrt(least)) if not blind[-1] else np.inf,
     )
 
 

@@ -222,12 +222,12 @@ class Conditional:
         found = expanded(self.posterior, values, self.columns)
         steep = self.steepness(values)
         return Expanded(
-            values,
-            self.x(values),
-            found.log_likelihood,
-            (steep.swapaxes(1, 2) @ found.gradient[..., None])[..., 0],
-            steep.swapaxes(1, 2) @ found.information @ steep,
-            steep,
+            values=values,
+            x=self.x(values),
+            log_likelihood=found.log_likelihood,
+            gradient=(steep.swapaxes(1, 2) @ found.gradient[..., None])[..., 0],
+            information=steep.swapaxes(1, 2) @ found.information @ steep,
+            steepness=steep,
         )
 
     def _objective(self, at: Expanded) -> tuple[Vector, Matrix, Array]:

@@ -69,12 +69,12 @@ class Layout:
         terms = _terms(names, model)
         delay_names = _distinct(by_delay)
         return cls(
-            tuple(drives),
-            tuple(responses),
-            tuple(ElementSlot(name, count) for name, count in zip(names, terms, strict=True)),
-            tuple(tuple(names.index(name) for name in row) for row in by_share),
-            delay_names,
-            tuple(tuple(delay_names.index(name) for name in row) for row in by_delay),
+            drives=tuple(drives),
+            responses=tuple(responses),
+            elements=tuple(ElementSlot(name, count) for name, count in zip(names, terms, strict=True)),
+            element_of=tuple(tuple(names.index(name) for name in row) for row in by_share),
+            delays=delay_names,
+            delay_of=tuple(tuple(delay_names.index(name) for name in row) for row in by_delay),
         )
 
     @cached_property

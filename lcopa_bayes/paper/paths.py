@@ -184,13 +184,13 @@ def _path_record(record: Record, response: int, drive: int, exposure: float) -> 
     )
     column = record.drive[:, [drive]]
     single = Record(
-        record.name,
-        record.time,
-        column - column[0],
-        record.response[:, [response]] - level,
-        (record.drive_axes[drive],),
-        (record.response_axes[response],),
-        record.time_unit,
+        name=record.name,
+        time=record.time,
+        drive=column - column[0],
+        response=record.response[:, [response]] - level,
+        drive_axes=(record.drive_axes[drive],),
+        response_axes=(record.response_axes[response],),
+        time_unit=record.time_unit,
     )
     return PathRecord(single, level, level_from, exposure, Blocks.of(single, exposure))
 

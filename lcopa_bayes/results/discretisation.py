@@ -205,12 +205,12 @@ def discretisation(problem: Problem, draws: Draws, *, jobs: int = 1) -> Discreti
     worst = int(np.abs(shifts).argmax())
     names = [draws.table.names[k] for k in rows]
     return Discretisation(
-        names[worst],
-        float(shifts[worst]),
-        float(errors[worst]),
-        problem.refinement,
-        _cells(problem),
-        tuple(names[k] for k in np.flatnonzero(~_negligible(shifts, errors))),
+        parameter=names[worst],
+        shift=float(shifts[worst]),
+        error=float(errors[worst]),
+        refinement=problem.refinement,
+        blocks=_cells(problem),
+        moved=tuple(names[k] for k in np.flatnonzero(~_negligible(shifts, errors))),
     )
 
 

@@ -184,18 +184,18 @@ def fit(
         draws, span=problem.scales.span, period=problem.scales.period, time_unit=study.time_unit
     )
     return Fit(
-        problem,
-        run,
-        draws,
-        tuple(shown),
-        tuple(remaining),
-        curves,
-        tuple(metrics),
-        moved,
-        weighed,
-        width,
-        response,
-        check,
+        problem=problem,
+        run=run,
+        draws=draws,
+        bands=tuple(shown),
+        residuals=tuple(remaining),
+        curves=curves,
+        metrics=tuple(metrics),
+        sensitivity=moved,
+        evidence=weighed,
+        discretisation=width,
+        frequency=response,
+        cross_check=check,
     )
 
 

@@ -171,14 +171,14 @@ def frequency_response(
         wide = _bandwidth(searched, reached[i, j], np.abs(gains[:, i, j]))
         paths.append(
             PathResponse(
-                name,
-                unit,
-                Bands(np.exp(log_gain.pointwise), np.exp(log_gain.simultaneous)),
-                Bands.of(np.degrees(phase[i, j])),
-                Estimate.of(
+                path=name,
+                unit=unit,
+                gain=Bands(np.exp(log_gain.pointwise), np.exp(log_gain.simultaneous)),
+                phase=Bands.of(np.degrees(phase[i, j])),
+                bandwidth=Estimate.of(
                     f"bandwidth[{name}]", f"1/{time_unit}", wide, ess=draws.ess, grade=draws.grade.level
                 ),
-                f"the sign of the gain is open: {100 * negative:.0f} % of draws are negative, and the "
+                note=f"the sign of the gain is open: {100 * negative:.0f} % of draws are negative, and the "
                 "phase has two values 180 deg apart"
                 if either
                 else "",

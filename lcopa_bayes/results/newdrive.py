@@ -190,15 +190,15 @@ def predict(
     squared = _squared(draws, fitted.centres(driven, times))
     grade = draws.grade
     return Prediction(
-        study.name,
-        driven,
-        tuple(predicted),
-        fitted.outside(driven, times, squared),
-        grade.level,
-        grade.reason,
-        study.time_unit,
-        study.seed,
-        plain(provenance(study, "predict") | {"draws_sha256": draws.sha256}),
+        study=study.name,
+        driven=driven,
+        bands=tuple(predicted),
+        outside=fitted.outside(driven, times, squared),
+        grade=grade.level,
+        grade_reason=grade.reason,
+        time_unit=study.time_unit,
+        seed=study.seed,
+        origin=plain(provenance(study, "predict") | {"draws_sha256": draws.sha256}),
     )
 
 

@@ -207,20 +207,20 @@ def band_of(
     shares = np.mean((noisy >= low) & (noisy <= high), axis=1)
     share = np.mean((observed >= low) & (observed <= high))
     return Band(
-        name,
-        axis.name,
-        axis.unit,
-        held_out,
-        times,
-        observed,
-        plant.pointwise,
-        with_noise.pointwise,
-        plant.simultaneous,
-        with_noise.simultaneous,
-        source,
-        used,
-        response.shape[0],
-        float((1 + np.count_nonzero(shares <= share)) / (1 + shares.size)),
+        record=name,
+        axis=axis.name,
+        unit=axis.unit,
+        held_out=held_out,
+        time=times,
+        observed=observed,
+        plant=plant.pointwise,
+        noisy=with_noise.pointwise,
+        plant_simultaneous=plant.simultaneous,
+        noisy_simultaneous=with_noise.simultaneous,
+        offset_from=source,
+        offset_samples=used,
+        draws=response.shape[0],
+        p_inside=float((1 + np.count_nonzero(shares <= share)) / (1 + shares.size)),
     )
 
 

@@ -81,17 +81,17 @@ def _residual(band: Band, draws: Draws, axis: int, noise: Noise, period: float) 
     rate = 1.0 / float(np.median(np.diff(band.time)))
     frequency, power = signal.periodogram(centred, fs=rate)
     return Residual(
-        band.record,
-        band.axis,
-        band.unit,
-        band.held_out,
-        band.time,
-        values,
-        innovations,
-        autocorrelation,
-        frequency[1:],
-        power[1:] / (2 * centred.var() / rate),
-        ljung_box(autocorrelation, n, fitted=noise.memory),
+        record=band.record,
+        axis=band.axis,
+        unit=band.unit,
+        held_out=band.held_out,
+        time=band.time,
+        values=values,
+        innovations=innovations,
+        autocorrelation=autocorrelation,
+        frequency=frequency[1:],
+        spectrum=power[1:] / (2 * centred.var() / rate),
+        p_white=ljung_box(autocorrelation, n, fitted=noise.memory),
     )
 
 
