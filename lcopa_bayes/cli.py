@@ -7,7 +7,7 @@ import gc
 import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -181,8 +181,7 @@ def _on_study(
         source = _source(options)
         source = study_of(source) if anew else source
         function = getattr(import_module(f"lcopa_bayes.verbs.{module}") if module else lcopa_bayes, verb)
-        given = {key: getattr(options, key) for key in keys}
-        given |= {key: of(options, source) for key, of in derived.items()}
+        given = _given(options, *keys) | {key: of(options, source) for key, of in derived.items()}
         given |= {"jobs": jobs} if hasattr(options, "jobs") else {}
         folder = _folder(options, source, *filter(None, [inside]))
         return _reported(function(source, folder=folder, **given), folder, jobs)
@@ -200,19 +199,15 @@ def _truth(options: argparse.Namespace, study: Any) -> object:
     return stated_values(options.truth)
 
 
+def _given(options: argparse.Namespace, *keys: str) -> dict[str, Any]:
+    """Options by the names under which a public function takes them."""
+    return {key: getattr(options, key) for key in keys}
+
+
 def _new(options: argparse.Namespace) -> Outcome:
+    keys = ("held_out", "time", "drives", "responses", "time_unit", "decimal", "time_format", "sheet")
     result = lcopa_bayes.new(
-        options.folder,
-        options.files,
-        held_out=options.held_out,
-        time=options.time,
-        drives=options.drive,
-        responses=options.response,
-        time_unit=options.time_unit,
-        decimal=options.decimal,
-        time_format=options.time_format,
-        sheet=options.sheet,
-        overwrite=options.overwrite,
+        options.folder, options.files, overwrite=options.overwrite, **_given(options, *keys)
     )
     after = f"lcopa-bayes check {options.folder}"
     return Outcome(result.to_json() | {"folder": str(options.folder)}, f"{result}\n\nnext: {after}")
@@ -235,16 +230,7 @@ def _optics(options: argparse.Namespace) -> Outcome:
     from lcopa_bayes.paper.staticoptics import OpticsPlan
     from lcopa_bayes.verbs.papers import optics
 
-    plan = OpticsPlan(
-        elements=options.elements,
-        pitch=options.pitch,
-        wavelength=options.wavelength,
-        fill_factor=options.fill_factor,
-        targets_deg=tuple(options.targets),
-        voltages=tuple(options.voltages),
-        pretilt=options.pretilt,
-        field=options.field,
-    )
+    plan = OpticsPlan(**_given(options, *(one.name for one in fields(OpticsPlan))))
     return _reported(optics(plan), options.out)
 
 

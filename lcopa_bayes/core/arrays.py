@@ -166,14 +166,7 @@ def _plain(value: Any) -> Any:
 
 
 TIME_UNITS: Mapping[str, int] = MappingProxyType(
-    {
-        "ns": 1,
-        "us": 1_000,
-        "ms": 1_000_000,
-        "s": 1_000_000_000,
-        "min": 60_000_000_000,
-        "h": 3_600_000_000_000,
-    }
+    {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000, "min": 60_000_000_000, "h": 3_600_000_000_000}
 )
 """Nanoseconds in each unit of time by its word."""
 

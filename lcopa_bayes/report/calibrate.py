@@ -9,10 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from lcopa_bayes.report.formatting import (
-    figures,
-    percent,
-)
+from lcopa_bayes.report.formatting import figures, percent
 from lcopa_bayes.report.page import Drawings, write_graded
 from lcopa_bayes.report.theme import BAND, HELD_OUT, INK, NOISE, Drawing, blank, grid, plain, svg_of
 

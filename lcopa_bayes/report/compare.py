@@ -12,9 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from lcopa_bayes.comparison.compare import folder_name
 from lcopa_bayes.core.errors import refuse_if
-from lcopa_bayes.report.formatting import (
-    figures,
-)
+from lcopa_bayes.report.formatting import figures
 from lcopa_bayes.report.page import Drawings, Verdict, write_graded
 from lcopa_bayes.report.theme import (
     CYCLE,

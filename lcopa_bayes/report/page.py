@@ -76,11 +76,7 @@ class Page:
         return Markup("<p>{}</p>\n").format(tied(text if caller is None else caller()))
 
     def table(
-        self,
-        rows: Iterable[Any],
-        *heads: str,
-        caption: str = "",
-        caller: Callable[[Any], str],
+        self, rows: Iterable[Any], *heads: str, caption: str = "", caller: Callable[[Any], str]
     ) -> Markup:
         """A table with a row for each of `rows`, whose `cells` the template gives; nothing without rows.
 

@@ -25,9 +25,7 @@ from lcopa_bayes.report.calibrate import write_calibration
 from lcopa_bayes.report.check import write_check, write_look
 from lcopa_bayes.report.compare import write_comparison
 from lcopa_bayes.report.design import write_design
-from lcopa_bayes.report.formatting import (
-    interval,
-)
+from lcopa_bayes.report.formatting import interval
 from lcopa_bayes.report.loop import write_loop
 from lcopa_bayes.report.page import Drawings, write_graded
 from lcopa_bayes.report.predict import write_prediction

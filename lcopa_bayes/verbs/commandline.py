@@ -169,8 +169,12 @@ def new(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--held-out", nargs="+", type=Path, default=[], help="tables not to fit")
     column = "by header or number, perhaps with a new name: 'heater [%%]=Column B'"
     parser.add_argument("--time", default="", metavar="COLUMN", help="the time column")
-    parser.add_argument("--drive", nargs="+", default=[], metavar="COLUMN", help=f"drives, {column}")
-    parser.add_argument("--response", nargs="+", default=[], metavar="COLUMN", help=f"responses, {column}")
+    parser.add_argument(
+        "--drive", nargs="+", default=[], dest="drives", metavar="COLUMN", help=f"drives, {column}"
+    )
+    parser.add_argument(
+        "--response", nargs="+", default=[], dest="responses", metavar="COLUMN", help=f"responses, {column}"
+    )
     parser.add_argument("--time-unit", default="", help="unit of a numeric time column")
     parser.add_argument("--decimal", default="", help="decimal sign, . or ,")
     parser.add_argument(
@@ -335,6 +339,7 @@ def optics(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--targets",
+        dest="targets_deg",
         nargs="+",
         type=float,
         metavar="DEG",

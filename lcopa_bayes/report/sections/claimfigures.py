@@ -26,9 +26,7 @@ from lcopa_bayes.paper.modelclaims import (
 from lcopa_bayes.paper.numericsclaims import delay_costs
 from lcopa_bayes.paper.opticsclaims import FAR_WEAKER, tilt_checks
 from lcopa_bayes.paper.paths import response_to
-from lcopa_bayes.report.formatting import (
-    figures,
-)
+from lcopa_bayes.report.formatting import figures
 from lcopa_bayes.report.theme import (
     BAND,
     CYCLE,

@@ -9,9 +9,7 @@ from typing import Any, TypeAlias
 import pandas as pd
 
 from lcopa_bayes.paper.steptable import KINDS
-from lcopa_bayes.report.formatting import (
-    figures,
-)
+from lcopa_bayes.report.formatting import figures
 from lcopa_bayes.report.theme import (
     CYCLE,
     HELD_OUT,

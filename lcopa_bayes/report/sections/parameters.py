@@ -13,16 +13,7 @@ from matplotlib.axes import Axes
 
 from lcopa_bayes.report.page import Drawings
 from lcopa_bayes.report.savedrun import SavedRun
-from lcopa_bayes.report.theme import (
-    BAND,
-    CYCLE,
-    HELD_OUT,
-    grid,
-    label,
-    legend_above,
-    paged,
-    svg_of,
-)
+from lcopa_bayes.report.theme import BAND, CYCLE, HELD_OUT, grid, label, legend_above, paged, svg_of
 
 _PER_FIGURE = 12
 """Parameters on one figure of traces or of priors."""

@@ -12,11 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lcopa_bayes.core.arrays import Index, Vector
-from lcopa_bayes.report.formatting import (
-    figures,
-    percent,
-    probability,
-)
+from lcopa_bayes.report.formatting import figures, percent, probability
 from lcopa_bayes.report.page import Drawings
 from lcopa_bayes.report.savedrun import SavedRun
 from lcopa_bayes.report.theme import (

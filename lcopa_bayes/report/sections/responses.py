@@ -9,12 +9,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from lcopa_bayes.report.formatting import (
-    NOT_REACHED,
-    OPEN,
-    interval,
-    to_spread,
-)
+from lcopa_bayes.report.formatting import NOT_REACHED, OPEN, interval, to_spread
 from lcopa_bayes.report.page import Drawings
 from lcopa_bayes.report.savedrun import SavedRun
 from lcopa_bayes.report.theme import (

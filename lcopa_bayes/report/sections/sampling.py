@@ -8,10 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from lcopa_bayes.report.formatting import (
-    NONE,
-    figures,
-)
+from lcopa_bayes.report.formatting import NONE, figures
 from lcopa_bayes.report.page import Drawings
 from lcopa_bayes.report.savedrun import SavedRun
 from lcopa_bayes.report.sections.parameters import density_axis, marginals
