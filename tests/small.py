@@ -10,9 +10,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import Command, on_off, step
-from lcopa_bayes.bench.device import Device
+from lcopa_bayes.bench.device import Bench, Device, simulate
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import (
@@ -20,9 +19,8 @@ from lcopa_bayes.data.settings import (
 )
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
-from lcopa_bayes.inference.parameter import Parameter, Place
+from lcopa_bayes.inference.parameter import Parameter, Place, Prior
 from lcopa_bayes.inference.parameters import ParameterTable
-from lcopa_bayes.inference.priors import Prior
 from lcopa_bayes.model.path import TransferPath
 from lcopa_bayes.sampling.convergence import Quality
 from lcopa_bayes.sampling.draws import Draws

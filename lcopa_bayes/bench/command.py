@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.errors import InputError, refuse_if
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Command:
     """Piecewise constant drive: `rest` before ``times[0]``, then ``values[i]`` from ``times[i]`` on.
@@ -38,8 +36,7 @@ class Command:
             problems.append(f"`values` must have shape {(times.size, rest.size)}; got {values.shape}")
         if (np.diff(times) <= 0).any():
             problems.append("`times` must increase")
-        if problems:
-            raise InputError(problems)
+        refuse_if(problems)
         for name, value in (("times", times), ("values", values), ("rest", rest)):
             object.__setattr__(self, name, value)
 

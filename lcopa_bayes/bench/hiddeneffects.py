@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias, final
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -81,7 +81,6 @@ _FINE = 8
 """Points per camera period on which a lag of the sensor is integrated."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Shot:
     """Properties of the record being simulated that a hidden effect may use."""
@@ -100,7 +99,6 @@ class Shot:
     """For what differs from record to record."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Hidden:
     """An effect by the places where it acts; None where it does not."""
@@ -125,7 +123,6 @@ class Hidden:
     """From noise to noise, (n, axes)."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class HiddenDevice:
     """A device with hidden effects; answers commands as `Device` does."""

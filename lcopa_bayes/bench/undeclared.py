@@ -7,14 +7,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import pi
 from types import ModuleType
-from typing import ClassVar, Literal, final
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from lcopa_bayes.bench import driveeffects, planteffects, readingeffects, unnamedeffects
-from lcopa_bayes.bench.acquisition import Bench, truth
 from lcopa_bayes.bench.command import Command, quiet, two_axis
-from lcopa_bayes.bench.device import Device
+from lcopa_bayes.bench.device import Bench, Device, truth
 from lcopa_bayes.bench.driveeffects import joined
 from lcopa_bayes.bench.hiddeneffects import STEPS, Hidden, HiddenDevice, Shot
 from lcopa_bayes.core.arrays import Matrix
@@ -27,7 +26,6 @@ LARGEST = pi / 2
 """Largest drive of either axis [rad]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Schedule:
     """Drive of one record."""
@@ -130,7 +128,6 @@ OUTSIDE: dict[str, Maker] = _makers(unnamedeffects)
 """Effects that no catalogue contains."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Campaign:
     """Records of one device with hidden effects, and what only the evaluation may read."""
@@ -248,7 +245,6 @@ def shot_of(device: Device, epoch: float, rng: np.random.Generator) -> Shot:
     return Shot(epoch, drive, np.abs(np.diag(steady)) * drive, device.paths[0][0].delay, steady, rng)
 
 
-@final
 @dataclass(frozen=True)
 class UndeclaredPlan(Ruled):
     """A campaign file with a table ``[undeclared]``: effects by name, at sizes drawn from the seed.

@@ -10,12 +10,12 @@ Vehtari 2022, Statistics and Computing 32). Both are computed exactly, not by si
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, final
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
 
-from lcopa_bayes.core.arrays import Array, Index, Vector
+from lcopa_bayes.core.arrays import Array, Index, Vector, attributes
 
 SIMULTANEOUS = 0.95
 """Probability that all that one band is drawn for lies inside it [-]."""
@@ -69,9 +69,9 @@ def corridor(replicas: int, values: int, level: float = SIMULTANEOUS) -> Limits:
     return _inside(tails, float(np.exp(low)))
 
 
-def bin_limits(replicas: int, bins: int, level: float = SIMULTANEOUS) -> tuple[int, int]:
+def bin_limits(replicas: int, bins: int) -> tuple[int, int]:
     """Limits on the counts of `bins` equal bins of uniform ranks, by Bonferroni's inequality."""
-    tail = (1 - level) / (2 * bins)
+    tail = (1 - SIMULTANEOUS) / (2 * bins)
     ends = stats.binom(replicas, 1 / bins)
     return int(ends.ppf(tail)), int(ends.ppf(1 - tail))
 
@@ -119,7 +119,6 @@ LEVELS = (0.5, 0.9)
 """Probabilities inside the central intervals that are checked [-]."""
 
 
-@final
 @dataclass(frozen=True)
 class Coverage:
     """Coverage of the central interval of one quantity at one level."""
@@ -165,12 +164,7 @@ class Coverage:
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
         return {
-            "parameter": self.parameter,
-            "kind": self.kind,
-            "level": self.level,
-            "observed": self.observed,
-            "lower": self.lower,
-            "upper": self.upper,
+            **attributes(self, "parameter", "kind", "level", "observed", "lower", "upper"),
             "band": BAND,
             "confidence": self.confidence,
             "within": self.holds,

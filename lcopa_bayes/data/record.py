@@ -12,23 +12,21 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, TypeAlias, final
+from typing import Protocol, TypeAlias
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from lcopa_bayes.core.arrays import Matrix, Vector, frozen
+from lcopa_bayes.core.arrays import TIME_UNITS, Matrix, Vector, frozen, in_time_unit
 from lcopa_bayes.core.errors import InputError, nearest, refuse_if
 from lcopa_bayes.core.files import write_whole
 from lcopa_bayes.core.rules import rebuilt
-from lcopa_bayes.core.units import TIME_UNITS, in_time_unit
 from lcopa_bayes.data.cells import FORM, SUFFIXES, CellTable, frame_cells, read_cells, refuse
 
 _ROLES = ("time", "drive", "response")
 
 
-@final
 @dataclass(frozen=True)
 class Axis:
     """One column of drive or response: a free name, which may hold underscores, and a free unit."""
@@ -55,7 +53,6 @@ class Driven(Protocol):
     def drive(self) -> Matrix: ...  # noqa: D102
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Record:
     """One experiment, sampled uniformly or not; arrays are finite, checked and read-only.
@@ -156,7 +153,6 @@ def _numbers(table: CellTable, column: int, *, missing: bool) -> Vector:
     return out
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Columns:
     """Columns of a record file by role."""
@@ -194,7 +190,7 @@ def load_columns(path: Path, time_unit: str | None = None, *, responses: bool = 
 
 def _columns(table: CellTable, time_unit: str | None, *, responses: bool) -> Columns:
     """Columns of a table's cells; InputError with everything wrong in them."""
-    n_rows = len(table.rows) if not table.problems else 2  # rows of another length are told already
+    n_rows = len(table.rows) if not table.problems else 2  # rows of another length are problems already
     given, axes = _roles(table, _ROLES if responses else _ROLES[:2])
     values = {role: [_numbers(table, j, missing=role == "response") for j in axes[role]] for role in _ROLES}
     for column, time in zip(axes["time"], values["time"], strict=True):

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import final
 
 import numpy as np
 from scipy.signal import correlate
@@ -19,8 +18,7 @@ from scipy.stats import chi2
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.noise import WhiteAR1
-from lcopa_bayes.inference.observations import Observed, Samples
-from lcopa_bayes.inference.restnoise import PlausibleNoise, mixed_shapes
+from lcopa_bayes.inference.observations import Observed, PlausibleNoise, Samples, mixed_shapes
 
 FEWEST = 50
 """Fewer quiet samples than this know the noise scale to worse than a tenth [-]."""
@@ -45,7 +43,6 @@ _WIDTHS = (6.0, 30.0)
 """Standard deviations of an outlier over that of the noise tried [-]."""
 
 
-@final
 @dataclass(frozen=True)
 class Law:
     """Stationary white noise plus a correlated part; either may vanish."""
@@ -114,7 +111,6 @@ def laws(drawn: Matrix) -> list[Law]:
     return [Law(*row) for row in drawn.tolist()]
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class AxisNoise:
     """Noise of one response axis and where it is known from."""

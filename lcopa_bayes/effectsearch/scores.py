@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 from scipy.stats import norm
 
-from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import LEVEL, Matrix, Vector, attributes
 from lcopa_bayes.core.covariance import covariance_of
-from lcopa_bayes.core.estimate import LEVEL
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.crossvalidation import groups, shifts
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
@@ -38,7 +37,6 @@ WIDTH = float(norm.ppf(0.5 + LEVEL / 2))
 """Half width of a central 90 % interval of a normal distribution [sd]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Score:
     """One response axis of one record against its prediction."""
@@ -86,10 +84,7 @@ class Score:
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
         return {
-            "record": self.record,
-            "axis": self.axis,
-            "unit": self.unit,
-            "held_out": self.held_out,
+            **attributes(self, "record", "axis", "unit", "held_out"),
             "samples": self.time.size,
             "rmse": self.rmse,
             "noise_sd": self.noise_sd,
@@ -100,7 +95,6 @@ class Score:
         }
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class State:
     """A model at its optimum under its noise, and how wide its bands must be."""

@@ -11,8 +11,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import refuse_if
-from lcopa_bayes.data.requirements import unmet_apart_from_rest
-from lcopa_bayes.data.rest import not_at_rest
+from lcopa_bayes.data.requirements import not_at_rest, unmet_apart_from_rest
 from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basefit import BaseFit, base_fit

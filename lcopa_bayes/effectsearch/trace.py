@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import final
 
 import numpy as np
 from scipy.special import logsumexp
@@ -39,7 +38,6 @@ SEEN = 0.1
 """Below this survival the records cannot see an effect [-]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Traced:
     """An effect with all its instances against one residual."""
@@ -70,7 +68,6 @@ class Traced:
         return max((one.survival for one in self.signatures), default=np.nan)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Trace:
     """All effects against one residual, and what chance alone gives."""

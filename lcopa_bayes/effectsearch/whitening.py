@@ -5,22 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.effectsearch.noise import Law
 from lcopa_bayes.inference.noise import WhiteAR1
-from lcopa_bayes.inference.observations import Samples
-from lcopa_bayes.inference.restnoise import PlausibleNoise
+from lcopa_bayes.inference.observations import PlausibleNoise, Samples
 
 _PER_LAW = 4
 """Draws of noise from each plausible law [-]."""
 _SEED = 7
 
 
-@final
 @dataclass(frozen=True)
 class Part:
     """Samples of one response axis of one record inside the stacked samples of all."""
@@ -52,7 +49,6 @@ def stacked(samples: Sequence[Samples], responses: Sequence[Array]) -> Matrix:
     )
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Whitening:
     """Noise of every axis applied to stacked samples; records are independent of each other."""

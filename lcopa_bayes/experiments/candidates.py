@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import final
 
 import numpy as np
 
@@ -21,7 +20,6 @@ _LEVELS = 4
 """Levels of a staircase and of an amplitude series."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Candidate:
     """A drive that may be played."""

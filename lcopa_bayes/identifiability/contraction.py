@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 from scipy.stats import rankdata
 
-from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.core.estimate import Estimate, plain
+from lcopa_bayes.core.arrays import Estimate, Matrix, Vector, attributes, plain
 from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.likelihood import Landscape
 from lcopa_bayes.inference.parameter import Parameter
@@ -29,7 +28,6 @@ LEVEL = 0.5
 """Width of an offset over the range of the response [-]."""
 
 
-@final
 @dataclass(frozen=True)
 class Tolerance:
     """Largest interval of an identified parameter."""
@@ -75,7 +73,6 @@ _STRAYING = 1000.0
 """A width relative to the median beyond this has no information [-]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Belief:
     """Posterior of one parameter beside its prior."""
@@ -106,7 +103,6 @@ class Belief:
         )
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Known:
     """A function of the parameters, by the posterior and by the prior."""
@@ -120,11 +116,7 @@ class Known:
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
         fields: dict[str, Any] = self.estimate.as_json() | plain(
-            {
-                "relative_width": self.relative_width,
-                "prior_relative_width": self.prior_relative_width,
-                "verdict": self.verdict,
-            }
+            attributes(self, "relative_width", "prior_relative_width", "verdict")
         )
         return fields
 
@@ -173,13 +165,13 @@ def beliefs(
         order = [q for q in np.argsort(-np.abs(spearman[p])) if q != p and abs(spearman[p, q]) >= _COMPANION]
         out.append(
             Belief(
-                name,
-                float(1 - columns[:, p].var() / prior_sd[k] ** 2),
-                tuple(names[q] for q in order),
-                tuple(float(spearman[p, q]) for q in order),
-                modes.get(name, 1),
-                by_name.get(name),
-                estimates[name],
+                parameter=name,
+                contraction=float(1 - columns[:, p].var() / prior_sd[k] ** 2),
+                companions=tuple(names[q] for q in order),
+                correlations=tuple(float(spearman[p, q]) for q in order),
+                modes=modes.get(name, 1),
+                sensitivity=by_name.get(name),
+                estimate=estimates[name],
             )
         )
     return tuple(out)

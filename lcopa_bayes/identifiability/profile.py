@@ -6,13 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2, t
 
-from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.core.estimate import LEVEL, plain
+from lcopa_bayes.core.arrays import LEVEL, Matrix, Vector, attributes, plain
 from lcopa_bayes.inference.likelihood import Landscape, Peak
 from lcopa_bayes.inference.posterior import Posterior
 
@@ -39,7 +38,6 @@ _FAR = 3
 """Draws beyond the last point from which another mode is sought."""
 
 
-@final
 @dataclass(frozen=True)
 class Freedom:
     """Numbers of samples and of fitted parameters."""
@@ -71,7 +69,6 @@ class Freedom:
         return self.samples * float(np.log1p(t.ppf((1 + level) / 2, degrees) ** 2 / degrees))
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Profile:
     """Largest likelihood at each value of one parameter.
@@ -157,9 +154,7 @@ class Profile:
                 "searched": self.ends,
                 "nuisance_at_bound": self.at_bound,
                 "nuisance_moving": self.moving,
-                "parts": self.parts,
-                "values": self.values,
-                "fall": self.fall,
+                **attributes(self, "parts", "values", "fall"),
             }
         )
 

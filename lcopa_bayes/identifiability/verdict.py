@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, final
+from typing import Any, Literal
 
 import numpy as np
 
-from lcopa_bayes.core.estimate import LEVEL, plain
+from lcopa_bayes.core.arrays import LEVEL, attributes, plain
 from lcopa_bayes.identifiability.contraction import Belief, Tolerance
 from lcopa_bayes.identifiability.curvature import Curvature
 from lcopa_bayes.identifiability.profile import Profile
@@ -30,7 +30,6 @@ _APART = 3.0
 """Factor between local and profile widths from which they disagree [-]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Finding:
     """Verdict of one parameter with its evidence."""
@@ -51,9 +50,7 @@ class Finding:
             {
                 "name": self.profile.parameter,
                 "unit": self.profile.unit,
-                "verdict": self.verdict,
-                "reason": self.reason,
-                "partners": self.partners,
+                **attributes(self, "verdict", "reason", "partners"),
                 "profile": self.profile.as_json(),
                 "contraction": self.belief.contraction,
                 "relative_sd": self.relative_sd,

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, final
+from typing import NamedTuple
 
 import numpy as np
 
@@ -66,7 +66,6 @@ class Expanded(NamedTuple):
     """Derivatives of the natural coordinates in the coordinates, (batch, size, size)."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Conditional:
     """Coordinates of what a posterior has beside orders, delays and noise."""
@@ -223,12 +222,12 @@ class Conditional:
         found = expanded(self.posterior, values, self.columns)
         steep = self.steepness(values)
         return Expanded(
-            values,
-            self.x(values),
-            found.log_likelihood,
-            (steep.swapaxes(1, 2) @ found.gradient[..., None])[..., 0],
-            steep.swapaxes(1, 2) @ found.information @ steep,
-            steep,
+            values=values,
+            x=self.x(values),
+            log_likelihood=found.log_likelihood,
+            gradient=(steep.swapaxes(1, 2) @ found.gradient[..., None])[..., 0],
+            information=steep.swapaxes(1, 2) @ found.information @ steep,
+            steepness=steep,
         )
 
     def _objective(self, at: Expanded) -> tuple[Vector, Matrix, Array]:

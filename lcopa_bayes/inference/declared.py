@@ -21,11 +21,9 @@ from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.defaultpriors import Scales
-from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.observations import Samples
-from lcopa_bayes.inference.parameter import Parameter, Place
+from lcopa_bayes.inference.parameter import COEFFICIENTS, CONSTANTS, Parameter, Place, Prior
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.inference.priors import Prior
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.declared import Declared
 from lcopa_bayes.model.effects.effect import Coefficient, Constant, Effect, Ranges, ScatterEffect
@@ -120,13 +118,13 @@ def record_ranges(study: Study, layout: Layout, scales: Scales) -> Ranges:
     speeds = [speed for one in samples for i in range(response.size) if (speed := _speed(one, i)) > 0]
     speed = study.effects.speed or min(speeds, default=scales.span)
     return Ranges(
-        drive,
-        np.where(response > 0, response, 1.0),
-        scales.period,
-        scales.span,
-        float(speed),
-        direct,
-        tuple(axis.name for axis in layout.responses),
+        drive=drive,
+        response=np.where(response > 0, response, 1.0),
+        period=scales.period,
+        span=scales.span,
+        speed=float(speed),
+        direct=direct,
+        names=tuple(axis.name for axis in layout.responses),
     )
 
 

@@ -44,16 +44,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.data.drive import first_change
 from lcopa_bayes.data.record import Record
-from lcopa_bayes.inference.observations import Observed, Samples, sampling_period
-from lcopa_bayes.inference.priors import Prior
-from lcopa_bayes.inference.restnoise import QuietNoise, quiet_noise
+from lcopa_bayes.inference.observations import Observed, QuietNoise, Samples, quiet_noise, sampling_period
+from lcopa_bayes.inference.parameter import Prior
 
 _TIMES = 20.0
 """Correlation times of the noise that fit into a record at least [-]."""
@@ -65,7 +63,6 @@ _BEYOND = 1.5
 """Factor by which correlated noise in motion exceeds the limit at rest at most [-]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Scales:
     """What the default priors are derived from."""
@@ -97,13 +94,13 @@ class Scales:
         samples = [Samples.of(record, period) for record in records]
         moved = np.max([np.abs(record.drive - record.drive[0]).max(axis=0) for record in records], axis=0)
         return cls(
-            float(max(spans)),
-            period,
-            np.where(amplitude > 0, amplitude, 1.0),
-            np.nanmean(response, axis=0),
-            np.where(moved > 0, moved, 1.0),
-            np.max([np.abs(record.drive[0]) for record in records], axis=0),
-            tuple(tuple(one.quiet(axis) for one in samples) for axis in range(response.shape[1])),
+            span=float(max(spans)),
+            period=period,
+            amplitude=np.where(amplitude > 0, amplitude, 1.0),
+            level=np.nanmean(response, axis=0),
+            excursion=np.where(moved > 0, moved, 1.0),
+            resting=np.max([np.abs(record.drive[0]) for record in records], axis=0),
+            at_rest=tuple(tuple(one.quiet(axis) for one in samples) for axis in range(response.shape[1])),
         )
 
     def gain(self, response: int, drive: int) -> Prior:

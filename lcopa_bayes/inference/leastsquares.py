@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import final
 
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
@@ -29,7 +28,6 @@ _TAIL = 1e-9
 """Prior mass beyond either end of the search on a logarithmic scale [-]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
     """Output-error least squares of a posterior's plant parameters at fixed noise parameters.
@@ -184,10 +182,7 @@ class LeastSquares:
             elif row.kind == "time" and not row.log_scale:
                 jacobian[:, k] /= raw[k]
         rows, prior = self._prior_rows(raw)
-        return (
-            np.concatenate([*parts, prior]),
-            np.concatenate([jacobian, rows])[:, self.columns],
-        )
+        return (np.concatenate([*parts, prior]), np.concatenate([jacobian, rows])[:, self.columns])
 
     def _plain(self, values: Matrix) -> Iterator[tuple[int, Observed, Matrix, Vector]]:
         """Response axis, samples, slopes in the table's rows (times in their logarithms) and misfit (model

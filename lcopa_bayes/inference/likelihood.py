@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import final
 
 import numpy as np
 from scipy.optimize import least_squares, minimize
@@ -31,7 +30,6 @@ _GAINED = 1e-3
 """Rounds between plant and noise end when the log likelihood gains less [nat]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Peak:
     """A maximum of the likelihood, perhaps with one parameter held."""
@@ -42,7 +40,6 @@ class Peak:
     """[nat]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Landscape:
     """Log likelihood of all free parameters, none integrated out; of the priors only the support counts.
@@ -224,8 +221,8 @@ class Landscape:
                 at = out.copy()
                 for k, coordinate in zip(moving, x, strict=True):
                     at[k] = self.value(k, coordinate)
-                told = [posterior.noise.pointwise(part, at[None, rows], gaps) for part, gaps in left]
-                return -float(sum(density.sum() for density in told))
+                densities = [posterior.noise.pointwise(part, at[None, rows], gaps) for part, gaps in left]
+                return -float(sum(density.sum() for density in densities))
 
             ends = [self.search(k) for k in moving]
             start = [

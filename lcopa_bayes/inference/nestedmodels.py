@@ -9,12 +9,11 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Flags, Matrix, Vector
-from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
+from lcopa_bayes.inference.parameter import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 
@@ -44,7 +43,6 @@ def lifted(values: Matrix, small: Posterior, large: Posterior, rng: np.random.Ge
     return _Lift(small.table, large.table, small.noise.kind, large.noise.kind, rng)(values, large)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class _Lift:
     small: ParameterTable
@@ -145,14 +143,14 @@ class _Lift:
             own = {
                 row.kind: k for k, row in enumerate(self.small.rows) if row.noise and row.place.first == axis
             }
-            told = {name: values[:, k] for name, k in own.items()}
+            columns = {name: values[:, k] for name, k in own.items()}
             if self.small_noise == "ar1" and self.large_noise == "white+ar1":
-                told |= {"sigma_ar": told["sigma"], "sigma": _HARDLY * told["sigma"]}
+                columns |= {"sigma_ar": columns["sigma"], "sigma": _HARDLY * columns["sigma"]}
             elif self.small_noise != self.large_noise:
-                sd = told["sigma"]
+                sd = columns["sigma"]
                 white = [target.noise.nearly_white(float(one)) for one in sd]
-                told = {name: np.array([one[name] for one in white]) for name in target.noise.names}
-            for name, column in told.items():
+                columns = {name: np.array([one[name] for one in white]) for name in target.noise.names}
+            for name, column in columns.items():
                 out[:, self.large.at(name, axis)] = column
         return True
 

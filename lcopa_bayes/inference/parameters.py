@@ -6,18 +6,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import lgamma, log
-from typing import NamedTuple, final
+from typing import NamedTuple
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Flags, Index, Matrix, Vector
-from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.core.errors import InputError, nearest, refuse_if
 from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.inference.defaultpriors import Scales
-from lcopa_bayes.inference.kinds import COEFFICIENTS, KINDS
 from lcopa_bayes.inference.noise import NOISES
-from lcopa_bayes.inference.parameter import Parameter, Place
-from lcopa_bayes.inference.priors import Prior
+from lcopa_bayes.inference.parameter import COEFFICIENTS, KINDS, Parameter, Place, Prior
 from lcopa_bayes.model.effects.declared import Declared
 from lcopa_bayes.model.forward import Dynamics
 from lcopa_bayes.model.layout import Layout
@@ -41,7 +39,6 @@ class Terms(NamedTuple):
         return sorted(self.times + self.orders)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class ParameterTable:
     """All parameters of a posterior; arrays of values have one column per row of the table."""
@@ -344,6 +341,5 @@ def _with_priors(
         value = np.nan if setting.fixed is None else setting.fixed
         out.append(replace(row, prior=prior, value=value, default=False))
         problems += out[-1].problems
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     return out

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.data.drive import AxisDrive, axis_drives
 from lcopa_bayes.data.record import Driven
+from lcopa_bayes.model.blockpulses import Circle
 from lcopa_bayes.model.grid import Mesh
 from lcopa_bayes.model.layout import Layout
-from lcopa_bayes.model.powerseries import Circle
 from lcopa_bayes.model.stepresponse import Slopes, StepResponse, step_response
 from lcopa_bayes.model.superposition import Phase, Superposition, blocks_of, phases
 
@@ -29,7 +29,6 @@ _ABREAST = 8
 """Portions are multiples of this: transforms of so many series run in one vector register."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Dynamics:
     """What shapes unit responses, for a batch of plants."""
@@ -65,7 +64,6 @@ StepResponses = dict[tuple[int, float], StepResponse]
 """Step responses by element and block width."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Experiment:
     """A record prepared for simulation: all that does not depend on parameters."""
@@ -114,7 +112,6 @@ class Experiment:
         return blocks_of(self.mesh.lattice, begin) if begin < np.inf else 0
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class ForwardModel:
     """Unit responses of every experiment: the operational matrices as a function of the dynamics."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, final
+from typing import NamedTuple
 
-from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.core.errors import nearest, refuse_if
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.data.settings import ModelSettings
 
@@ -40,7 +40,6 @@ class PathSlot(NamedTuple):
     """Of its gain [response unit per drive unit]."""
 
 
-@final
 @dataclass(frozen=True)
 class Layout:
     """Axes of a plant and the slots its paths take their element and delay from."""
@@ -70,12 +69,12 @@ class Layout:
         terms = _terms(names, model)
         delay_names = _distinct(by_delay)
         return cls(
-            tuple(drives),
-            tuple(responses),
-            tuple(ElementSlot(name, count) for name, count in zip(names, terms, strict=True)),
-            tuple(tuple(names.index(name) for name in row) for row in by_share),
-            delay_names,
-            tuple(tuple(delay_names.index(name) for name in row) for row in by_delay),
+            drives=tuple(drives),
+            responses=tuple(responses),
+            elements=tuple(ElementSlot(name, count) for name, count in zip(names, terms, strict=True)),
+            element_of=tuple(tuple(names.index(name) for name in row) for row in by_share),
+            delays=delay_names,
+            delay_of=tuple(tuple(delay_names.index(name) for name in row) for row in by_delay),
         )
 
     @cached_property
@@ -161,6 +160,5 @@ def _terms(names: tuple[str, ...], model: ModelSettings) -> list[int]:
         for name in names
         if name not in model.terms
     ]
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     return [model.terms[name] for name in names]

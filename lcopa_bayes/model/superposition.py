@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import ceil
-from typing import final
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.data.drive import AxisDrive
+from lcopa_bayes.model.blockpulses import Circle, Spectrum
 from lcopa_bayes.model.grid import Lattice
-from lcopa_bayes.model.powerseries import Circle, Spectrum
 from lcopa_bayes.model.stepresponse import Kind, StepResponse
 
 SPARE = 5
@@ -32,7 +31,6 @@ _ADDED = 10
 """Changes of one phase that are added one by one; more are convolved on the circle."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Phase:
     """Changes of a drive that are whole blocks apart."""
@@ -86,7 +84,6 @@ def blocks_of(lattice: Lattice, begin: float) -> int:
     return ceil((float(lattice.times[-1]) - begin) / lattice.step) + SPARE if lattice.times.size else SPARE
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class _Read:
     """A step response on the lattice of a record."""
@@ -120,7 +117,6 @@ class _Read:
         return np.asarray(windows[:, np.arange(start.size), first][:, :, slots])
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Superposition:
     """Responses of elements to drives, for one batch of plants; what records share is read once."""
@@ -160,13 +156,7 @@ class Superposition:
         return out
 
     def _add_anywhere(
-        self,
-        out: Array,
-        response: StepResponse,
-        phase: Phase,
-        lattice: Lattice,
-        delays: Vector,
-        kind: Kind,
+        self, out: Array, response: StepResponse, phase: Phase, lattice: Lattice, delays: Vector, kind: Kind
     ) -> None:
         """Add the response to one phase at sample times of any spacing."""
         x = (lattice.times - phase.time - delays[:, None]) / lattice.step

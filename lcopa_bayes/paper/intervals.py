@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 from math import isfinite
-from typing import NamedTuple, final
+from typing import NamedTuple
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.errors import InputError, refuse_if
 
 _ROUND = 9
 """Decimals to which orders are compared."""
@@ -42,7 +42,6 @@ class Candidates(NamedTuple):
         return int(self.orders.shape[0] * self.delays.size)
 
 
-@final
 @dataclass(frozen=True)
 class Scan:
     """Intervals of a scan. InputError with all problems unless the fields are as they say."""
@@ -83,8 +82,7 @@ class Scan:
             problems.append(f"`stiffness` needs positive values of k; got {self.stiffness!r}")
         if isinstance(self.rounds, bool) or not isinstance(self.rounds, int) or self.rounds < 0:
             problems.append(f"`rounds` must be a whole number, 0 or more; got {self.rounds!r}")
-        if problems:
-            raise InputError(problems)
+        refuse_if(problems)
 
     def order_intervals(self, terms: int) -> tuple[Interval, ...]:
         """The interval of each order of a path with so many terms; InputError when they do not fit."""
@@ -120,8 +118,7 @@ class Scan:
             problems.append(
                 f"no whole number of blocks of {block:g} lies in the delay interval {(low, high)}"
             )
-        if problems:
-            raise InputError(problems)
+        refuse_if(problems)
         return Candidates(orders, block * counts)
 
     def next_round(

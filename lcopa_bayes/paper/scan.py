@@ -11,18 +11,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
-from lcopa_bayes.core.progress import Progress
-from lcopa_bayes.model.blockpulses import integration_weights, lower_toeplitz
+from lcopa_bayes.core.parallel import Progress
+from lcopa_bayes.model.blockpulses import Circle, Spectrum, integration_weights, lower_toeplitz
 from lcopa_bayes.model.path import Normalisation, TransferPath
-from lcopa_bayes.model.powerseries import Circle, Spectrum
-from lcopa_bayes.paper.equation import differenced_integrals, known_column, least_squares
 from lcopa_bayes.paper.intervals import Candidates, Scan
-from lcopa_bayes.paper.paths import Blocks
+from lcopa_bayes.paper.paths import Blocks, differenced_integrals, known_column, least_squares
 
 _CELLS = 1 << 16
 """Candidates times blocks evaluated at once: 256 candidates of a 250-sample record, 1 MB an array."""
@@ -30,7 +27,6 @@ _ROUND = 9
 """Decimals to which exponents are distinguished."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Evaluated:
     """Coefficients and output errors of all candidates of a round, delays varying fastest."""
@@ -57,7 +53,6 @@ class Evaluated:
         return tuple(map(float, self.candidates.orders[row])), float(self.candidates.delays[late])
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class _Ground:
     """Records on equal blocks and their stored series."""
@@ -184,7 +179,6 @@ def _output_squares(grounds: Sequence[_Ground], at: Index, late: Index, coeffici
     return total
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Scanned:
     """The best candidates of a scan."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, TypeAlias, final
+from typing import Any, TypeAlias
 
-from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.arrays import attributes, plain
 from lcopa_bayes.model.literature import Stated
 
 
@@ -25,7 +25,6 @@ class Kind(Enum):
         return cls.SUPPORTED if holds else cls.CONTRADICTED
 
 
-@final
 @dataclass(frozen=True)
 class Verdict:
     """Outcome of one test."""
@@ -48,7 +47,6 @@ def waiting(stage: str, question: str) -> Verdict:
     return undecided(f"No {stage} is among the evidence; it has to answer: {question}")
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Evidence:
     """What beyond the printed numbers a test may read: the results of other stages, absent until run."""
@@ -63,7 +61,6 @@ Test: TypeAlias = Callable[[Stated, Evidence], Verdict]
 """Computes a verdict from the stated numbers and the evidence alone."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Claim:
     """A sentence of the paper and the test of it: a copy of `Stated` with another number can give another
@@ -76,7 +73,6 @@ class Claim:
     test: Test
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Judged:
     """A claim with its verdict."""
@@ -86,15 +82,12 @@ class Judged:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        fields: dict[str, Any] = plain(
+        return plain(
             {
                 "id": self.claim.id,
                 "verdict": self.verdict.kind.value,
-                "number": self.verdict.number,
-                "unit": self.verdict.unit,
-                "how": self.verdict.how,
+                **attributes(self.verdict, "number", "unit", "how"),
                 "text": self.claim.text,
                 "source": self.claim.source,
             }
         )
-        return fields

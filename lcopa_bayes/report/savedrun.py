@@ -7,13 +7,13 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from lcopa_bayes.core.arrays import Matrix
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.results.bands import POINTWISE, QUANTILE_NAMES, SIMULTANEOUS
 from lcopa_bayes.results.datatree import posterior_draws
 from lcopa_bayes.results.runfolder import ORIGINS
@@ -45,7 +45,7 @@ TABLES: Mapping[str, tuple[str, ...]] = {
 }
 """Tables the report draws and the columns it needs of each."""
 _CHECK_TABLES: Mapping[str, tuple[str, ...]] = {
-    "cross_check_density": ("name", "log_scale", "left", "right", "ensembles", "nested"),
+    "cross_check_density": ("name", "log_scale", "left", "right", "ensembles", "nested")
 }
 """The same of a run that was checked by a second method."""
 _RESULTS = (
@@ -56,7 +56,6 @@ _RESULTS = (
 _PROVENANCE = ("command", "seed", "inputs_sha256", "python", "versions")
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class SavedRun:
     """Results, tables and draws read from a run folder."""
@@ -131,8 +130,7 @@ def load_run(folder: Path) -> SavedRun:
             "both must come from the same run, so run `fit` again"
             for name in absent
         ]
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     return SavedRun(results, origin, tables, draws)
 
 

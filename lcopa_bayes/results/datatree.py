@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any
 
 import arviz_base
 import numpy as np
@@ -21,7 +21,7 @@ from lcopa_bayes.core.files import enduring
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.results.prediction import record_draws, responses
-from lcopa_bayes.results.provenance import settings_of
+from lcopa_bayes.results.runfolder import settings_of
 
 if TYPE_CHECKING:
     from lcopa_bayes.results.fit import Fit
@@ -187,7 +187,6 @@ def variable_names(wanted: Sequence[str]) -> list[str]:
     return out
 
 
-@final
 @dataclass(frozen=True)
 class _Series:
     """What was seen of some records, by variable name."""
@@ -218,7 +217,6 @@ class _Series:
         )
 
 
-@final
 @dataclass(frozen=True)
 class _Drives:
     """Drives of some records, by variable name."""

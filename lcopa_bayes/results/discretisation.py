@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.core.arrays import Flags, Matrix, Vector
+from lcopa_bayes.core.arrays import Flags, Matrix, Vector, attributes
 from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.inference.assembly import Problem
@@ -48,7 +48,6 @@ _PORTION = 32
 """Draws that one process takes at once [-]."""
 
 
-@final
 @dataclass(frozen=True)
 class Discretisation:
     """Shift of the posterior means by the width of the blocks."""
@@ -105,9 +104,7 @@ class Discretisation:
             "parameter": self.parameter,
             "shift_sd": self.shift,
             "shift_error_sd": self.error,
-            "refinement": self.refinement,
-            "blocks": self.blocks,
-            "negligible": self.negligible,
+            **attributes(self, "refinement", "blocks", "negligible"),
             "moved": list(self.moved),
         }
 
@@ -208,12 +205,12 @@ def discretisation(problem: Problem, draws: Draws, *, jobs: int = 1) -> Discreti
     worst = int(np.abs(shifts).argmax())
     names = [draws.table.names[k] for k in rows]
     return Discretisation(
-        names[worst],
-        float(shifts[worst]),
-        float(errors[worst]),
-        problem.refinement,
-        _cells(problem),
-        tuple(names[k] for k in np.flatnonzero(~_negligible(shifts, errors))),
+        parameter=names[worst],
+        shift=float(shifts[worst]),
+        error=float(errors[worst]),
+        refinement=problem.refinement,
+        blocks=_cells(problem),
+        moved=tuple(names[k] for k in np.flatnonzero(~_negligible(shifts, errors))),
     )
 
 

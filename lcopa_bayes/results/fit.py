@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from xarray import DataTree
 
-from lcopa_bayes.core.arrays import Matrix, digest_of
+from lcopa_bayes.core.arrays import Estimate, Matrix, digest_of
 from lcopa_bayes.core.errors import refuse_if
-from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.core.files import save_json, save_table, writable_folder, write_text, write_whole
 from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.data.study import Study
@@ -25,9 +24,8 @@ from lcopa_bayes.results.firstlook import FirstLook
 from lcopa_bayes.results.frequency import FrequencyResponse, frequency_response
 from lcopa_bayes.results.prediction import Band, study_bands
 from lcopa_bayes.results.predictive import Predictive
-from lcopa_bayes.results.provenance import fingerprint, provenance
 from lcopa_bayes.results.residuals import Residual, residuals
-from lcopa_bayes.results.runfolder import add_origin, opened
+from lcopa_bayes.results.runfolder import add_origin, fingerprint, opened, provenance
 from lcopa_bayes.results.savedfit import NAME as SAVED
 from lcopa_bayes.results.savedfit import fit_to_json
 from lcopa_bayes.results.sensitivity import Sensitivity, sensitivity
@@ -48,7 +46,6 @@ _QUICK = 4
 """How many times fewer steps a quick fit takes."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Fit(Predictive):
     """A fitted study: draws of its posterior, what it predicts, and how far both can be trusted."""
@@ -188,18 +185,18 @@ def fit(
         draws, span=problem.scales.span, period=problem.scales.period, time_unit=study.time_unit
     )
     return Fit(
-        problem,
-        run,
-        draws,
-        tuple(shown),
-        tuple(remaining),
-        curves,
-        tuple(metrics),
-        moved,
-        weighed,
-        width,
-        response,
-        check,
+        problem=problem,
+        run=run,
+        draws=draws,
+        bands=tuple(shown),
+        residuals=tuple(remaining),
+        curves=curves,
+        metrics=tuple(metrics),
+        sensitivity=moved,
+        evidence=weighed,
+        discretisation=width,
+        frequency=response,
+        cross_check=check,
     )
 
 

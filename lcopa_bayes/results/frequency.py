@@ -5,17 +5,16 @@ At ``s = i 2 pi f`` (Ta et al. 2026, Eq. 31, stiffness divided out)."""
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
+from lcopa_bayes.core.arrays import Array, Estimate, Matrix, Vector, frozen, plain
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.core.estimate import Estimate, plain
 from lcopa_bayes.inference.parameters import ParameterTable
-from lcopa_bayes.model.transfer import denominator
+from lcopa_bayes.model.stepresponse import denominator
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS, Bands, named
 from lcopa_bayes.results.result import notebook_table
 from lcopa_bayes.sampling.draws import Draws
@@ -34,7 +33,6 @@ _SIGN = 0.05
 """Share of draws with a gain of the other sign from which the phase has two values [-]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class PathResponse:
     """Frequency response of one path."""
@@ -56,13 +54,10 @@ class PathResponse:
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
         curves = {"gain": self.gain._asdict(), "phase_deg": self.phase._asdict()}
-        out: dict[str, Any] = plain(
-            {"path": self.path, "unit": self.unit, **curves, "bandwidth": self.bandwidth.as_json()}
-        )
+        out = plain({"path": self.path, "unit": self.unit, **curves, "bandwidth": self.bandwidth.as_json()})
         return out | ({"note": self.note} if self.note else {})
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class FrequencyResponse:
     """Gain and phase of every path over frequency."""
@@ -110,7 +105,7 @@ class FrequencyResponse:
 
     def to_json(self) -> dict[str, Any]:
         """Frequencies, bands and bandwidths as plain values."""
-        out: dict[str, Any] = plain(
+        return plain(
             {
                 "frequency": self.frequency,
                 "time_unit": self.time_unit,
@@ -120,7 +115,6 @@ class FrequencyResponse:
                 "draws": self.draws,
             }
         )
-        return out
 
     def _repr_html_(self) -> str:
         return notebook_table(self.summary())
@@ -147,12 +141,7 @@ def transfer_function(table: ParameterTable, values: Matrix, frequency: Vector) 
 
 
 def frequency_response(
-    draws: Draws,
-    frequencies: ArrayLike | None = None,
-    *,
-    span: float,
-    period: float,
-    time_unit: str,
+    draws: Draws, frequencies: ArrayLike | None = None, *, span: float, period: float, time_unit: str
 ) -> FrequencyResponse:
     """Gain and phase of every path with pointwise and simultaneous 50 and 90 % bands.
 
@@ -182,18 +171,14 @@ def frequency_response(
         wide = _bandwidth(searched, reached[i, j], np.abs(gains[:, i, j]))
         paths.append(
             PathResponse(
-                name,
-                unit,
-                Bands(np.exp(log_gain.pointwise), np.exp(log_gain.simultaneous)),
-                Bands.of(np.degrees(phase[i, j])),
-                Estimate.of(
-                    f"bandwidth[{name}]",
-                    f"1/{time_unit}",
-                    wide,
-                    ess=draws.ess,
-                    grade=draws.grade.level,
+                path=name,
+                unit=unit,
+                gain=Bands(np.exp(log_gain.pointwise), np.exp(log_gain.simultaneous)),
+                phase=Bands.of(np.degrees(phase[i, j])),
+                bandwidth=Estimate.of(
+                    f"bandwidth[{name}]", f"1/{time_unit}", wide, ess=draws.ess, grade=draws.grade.level
                 ),
-                f"the sign of the gain is open: {100 * negative:.0f} % of draws are negative, and the "
+                note=f"the sign of the gain is open: {100 * negative:.0f} % of draws are negative, and the "
                 "phase has two values 180 deg apart"
                 if either
                 else "",

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -26,8 +26,7 @@ from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.results.datatree import POSTERIOR, load_tree, posterior_draws
 from lcopa_bayes.results.predictive import Predictive
-from lcopa_bayes.results.provenance import provenance
-from lcopa_bayes.results.runfolder import add_origin, opened, origins
+from lcopa_bayes.results.runfolder import add_origin, opened, origins, provenance
 from lcopa_bayes.sampling.convergence import Limitation, Quality
 from lcopa_bayes.sampling.draws import Draws
 from lcopa_bayes.sampling.modes import Modes
@@ -38,7 +37,6 @@ _AGAIN = "run `fit` on the study again with this version of lcopa-bayes"
 _CUT = "the run was cut short, or files of two runs are mixed; run `fit` again"
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class SavedFit(Predictive):
     """A fit that was read from its run folder: it predicts as it did after sampling."""

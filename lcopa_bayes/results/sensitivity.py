@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, final
+from typing import Any, Literal
 
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector
-from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.arrays import Array, Matrix, Vector, plain
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.convergence import Level
 from lcopa_bayes.sampling.draws import Draws
@@ -35,7 +34,6 @@ _RANK: dict[Diagnosis, int] = {
 }
 
 
-@final
 @dataclass(frozen=True)
 class Sensitivity:
     """How fast one parameter's posterior moves with the power of the prior and of the likelihood."""
@@ -61,8 +59,7 @@ class Sensitivity:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; what is not trusted is None."""
-        values: dict[str, Any] = plain(asdict(self) | {"threshold": THRESHOLD})
-        return values
+        return plain(asdict(self) | {"threshold": THRESHOLD})
 
 
 def sensitivity(draws: Draws, posterior: Posterior) -> tuple[Sensitivity, ...]:
@@ -154,7 +151,6 @@ def _note(prior: float, prior_error: float, likelihood: float, likelihood_error:
     return "; ".join(words)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class _Scale:
     """Sensitivity of all parameters to one density."""

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from typing import NamedTuple, final
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import logsumexp
@@ -173,7 +173,6 @@ def _drawn(
     return x, log_source, exists
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class _Subsets:
     """Draws of the shares of one element, every subset of its times from the prior in turn."""

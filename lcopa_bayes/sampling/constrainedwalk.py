@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import final
 
 import numpy as np
 
@@ -31,7 +30,6 @@ _WANDER = 0.02
 """Deviation added to the differences that slides consist of [-]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Walk:
     """Moves of points within the constraint."""

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 from scipy.stats import kstwobign, norm
 
-from lcopa_bayes.core.arrays import Vector
-from lcopa_bayes.core.estimate import EQUAL_TAILED, LEVEL, plain
+from lcopa_bayes.core.arrays import EQUAL_TAILED, LEVEL, Vector, attributes, plain
 from lcopa_bayes.sampling.convergence import Grade, Level, Limitation
 from lcopa_bayes.sampling.draws import Draws
 from lcopa_bayes.sampling.nested import Nested
@@ -26,7 +25,6 @@ _REMEDY = (
 )
 
 
-@final
 @dataclass(frozen=True)
 class Summary:
     """Marginal of a parameter by one method, in the parameter's unit."""
@@ -54,7 +52,6 @@ class Summary:
         return {"value": self.value} | interval | {"ess": self.ess}
 
 
-@final
 @dataclass(frozen=True)
 class Compared:
     """A parameter by both methods."""
@@ -73,7 +70,6 @@ class Compared:
     """Smallest distance that is called a disagreement [-]."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class CrossCheck:
     """A run beside nested sampling of the same posterior."""
@@ -190,14 +186,12 @@ class CrossCheck:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        fields: dict[str, Any] = plain(
+        return plain(
             {
                 "agrees": self.agrees,
                 "sentence": self.sentence,
                 "alarm": ALARM,
-                "log_evidence": self.nested.log_evidence,
-                "log_evidence_sd": self.nested.log_evidence_sd,
-                "run_log_evidences": self.nested.run_log_evidences,
+                **attributes(self.nested, "log_evidence", "log_evidence_sd", "run_log_evidences"),
                 "run_log_evidence": self.log_evidence,
                 "run_log_evidence_sd": self.log_evidence_sd,
                 "evidence_p": self.evidence_p,
@@ -208,15 +202,12 @@ class CrossCheck:
                         "unit": parameter.unit,
                         "run": parameter.run.as_json(),
                         "nested": parameter.nested.as_json(),
-                        "distance": parameter.distance,
-                        "p": parameter.p,
-                        "resolution": parameter.resolution,
+                        **attributes(parameter, "distance", "p", "resolution"),
                     }
                     for parameter in self.parameters
                 ],
             }
         )
-        return fields
 
 
 def holm(p: Sequence[float]) -> list[float]:

@@ -16,15 +16,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import ceil
-from typing import NamedTuple, final
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import logsumexp
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
-from lcopa_bayes.core.parallel import Workers
-from lcopa_bayes.core.progress import Progress
+from lcopa_bayes.core.parallel import Progress, Workers
 from lcopa_bayes.inference.conditional import Conditional
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.optimum import Optimum, again, find_optima
@@ -111,7 +110,6 @@ class _Point(NamedTuple):
     """Effective share of the draws tried [-]."""
 
 
-@final
 class Search:
     """Points, proposals and weights of a search; deterministic given its arguments and what it is asked.
 

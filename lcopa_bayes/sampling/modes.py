@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise
 from math import sqrt
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 from scipy.ndimage import gaussian_filter1d
 
-from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector, frozen
-from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector, attributes, frozen, plain
 
 DEPTH = 0.5
 """The minimum between two modes is below this share of the lower of both [-] ..."""
@@ -34,7 +33,6 @@ minima due to noise do not matter, as each has to be certain."""
 _COUNT = {2: "two", 3: "three", 4: "four"}
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Modes:
     """Modes of one parameter's marginal, in increasing order; a single mode without boundaries."""
@@ -89,12 +87,9 @@ class Modes:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; shares by ensemble and mode."""
-        fields: dict[str, Any] = plain(
+        return plain(
             {
-                "parameter": self.parameter,
-                "unit": self.unit,
-                "boundaries": self.boundaries,
-                "shares": self.shares,
+                **attributes(self, "parameter", "unit", "boundaries", "shares"),
                 "shares_mcse": self.errors,
                 "pooled": self.pooled,
                 "pooled_mcse": self.pooled_errors,
@@ -102,7 +97,6 @@ class Modes:
                 "sentence": self.sentence(),
             }
         )
-        return fields
 
     def sentence(self) -> str:
         """Number, position and shares of the modes, and the remedy when the ensembles weigh them

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 from dynesty import NestedSampler
@@ -18,8 +18,7 @@ from dynesty.internal_samplers import InternalSampler, SamplerArgument, SamplerR
 from scipy.special import logsumexp
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
-from lcopa_bayes.core.parallel import workers
-from lcopa_bayes.core.progress import Progress
+from lcopa_bayes.core.parallel import Progress, workers
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.constrainedwalk import Walk
@@ -42,7 +41,6 @@ _CHUNK = 128
 """Draws completed at a time."""
 
 
-@final
 @dataclass(frozen=True)
 class NestedPlan:
     """How thoroughly to sample."""
@@ -63,7 +61,6 @@ class NestedPlan:
         return cls(8, live // 4 if quick else live, 20 * dimension, seed)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Nested:
     """What nested sampling gave."""
@@ -190,7 +187,6 @@ class _Together:
         return [function(argument) for argument in given]
 
 
-@final
 class _ConstrainedSampler(InternalSampler):  # type: ignore[misc]
     """How dynesty finds new live points; see dynesty.internal_samplers.InternalSampler."""
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import final
 
 import numpy as np
 
@@ -35,7 +34,6 @@ def applies(posterior: Posterior) -> bool:
     return bool(conditional.given and conditional.elements and conditional.columns)
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Outer:
     """The parameters that are searched, in their sampled coordinates y."""
@@ -76,7 +74,6 @@ class Outer:
         return out
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class PriorOrders:
     """A proposal: orders from their prior, the rest from a mixture, None where there is no rest."""
@@ -108,7 +105,6 @@ class PriorOrders:
         return total if self.rest is None else total + self.rest.log_density(y[:, ~outer.orders])
 
 
-@final
 @dataclass(frozen=True)
 class Optima:
     """Task: optimum of the rest from `starts`, or from the best of prior draws where these are None."""
@@ -130,7 +126,6 @@ class Optima:
         return at.values, objective, conditional.uncertainty(at)
 
 
-@final
 @dataclass(frozen=True)
 class Draw:
     """Task: optimum of the rest from `starts`, and a draw of it."""

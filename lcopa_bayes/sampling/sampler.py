@@ -8,13 +8,11 @@ from functools import cached_property
 from math import ceil
 from pathlib import Path
 from time import monotonic
-from typing import final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix
-from lcopa_bayes.core.parallel import workers
-from lcopa_bayes.core.progress import Progress
+from lcopa_bayes.core.parallel import Progress, workers
 from lcopa_bayes.data.settings import Method
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
@@ -60,7 +58,6 @@ _SURPLUS = 1.12
 """... and effective importance draws: 1.12 and 10 times as many are together worth 1.007 times as many."""
 
 
-@final
 @dataclass(frozen=True)
 class SamplePlan:
     """How long and how wide to sample."""
@@ -110,7 +107,6 @@ class SamplePlan:
         )
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Run:
     """What sampling gave."""
@@ -335,7 +331,6 @@ def _sampled_values(posterior: Posterior, run: Run, *, kept: bool = True) -> Arr
     return values.reshape(*coordinates.shape[:3], -1)
 
 
-@final
 @dataclass(frozen=True)
 class _Birth:
     """Task: a new ensemble of a seed."""
@@ -346,7 +341,6 @@ class _Birth:
         return Ensemble.tempered(posterior, self.walkers, _SWEEPS, seed)
 
 
-@final
 @dataclass(frozen=True)
 class _Round:
     """Task: an ensemble one round further."""

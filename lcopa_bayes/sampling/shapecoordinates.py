@@ -12,7 +12,7 @@ There one term is held: it keeps its own time constant, and one ratio less fixes
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple, final
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,7 +31,6 @@ class Shape(NamedTuple):
     """log |d log ratios / d log times|, (batch,)."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class ElementColumns:
     """Columns of an element among the sampled coordinates; its times are sampled by logarithm."""

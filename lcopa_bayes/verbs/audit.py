@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
 
 import pandas as pd
 
@@ -15,7 +14,6 @@ from lcopa_bayes.verbs.fit import basis
 from lcopa_bayes.verbs.sources import FitLike
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class AuditResult(StoredResult):
     """Identifiability of every free parameter, and what to measure next."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
 
 import pandas as pd
 
@@ -27,7 +26,6 @@ TEMPLATE = "design/next.csv"
 """File of the winning drive, a record table whose responses are to be filled in."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class DesignResult(StoredResult):
     """Drives compared by the precision they promise, and the one to play next."""

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
 
 import pandas as pd
 
 from lcopa_bayes.results.firstlook import FirstLook, first_look
-from lcopa_bayes.results.provenance import provenance
+from lcopa_bayes.results.runfolder import provenance
 from lcopa_bayes.results.stored import StoredResult
 from lcopa_bayes.verbs.sources import StudyLike, study_of
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class LookResult(StoredResult):
     """The best of a few least-squares searches, with draws about it."""

@@ -5,19 +5,17 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import final
 
 import pandas as pd
 
-from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.arrays import plain
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.data.studywriter import write_study
 from lcopa_bayes.effectsearch.loop import loop as searched
 from lcopa_bayes.effectsearch.summary import drawn, results, words
 from lcopa_bayes.inference.assembly import problem_of
-from lcopa_bayes.results.provenance import provenance
-from lcopa_bayes.results.runfolder import opened
+from lcopa_bayes.results.runfolder import opened, provenance
 from lcopa_bayes.results.stored import StoredResult
 from lcopa_bayes.verbs.sources import FitLike, study_of
 
@@ -27,7 +25,6 @@ EXPLAINED = "explained.toml"
 """File of the study with what a loop found."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class LoopResult(StoredResult):
     """What the model of a study lacks."""

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
 
 import pandas as pd
 
@@ -15,20 +14,17 @@ from lcopa_bayes.core.files import writable_folder
 from lcopa_bayes.paper.auditclaims import load_audit
 from lcopa_bayes.paper.claims import judge
 from lcopa_bayes.paper.comparisonclaims import load_comparison
-from lcopa_bayes.paper.figures import panels
 from lcopa_bayes.paper.identify import identify as identified
 from lcopa_bayes.paper.identify import results, scannable
 from lcopa_bayes.paper.intervals import Scan
-from lcopa_bayes.paper.opticsplan import OpticsPlan
-from lcopa_bayes.paper.staticoptics import static_optics
-from lcopa_bayes.paper.steptable import load_posterior, step_table
+from lcopa_bayes.paper.staticoptics import OpticsPlan, static_optics
+from lcopa_bayes.paper.steptable import load_posterior, panels, step_table
 from lcopa_bayes.paper.verdict import Evidence, Kind
-from lcopa_bayes.results.provenance import provenance
+from lcopa_bayes.results.runfolder import provenance
 from lcopa_bayes.results.stored import StoredResult
 from lcopa_bayes.verbs.sources import FitLike, study_of
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class OpticsResult(StoredResult):
     """Far field, director and the chain from volts to angle."""
@@ -44,7 +40,6 @@ class OpticsResult(StoredResult):
         return f"{pd.DataFrame(self.values['mean_tilt']).to_string(index=False)}\n\n{super().__str__()}"
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class IdentifyResult(StoredResult):
     """The paper's identification of every path, with the integer rival and its Table 1."""
@@ -71,7 +66,6 @@ class IdentifyResult(StoredResult):
         )
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class ClaimsResult(StoredResult):
     """The paper's claims with their verdicts."""

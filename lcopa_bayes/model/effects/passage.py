@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple, TypeAlias, final
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from scipy import fft
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
+from lcopa_bayes.model.blockpulses import Spectrum
 from lcopa_bayes.model.effects.balance import RunawayError, balanced, earlier, iterated, resting
 from lcopa_bayes.model.effects.effect import (
     Effect,
@@ -22,8 +23,7 @@ from lcopa_bayes.model.effects.effect import (
 )
 from lcopa_bayes.model.forward import Dynamics, Experiment, ForwardModel, StepResponses, deflections
 from lcopa_bayes.model.layout import Layout
-from lcopa_bayes.model.powerseries import Spectrum
-from lcopa_bayes.model.transfer import transfer
+from lcopa_bayes.model.stepresponse import transfer
 
 Acting: TypeAlias = Sequence[tuple[Effect, Vector]]
 """Effects with their coefficients."""
@@ -36,7 +36,6 @@ _SWEEPS = 100
 """Most sweeps of the iteration [-]: what they do not bring to rest is solved by dividing the record."""
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Plant:
     """One plant as numbers."""
@@ -123,7 +122,6 @@ def passed(
     return out
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Passage:
     """One record through one plant or many, with what acts between commands and reading.
@@ -234,7 +232,6 @@ class Passage:
         return (level.reshape(rest.shape) - rest).T, np.moveaxis(y, 1, 0), failures
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class _Forced:
     """Forces on the direct paths of plants, a row for every axis of every plant."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import ClassVar, Self, final
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -24,7 +24,6 @@ from lcopa_bayes.model.effects.effect import (
 )
 
 
-@final
 class GainDrift(ReadoutEffect):
     """Deflection that changes in size through the campaign."""
 
@@ -45,7 +44,6 @@ class GainDrift(ReadoutEffect):
         return np.asarray((1 + psi[0] * scene.epoch) * y)
 
 
-@final
 class ClockSkew(DriveEffect):
     """Driver and camera clocks that run at different speeds."""
 
@@ -70,7 +68,6 @@ class ClockSkew(DriveEffect):
         return AxisDrive.of_jumps(drive.times + psi[0] * (drive.times - start), drive.jumps), rest
 
 
-@final
 class TriggerJitter(DriveEffect):
     """A record whose drive starts late or early as a whole."""
 
@@ -96,7 +93,6 @@ class TriggerJitter(DriveEffect):
         return AxisDrive.of_jumps(drive.times + psi[0], drive.jumps), rest
 
 
-@final
 class PointingOffset(ParallelEffect):
     """A record whose response is shifted as a whole."""
 
@@ -121,7 +117,6 @@ class PointingOffset(ParallelEffect):
         return np.tile(psi, (scene.times.size, 1))
 
 
-@final
 class PointingDrift(ParallelEffect):
     """A record whose response drifts."""
 
@@ -148,7 +143,6 @@ class PointingDrift(ParallelEffect):
         return np.outer((scene.times - middle) / scene.ranges.span, psi)
 
 
-@final
 class Outliers(ScatterEffect):
     """Noise with heavy tails: Student's t instead of the normal distribution."""
 
@@ -177,7 +171,6 @@ def _wave(scene: Scene, frequency: float) -> Matrix:
     return np.stack((np.cos(phase), np.sin(phase)))
 
 
-@final
 @dataclass(frozen=True)
 class Vibration(ParallelEffect):
     """A vibration of the mount, with a phase of its own in every record."""
@@ -213,7 +206,6 @@ class Vibration(ParallelEffect):
         return np.asarray((psi.reshape(-1, 2) @ _wave(scene, self.frequency)).T)
 
 
-@final
 @dataclass(frozen=True)
 class Flicker(ReadoutEffect):
     """A ripple in proportion to the deflection, with a phase of its own in every record."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Self, final
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from lcopa_bayes.model.layout import Layout
 _STEERING = "diffraction angle against tilt, see lcopa_bayes.optics"
 
 
-@final
 class OddCurvature(ReadoutEffect):
     """Soft saturation, alike in both directions."""
 
@@ -34,7 +33,6 @@ class OddCurvature(ReadoutEffect):
         return np.asarray(y + psi[0] * y * (y / scene.ranges.response) ** 2)
 
 
-@final
 class EvenCurvature(ReadoutEffect):
     """Curvature that differs between the two directions."""
 
@@ -54,7 +52,6 @@ class EvenCurvature(ReadoutEffect):
         return np.asarray(y + psi[0] * y**2 / scene.ranges.response)
 
 
-@final
 class BilinearCrosstalk(ReadoutEffect):
     """Each axis gains by the product of two axes."""
 
@@ -81,7 +78,6 @@ class BilinearCrosstalk(ReadoutEffect):
         return np.asarray(y + psi[0] * scene.ranges.response * part * others)
 
 
-@final
 class AxisRotation(ReadoutEffect):
     """Camera and device axes at an angle."""
 
@@ -106,7 +102,6 @@ class AxisRotation(ReadoutEffect):
         return np.asarray(y @ np.array([[c, s], [-s, c]]))
 
 
-@final
 @dataclass(frozen=True)
 class Clipping(ReadoutEffect):
     """The reading stops at a limit."""
@@ -140,7 +135,6 @@ class Clipping(ReadoutEffect):
         return np.asarray(y - psi[0] * np.sign(y) * beyond)
 
 
-@final
 @dataclass(frozen=True)
 class CentroidLocking(ReadoutEffect):
     """A centroid drawn to the pixels of the camera."""
@@ -170,7 +164,6 @@ class CentroidLocking(ReadoutEffect):
         return np.asarray(y + psi[0] * size * np.sin(2 * np.pi * self.cycles * y / size))
 
 
-@final
 class CrossFade(ReadoutEffect):
     """The far field passes from one diffraction order to the next: the centroid waits, then hurries.
 

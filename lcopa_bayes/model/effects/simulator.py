@@ -6,7 +6,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TypeVar, final
+from typing import TypeVar
 
 import numpy as np
 
@@ -32,7 +32,6 @@ UPSTREAM = (DriveEffect, ElementEffect, ForceEffect, SensorEffect)
 _Value = TypeVar("_Value")
 
 
-@final
 class Latest(OrderedDict[bytes, _Value]):
     """The three values used last, so that what acts after the plant is evaluated without simulating it
     again."""
@@ -47,7 +46,6 @@ class Latest(OrderedDict[bytes, _Value]):
         return self[key]
 
 
-@final
 @dataclass(frozen=True, eq=False)
 class Simulator:
     """Responses of every experiment of `model` with `effects`.
