@@ -11,6 +11,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.effectsearch.basefit import renewed
 from lcopa_bayes.effectsearch.crossvalidation import groups, log_scores
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
@@ -127,17 +128,25 @@ class Refit:
         """p-value of an effect's coefficients being zero, over all noise that is plausible [-].
 
         Their covariance is that of the estimate under the noise as it is, not as it was weighted: larger
-        where noise is as slow as the tangents (White 1982, Econometrica 50). Other coordinates held by an end
-        of their support stay there: a delay that cannot shrink is no alias.
+        where noise is as slow as the tangents (White 1982, Econometrica 50). Other coordinates that an end of
+        their support holds, or would hold if the coefficients vanished, stay where they are: a delay that
+        cannot shrink is no alias.
         """
-        where = self.places(name)
-        psi = self.optimum.x[where]
-        free = np.flatnonzero(~self.optimum.stuck | np.isin(np.arange(self.optimum.x.size), where))
-        at = np.searchsorted(free, where)
+        where, x, information = self.places(name), self.optimum.x, self.optimum.information
+        psi, own = x[where], np.isin(np.arange(x.size), where)
+        low, high = self.model.bounds
+        still = self.optimum.stuck & ~own
+        while True:
+            free = np.flatnonzero(~still)
+            at = np.searchsorted(free, where)
+            gain = covariance_of(information[np.ix_(free, free)])[:, at]
+            there = x[free] - gain @ np.linalg.solve(gain[at], psi)
+            beyond = ~own[free] & ((there < low[free]) | (there > high[free]))
+            if not beyond.any():
+                break
+            still[free[beyond]] = True
         tangents = self.optimum.jacobian[:, free]
-        information = self.optimum.information[np.ix_(free, free)]
-        gain = np.linalg.pinv(information, hermitian=True)[:, at]
-        held = information - tangents.T @ tangents  # what priors say
+        held = information[np.ix_(free, free)] - tangents.T @ tangents  # what priors say
         noise = self.whitening.covariances(tangents @ gain, _PROCESSES)
         power = [psi @ np.linalg.solve(one + gain.T @ held @ gain, psi) for one in noise]
         return float(np.mean(chi2.sf(power, len(where))))

@@ -12,7 +12,11 @@ import numpy as np
 from lcopa_bayes.core.arrays import Flags, Index, Matrix, Vector
 from lcopa_bayes.data.record import Record
 
+_ROUNDED = 1e-4
+"""Deviation from whole sampling periods that rounded time stamps explain [sampling periods]."""
 BEFORE_DRIVE = "samples before the drive acts"
+_FEWEST = 8
+"""Fewer samples before the drive moves, or changes of it, do not show whether a record begins at rest [-]."""
 """Source of an offset."""
 
 
@@ -50,7 +54,8 @@ class Samples:
 
     @classmethod
     def of(cls, record: Record, period: float) -> Samples:
-        """Samples of a record; gaps are counted in `period` [time unit]."""
+        """Samples of a record; gaps are counted in `period` [time unit], and whole periods where they are as
+        good as whole: time stamps are rounded."""
         taken = ~np.isnan(record.response)
         rows = np.flatnonzero(taken.any(axis=1))
         times = record.time[rows]
@@ -59,6 +64,7 @@ class Samples:
             index = np.flatnonzero(taken[rows, axis])
             at = times[index]
             gaps = np.concatenate(([1.0], np.diff(at) / period))[: at.size]
+            gaps = np.where(np.abs(gaps - np.round(gaps)) < _ROUNDED, np.round(gaps), gaps)
             axes.append(Observed(index, record.response[rows[index], axis], gaps))
         return cls(record, times, tuple(axes))
 
@@ -85,7 +91,22 @@ class Samples:
             )
         if not quiet.any():
             return ~quiet, "all samples of the held-out record, none of which is before the drive acts"
+        if np.count_nonzero(quiet) < _FEWEST and self._moving:
+            return np.ones_like(quiet), "all samples of the held-out record, whose drive moves from the start"
         return quiet, BEFORE_DRIVE
+
+    @property
+    def _moving(self) -> bool:
+        """Whether the drive changes again and again, first before it has held for twice its usual time.
+
+        Then it may have moved before the record too, unless an early row without a response states what the
+        plant rested under.
+        """
+        drive, response = self.record.drive, self.record.response
+        changes = self.record.time[1:][(np.diff(drive, axis=0) != 0).any(axis=1)]
+        stated = bool(np.isnan(response[0]).all())
+        still = self.first_change - self.record.time[0]
+        return not stated and changes.size >= _FEWEST and bool(still < 2 * np.median(np.diff(changes)))
 
     def matrix(self) -> Matrix:
         """Responses at `times`, (samples, axes), NaN where missing [response unit]."""

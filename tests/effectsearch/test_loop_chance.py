@@ -182,7 +182,8 @@ def test_significance_beside_coloured_noise_is_what_it_says():
         optimum = SimpleNamespace(
             x=x, stuck=np.zeros(4, bool), jacobian=tangents, information=information, covariance=None
         )
-        seen = SimpleNamespace(optimum=optimum, whitening=white, places=lambda _: [3])
+        wide = SimpleNamespace(bounds=(np.full(4, -np.inf), np.full(4, np.inf)))
+        seen = SimpleNamespace(model=wide, optimum=optimum, whitening=white, places=lambda _: [3])
         new.append(Refit.wald(seen, "curve"))
         old.append(chi2.sf(x[3] ** 2 / np.linalg.inv(information)[3, 3], 1))
     for level in (0.2, 0.05, 0.01):
