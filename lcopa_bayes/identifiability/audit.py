@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.arrays import Matrix, Vector, attributes, plain
@@ -32,6 +31,7 @@ from lcopa_bayes.identifiability.curvature import (
     sensitivities,
 )
 from lcopa_bayes.identifiability.profile import Profile, profile
+from lcopa_bayes.identifiability.radial import Radial, radial
 from lcopa_bayes.identifiability.symmetries import (
     DIFFERENCED,
     TOLERANCES,
@@ -42,84 +42,24 @@ from lcopa_bayes.identifiability.symmetries import (
 )
 from lcopa_bayes.identifiability.verdict import Finding, judged
 from lcopa_bayes.inference.likelihood import Landscape, Peak
-from lcopa_bayes.inference.optimum import find_optima
+from lcopa_bayes.inference.optimum import Optimum, find_optima
 from lcopa_bayes.inference.parameter import Parameter
+from lcopa_bayes.inference.surrogate import Surrogate
 from lcopa_bayes.model.effects.effect import UnstableError
 from lcopa_bayes.results.adequacy import unresolved
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.sensitivity import sensitivity
+from lcopa_bayes.sampling.draws import Draws
 
-_MOVED = 0.2
-"""Share of the radius from which a parameter counts as moved [-]."""
-_WEIGHT = 10.0
-"""Standardised residual of a point that stays at the maximum: far above what the data object [-]."""
-
-
-@dataclass(frozen=True)
-class Radial:
-    """Result of the radial test (Kreutz 2018, Bioinformatics 34)."""
-
-    radius: float
-    """Distance requested, in prior standard deviations [-]."""
-    reached: float
-    """Distance reached [-]."""
-    fall: float
-    """``2 (max L - L)`` there [nat]."""
-    moved: tuple[str, ...]
-    """Parameters that moved, farthest first."""
-
-    def as_json(self) -> dict[str, Any]:
-        """Plain values."""
-        return plain(vars(self))
-
-
-def radial(landscape: Landscape, peak: Peak, prior_sd: Vector, direction: Vector, radius: float) -> Radial:
-    """The easier of two fits that start along plus and minus `direction` and are pulled to `radius`.
-
-    Plant parameters only, at the noise parameters of `peak`; distances in prior standard deviations
-    (`prior_sd`, (rows,)) of the sampled scale.
-    """
-    least = landscape.least
-    centre, scale = least.coordinates(peak.values), prior_sd[least.columns]
-    ends = np.array([landscape.search(k) for k in least.columns]).T
-    names = [landscape.posterior.table.names[k] for k in least.columns]
-    moving = list(range(centre.size))
-    base = landscape.rows(centre, peak.values, moving)[0]
-
-    def pulled(x: Vector) -> tuple[Vector, Matrix]:
-        residual, jacobian = landscape.rows(x, peak.values, moving)
-        away = (x - centre) / scale
-        distance = float(np.linalg.norm(away))
-        slope = away / scale / max(distance, 1e-12)
-        pull = _WEIGHT * (distance - radius) / radius
-        return np.append(residual, pull), np.vstack([jacobian, _WEIGHT * slope / radius])
-
-    def residual_of(x: Vector) -> Vector:
-        return pulled(x)[0]
-
-    def jacobian_of(x: Vector) -> Matrix:
-        return pulled(x)[1]
-
-    candidates = []
-    for sign in (-1.0, 1.0):
-        start = np.clip(centre + 0.1 * sign * radius * scale * direction, *ends)
-        solved = least_squares(
-            residual_of, start, jacobian_of, bounds=(ends[0], ends[1]), x_scale="jac",
-            max_nfev=100,
-        )  # fmt: skip
-        residual = landscape.rows(solved.x, peak.values, moving)[0]
-        away = np.abs(solved.x - centre) / scale
-        order = [p for p in np.argsort(-away) if away[p] > _MOVED * radius]
-        fall = float(residual @ residual - base @ base)
-        reached = float(np.linalg.norm(away))
-        candidates.append(Radial(radius, reached, max(fall, 0.0), tuple(names[p] for p in order)))
-    return min(
-        candidates, key=lambda candidate: candidate.fall + (_WEIGHT * (candidate.reached / radius - 1)) ** 2
-    )
-
-
-_POINTS = 24
-"""Prior draws at which symmetries are sought, besides likely ones."""
+_POINTS, _FEWER = 24, 6
+"""Prior draws at which symmetries are sought, besides likely ones, and with effects, whose slopes cost a
+second each."""
+_CURVES = 1_000
+"""Prior draws whose step responses are evaluated [-]."""
+_TRIED = 128
+"""Draws at which a surrogate is compared with the posterior [-]."""
+_ASTRAY = 1.0
+"""Standard deviation of the difference of their log likelihoods from which it is not used [nat]."""
 _WITNESSES = 400
 """Draws that profiles are started from."""
 _CLIMBED = 8
@@ -205,14 +145,20 @@ def audit(fit: Predictive, *, jobs: int = 1) -> Audit:
     with threadpool_limits(1):
         prior = prior_draws(landscape, rng)
         spread = prior_spread(landscape, prior)
-        optima = np.array([o.values for o in find_optima(posterior, rng)]).reshape(-1, prior.shape[1])
         thinned = fit.draws.thinned(_WITNESSES)
-        likely = thinned[np.argsort(-landscape.log_likelihood(thinned))[:_CLIMBED]]
+        near = None if posterior.simulation is None else _near(landscape, fit.draws, rng, jobs)
+        ground = near or landscape
+        ranked = thinned[np.argsort(-ground.log_likelihood(thinned))]
+        likely = ranked[:_CLIMBED]
+        optima = np.empty((0, prior.shape[1]))
+        if near is None:
+            optima = np.array([o.values for o in find_optima(posterior, rng)]).reshape(-1, prior.shape[1])
         starts = np.concatenate([optima, likely])
-        peak = max((landscape.maximise(v) for v in starts), key=lambda peak: peak.log_likelihood)
-        known = known_best(fit.draws, prior, fit.problem.scales.span, time_unit=fit.study.time_unit)
-    profiles, peak = _profiles(landscape, peak, np.concatenate([thinned, optima]), jobs)
-    points = _points(landscape, (*prior[:_POINTS], *likely)) if landscape.least.columns else []
+        peak = max((ground.maximise(v) for v in starts), key=lambda peak: peak.log_likelihood)
+        known = known_best(fit.draws, prior[:_CURVES], fit.problem.scales.span, time_unit=fit.study.time_unit)
+    profiles, peak = _profiles(ground, peak, np.concatenate([thinned, optima]), jobs)
+    count = _POINTS if posterior.simulation is None else _FEWER
+    points = _points(landscape, (*prior[:count], *likely[:count])) if landscape.least.columns else []
     symmetric, curved, moved, printed = Structure((), 0, 0, True, np.empty(0)), None, None, None
     if points:
         tolerances = TOLERANCES if posterior.simulation is None else DIFFERENCED
@@ -223,7 +169,7 @@ def audit(fit: Predictive, *, jobs: int = 1) -> Audit:
         printed = printed_structure(points, rng)
         curved = curvature(landscape, peak.values, spread)
         moved = radial(landscape, peak, spread, curved.directions[-1], _RADIUS)
-    believed = beliefs(landscape, fit.draws, spread, sensitivity(fit.draws, posterior))
+    believed = beliefs(landscape, fit.draws, spread, sensitivity(fit.draws, ground.posterior))
     rows = [posterior.table.rows[k] for k in landscape.free]
     scales = fit.problem.scales
     fast = unresolved(fit.draws, scales.period)
@@ -246,6 +192,29 @@ def audit(fit: Predictive, *, jobs: int = 1) -> Audit:
         delays=apart,
         peak=peak,
     )
+
+
+def _near(landscape: Landscape, draws: Draws, rng: np.random.Generator, jobs: int) -> Landscape | None:
+    """The likelihood of a plant with effects by a surrogate about its draws; None where it does not hold.
+
+    A profile asks for the likelihood 100 000 times; its points are evaluated by the posterior itself.
+    """
+    posterior, flat = landscape.posterior, draws.flat
+    z = posterior.coordinates(flat)
+    best = flat[np.argmax(draws.log_density.ravel())]
+    about = Optimum(best, np.cov(z.T), float(draws.log_density.max()))
+    tried = draws.thinned(_TRIED)
+    with workers(None, jobs=jobs) as crew:
+        surrogate = Surrogate.of(posterior, about, rng, crew.map)
+        parts = np.array_split(tried, max(1, _TRIED // 16))
+        exact = np.concatenate(list(crew.map(posterior.joint_log_likelihood, parts)))
+    if surrogate is None:
+        return None
+    columns = np.stack([landscape.column(k, flat) for k in landscape.free])
+    near = Landscape(
+        replace(posterior, surrogate=surrogate), np.asarray(np.linalg.inv(np.cov(columns)), dtype=float)
+    )
+    return near if float(np.std(exact - near.log_likelihood(tried))) < _ASTRAY else None
 
 
 def _points(landscape: Landscape, values: Iterable[Vector]) -> list[Sensitivities]:
@@ -277,7 +246,7 @@ def _profiles(landscape: Landscape, peak: Peak, witnesses: Matrix, jobs: int) ->
         better = top.best - peak.log_likelihood
         if better > 0:
             peak = Peak(top.top, top.best)
-        if better <= _BETTER:
+        if better <= _BETTER or landscape.precision is not None:
             break
     return [replace(profile, best=max(peak.log_likelihood, profile.best)) for profile in profiles], peak
 
