@@ -21,6 +21,8 @@ _SAME = 1e-2
 """Optima closer than this in every sampled coordinate are one [natural log or parameter unit]."""
 _WEIGHTLESS = 30.0
 """Log density below the best from which an optimum has no weight [nat]."""
+_HOPELESS = 300.0
+"""The same of a start that slopes of the plant alone led to, which end some nats below the optimum [nat]."""
 _DISTINCT = 0.5
 """Starts closer than this in every sampled coordinate count as one [natural log or parameter unit]."""
 _PLANTS = 3
@@ -83,7 +85,7 @@ def again(posterior: Posterior, optima: Sequence[Optimum]) -> tuple[Optimum, ...
 
 def _near(posterior: Posterior, starts: Sequence[Vector]) -> list[Vector]:
     """Table values to which effects and plant descend by slopes of the plant alone, fifty times cheaper than
-    those with the effects in place; duplicates removed."""
+    those with the effects in place; duplicates removed, and those far below the best."""
     rough, kept = LeastSquares(posterior, exact=False), list[Vector]()
     for start in starts:
         values = posterior.complete(posterior.coordinates(start[None]), None)[0]
@@ -94,7 +96,9 @@ def _near(posterior: Posterior, starts: Sequence[Vector]) -> list[Vector]:
         here = posterior.coordinates(values[None])[0]
         if all(np.abs(here - posterior.coordinates(v[None])[0]).max() > _SAME for v in kept):
             kept.append(values)
-    return kept
+    density = [float(posterior.log_density(posterior.coordinates(v[None]))[0]) for v in kept]
+    best = max(density, default=0.0)
+    return [v for v, level in zip(kept, density, strict=True) if level >= best - _HOPELESS]
 
 
 def _descended(posterior: Posterior, starts: Sequence[Vector], *, rounds: int = 2) -> list[Optimum]:

@@ -52,6 +52,15 @@ class Dynamics:
         return Dynamics(times, orders, self.delays[plants])
 
 
+def joined(parts: Sequence[Dynamics]) -> Dynamics:
+    """All plants of several batches with the same elements."""
+    times, orders = (
+        tuple(np.concatenate(each) for each in zip(*side, strict=True))
+        for side in ([part.times for part in parts], [part.orders for part in parts])
+    )
+    return Dynamics(times, orders, np.concatenate([part.delays for part in parts]))
+
+
 StepResponses = dict[tuple[int, float], StepResponse]
 """Step responses by element and block width."""
 

@@ -173,7 +173,7 @@ def fit(
             log_evidence_sd=weighed.sd if weighed else None,
         )
         draws = draws.limited(check.limitations(draws.grade))
-    width = discretisation(problem, draws)
+    width = discretisation(problem, draws, jobs=jobs)
     curves = step_curves(draws, problem.scales.span)
     draws = draws.limited([*width.limitations, *too_fast(draws, curves, problem.scales.period)])
     shown = study_bands(problem, draws)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple, TypeAlias, final
@@ -77,6 +77,20 @@ def linear(
         Moved(scene, deflections(model.layout, scene.rest, plant.gains[None], units)[:, 0].T)
         for scene, units in zip(scenes, responses, strict=True)
     ]
+
+
+def forced(
+    model: ForwardModel, scenes: Sequence[Scene], gains: Array, dynamics: Dynamics, forces: Forces
+) -> Iterator[tuple[Array, dict[int, str]]]:
+    """Of every record, deflections of many plants under forces, (axes, batch, samples) [response unit], and
+    why some of the plants, by number, have no bounded response."""
+    spectra: Spectra = {}
+    for experiment, scene, units in zip(
+        model.experiments, scenes, model.unit_responses(dynamics), strict=True
+    ):
+        passage = Passage(model.layout, experiment, scene, gains, dynamics, forces, spectra)
+        change, failures = passage.change()
+        yield deflections(model.layout, scene.rest, gains, units) + change, failures
 
 
 def passed(
