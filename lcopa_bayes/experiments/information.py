@@ -106,7 +106,9 @@ class Bench:
         dynamics = self.problem.posterior.table.dynamics(values[None])
         step = self.mesh.lattice.step
         return [
-            Prepared(step_response(times, orders, self.circle, step, slopes=True), Superposition(self.circle))
+            Prepared(
+                step_response(times, orders, self.circle, step, slopes="all"), Superposition(self.circle)
+            )
             for times, orders in zip(dynamics.times, dynamics.orders, strict=True)
         ]
 
@@ -162,7 +164,7 @@ class Bench:
         delays = values[None, self.problem.posterior.table.at("delay", slot)]
         changes = phases(drive, lattice.step)
         out[:-1, later] = superposition(response, changes, lattice, delays, (0, slot))[:, 0]
-        by_block = superposition(response, changes, lattice, delays, (0, slot), "slope")
+        by_block = superposition(response.alone, changes, lattice, delays, (0, slot), "slope")
         out[-1, later] = -by_block[0, 0] / lattice.step
         return out
 

@@ -39,7 +39,8 @@ def expanded(posterior: Posterior, values: Matrix, columns: Sequence[int]) -> Ex
         parts = [expanded(posterior, part, columns) for part in portions]
         return Expansion(*(np.concatenate(each) for each in zip(*parts, strict=True)))
     table, batch, size = posterior.table, len(values), len(columns)
-    slopes = posterior.model.unit_slopes(table.dynamics(values))
+    in_orders = any(table.rows[k].kind == "order" for k in columns)
+    slopes = posterior.model.unit_slopes(table.dynamics(values), in_orders=in_orders)
     units = [unit for unit, _ in slopes]
     total, gradient = np.zeros(batch), np.zeros((batch, size))
     information = np.zeros((batch, size, size))
@@ -74,14 +75,15 @@ def expanded(posterior: Posterior, values: Matrix, columns: Sequence[int]) -> Ex
             residual = posterior.residual(axis, r, observed, centre, units[r])
             stacked[:, -1] = residual
             if isinstance(posterior.noise, GaussianNoise):
-                white, scale = posterior.noise.whiten(stacked, noise, observed.gaps)
+                products, scale = posterior.noise.products(stacked, noise, observed.gaps)
                 total -= scale + 0.5 * observed.values.size * LOG_2PI
             else:
                 total += posterior.noise.pointwise(residual, noise, observed.gaps).sum(axis=1)
                 sigma, nu = noise[:, 0, None, None], noise[:, 1, None]
                 weight = np.sqrt((nu + 1) / (nu + (residual / sigma[:, 0]) ** 2))
                 white = stacked / sigma * weight[:, None, :]
-            normal += white @ white.swapaxes(1, 2)
+                products = white @ white.swapaxes(1, 2)
+            normal += products
         combine = np.zeros((batch, len(series), size))
         if block:
             inner, rest = normal[:, : len(block), : len(block)], normal[:, : len(block), len(block) :]

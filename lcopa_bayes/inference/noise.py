@@ -18,6 +18,11 @@ if TYPE_CHECKING:
     from lcopa_bayes.inference.defaultpriors import Scales
 
 LOG_2PI = float(np.log(2 * np.pi))
+_HEAD, _STEADY = 64, 1e-15
+"""Samples after which innovation variances of equally spaced samples have mostly settled, and the relative
+change from one sample to the next below which they have [-]."""
+_FEW = 8
+"""Columns from which a product of matrices is faster than scalar products [-]."""
 _SLIGHT = 0.1
 """A correlation, or a correlated part over the white one, that hardly shows [-]."""
 
@@ -71,6 +76,11 @@ class GaussianNoise(Noise):
     def whiten(self, columns: Array, parameters: Matrix, gaps: Vector) -> tuple[Array, Vector]:
         """Whitened columns (batch, k, n) and the sum over samples of log innovation sd, (batch,)."""
 
+    @abstractmethod
+    def products(self, columns: Array, parameters: Matrix, gaps: Vector) -> tuple[Array, Vector]:
+        """Scalar products of the whitened columns (batch, k, n) with each other, (batch, k, k), and the sum
+        over samples of log innovation sd, (batch,): what a density needs, without the whitened columns."""
+
     def pointwise(self, residual: Matrix, parameters: Matrix, gaps: Vector) -> Matrix:
         """Log density of each sample given those before it, (batch, n)."""
         white = self.standard(residual, parameters, gaps)
@@ -96,6 +106,11 @@ class White(GaussianNoise):
         """Whitened columns (batch, k, n) and the sum over samples of log innovation sd, (batch,)."""
         sigma = parameters[:, 0]
         return columns * (1 / sigma)[:, None, None], gaps.size * np.log(sigma)
+
+    def products(self, columns: Array, parameters: Matrix, gaps: Vector) -> tuple[Array, Vector]:
+        """Scalar products of whitened columns, (batch, k, k), and the sum of log innovation sd, (batch,)."""
+        sigma = parameters[:, 0]
+        return _scalar_products(columns, columns) / (sigma**2)[:, None, None], gaps.size * np.log(sigma)
 
     def log_scales(self, parameters: Matrix, gaps: Vector) -> Matrix:
         """Log standard deviation, (batch, 1)."""
@@ -136,6 +151,18 @@ class AR1(GaussianNoise):
         out /= np.exp(scales)[:, None, :]
         return out, scales.sum(axis=1)
 
+    def products(self, columns: Array, parameters: Matrix, gaps: Vector) -> tuple[Array, Vector]:
+        """Scalar products of whitened columns, (batch, k, k), and the sum of log innovation sd, (batch,)."""
+        if gaps.size < 2 or not equal(gaps):
+            white, scales = self.whiten(columns, parameters, gaps)
+            return _scalar_products(white, white), scales
+        link, scales = self._transition(parameters, gaps[:2])
+        later = columns[..., 1:] - link[:, :, None] * columns[..., :-1]
+        first = columns[..., :1] * np.exp(-scales[:, :1, None])
+        later_scale = np.exp(2 * scales[:, 1])[:, None, None]
+        products = _scalar_products(later, later) / later_scale + _scalar_products(first, first)
+        return products, scales[:, 0] + (gaps.size - 1) * scales[:, 1]
+
     def log_scales(self, parameters: Matrix, gaps: Vector) -> Matrix:
         """Log innovation sd of each sample, (batch, n)."""
         return self._transition(parameters, gaps)[1]
@@ -143,10 +170,7 @@ class AR1(GaussianNoise):
     def draw(self, parameters: Matrix, gaps: Vector, rng: np.random.Generator) -> Matrix:
         """Noise for each parameter set, (batch, n) [response unit]."""
         link, scales = self._transition(parameters, gaps)
-        out = np.exp(scales) * rng.standard_normal(scales.shape)
-        for k in range(1, gaps.size):
-            out[:, k] += link[:, k - 1] * out[:, k - 1]
-        return out
+        return _correlated(np.exp(scales) * rng.standard_normal(scales.shape), link)
 
     @staticmethod
     def priors(scales: Scales, axis: int) -> Mapping[str, Prior]:
@@ -194,11 +218,7 @@ class WhiteAR1(GaussianNoise):
         if n == 0:
             return np.empty((batch, k, 0)), np.zeros(parameters.shape[0])
         link, variances, lower = self._factors(np.broadcast_to(parameters, (batch, 3)), gaps)
-        work = np.empty((k, batch, n))
-        taken = columns.swapaxes(0, 1)
-        work[..., 0] = taken[..., 0]
-        np.multiply(link, taken[..., :-1], out=work[..., 1:])
-        np.subtract(taken[..., 1:], work[..., 1:], out=work[..., 1:])
+        work = _differences(columns, link, (k, batch, n))
         # LAPACK solves L D L' x = w for the whole batch at once; innovations are D L' x
         solved = dpttrs(variances, lower, work.reshape(k, batch * n).T, overwrite_b=1)[0].T
         out = solved.copy()
@@ -206,6 +226,17 @@ class WhiteAR1(GaussianNoise):
         out *= np.sqrt(variances)
         logs = 0.5 * np.log(variances).reshape(batch, n).sum(axis=1)
         return out.reshape(k, batch, n).swapaxes(0, 1), logs[: parameters.shape[0]]
+
+    def products(self, columns: Array, parameters: Matrix, gaps: Vector) -> tuple[Array, Vector]:
+        """Scalar products of whitened columns, (batch, k, k), and the sum of log innovation sd, (batch,)."""
+        batch, k, n = columns.shape
+        if n == 0:
+            return np.zeros((batch, k, k)), np.zeros(batch)
+        link, variances, lower = self._factors(parameters, gaps)
+        work = _differences(columns, link, (k, batch, n))
+        solved = dpttrs(variances, lower, work.reshape(k, batch * n).T)[0].T.reshape(k, batch, n)
+        logs = 0.5 * np.log(variances).reshape(batch, n).sum(axis=1)
+        return _scalar_products(work.swapaxes(0, 1), solved.swapaxes(0, 1)), logs
 
     def adjoint(self, columns: Matrix, parameters: Vector, gaps: Vector) -> Matrix:
         """Adjoint of `whiten` at one parameter set (3,): columns (k, n), same shape [1 / response unit]."""
@@ -225,8 +256,8 @@ class WhiteAR1(GaussianNoise):
         sigma, sigma_ar, rho = (parameters[:, k : k + 1] for k in range(3))
         link = rho ** gaps[1:]
         out = sigma_ar * rng.standard_normal((parameters.shape[0], gaps.size))
-        for k in range(1, gaps.size):
-            out[:, k] = link[:, k - 1] * out[:, k - 1] + np.sqrt(1 - link[:, k - 1] ** 2) * out[:, k]
+        out[:, 1:] *= np.sqrt(1 - link**2)
+        out = _correlated(out, link)
         return out + sigma * rng.standard_normal(out.shape)
 
     @staticmethod
@@ -259,12 +290,26 @@ class WhiteAR1(GaussianNoise):
 
     @staticmethod
     def _factors(parameters: Matrix, gaps: Vector) -> tuple[Matrix, Vector, Vector]:
-        """Correlation with the previous sample, (batch, n - 1); of the whole batch in one row, innovation
-        variances, (batch n,), and what the next sample takes of an innovation, (batch n - 1,)."""
+        """Correlation with the previous sample, (batch, n - 1), or (batch, 1) where samples are equally
+        spaced; of the whole batch in one row, innovation variances, (batch n,), and what the next sample
+        takes of an innovation, (batch n - 1,)."""
         white, correlated, rho = parameters[:, :1] ** 2, parameters[:, 1:2] ** 2, parameters[:, 2:]
         with np.errstate(divide="ignore"):  # no correlation: minus infinity, whose exponential is zero
-            steps = np.log(rho) * gaps[1:]
+            steps = np.log(rho) * (gaps[1:2] if equal(gaps) else gaps[1:])
         link = np.exp(steps)
+        if steps.shape[1] == 1 and gaps.size > 2 * _HEAD:
+            _, variances, lower = WhiteAR1._factors(parameters, gaps[:_HEAD])
+            head = variances.reshape(-1, _HEAD)
+            if (np.abs(head[:, -1] - head[:, -2]) <= _STEADY * head[:, -1]).all():
+                rest = gaps.size - _HEAD
+                innovations = np.append(lower, 0.0).reshape(-1, _HEAD)
+                innovations[:, -1] = innovations[:, -2]
+                variances, lower = (
+                    np.concatenate([each, np.repeat(each[:, -1:], rest, axis=1)], axis=1)
+                    for each in (head, innovations)
+                )
+                lower[:, -1] = 0.0
+                return link, variances.ravel(), lower.ravel()[:-1]
         diagonal = np.empty((parameters.shape[0], gaps.size))
         diagonal[:, :1] = correlated + white
         diagonal[:, 1:] = white * (1 + link**2) - correlated * np.expm1(2 * steps)
@@ -314,6 +359,37 @@ class Student(Noise):
 
 NOISES: dict[str, type[Noise]] = {noise.kind: noise for noise in (White, AR1, WhiteAR1, Student)}
 """Noise models by the name a study gives them."""
+
+
+def equal(gaps: Vector) -> bool:
+    """Whether samples are equally spaced; the first gap is not used."""
+    return bool((gaps[2:] == gaps[1:2]).all())
+
+
+def _scalar_products(a: Array, b: Array) -> Array:
+    """Of columns (batch, k, n) of one with columns of another, (batch, k, k)."""
+    if a.shape[1] < _FEW:
+        return np.asarray(np.vecdot(a[:, :, None], b[:, None]))
+    return np.asarray(a @ b.swapaxes(1, 2))
+
+
+def _differences(columns: Array, link: Matrix, shape: tuple[int, int, int]) -> Array:
+    """What each sample of columns (batch, k, n) adds to `link` times the one before, (k, batch, n)."""
+    work, taken = np.empty(shape), columns.swapaxes(0, 1)
+    work[..., 0] = taken[..., 0]
+    np.multiply(link, taken[..., :-1], out=work[..., 1:])
+    np.subtract(taken[..., 1:], work[..., 1:], out=work[..., 1:])
+    return work
+
+
+def _correlated(innovations: Matrix, link: Matrix) -> Matrix:
+    """Sums of innovations (batch, n), each with `link` (batch, n - 1) times the sum before."""
+    out, links = np.ascontiguousarray(innovations.T), np.ascontiguousarray(link.T)
+    part = np.empty(out.shape[1:])
+    for k, factor in enumerate(links):
+        np.multiply(factor, out[k], out=part)
+        out[k + 1] += part
+    return out.T
 
 
 def _root_mean_square(residuals: Sequence[Vector]) -> float:

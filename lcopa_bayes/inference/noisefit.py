@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from scipy.special import log_expit
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.inference.noise import Noise
+from lcopa_bayes.inference.noise import GaussianNoise, Noise
 from lcopa_bayes.inference.parameter import Parameter
 
 _TAIL = 1e-9
@@ -74,7 +74,11 @@ class NoiseFit:
         total = np.zeros(len(x))
         for residual, gaps in zip(self.residuals, self.gaps, strict=True):
             seen = np.broadcast_to(residual, (len(x), residual.size))
-            total += self.noise.pointwise(seen, values, gaps).sum(axis=1)
+            if isinstance(self.noise, GaussianNoise):
+                squares, scales = self.noise.products(seen[:, None], values, gaps)
+                total -= 0.5 * squares[:, 0, 0] + scales
+            else:
+                total += self.noise.pointwise(seen, values, gaps).sum(axis=1)
         for column, k in enumerate(self.free):
             row, at = self.rows[k], x[:, column]
             total += row.log_prior(values[:, k])

@@ -12,6 +12,8 @@ import numpy as np
 from lcopa_bayes.core.arrays import Flags, Index, Matrix, Vector
 from lcopa_bayes.data.record import Record
 
+_ROUNDED = 1e-4
+"""Deviation from whole sampling periods that rounded time stamps explain [sampling periods]."""
 BEFORE_DRIVE = "samples before the drive acts"
 _FEWEST = 8
 """Fewer samples before the drive moves, or changes of it, do not show whether a record begins at rest [-]."""
@@ -52,7 +54,8 @@ class Samples:
 
     @classmethod
     def of(cls, record: Record, period: float) -> Samples:
-        """Samples of a record; gaps are counted in `period` [time unit]."""
+        """Samples of a record; gaps are counted in `period` [time unit], and whole periods where they are as
+        good as whole: time stamps are rounded."""
         taken = ~np.isnan(record.response)
         rows = np.flatnonzero(taken.any(axis=1))
         times = record.time[rows]
@@ -61,6 +64,7 @@ class Samples:
             index = np.flatnonzero(taken[rows, axis])
             at = times[index]
             gaps = np.concatenate(([1.0], np.diff(at) / period))[: at.size]
+            gaps = np.where(np.abs(gaps - np.round(gaps)) < _ROUNDED, np.round(gaps), gaps)
             axes.append(Observed(index, record.response[rows[index], axis], gaps))
         return cls(record, times, tuple(axes))
 

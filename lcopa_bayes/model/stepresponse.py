@@ -12,7 +12,7 @@ blocks laid over the onset and read by a parabola are off by several percent.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, final
 
@@ -24,7 +24,8 @@ from lcopa_bayes.model.transfer import transfer, transfer_slopes
 
 Kind = Literal["integral", "value", "slope"]
 """What is read: the running integral from the onset [blocks], the value, or the derivative [per block]."""
-
+Slopes = Literal["times", "all"] | None
+"""Derivatives beside a response: none, in the logarithms of the time constants, or in the orders too."""
 _RATIO = 4
 """Blocks of a level in one block of the next coarser level."""
 _LEVELS = 3
@@ -80,7 +81,7 @@ class StepResponse:
     """Unit step responses of a batch of elements and, as further rows, their derivatives.
 
     Times are counted in blocks from the onset. Rows: the response; with derivatives also one row per
-    logarithm of a time constant and one per order.
+    logarithm of a time constant and, where wanted, one per order.
     """
 
     coarse: Array
@@ -90,12 +91,8 @@ class StepResponse:
     onset is read from the coarse blocks."""
     orders: Vector
     """Leading order of each element, (batch,) [-]."""
-
-    @property
-    def _leading(self) -> int | None:
-        """Row of the derivative in the leading order."""
-        rows = self.coarse.shape[0]
-        return None if rows == 1 else 1 + (rows - 1) // 2
+    leading: int | None = None
+    """Row of the derivative in the leading order, if there is one."""
 
     @cached_property
     def _sums(self) -> Array:
@@ -146,15 +143,20 @@ class StepResponse:
         out[:, near[0], near[1]] = self._read_fine(near[0], x[near], kind)
         return out
 
+    @cached_property
+    def alone(self) -> StepResponse:
+        """The same without derivatives."""
+        return replace(self, coarse=self.coarse[:1], fine=self.fine[:1], leading=None)
+
     def first(self, n: int) -> StepResponse:
         """The first `n` blocks."""
         if n == self.coarse.shape[2]:
             return self
-        return StepResponse(self.coarse[:, :, :n], self.fine, self.orders)
+        return replace(self, coarse=self.coarse[:, :, :n])
 
     def beyond(self, means: Array) -> StepResponse:
         """Other responses of these elements, as block means alone, (rows, batch, n)."""
-        return StepResponse(means, self.fine[:, :0], self.orders)
+        return replace(self, coarse=means, fine=self.fine[:, :0])
 
     def _near(self, x: Array, kind: Kind) -> Array:
         """Readings at positions below _NEAR, (places, batch, positions) -> (rows, *x.shape)."""
@@ -204,8 +206,8 @@ class StepResponse:
         else:
             scale, by_order = growth, log
         response = edge * scale
-        if self._leading is not None:
-            response[self._leading] += edge[0] * scale * by_order
+        if self.leading is not None:
+            response[self.leading] += edge[0] * scale * by_order
         values[:, chosen] = np.where(after, response, 0.0)
 
 
@@ -219,12 +221,12 @@ _FINE_CIRCLE = Circle(_FINE)
 
 
 def step_response(
-    times: Matrix, orders: Matrix, circle: Circle, step: float, *, slopes: bool = False
+    times: Matrix, orders: Matrix, circle: Circle, step: float, *, slopes: Slopes = None
 ) -> StepResponse:
     """Step responses of ``1 / (1 + sum_i (T_i s)^order_i)`` on `circle.n` blocks of width `step`.
 
     Parameters: times [time unit] and orders [-], (batch, terms), orders not increasing along a row; step
-    [time unit]; with `slopes` the derivatives in every log time constant and order are rows too.
+    [time unit]; `slopes` are rows too: the derivatives in every log time constant, and in every order.
     Accuracy: second order in `step` away from the onset; see the module for the onset itself. What the
     blocks are too wide for, `transfer` says.
     """
@@ -234,7 +236,7 @@ def step_response(
     for level in range(_LEVELS - 2, -1, -1):
         _hand_over(fine[:, level + 1], fine[:, level])
     _hand_over(fine[:, 0], coarse)
-    return StepResponse(coarse, fine, orders[:, 0])
+    return StepResponse(coarse, fine, orders[:, 0], 1 + times.shape[-1] if slopes == "all" else None)
 
 
 def _hand_over(narrow: Array, wide: Array) -> None:
@@ -244,11 +246,11 @@ def _hand_over(narrow: Array, wide: Array) -> None:
     wide[..., :count] = parts.mean(axis=-1)
 
 
-def _means(times: Array, orders: Matrix, circle: Circle, *, slopes: bool) -> Array:
+def _means(times: Array, orders: Matrix, circle: Circle, *, slopes: Slopes) -> Array:
     """Block means of the step responses, (rows, ..., n); times in blocks."""
-    if not slopes:
+    if slopes is None:
         return _stepped(transfer(times, orders, circle, 1.0), circle)[None]
-    value, parts = transfer_slopes(times, orders, circle, 1.0)
+    value, parts = transfer_slopes(times, orders, circle, 1.0, in_orders=slopes == "all")
     return np.stack([_stepped(row, circle) for row in (value, *parts.log_times, *parts.orders)])
 
 

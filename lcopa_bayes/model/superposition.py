@@ -144,8 +144,7 @@ class Superposition:
         Parameters: delays (batch,) [time unit]; key: element and delay slot, the same for the same
         `response` and `delays`; kind "slope" reads the derivative per block instead.
         """
-        shape = (*response.coarse.shape[:2], lattice.times.size)
-        out = np.zeros(shape if kind == "value" else (1, *shape[1:]))
+        out = np.zeros((*response.coarse.shape[:2], lattice.times.size))
         if not lattice.times.size:
             return out
         if lattice.slots is None:
@@ -182,7 +181,7 @@ class Superposition:
             else:
                 before: Kind = "value" if kind == "slope" else "integral"
                 reading = (source.at(reached, before) - source.at(reached - width, before)) / width
-            out += jump * reading[: out.shape[0]]
+            out += jump * reading
 
     def _convolved(self, response: StepResponse, phase: Phase) -> StepResponse:
         """Response to all changes of a phase as block means; its onsets are read as the blocks have them."""
@@ -247,4 +246,4 @@ def _readings(response: StepResponse, origins: Matrix, lattice: Lattice, kind: K
         for k, blocks in np.ndenumerate(-whole.astype(int)):
             late[:, *k, blocks:] -= early[:, *k, : early.shape[-1] - blocks]
         readings = late / width
-    return readings[:1] if kind == "slope" else readings
+    return readings

@@ -25,7 +25,7 @@ class TransferSlopes:
     log_times: tuple[Spectrum, ...]
     """In the logarithm of each time constant."""
     orders: tuple[Spectrum, ...]
-    """In each order."""
+    """In each order, where wanted."""
 
 
 def denominator(times: Matrix, orders: Matrix, angular: Vector) -> Spectrum:
@@ -58,14 +58,13 @@ def transfer(times: Array, orders: Matrix, circle: Circle, step: float) -> Spect
 
 
 def transfer_slopes(
-    times: Array, orders: Matrix, circle: Circle, step: float
+    times: Array, orders: Matrix, circle: Circle, step: float, *, in_orders: bool = True
 ) -> tuple[Spectrum, TransferSlopes]:
-    """`transfer` and its exact derivatives in every log time constant and order."""
+    """`transfer` and its exact derivatives in every log time constant and, unless `in_orders` is false, every
+    order."""
     top, denominator, integrals = _parts(times, orders, circle, step)
     value = top / denominator
     scale = _scale(times, orders, step)
-    logs = np.log(times / step)
-    log_times = [logs[..., i, None] for i in range(orders.shape[1])]
 
     def slope(order: Vector) -> Spectrum:
         return _differenced(integration_weights_slope(order, circle.n, 1.0), circle)
@@ -74,6 +73,10 @@ def transfer_slopes(
         -value * (orders[:, i, None] * scale[i]) * integral / denominator
         for i, integral in enumerate(integrals)
     )
+    if not in_orders:
+        return value, TransferSlopes(by_time, ())
+    logs = np.log(times / step)
+    log_times = [logs[..., i, None] for i in range(orders.shape[1])]
     by_order = []
     leading = slope(orders[:, 0]) * (1.0 - value) - value * scale[0] * log_times[0] * integrals[0]
     for i in range(1, orders.shape[1]):

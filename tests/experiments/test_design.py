@@ -54,7 +54,7 @@ class Known(Predictive):
     def save(self, folder):
         return folder
 
-    def report(self, folder):
+    def report(self, folder, *, jobs=1):
         return folder
 
 
