@@ -11,6 +11,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.effectsearch.basefit import renewed
 from lcopa_bayes.effectsearch.crossvalidation import groups, log_scores
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
@@ -156,7 +157,7 @@ class Refit:
         while True:
             free = np.flatnonzero(~still)
             at = np.searchsorted(free, where)
-            gain = np.linalg.pinv(information[np.ix_(free, free)], hermitian=True)[:, at]
+            gain = covariance_of(information[np.ix_(free, free)])[:, at]
             there = x[free] - gain @ np.linalg.solve(gain[at], psi)
             beyond = ~own[free] & ((there < low[free]) | (there > high[free]))
             if not beyond.any():

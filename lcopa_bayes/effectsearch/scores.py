@@ -10,6 +10,7 @@ import numpy as np
 from scipy.stats import norm
 
 from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.core.estimate import LEVEL
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.crossvalidation import groups, shifts
@@ -186,7 +187,7 @@ def _laplace(state: State, seed: int) -> tuple[Draws, Noise]:
     coordinates at an end of their support stay there."""
     model, optimum, rng = state.model, state.optimum, np.random.default_rng([seed, 14])
     free = np.flatnonzero(~optimum.stuck)
-    covariance = np.linalg.pinv(optimum.information[np.ix_(free, free)], hermitian=True)
+    covariance = covariance_of(optimum.information[np.ix_(free, free)])
     x = np.tile(optimum.x, (_TRIES * _DRAWS, 1))
     x[:, free] += rng.multivariate_normal(np.zeros(free.size), covariance, len(x), method="eigh")
     low, high = model.bounds

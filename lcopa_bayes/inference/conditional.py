@@ -17,6 +17,7 @@ from typing import NamedTuple, final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
+from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.inference.expansion import expanded
 from lcopa_bayes.inference.posterior import Posterior
 
@@ -270,7 +271,7 @@ class Conditional:
         """Standard deviations of the natural coordinates about optima, at most those of the priors, (batch,
         size)."""
         steep, information = at.steepness, self._objective(at)[2]
-        covariance = steep @ np.linalg.pinv(information, hermitian=True) @ steep.swapaxes(1, 2)
+        covariance = steep @ covariance_of(information) @ steep.swapaxes(1, 2)
         sd = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
         return np.asarray(np.minimum(sd, self.widths))
 

@@ -66,6 +66,13 @@ class LeastSquares:
             high.append(b - edge)
         return np.array(low), np.array(high)
 
+    @property
+    def prior_precision(self) -> Vector:
+        """Of uniform laws between the bounds; 0 for coordinates without: no direction is wider than its
+        prior."""
+        width = self.bounds[1] - self.bounds[0]
+        return np.where(np.isfinite(width), 12.0 / np.where(width > 0, width, 1.0) ** 2, 0.0)
+
     def bounds_around(self, values: Vector) -> tuple[Vector, Vector]:
         """Bounds that also keep orders decreasing where terms cannot be exchanged, and terms resolved.
 

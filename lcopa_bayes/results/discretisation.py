@@ -17,6 +17,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.arrays import Flags, Matrix, Vector
+from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.leastsquares import LeastSquares
@@ -168,8 +169,7 @@ def optimum_shift(problem: Problem, values: Vector) -> float:
     here = LeastSquares(problem.posterior)
     x = here.coordinates(values)
     residual, jacobian = here.residual(x, values)
-    precision = jacobian.T @ jacobian + _prior_precision(here)
-    covariance = np.asarray(np.linalg.pinv(precision, hermitian=True), dtype=float)
+    covariance = covariance_of(jacobian.T @ jacobian + np.diag(here.prior_precision))
     finer = [LeastSquares(problem.refined(factor).posterior) for factor in FACTORS]
     changes = [each.misfit(x, values) - residual for each in finer]  # slopes with effects cost most
     return largest_shift(covariance, jacobian, changes)
@@ -184,13 +184,6 @@ def largest_shift(covariance: Matrix, jacobian: Matrix, changes: Sequence[Vector
     sd = np.sqrt(np.diag(covariance))
     shifts = [np.abs(covariance @ (jacobian.T @ change)) / np.where(sd > 0, sd, np.inf) for change in changes]
     return float(np.max(shifts)) * _REST
-
-
-def _prior_precision(problem: LeastSquares) -> Matrix:
-    """No direction is wider than its prior: precision of a uniform law between the bounds."""
-    low, high = problem.bounds
-    width = high - low
-    return np.diag(np.where(np.isfinite(width), 12.0 / np.where(width > 0, width, 1.0) ** 2, 0.0))
 
 
 def discretisation(problem: Problem, draws: Draws, *, jobs: int = 1) -> Discretisation:

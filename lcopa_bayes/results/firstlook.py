@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 from scipy.special import logsumexp
 
+from lcopa_bayes.core.covariance import root_of
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.estimate import Estimate, plain
 from lcopa_bayes.data.requirements import unmet
@@ -168,8 +169,7 @@ def _near(posterior: Posterior, optimum: Optimum, rng: np.random.Generator) -> t
     where enough of its draws count, else draws of the Gaussian; and the effective share of these [-]."""
     count = _DRAWS if posterior.simulation is None else _SIMULATED
     centre = posterior.coordinates(optimum.values[None])[0]
-    values, vectors = np.linalg.eigh(optimum.covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    root = root_of(optimum.covariance)
     kept = [np.zeros((1, centre.size))]
     for _ in range(_TRIED):
         standard = rng.standard_normal((count, centre.size))
