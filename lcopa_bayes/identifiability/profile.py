@@ -195,12 +195,18 @@ class _Path:
             self.extend(self.start, side, first_step)
             self.seek(side)
         self.refine()
-        for at in (sorted(self.points), sorted(self.points, reverse=True)):
-            for near, far in pairwise(at):  # from either end through to the other
-                self.improve(far, self.points[near].values)
-        self.from_draws()
-        self.extend_ends()
-        self.refine()
+        if self.landscape.precision is None:  # else of one mode, and from the posterior itself at the end
+            for at in (sorted(self.points), sorted(self.points, reverse=True)):
+                for near, far in pairwise(at):  # from either end through to the other
+                    self.improve(far, self.points[near].values)
+            self.from_draws()
+            self.extend_ends()
+            self.refine()
+        else:
+            points = list(self.points.values())
+            levels = self.landscape.exact(np.array([point.values for point in points])).tolist()
+            renewed = [Peak(point.values, level) for point, level in zip(points, levels, strict=True)]
+            self.points = dict(zip(self.points, renewed, strict=True))
         return self.profile()
 
     def solve(self, u: float, start: Vector, *, most: int = 60) -> Peak:

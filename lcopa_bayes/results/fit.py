@@ -18,6 +18,7 @@ from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.optimum import Optimum
+from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.results.adequacy import limitations
 from lcopa_bayes.results.datatree import POSTERIOR, posterior_tree, save_tree
 from lcopa_bayes.results.discretisation import Discretisation, discretisation, optima_of, resolved_optima
@@ -79,6 +80,11 @@ class Fit(Predictive):
     """How a second, independent sampling method agrees; None without one."""
     rival: Rival | None = None
     """The same study with integer orders, and how it predicts; None when none was fitted."""
+
+    @property
+    def near(self) -> Posterior:
+        """The posterior, with effects by what the draws were made with: a response costs a hundredth."""
+        return replace(self.problem.posterior, surrogate=self.run.surrogate)
 
     @property
     def verdict(self) -> str:
@@ -183,7 +189,7 @@ def fit(
         limitations(problem, draws, shown, remaining, np.random.default_rng([plan.seed, 4]))
     )
     metrics = step_metrics(draws, curves, time_unit=study.time_unit)
-    moved = sensitivity(draws, problem.posterior)
+    moved = sensitivity(draws, replace(problem.posterior, surrogate=run.surrogate))
     response = frequency_response(
         draws, span=problem.scales.span, period=problem.scales.period, time_unit=study.time_unit
     )

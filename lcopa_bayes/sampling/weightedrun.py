@@ -86,7 +86,7 @@ def weighted_run(
             share = weighted.ess / weighted.count
     if not usable(weighted):
         return None
-    run = Run((), plan, weighted)
+    run = Run((), plan, weighted, surrogate=near.surrogate)
     draws = gather(near, run)
     if share < LEAST_EFFICIENCY:
         draws = draws.limited(
