@@ -16,6 +16,8 @@ from lcopa_bayes.inference.observations import PlausibleNoise, Samples
 _PER_LAW = 4
 """Draws of noise from each plausible law [-]."""
 _SEED = 7
+_SHORTER = 0.9
+"""Share of the likeliest law's memory below which a residual's own is another [-]."""
 
 
 @dataclass(frozen=True)
@@ -111,13 +113,17 @@ class Whitening:
 
     def covariances(self, columns: Matrix, count: int) -> Array:
         """Covariance of products of whitened noise with columns (n, k), under `count` plausible laws,
-        (count, k, k) [-]; the estimate is right once where the noise is known, (1, k, k)."""
+        (count, k, k) [-]; the estimate is right once where the noise is known, (1, k, k).
+
+        None remembers longer than the residual that it was fitted to.
+        """
         if not self.posterior:
             return (columns.T @ columns)[None]
         back, k = self.adjoint(columns.T), columns.shape[1]
         rng, out = np.random.default_rng(_SEED), np.zeros((count, k, k))
         for axis, posterior in enumerate(self.posterior):
-            drawn = posterior.draw(count, rng)
+            shorter = self._shorter(axis)
+            drawn = np.tile(shorter, (count, 1)) if shorter else posterior.draw(count, rng)
             rho, which = np.unique(drawn[:, 2], return_inverse=True)
             white, correlated = np.zeros((k, k)), np.zeros((rho.size, k, k))
             for part, gaps in self._filled:
@@ -127,6 +133,20 @@ class Whitening:
             out += drawn[:, 0, None, None] ** 2 * white
             out += drawn[:, 1, None, None] ** 2 * correlated[which]
         return out
+
+    def _shorter(self, axis: int) -> tuple[float, float, float] | None:
+        """The law of an axis, as `WhiteAR1` takes it, where its residual remembers less than the plausible
+        laws; else None.
+
+        From sample to sample a smooth misfit looks like a random walk. Where its own autocorrelations sum up
+        to less than those of the likeliest law, ``sum_k rho^2k = (1 + rho^2) / (1 - rho^2)`` has that sum.
+        """
+        if not self.dependence:
+            return None
+        own, likeliest = self.dependence[axis], Law.of(self.posterior[axis])
+        if own >= _SHORTER * likeliest.correlated(self.size):
+            return None
+        return 0.0, self.noise[axis].sd, float(np.sqrt((own - 1) / (own + 1)))
 
     @cached_property
     def effective(self) -> float:
