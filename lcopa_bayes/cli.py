@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, final
 
 import lcopa_bayes
 
@@ -46,6 +46,7 @@ Derived = Callable[[argparse.Namespace, Any], object]
 """An argument of a public function from the options and the study or fit."""
 
 
+@final
 @dataclass(frozen=True)
 class Outcome:
     """What a verb prints."""
@@ -56,6 +57,7 @@ class Outcome:
     """For a reader."""
 
 
+@final
 @dataclass(frozen=True)
 class Verb:
     """A verb of the command line."""

@@ -19,8 +19,9 @@ from lcopa_bayes.data.settings import (
 )
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
-from lcopa_bayes.inference.parameter import Parameter, Place, Prior
+from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.inference.priors import Prior
 from lcopa_bayes.model.path import TransferPath
 from lcopa_bayes.sampling.convergence import Quality
 from lcopa_bayes.sampling.draws import Draws

@@ -132,14 +132,32 @@ def concrete_bases(sources: list[str]) -> set[str]:
     return {base for each in bases.values() for base in each if base in bases} - abstract
 
 
+def undecorated(sources: list[str]) -> set[str]:
+    """Classes from which none derives and that do not say so."""
+    classes = [
+        node for source in sources for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ClassDef)
+    ]
+    bases = {ast.unparse(base).partition("[")[0] for node in classes for base in node.bases}
+    return {
+        node.name
+        for node in classes
+        if node.name not in bases
+        and "Protocol" not in map(ast.unparse, node.bases)
+        and "final" not in map(ast.unparse, node.decorator_list)
+    }
+
+
 def test_every_class_is_abstract_or_final():
     """Nothing concrete is overridden: what a class does is read in one place."""
-    assert concrete_bases([path.read_text() for path in MODULES]) == OPEN
+    sources = [path.read_text() for path in MODULES]
+    assert concrete_bases(sources) == OPEN
+    assert undecorated(sources) == set()
 
 
 def test_a_concrete_base_is_seen():
     assert concrete_bases(["class A: ...", "class B(A): ..."]) == {"A"}
     assert concrete_bases(["class A(ABC): ...", "class B(A): ..."]) == set()
+    assert undecorated(["class A(ABC): ...", "class B(A): ..."]) == {"B"}
 
 
 def test_importing_has_no_side_effects():

@@ -25,7 +25,7 @@ from lcopa_bayes.data.settings import (
 )
 from lcopa_bayes.data.studyfile import load_candidates, load_study
 from lcopa_bayes.identifiability import verdict as audit
-from lcopa_bayes.inference.parameter import COEFFICIENTS, CONSTANTS, KINDS
+from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS, KINDS
 from lcopa_bayes.model.effects.catalogue import bundled
 from lcopa_bayes.results import adequacy, discretisation
 from lcopa_bayes.sampling import convergence, evidence

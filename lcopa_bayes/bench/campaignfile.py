@@ -33,7 +33,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, final
 
 import numpy as np
 
@@ -67,6 +67,7 @@ _UNDECLARED = {"effects": _TEXTS, "drives": _TEXT, "correlation": _NUMBER, "nois
 _TABLES = {"campaign", "bench", "path", "record", "undeclared"}
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Plan:
     """A campaign that can be run."""

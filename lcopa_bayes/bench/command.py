@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,6 +13,7 @@ from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
 from lcopa_bayes.core.errors import InputError, refuse_if
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Command:
     """Piecewise constant drive: `rest` before ``times[0]``, then ``values[i]`` from ``times[i]`` on.

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from math import inf, isfinite, sqrt
-from typing import Annotated, Protocol, TypeAlias
+from typing import Annotated, Protocol, TypeAlias, final
 
 import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial, chebyshev
@@ -40,6 +40,7 @@ _RESOLUTION = 1e-12
 rounding must not resolve the steep onset of a low order."""
 
 
+@final
 class TableError(ArithmeticError):
     """A response too rough to tabulate; holds the `time` reached and the remaining `error`."""
 
@@ -143,6 +144,7 @@ class Responsive(Protocol):
     def response(self, command: Command, time: ArrayLike, *, exposure: float = 0.0) -> Matrix: ...  # noqa: D102
 
 
+@final
 @dataclass(frozen=True)
 class Device:
     """Responses that are sums over paths from all drives, each about a resting offset.
@@ -231,6 +233,7 @@ _DEVIATIONS = Rule(
 _CORRELATION = Rule("a number between -1 and 1", lambda value: is_number(value) and -1 < value < 1)
 
 
+@final
 @dataclass(frozen=True)
 class Bench(Ruled):
     """How a device is driven and watched, with times in the unit of the device; InputError with all that is

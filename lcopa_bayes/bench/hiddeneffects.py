@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from typing import TypeAlias, final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,6 +25,7 @@ _CLOSE = 1e-13
 """Change of a deflection that ends the iteration of a step, over the largest force [-]."""
 
 
+@final
 class MarchError(ArithmeticError):
     """The deflection is unbounded; holds the `time` reached."""
 
@@ -81,6 +82,7 @@ _FINE = 8
 """Points per camera period on which a lag of the sensor is integrated."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Shot:
     """Properties of the record being simulated that a hidden effect may use."""
@@ -99,6 +101,7 @@ class Shot:
     """For what differs from record to record."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Hidden:
     """An effect by the places where it acts; None where it does not."""
@@ -123,6 +126,7 @@ class Hidden:
     """From noise to noise, (n, axes)."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class HiddenDevice:
     """A device with hidden effects; answers commands as `Device` does."""

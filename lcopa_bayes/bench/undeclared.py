@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import pi
 from types import ModuleType
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, final
 
 import numpy as np
 
@@ -26,6 +26,7 @@ LARGEST = pi / 2
 """Largest drive of either axis [rad]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Schedule:
     """Drive of one record."""
@@ -128,6 +129,7 @@ OUTSIDE: dict[str, Maker] = _makers(unnamedeffects)
 """Effects that no catalogue contains."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Campaign:
     """Records of one device with hidden effects, and what only the evaluation may read."""
@@ -245,6 +247,7 @@ def shot_of(device: Device, epoch: float, rng: np.random.Generator) -> Shot:
     return Shot(epoch, drive, np.abs(np.diag(steady)) * drive, device.paths[0][0].delay, steady, rng)
 
 
+@final
 @dataclass(frozen=True)
 class UndeclaredPlan(Ruled):
     """A campaign file with a table ``[undeclared]``: effects by name, at sizes drawn from the seed.

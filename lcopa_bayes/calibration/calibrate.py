@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 from lcopa_bayes.calibration.replica import ENGINES, Engine, Failure, Outcome, Replication
 from lcopa_bayes.calibration.truths import Stated, Truths, truths_around, truths_stated
@@ -38,6 +38,7 @@ def store_fingerprint(replication: Replication) -> str:
     return hashlib.sha256(json.dumps(values).encode()).hexdigest()
 
 
+@final
 @dataclass(frozen=True)
 class Store:
     """Folder of outcomes that share a fingerprint."""
@@ -92,6 +93,7 @@ ENOUGH = 400
 """Effective draws of a replica: a rank among so many is exact to 0.05, far below the scatter of ranks."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """Replicas of a study, in the order of their numbers."""

@@ -10,12 +10,13 @@ Vehtari 2022, Statistics and Computing 32). Both are computed exactly, not by si
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, final
 
 import numpy as np
 from scipy import stats
 
-from lcopa_bayes.core.arrays import Array, Index, Vector, attributes
+from lcopa_bayes.core.arrays import Array, Index, Vector
+from lcopa_bayes.core.estimate import attributes
 
 SIMULTANEOUS = 0.95
 """Probability that all that one band is drawn for lies inside it [-]."""
@@ -25,6 +26,7 @@ _HALVINGS = 14
 """Bisections of the logarithm of a pointwise tail probability."""
 
 
+@final
 class Limits(NamedTuple):
     """Smallest and largest number that lies inside, one per rank value or per bin."""
 
@@ -119,6 +121,7 @@ LEVELS = (0.5, 0.9)
 """Probabilities inside the central intervals that are checked [-]."""
 
 
+@final
 @dataclass(frozen=True)
 class Coverage:
     """Coverage of the central interval of one quantity at one level."""

@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, final, get_args
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -142,6 +142,7 @@ _STREAM = 4
 """Marks the randomness of truth, noise and ranks apart from that of sampling."""
 
 
+@final
 class Quantity(NamedTuple):
     """What is ranked."""
 
@@ -152,6 +153,7 @@ class Quantity(NamedTuple):
     unit: str
 
 
+@final
 @dataclass(frozen=True)
 class Outcome:
     """What one replica gave; the tuples have one entry per quantity."""
@@ -184,6 +186,7 @@ class Outcome:
     """Whether the fit takes that shift for negligible."""
 
 
+@final
 @dataclass(frozen=True)
 class Failure:
     """A replica that could not be done."""
@@ -193,6 +196,7 @@ class Failure:
     error: str
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Replication:
     """How replicas of a study are made; replica k depends on the seed of `plan` and on k alone."""

@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeAlias
+from typing import TypeAlias, final
 
 import numpy as np
 import xarray as xr
@@ -22,6 +22,7 @@ _TRIES = 1_000
 """Draws from the prior within which the orders must once decrease beside stated ones."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Truths:
     """A source of truths."""

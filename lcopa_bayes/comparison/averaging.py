@@ -14,11 +14,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import hypot, log
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import EQUAL_TAILED, LEVEL, Index, Matrix, Vector
+from lcopa_bayes.core.arrays import Index, Matrix, Vector
+from lcopa_bayes.core.estimate import EQUAL_TAILED, LEVEL
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.steps import metrics_of
 from lcopa_bayes.sampling.convergence import Grade
@@ -160,6 +161,7 @@ ERRORS = 2.0
 """Standard errors that a difference must exceed to count [-]."""
 
 
+@final
 @dataclass(frozen=True)
 class Gain:
     """What one candidate gains over another."""

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from math import log, sqrt
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, final
 
 import numpy as np
 import pandas as pd
@@ -22,8 +22,9 @@ from lcopa_bayes.comparison.averaging import quantiles
 from lcopa_bayes.comparison.candidates import Candidate
 from lcopa_bayes.comparison.predictivedensity import Predicted, predictions
 from lcopa_bayes.comparison.priorwidth import widths
-from lcopa_bayes.core.arrays import Estimate, Matrix, Vector, attributes, plain
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import Estimate, attributes, plain
 from lcopa_bayes.core.files import save_json, save_table, writable_folder
 from lcopa_bayes.data.settings import SamplerSettings
 from lcopa_bayes.data.study import Study
@@ -52,6 +53,7 @@ Answer = Literal["integer", "not an integer", "undecided"]
 Method = Literal["draws at the integer", "normal tail", "undefined"]
 
 
+@final
 @dataclass(frozen=True)
 class IntegerOrder:
     """What the draws say of one order."""
@@ -147,6 +149,7 @@ _CLIMBED = 4
 """Draws the maximum is sought from."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Criteria:
     """AIC and BIC, for those who want them: they ignore priors and confounded parameters."""
@@ -206,6 +209,7 @@ _VERSION = 4
 """Raised when what a card holds changes."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Contender:
     """A candidate and how it is to be fitted."""

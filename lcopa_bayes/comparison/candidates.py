@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import final
 
 from lcopa_bayes.core.errors import InputError, nearest, refuse_if
 from lcopa_bayes.data.settings import CandidateSettings, ModelSettings, PriorSettings
@@ -29,6 +30,7 @@ _MOST = 3
 """Most terms of the candidates a study has without asking."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Candidate:
     """A model to compare."""

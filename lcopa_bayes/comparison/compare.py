@@ -18,8 +18,9 @@ from lcopa_bayes.comparison.candidatefit import Contender, contender
 from lcopa_bayes.comparison.candidates import Candidate
 from lcopa_bayes.comparison.containment import Check
 from lcopa_bayes.comparison.decision import decided
-from lcopa_bayes.core.arrays import Matrix, Vector, plain
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.errors import InputError, refuse_if
+from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import writable_folder
 from lcopa_bayes.core.parallel import Progress, workers
 from lcopa_bayes.data.study import Study

@@ -11,7 +11,7 @@ import hashlib
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from scipy.special import logsumexp
@@ -43,6 +43,7 @@ _PROBED = 1_000
 Card = Mapping[str, Any]
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Check:
     """Task: a candidate's card held against the cards of those it may contain."""

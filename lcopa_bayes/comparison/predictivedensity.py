@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, final
 
 import numpy as np
 from scipy.special import logsumexp
@@ -20,7 +20,8 @@ from lcopa_bayes.comparison.sequentialdensity import (
     predicted,
     without,
 )
-from lcopa_bayes.core.arrays import Array, Matrix, Vector, attributes, plain
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.inference.observations import Observed, Samples
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.forward import ForwardModel
@@ -39,6 +40,7 @@ _BEYOND = 3.0
 Method = Literal["exact", "importance weights", "refit"]
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Predicted:
     """Log predictive densities of the samples of one part, all axes."""
@@ -164,6 +166,7 @@ def _walkers(fit: Fit) -> Array:
     return fit.run.kept()[0][:, :, -1]
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class _Scored:
     """Densities of the samples of a part under weighted draws."""

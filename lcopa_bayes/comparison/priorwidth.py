@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from math import exp, log, sqrt
-from typing import Any, Literal
+from typing import Any, Literal, final
 
 import numpy as np
 from scipy.special import logsumexp
 
-from lcopa_bayes.core.arrays import plain
-from lcopa_bayes.inference.parameter import Parameter, Prior
+from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.priors import Prior
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.sampling.bridge import transferred
 from lcopa_bayes.sampling.evidence import evidence
@@ -24,6 +25,7 @@ _WIDENED = frozenset({"gain", "time", "delay"})
 noise scale are alike in all candidates."""
 
 
+@final
 @dataclass(frozen=True)
 class Width:
     """Log evidence under other priors."""

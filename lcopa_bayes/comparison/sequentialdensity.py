@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, final
 
 import numpy as np
 from scipy.special import logsumexp
@@ -38,6 +38,7 @@ CUTS = (0.5, 0.625, 0.75, 0.875)
 """Shares of a single record that are known when what follows is predicted [-]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Part:
     """Samples predicted from others."""
@@ -127,6 +128,7 @@ def _resting(samples: Samples, axis: int) -> int:
     return samples.quiet(axis).values.size if np.isfinite(samples.first_change) else 0
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Level:
     """Level of one axis of a predicted record."""

@@ -12,10 +12,10 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from io import FileIO, RawIOBase
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, final
 
-from lcopa_bayes.core.arrays import plain
 from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.core.estimate import plain
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -89,6 +89,7 @@ def _number(error: OSError | RuntimeError) -> int | None:
     return int(hidden[1]) if hidden else None
 
 
+@final
 class Enduring(RawIOBase):
     """A binary file for HDF5 to write into that fails only afterwards.
 

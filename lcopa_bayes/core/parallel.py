@@ -19,7 +19,7 @@ from importlib import import_module
 from multiprocessing import forkserver, parent_process
 from multiprocessing.context import BaseContext, SpawnContext, SpawnProcess
 from threading import Thread
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, final
 
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
@@ -37,6 +37,7 @@ CONNECT = 5.0
 _ADVICE = "what was finished is stored; go on with --resume"
 
 
+@final
 class Workers(Generic[S]):
     """What does tasks `task(shared, one)`; the results do not depend on who it is."""
 
@@ -74,6 +75,7 @@ class Workers(Generic[S]):
         return self.each(_Alone(function), inputs)
 
 
+@final
 class _Later:
     """A task of this process, done when its result is asked for."""
 
@@ -179,6 +181,7 @@ def _cluster(shared: S, address: str) -> Iterator[Workers[S]]:
         raise InputError(f"--dask {address}: the scheduler was lost ({error}); {_ADVICE}") from None
 
 
+@final
 class _Alone(Generic[T, R]):
     """Task: a function of the input alone."""
 
@@ -206,6 +209,7 @@ def _main_hidden() -> Iterator[None]:
         main.update(seen)
 
 
+@final
 class _Spawned(SpawnProcess):
     """A process of its own."""
 
@@ -215,6 +219,7 @@ class _Spawned(SpawnProcess):
             super().start()
 
 
+@final
 class _SpawnContext(SpawnContext):
     """Starts workers as processes of their own."""
 
@@ -224,6 +229,7 @@ class _SpawnContext(SpawnContext):
 if sys.platform == "linux":  # elsewhere system libraries do not outlast a fork
     from multiprocessing.context import ForkServerContext, ForkServerProcess
 
+    @final
     class _Forked(ForkServerProcess):
         """A process forked from one that has imported what it needs."""
 
@@ -232,6 +238,7 @@ if sys.platform == "linux":  # elsewhere system libraries do not outlast a fork
             with _main_hidden():
                 super().start()
 
+    @final
     class _ForkContext(ForkServerContext):
         """Starts workers as forks of one process, which imports the package once for all of them."""
 
@@ -293,6 +300,7 @@ _LINE = "{desc}: {n_fmt}/{total_fmt} {unit}s, {elapsed} so far, {remaining} left
 _COUNT = "{desc}: {n_fmt} {unit}s, {elapsed} so far{postfix}"
 
 
+@final
 class Progress(tqdm):  # type: ignore[type-arg]
     """`tqdm` that writes lines a log can hold where standard error is no terminal.
 

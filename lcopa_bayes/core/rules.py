@@ -9,11 +9,12 @@ from dataclasses import dataclass
 from functools import cache
 from numbers import Integral, Real
 from types import MappingProxyType, NoneType
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, final, get_args, get_origin, get_type_hints
 
 from lcopa_bayes.core.errors import nearest, refuse_if
 
 
+@final
 @dataclass(frozen=True)
 class Rule:
     """What a value must be."""

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, final
 
 import pandas as pd
 
@@ -23,6 +23,7 @@ _MOST = 5
 """Problems named per column, so that one shifted column does not bury the others."""
 
 
+@final
 @dataclass(frozen=True)
 class CellTable:
     """A file as text, so that every bad cell can be quoted; `rows` are numbers of lines, or of rows."""

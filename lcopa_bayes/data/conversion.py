@@ -9,11 +9,13 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import TIME_UNITS, Vector
+from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError, nearest, refuse_if
+from lcopa_bayes.core.units import TIME_UNITS
 from lcopa_bayes.data.cells import CellTable
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.spreadsheet import decimal_sign, numbers, seconds
@@ -47,6 +49,7 @@ UNKNOWN = "-"
 """Unit of a column whose header names none."""
 
 
+@final
 @dataclass(frozen=True)
 class Mapped:
     """Columns as a user names them, by header, by header without its unit or by number, each perhaps behind a
@@ -63,6 +66,7 @@ class Mapped:
     """Format of time stamps, as of `datetime.strptime`; empty: recognised from them."""
 
 
+@final
 @dataclass(eq=False)
 class Converted:
     """Records of tables, and how these were read."""
@@ -72,6 +76,7 @@ class Converted:
     """What was taken for what, one sentence each."""
 
 
+@final
 @dataclass(frozen=True)
 class _Column:
     """A header: its words, its unit, and how its cells read in every table."""

@@ -12,16 +12,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lcopa_bayes.core.arrays import TIME_UNITS, Matrix, Vector, frozen, in_time_unit
+from lcopa_bayes.core.arrays import Matrix, Vector, frozen
 from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.core.rules import rebuilt
+from lcopa_bayes.core.units import TIME_UNITS, in_time_unit
 from lcopa_bayes.data.record import Axis, Columns, Driven
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class AxisDrive:
     """Deviation of a drive from its resting value, as a sequence of changes.
@@ -113,6 +116,7 @@ Units = str | Mapping[str, str] | None
 """One unit for all axes, one per axis by name, or none: those of the study."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Drive:
     """Values of every drive axis over time; InputError with all that is wrong with them.

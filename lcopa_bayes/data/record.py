@@ -12,21 +12,23 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, TypeAlias
+from typing import Protocol, TypeAlias, final
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from lcopa_bayes.core.arrays import TIME_UNITS, Matrix, Vector, frozen, in_time_unit
+from lcopa_bayes.core.arrays import Matrix, Vector, frozen
 from lcopa_bayes.core.errors import InputError, nearest, refuse_if
 from lcopa_bayes.core.files import write_whole
 from lcopa_bayes.core.rules import rebuilt
+from lcopa_bayes.core.units import TIME_UNITS, in_time_unit
 from lcopa_bayes.data.cells import FORM, SUFFIXES, CellTable, frame_cells, read_cells, refuse
 
 _ROLES = ("time", "drive", "response")
 
 
+@final
 @dataclass(frozen=True)
 class Axis:
     """One column of drive or response: a free name, which may hold underscores, and a free unit."""
@@ -53,6 +55,7 @@ class Driven(Protocol):
     def drive(self) -> Matrix: ...  # noqa: D102
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Record:
     """One experiment, sampled uniformly or not; arrays are finite, checked and read-only.
@@ -153,6 +156,7 @@ def _numbers(table: CellTable, column: int, *, missing: bool) -> Vector:
     return out
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Columns:
     """Columns of a record file by role."""

@@ -10,15 +10,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import pairwise
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Literal, TypeAlias, final
 
 import numpy as np
 from scipy import stats
 from scipy.stats.distributions import rv_frozen
 
-from lcopa_bayes.core.arrays import TIME_UNITS
 from lcopa_bayes.core.errors import nearest
 from lcopa_bayes.core.rules import FLAG, FOLDER, POSITIVE, Rule, Ruled, is_number, texts, whole, word_of
+from lcopa_bayes.core.units import TIME_UNITS
 
 Share: TypeAlias = Literal["paper", "all", "none"]
 """Which paths share an element."""
@@ -50,6 +50,7 @@ _ORDERS = Rule('"free" or numbers in (0, 2], such as [2, 1]', _are_orders)
 _EXPOSURE = Rule("a time, zero or more", lambda value: is_number(value) and value >= 0)
 
 
+@final
 @dataclass(frozen=True)
 class HeadingSettings(Ruled):
     """Table ``[study]``."""
@@ -63,6 +64,7 @@ class HeadingSettings(Ruled):
     """Seed of every random number of the study."""
 
 
+@final
 @dataclass(frozen=True)
 class RecordsSettings(Ruled):
     """Table ``[records]``: file names, relative to the study file."""
@@ -77,6 +79,7 @@ class RecordsSettings(Ruled):
         return ["`fit` names no record; name one or more"] if self.fit == () else []
 
 
+@final
 @dataclass(frozen=True)
 class ModelSettings(Ruled):
     """Table ``[model]``."""
@@ -123,6 +126,7 @@ class ModelSettings(Ruled):
         return []
 
 
+@final
 @dataclass(frozen=True)
 class NoiseSettings(Ruled):
     """Table ``[noise]``."""
@@ -131,6 +135,7 @@ class NoiseSettings(Ruled):
     """Independent Gaussian, first-order autoregressive, the sum of both, or independent Student noise."""
 
 
+@final
 @dataclass(frozen=True)
 class SamplerSettings(Ruled):
     """Table ``[sampler]``."""
@@ -156,6 +161,7 @@ class SamplerSettings(Ruled):
     ensembles only where its weights fail."""
 
 
+@final
 @dataclass(frozen=True)
 class EffectsSettings(Ruled):
     """Table ``[effects]``."""
@@ -176,6 +182,7 @@ def _distributions() -> Mapping[str, stats.rv_continuous]:
     return {name: value for name, value in vars(stats).items() if isinstance(value, stats.rv_continuous)}
 
 
+@final
 @dataclass(frozen=True)
 class PriorSettings(Ruled):
     """One line of ``[priors]``: a fixed value, or any continuous distribution of `scipy.stats`."""
@@ -235,6 +242,7 @@ class PriorSettings(Ruled):
         return _distributions()[self.dist](**self.parameters)
 
 
+@final
 @dataclass(frozen=True)
 class CompareSettings(Ruled):
     """Table ``[compare]``."""
@@ -243,6 +251,7 @@ class CompareSettings(Ruled):
     """Candidates by name; None: chosen from the study, and all of ``[[candidates]]``."""
 
 
+@final
 @dataclass(frozen=True)
 class CandidateSettings(Ruled):
     """One table of ``[[candidates]]``; what is not given is as in the study."""

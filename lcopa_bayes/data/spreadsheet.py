@@ -17,6 +17,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import count, product, zip_longest
 from pathlib import Path
+from typing import final
 from zipfile import BadZipFile
 
 import numpy as np
@@ -205,6 +206,7 @@ _FORMATS = (*(f"{date} {clock}" for date, clock in product(_DATES, _CLOCKS)), *_
 _DAY = 86_400.0
 
 
+@final
 @dataclass(frozen=True)
 class Sign:
     """A decimal sign, or why it is ambiguous."""

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import in_time_unit
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.rules import rebuilt
+from lcopa_bayes.core.units import in_time_unit
 from lcopa_bayes.data.record import Axis, Record, RecordLike, records_of, several
 from lcopa_bayes.data.settings import (
     CandidateSettings,
@@ -28,6 +28,7 @@ from lcopa_bayes.data.settings import (
 from lcopa_bayes.data.tables import settings_from, study_settings
 
 
+@final
 @dataclass(frozen=True, eq=False, init=False)
 class Study:
     """Records and settings of one study; every record has the axes of the first, in its order.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import final
 
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.files import read_tables
@@ -43,6 +44,7 @@ def _hashes(paths: Iterable[Path]) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
 
 
+@final
 class BrokenStudyError(InputError):
     """A study file with problems whose plant and records can be used: more may be wrong with these."""
 

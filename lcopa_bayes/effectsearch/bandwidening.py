@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 
@@ -28,6 +29,7 @@ def since_command(record: Samples) -> Vector:
     return out
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Widening:
     """Excess variance of the residual by time since the last command, per axis, and where it is known."""

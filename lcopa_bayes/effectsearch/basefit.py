@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import final
 
 import numpy as np
 
@@ -31,6 +32,7 @@ _MOVED = 0.05
 """Change of the dead time from which the noise is measured anew [-]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class BaseFit:
     """The plant alone at its optimum under the measured noise."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 
@@ -22,6 +23,7 @@ _STRETCHES = 10
 """Stretches of successive samples in each part [-]."""
 
 
+@final
 @dataclass(frozen=True)
 class Group:
     """Samples that are left out together."""

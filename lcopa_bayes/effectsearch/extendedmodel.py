@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import final
 
 import numpy as np
 
@@ -12,8 +13,8 @@ from lcopa_bayes.core.arrays import Flags, Matrix, Vector
 from lcopa_bayes.effectsearch.whitening import stacked
 from lcopa_bayes.inference.declared import with_effects
 from lcopa_bayes.inference.effects import Effected, Placed, effected
+from lcopa_bayes.inference.kinds import CONSTANTS
 from lcopa_bayes.inference.leastsquares import LeastSquares
-from lcopa_bayes.inference.parameter import CONSTANTS
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.effects.effect import Effect, ForceEffect
 
@@ -23,6 +24,7 @@ _UNIT = np.array([1.0, 0.0, 0.0])
 """Noise of unit scale, as `WhiteAR1` takes it."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class ExtendedModel:
     """A posterior with effects at the scales of a base fit, in the search coordinates of `LeastSquares`:

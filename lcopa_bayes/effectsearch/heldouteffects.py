@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 from scipy.stats import chi2, norm
@@ -59,6 +60,7 @@ def missed(study: Study, fit: Sequence[Score], scores: Sequence[Score], state: S
     return float(np.sqrt(1 + errors.beyond / errors.count))
 
 
+@final
 @dataclass(frozen=True)
 class Errors:
     """Squared errors on records that were not fitted, inside the fitted drive range."""

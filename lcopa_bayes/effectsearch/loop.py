@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.core.arrays import LEVEL
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import LEVEL
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.basefit import BaseFit
@@ -35,6 +35,7 @@ from lcopa_bayes.sampling.convergence import Grade
 from lcopa_bayes.sampling.draws import Draws
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Side:
     """Model and errors before or after."""
@@ -47,6 +48,7 @@ class Side:
     """Laplace approximation, noise held at its estimate [nat]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Loop:
     """What the loop found in a study."""

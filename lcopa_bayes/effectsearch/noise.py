@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import final
 
 import numpy as np
 from scipy.signal import correlate
@@ -43,6 +44,7 @@ _WIDTHS = (6.0, 30.0)
 """Standard deviations of an outlier over that of the noise tried [-]."""
 
 
+@final
 @dataclass(frozen=True)
 class Law:
     """Stationary white noise plus a correlated part; either may vanish."""
@@ -111,6 +113,7 @@ def laws(drawn: Matrix) -> list[Law]:
     return [Law(*row) for row in drawn.tolist()]
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class AxisNoise:
     """Noise of one response axis and where it is known from."""

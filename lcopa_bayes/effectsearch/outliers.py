@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import final
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -35,6 +36,7 @@ _NORMAL = 0.6744897501960817
 """Median of the magnitude of a standard normal deviate."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Outlying:
     """Outliers of a study, and the study without them."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from scipy.stats import chi2
@@ -21,7 +21,7 @@ from lcopa_bayes.effectsearch.signature import Scale
 from lcopa_bayes.effectsearch.trace import LEVEL
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.effects import Placed
-from lcopa_bayes.inference.parameter import CONSTANTS
+from lcopa_bayes.inference.kinds import CONSTANTS
 from lcopa_bayes.model.effects.effect import Effect, Ranges
 
 SIGNIFICANT = 2.7e-3
@@ -50,6 +50,7 @@ _DELAYS = (-0.25, -0.1)
 """Shares of a delay by which it is also started earlier, for effects that act on the drive [-]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Refit:
     """The plant with a set of effects at its optimum."""

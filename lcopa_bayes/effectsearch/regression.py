@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import final
 
 import numpy as np
 
@@ -27,6 +28,7 @@ _PUSHED = 0.3
 """Slope of the cost per standard deviation from which such a coordinate is held by its bound [nat]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Optimum:
     """Where a descent ended."""
@@ -73,6 +75,7 @@ class Optimum:
         return np.sqrt(np.diag(self.covariance))
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Regression:
     """A model fitted to the stacked samples under a fixed whitening."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from scipy import signal, stats
@@ -21,6 +21,7 @@ _SEEN = 1e-3
 _BANDS = 24
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class View:
     """One axis' residual against one thing."""
@@ -45,6 +46,7 @@ class View:
         return labels | {"x": self.x, "y": self.y, "error": self.error, "sentence": self.sentence}
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class _Axis:
     """Pooled samples of one axis."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import final
 
 import numpy as np
 
@@ -36,6 +37,7 @@ _PAIRS = 2
 """Pairs refitted [-]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Round:
     """One look at a residual."""
@@ -48,6 +50,7 @@ class Round:
     chosen: Refit | None
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Search:
     """All rounds and the model they end with."""

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from scipy.stats import norm
 
-from lcopa_bayes.core.arrays import LEVEL, Matrix, Vector, attributes
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of
+from lcopa_bayes.core.estimate import LEVEL, attributes
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.crossvalidation import groups, shifts
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
@@ -37,6 +38,7 @@ WIDTH = float(norm.ppf(0.5 + LEVEL / 2))
 """Half width of a central 90 % interval of a normal distribution [sd]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Score:
     """One response axis of one record against its prediction."""
@@ -95,6 +97,7 @@ class Score:
         }
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class State:
     """A model at its optimum under its noise, and how wide its bands must be."""

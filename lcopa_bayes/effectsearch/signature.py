@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import final
 
 import numpy as np
 from scipy.special import log_ndtr
@@ -25,6 +26,7 @@ _RANK = 1e-9
 """Singular values below this share of the largest are zero [-]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Projection:
     """``(I + J J')^(-1/2)`` from tangents J (n, k) scaled by their prior sd."""
@@ -61,6 +63,7 @@ def log_bayes_factors(signature: Matrix, residuals: Matrix) -> Vector:
     return np.asarray(gain - 0.5 * np.log1p(power).sum())
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Scale:
     """What is known of the noise scale: quiet samples and, to the same rights, the residuals themselves.
@@ -90,6 +93,7 @@ class Scale:
         return float(-0.5 * whole * np.expm1(-2 * gain / (self.quiet + self.freedom)))
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Signature:
     """One instance of an effect, whitened and projected off what the base model can imitate."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import attributes, plain
+from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.effectsearch.crossvalidation import in_turn
 from lcopa_bayes.effectsearch.loop import Loop, Side
 from lcopa_bayes.effectsearch.residuals import View, views

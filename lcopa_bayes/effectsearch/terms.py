@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -42,6 +42,7 @@ _AT_END = 1e-2
 """Closer to the end of its prior than this share, a delay is at it [-]."""
 
 
+@final
 class Base(NamedTuple):
     """A study's base fit, perhaps with more viscous terms than it states."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import final
 
 import numpy as np
 from scipy.special import logsumexp
@@ -38,6 +39,7 @@ SEEN = 0.1
 """Below this survival the records cannot see an effect [-]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Traced:
     """An effect with all its instances against one residual."""
@@ -68,6 +70,7 @@ class Traced:
         return max((one.survival for one in self.signatures), default=np.nan)
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Trace:
     """All effects against one residual, and what chance alone gives."""

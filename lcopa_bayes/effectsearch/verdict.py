@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, final
 
 Kind = Literal["clean", "explained", "disturbance", "unexplained"]
 Confidence = Literal["firm", "tentative"]
@@ -21,6 +21,7 @@ MARGIN = 3.0
 """Log evidence by which a generic class or another set must win [nat]."""
 
 
+@final
 @dataclass(frozen=True)
 class Verdict:
     """Conclusion of a loop."""
@@ -30,6 +31,7 @@ class Verdict:
     sentence: str
 
 
+@final
 @dataclass(frozen=True)
 class Findings:
     """What a loop found, as far as the verdict depends on it."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import final
 
 import numpy as np
 
@@ -20,6 +21,7 @@ _SHORTER = 0.9
 """Share of the likeliest law's memory below which a residual's own is another [-]."""
 
 
+@final
 @dataclass(frozen=True)
 class Part:
     """Samples of one response axis of one record inside the stacked samples of all."""
@@ -51,6 +53,7 @@ def stacked(samples: Sequence[Samples], responses: Sequence[Array]) -> Matrix:
     )
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Whitening:
     """Noise of every axis applied to stacked samples; records are independent of each other."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 
@@ -20,6 +21,7 @@ _LEVELS = 4
 """Levels of a staircase and of an amplitude series."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Candidate:
     """A drive that may be played."""

@@ -5,14 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import isfinite
 from operator import call
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from scipy.stats import chi2
 
 from lcopa_bayes.bench.device import Bench as VirtualBench
 from lcopa_bayes.bench.device import truth
-from lcopa_bayes.core.arrays import LEVEL, Array, Flags, Matrix, Vector, attributes, plain
+from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
+from lcopa_bayes.core.estimate import LEVEL, attributes, plain
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.experiments.design import LINEAR, Design
 from lcopa_bayes.experiments.information import Bench, Trial, device_of
@@ -23,6 +24,7 @@ _RESAMPLED = 2000
 """Bootstrap samples behind the interval of a factor."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Achieved:
     """Estimates from independent records of one drive."""
@@ -42,6 +44,7 @@ class Achieved:
         return np.asarray(self.errors.std(axis=0, ddof=1))
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Confirmation:
     """Expected against achieved precision of the winner and the plain step at one draw of the posterior."""

@@ -8,11 +8,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Array, Estimate, Flags, Matrix, Vector, quantile
+from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import Estimate, quantile
 from lcopa_bayes.experiments.candidates import PLAIN, Candidate, candidates
 from lcopa_bayes.experiments.information import Bench
 from lcopa_bayes.experiments.limits import Limits, bench_times, limits_of
@@ -28,6 +30,7 @@ _TOUCHED = 1e-6
 """Squared weight in a singular direction from which a parameter's variance is infinite [-]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Promise:
     """Cramer-Rao covariances of the plant's parameters after one drive of one length."""
@@ -154,6 +157,7 @@ _PRIOR_POINTS = 12
 """Draws of the prior at which symmetries are looked for, besides those of the posterior."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Design:
     """Promises of every drive at every bench time tried."""

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import ceil
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,6 +40,7 @@ _NOTHING = 1e-11
 """Share of a slope that is not constant below which a resting response makes up for all of it [-]."""
 
 
+@final
 class Prepared(NamedTuple):
     """An element at one set of values."""
 
@@ -49,6 +50,7 @@ class Prepared(NamedTuple):
     """Its readings, shared by all drives."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Bench:
     """A record of `time` [time unit], sampled every `period`, that is still to be taken.
@@ -222,6 +224,7 @@ _AT_BOUND = 1e-3
 """Closer to an end of the search than this, on its coordinate, an estimate leans on it."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Trial:
     """One record of one drive, with noise of its own, fitted."""
@@ -241,6 +244,7 @@ class Trial:
         return _errors(problem, again, result, values, self.names), _leaning(again, result, self.names)
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class EffectedDevice:
     """A plant with effects, simulated by the model itself: no device of the virtual bench has them."""

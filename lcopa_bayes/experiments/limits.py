@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import isfinite
+from typing import final
 
 import numpy as np
 
@@ -23,6 +24,7 @@ _PER_REFRESH = round(PAPER.records.camera_rate / PAPER.records.refresh_rate)
 """Camera samples per refresh of the drive on the paper's bench, taken over for other time scales."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Limits:
     """Drives stay between `low` and `high`, start at `rest` and change at multiples of `refresh`."""

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Estimate, Vector, plain, quantile
+from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import Estimate, plain, quantile
 from lcopa_bayes.experiments.design import Design, Promise, design
 from lcopa_bayes.results.predictive import Predictive
 

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.core.arrays import Matrix, Vector, attributes, plain
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.identifiability.contraction import (
     Known,
@@ -72,6 +73,7 @@ _TRIES = 3
 """... this many times at most."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Audit:
     """Identifiability of a fitted study."""

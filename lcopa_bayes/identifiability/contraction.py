@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from scipy.stats import rankdata
 
-from lcopa_bayes.core.arrays import Estimate, Matrix, Vector, attributes, plain
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.estimate import Estimate, attributes, plain
 from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.likelihood import Landscape
 from lcopa_bayes.inference.parameter import Parameter
@@ -28,6 +29,7 @@ LEVEL = 0.5
 """Width of an offset over the range of the response [-]."""
 
 
+@final
 @dataclass(frozen=True)
 class Tolerance:
     """Largest interval of an identified parameter."""
@@ -73,6 +75,7 @@ _STRAYING = 1000.0
 """A width relative to the median beyond this has no information [-]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Belief:
     """Posterior of one parameter beside its prior."""
@@ -103,6 +106,7 @@ class Belief:
         )
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Known:
     """A function of the parameters, by the posterior and by the prior."""

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from scipy.stats import norm
 
-from lcopa_bayes.core.arrays import LEVEL, Matrix, Vector, plain
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.estimate import LEVEL, plain
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.likelihood import Landscape
@@ -22,6 +23,7 @@ from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Sensitivities:
     """Derivatives of the samples, whitened by the noise model, at one set of values.
@@ -78,6 +80,7 @@ _SHOWN = 0.1
 """Weights of a direction that are named [-]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Curvature:
     """Local precision of the free plant parameters on their sampled scale."""
@@ -198,6 +201,7 @@ def _spectral(matrix: Matrix) -> tuple[Vector, Matrix]:
     return whole, rows
 
 
+@final
 @dataclass(frozen=True)
 class Separation:
     """Smallest difference of the delays of two paths that the records resolve."""
@@ -209,6 +213,7 @@ class Separation:
     where the records have no information about one of the two."""
 
 
+@final
 @dataclass(frozen=True)
 class Delays:
     """Delay separation at the maximum of the likelihood, every path given a delay of its own."""

@@ -6,12 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from scipy.stats import chi2, t
 
-from lcopa_bayes.core.arrays import LEVEL, Matrix, Vector, attributes, plain
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.estimate import LEVEL, attributes, plain
 from lcopa_bayes.inference.likelihood import Landscape, Peak
 from lcopa_bayes.inference.posterior import Posterior
 
@@ -38,6 +39,7 @@ _FAR = 3
 """Draws beyond the last point from which another mode is sought."""
 
 
+@final
 @dataclass(frozen=True)
 class Freedom:
     """Numbers of samples and of fitted parameters."""
@@ -69,6 +71,7 @@ class Freedom:
         return self.samples * float(np.log1p(t.ppf((1 + level) / 2, degrees) ** 2 / degrees))
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Profile:
     """Largest likelihood at each value of one parameter.
@@ -169,6 +172,7 @@ def profile(landscape: Landscape, k: int, peak: Peak, witnesses: Matrix, first_s
     return _Path(landscape, k, peak, witnesses).run(first_step)
 
 
+@final
 class _Path:
     """Points of one profile under construction."""
 

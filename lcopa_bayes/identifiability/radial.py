@@ -8,7 +8,8 @@ from typing import Any, final
 import numpy as np
 from scipy.optimize import least_squares
 
-from lcopa_bayes.core.arrays import Matrix, Vector, plain
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.inference.likelihood import Landscape, Peak
 
 _MOVED = 0.2

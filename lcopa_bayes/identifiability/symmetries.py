@@ -9,11 +9,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import combinations
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Matrix, Vector, plain
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.identifiability.curvature import Sensitivities
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.model.literature import PAPER
@@ -40,6 +41,7 @@ _NOTHING = 1e-10
 """Relative change of the responses below which a parameter has no effect [-]."""
 
 
+@final
 @dataclass(frozen=True)
 class Symmetry:
     """Parameters that can make up for each other exactly."""
@@ -56,6 +58,7 @@ class Symmetry:
         return plain(asdict(self))
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Structure:
     """What the model and the drives leave open before any noise."""
@@ -239,6 +242,7 @@ SPRINGS = 4
 """Springs of the element, of which Eq. 16 adds up the stiffnesses."""
 
 
+@final
 class PrintedForm(NamedTuple):
     """Values of a path as Eqs. 16, 21 and 28 write them."""
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import LEVEL, attributes, plain
+from lcopa_bayes.core.estimate import LEVEL, attributes, plain
 from lcopa_bayes.identifiability.contraction import Belief, Tolerance
 from lcopa_bayes.identifiability.curvature import Curvature
 from lcopa_bayes.identifiability.profile import Profile
@@ -30,6 +30,7 @@ _APART = 3.0
 """Factor between local and profile widths from which they disagree [-]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Finding:
     """Verdict of one parameter with its evidence."""

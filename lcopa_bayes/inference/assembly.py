@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import final
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from lcopa_bayes.model.forward import ForwardModel, forward_model
 from lcopa_bayes.model.layout import Layout
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Problem:
     """A study made ready for inference."""

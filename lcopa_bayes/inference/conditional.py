@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -32,6 +32,7 @@ _QUARTERS = (0.1587, 0.8413)
 """Quantiles of a prior one standard deviation apart from the middle, were it normal."""
 
 
+@final
 class Element(NamedTuple):
     """An element of the plant among the coordinates."""
 
@@ -50,6 +51,7 @@ class Element(NamedTuple):
         return slice(self.first, self.first + len(self.free))
 
 
+@final
 class Expanded(NamedTuple):
     """Expansions of the log likelihood about points, (batch, ...)."""
 
@@ -66,6 +68,7 @@ class Expanded(NamedTuple):
     """Derivatives of the natural coordinates in the coordinates, (batch, size, size)."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Conditional:
     """Coordinates of what a posterior has beside orders, delays and noise."""

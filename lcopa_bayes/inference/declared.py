@@ -21,9 +21,11 @@ from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.defaultpriors import Scales
+from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.observations import Samples
-from lcopa_bayes.inference.parameter import COEFFICIENTS, CONSTANTS, Parameter, Place, Prior
+from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.priors import Prior
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.declared import Declared
 from lcopa_bayes.model.effects.effect import Coefficient, Constant, Effect, Ranges, ScatterEffect

@@ -44,6 +44,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import final
 
 import numpy as np
 
@@ -51,7 +52,7 @@ from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.data.drive import first_change
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.inference.observations import Observed, QuietNoise, Samples, quiet_noise, sampling_period
-from lcopa_bayes.inference.parameter import Prior
+from lcopa_bayes.inference.priors import Prior
 
 _TIMES = 20.0
 """Correlation times of the noise that fit into a record at least [-]."""
@@ -63,6 +64,7 @@ _BEYOND = 1.5
 """Factor by which correlated noise in motion exceeds the limit at rest at most [-]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Scales:
     """What the default priors are derived from."""

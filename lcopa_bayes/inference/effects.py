@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import final
 
 import numpy as np
 
@@ -36,6 +37,7 @@ _STEP = 1e-4
 """Step of a constant, over its value or, where it lies between 0 and 1, over 1 [-]."""
 
 
+@final
 @dataclass(frozen=True)
 class Placed:
     """One entry of psi."""
@@ -49,6 +51,7 @@ class Placed:
     """Position of its record; None when it acts on all."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Effected:
     """Base model plus effects over a set of records."""

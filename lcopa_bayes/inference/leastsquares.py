@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import final
 
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
@@ -28,6 +29,7 @@ _TAIL = 1e-9
 """Prior mass beyond either end of the search on a logarithmic scale [-]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
     """Output-error least squares of a posterior's plant parameters at fixed noise parameters.

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import final
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -33,6 +34,7 @@ _GAINED = 1e-3
 """Rounds between plant and noise end when the log likelihood gains less [nat]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Peak:
     """A maximum of the likelihood, perhaps with one parameter held."""
@@ -43,6 +45,7 @@ class Peak:
     """[nat]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Landscape:
     """Log likelihood of all free parameters, none integrated out; of the priors only the support counts.

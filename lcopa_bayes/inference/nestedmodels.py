@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Flags, Matrix, Vector
-from lcopa_bayes.inference.parameter import COEFFICIENTS, CONSTANTS
+from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 
@@ -43,6 +44,7 @@ def lifted(values: Matrix, small: Posterior, large: Posterior, rng: np.random.Ge
     return _Lift(small.table, large.table, small.noise.kind, large.noise.kind, rng)(values, large)
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class _Lift:
     small: ParameterTable

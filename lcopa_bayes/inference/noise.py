@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, final
 
 import numpy as np
 from scipy.linalg.lapack import dpttrs
@@ -12,7 +12,7 @@ from scipy.special import gammaln
 from scipy.stats import t as student_t
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
-from lcopa_bayes.inference.parameter import Prior
+from lcopa_bayes.inference.priors import Prior
 from lcopa_bayes.inference.recursions import correlated, differences, equal, factors, scalar_products
 
 if TYPE_CHECKING:
@@ -91,6 +91,7 @@ class GaussianNoise(Noise):
         """Log innovation sd of each sample, broadcastable to (batch, n)."""
 
 
+@final
 class White(GaussianNoise):
     """Independent Gaussian samples."""
 
@@ -126,6 +127,7 @@ class White(GaussianNoise):
         return {"sigma": sd}
 
 
+@final
 class AR1(GaussianNoise):
     """Gaussian samples whose correlation over a gap of g sampling periods is ``rho**g``.
 
@@ -191,6 +193,7 @@ class AR1(GaussianNoise):
         return link, scales
 
 
+@final
 class WhiteAR1(GaussianNoise):
     """White measurement noise plus a correlated part that is Gaussian and stationary.
 
@@ -282,6 +285,7 @@ class WhiteAR1(GaussianNoise):
         }
 
 
+@final
 class Student(Noise):
     """Independent Student-t samples: scale `sigma`, `nu` degrees of freedom."""
 

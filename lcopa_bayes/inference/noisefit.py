@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import final
 
 import numpy as np
 from scipy.optimize import minimize
@@ -24,6 +25,7 @@ _STEP = 0.05
 """Step of the differences that give the curvature [natural log or logit]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class NoiseFit:
     """Posterior of the free noise parameters of one response axis given its residuals.

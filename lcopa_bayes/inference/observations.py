@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import final
 
 import numpy as np
 from scipy.special import expit
@@ -24,6 +25,7 @@ _FEWEST = 8
 """Source of an offset."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Observed:
     """Samples of one response axis in one record."""
@@ -44,6 +46,7 @@ class Observed:
         return slice(first, last) if last - first == self.index.size else self.index
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Samples:
     """All samples of one record."""
@@ -140,6 +143,7 @@ _CELLS = 2_000_000
 """Samples times parameter sets that are whitened at once [-]."""
 
 
+@final
 @dataclass(frozen=True)
 class QuietNoise:
     """Noise of one response axis as its samples at rest give it."""
@@ -154,6 +158,7 @@ class QuietNoise:
     """97.5 % limit of the correlated part's standard deviation [response unit]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class PlausibleNoise:
     """Posterior of `WhiteAR1` given pieces of it, over a grid of shares and correlations.

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of
+from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.leastsquares import LeastSquares
-from lcopa_bayes.inference.parameter import COEFFICIENTS, CONSTANTS, Parameter
+from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.inference.poles import regressed
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.effects.effect import UnstableError
@@ -35,6 +37,7 @@ _HARDLY = 1e-2
 """Size of a coefficient that cannot be negative where it should vanish [prior scale]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Optimum:
     """A local least-squares solution."""

@@ -1,157 +1,18 @@
-"""One number of the model: its name, unit, place, prior and the scale it is sampled on.
-
-Kinds of parameters: what all parameters of one kind have in common, declared once.
-
-Prior densities by their scipy.stats name, with the common ones evaluated in closed form.
-"""
+"""One number of the model: its name, unit, place, prior and the scale it is sampled on."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from math import inf, log, pi
-from types import MappingProxyType
-from typing import Any, Literal, NamedTuple
+from math import inf, log
+from typing import NamedTuple, final
 
 import numpy as np
-from scipy import stats
 from scipy.special import expit, log_expit, logit
 
-from lcopa_bayes.core.arrays import Array, Flags, Vector
-
-
-def _uniform(x: Vector, p: Mapping[str, float]) -> Vector:
-    low, width = p.get("loc", 0.0), p.get("scale", 1.0)
-    standard = (x - low) / width  # as scipy rounds, so that both agree on which ends are inside
-    return np.where((standard >= 0) & (standard <= 1), -log(width), -np.inf)
-
-
-def _loguniform(x: Vector, p: Mapping[str, float]) -> Vector:
-    inside = (x >= p["a"]) & (x <= p["b"])
-    level = -log(log(p["b"] / p["a"]))
-    return np.where(inside, level - np.log(np.where(inside, x, 1.0)), -np.inf)
-
-
-def _norm(x: Vector, p: Mapping[str, float]) -> Vector:
-    mean, sd = p.get("loc", 0.0), p.get("scale", 1.0)
-    return -log(sd) - 0.5 * log(2 * pi) - 0.5 * ((x - mean) / sd) ** 2
-
-
-_CLOSED = {"uniform": _uniform, "loguniform": _loguniform, "norm": _norm}
-_CLOSED_PARAMETERS = {"uniform": {"loc", "scale"}, "loguniform": {"a", "b"}, "norm": {"loc", "scale"}}
-"""Closed forms are ten times faster than scipy's general path and tested against it."""
-
-
-@dataclass(frozen=True)
-class Prior:
-    """A proper density of one parameter."""
-
-    dist: str
-    """Name of a continuous distribution of scipy.stats."""
-    parameters: Mapping[str, float]
-    """Its shape parameters, `loc` and `scale`, in the parameter's unit."""
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "parameters", MappingProxyType(dict(self.parameters)))
-
-    @cached_property
-    def frozen(self) -> Any:
-        """The scipy.stats distribution."""
-        return getattr(stats, self.dist)(**self.parameters)
-
-    def log_density(self, x: Vector) -> Vector:
-        """Logarithm of the density; -inf outside the support."""
-        if set(self.parameters) <= _CLOSED_PARAMETERS.get(self.dist, set()):
-            return _CLOSED[self.dist](x, self.parameters)
-        return np.asarray(self.frozen.logpdf(x), dtype=float)
-
-    @cached_property
-    def support(self) -> tuple[float, float]:
-        """Lower and upper end, infinite when open."""
-        low, high = self.frozen.support()
-        return float(low), float(high)
-
-    @property
-    def normal(self) -> tuple[float, float] | None:
-        """Mean and standard deviation of the square that the logarithm of the density is; None for another.
-        That of a half-normal density falls from its lower end."""
-        if self.dist == "norm":
-            return float(self.frozen.mean()), float(self.frozen.std())
-        if self.dist == "halfnorm":
-            return self.support[0], self.parameters.get("scale", 1.0)
-        return None
-
-    def draw(self, size: int | tuple[int, ...], rng: np.random.Generator) -> Array:
-        """Independent draws."""
-        return np.asarray(self.frozen.rvs(size=size, random_state=rng), dtype=float)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return Prior, (self.dist, dict(self.parameters))
-
-    def __str__(self) -> str:
-        inside = ", ".join(f"{key}={value:.4g}" for key, value in self.parameters.items())
-        return f"{self.dist}({inside})"
-
-
-@dataclass(frozen=True)
-class Kind:
-    """A kind of parameter."""
-
-    name: str
-    low: float = -inf
-    """Lower end of the domain, excluded [unit of the parameter]."""
-    high: float = inf
-    """Upper end of the domain, excluded unless `closed` [unit of the parameter]."""
-    closed: bool = False
-    """Whether the upper end belongs to the domain."""
-    scale: Literal["plain", "log", "logit"] = "plain"
-    """What the parameter is sampled by: its value, its logarithm or its logit."""
-    zero: bool = False
-    """Whether it may be fixed at 0: no delay, no correlation."""
-    noise: Literal["", "scale", "shape"] = ""
-    """Of a noise model: a standard deviation or scale [response unit], or a shape [-]; "" of the plant."""
-
-    def contains(self, x: Vector) -> Flags:
-        """Whether values lie in the domain."""
-        inside: Flags = (x > self.low) & ((x <= self.high) if self.closed else (x < self.high))
-        return inside
-
-    @property
-    def interval(self) -> str:
-        """The domain as text, with the values a parameter may be fixed at."""
-        return f"{'[' if self.zero else '('}{self.low:g}, {self.high:g}{']' if self.closed else ')'}"
-
-
-COEFFICIENTS = ("coefficient", "magnitude")
-"""Kinds of what an effect estimates; it vanishes where they are 0."""
-CONSTANTS = ("constant", "fraction", "choice")
-"""Kinds of the internal constants of effects."""
-KINDS: Mapping[str, Kind] = MappingProxyType(
-    {
-        kind.name: kind
-        for kind in (
-            Kind("gain"),
-            Kind("time", low=0.0, scale="log"),
-            Kind("order", low=0.0, high=2.0, closed=True),
-            Kind("delay", low=0.0, zero=True),
-            Kind("offset"),
-            Kind("sigma", low=0.0, scale="log", noise="scale"),
-            Kind("sigma_ar", low=0.0, scale="log", noise="scale", zero=True),
-            # near 1 the logit and the logarithm of the noise scale trade off along a straight line
-            Kind("rho", low=0.0, high=1.0, scale="logit", noise="shape", zero=True),
-            Kind("nu", low=0.0, scale="log", noise="shape"),
-            # of effects: what they estimate, of either sign or not, and their internal constants
-            Kind("coefficient"),
-            Kind("magnitude", low=0.0, zero=True),
-            Kind("constant", low=0.0, scale="log"),
-            Kind("fraction", low=0.0, high=1.0, closed=True, zero=True),
-            Kind("choice", low=0.0, high=1.0, closed=True, zero=True),
-        )
-    }
-)
-"""Every kind by its name."""
-
+from lcopa_bayes.core.arrays import Array, Vector
+from lcopa_bayes.inference.kinds import KINDS, Kind
+from lcopa_bayes.inference.priors import Prior
 
 _LEAST_MASS = 1e-9
 """A prior with less mass in its parameter's domain is a mistake [-]."""
@@ -159,6 +20,7 @@ _REJECTION = 0.1
 """Draws are rejected until inside the domain down to this mass [-], and found by inversion below it."""
 
 
+@final
 class Place(NamedTuple):
     """Where a parameter enters: (response, drive) for gains, (element, term) for times and orders,
     (slot, 0) for delays, (response, record or -1 for all) for offsets, (response, 0) for noise,
@@ -168,6 +30,7 @@ class Place(NamedTuple):
     second: int
 
 
+@final
 @dataclass(frozen=True)
 class Parameter:
     """One number of the model."""

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import lgamma, log
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -14,8 +14,10 @@ from lcopa_bayes.core.arrays import Array, Flags, Index, Matrix, Vector
 from lcopa_bayes.core.errors import InputError, nearest, refuse_if
 from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.inference.defaultpriors import Scales
+from lcopa_bayes.inference.kinds import COEFFICIENTS, KINDS
 from lcopa_bayes.inference.noise import NOISES
-from lcopa_bayes.inference.parameter import COEFFICIENTS, KINDS, Parameter, Place, Prior
+from lcopa_bayes.inference.parameter import Parameter, Place
+from lcopa_bayes.inference.priors import Prior
 from lcopa_bayes.model.effects.declared import Declared
 from lcopa_bayes.model.forward import Dynamics
 from lcopa_bayes.model.layout import Layout
@@ -27,6 +29,7 @@ _LEAST_ORDERED = 1e-3
 """Below this mass the share is not measured to 7 % and draws are rejected for ever [-]."""
 
 
+@final
 class Terms(NamedTuple):
     """Positions of the parameters of an element, by term."""
 
@@ -39,6 +42,7 @@ class Terms(NamedTuple):
         return sorted(self.times + self.orders)
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class ParameterTable:
     """All parameters of a posterior; arrays of values have one column per row of the table."""

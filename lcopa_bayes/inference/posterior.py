@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeAlias
+from typing import TypeAlias, final
 
 import numpy as np
 from scipy.special import expit, log_expit, logit
 
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
+from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.noise import LOG_2PI, GaussianNoise, Noise
 from lcopa_bayes.inference.observations import Observed, Samples
-from lcopa_bayes.inference.parameter import COEFFICIENTS, CONSTANTS, Parameter
+from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.simulation import Simulated, Simulation
 from lcopa_bayes.model.forward import ForwardModel
@@ -24,6 +25,7 @@ _PORTION = 128
 """Parameter sets evaluated at once: what one portion holds stays in the processor's cache."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Posterior:
     """Log density of the sampled coordinates, a batch at a time.
@@ -293,6 +295,7 @@ class Posterior:
         return replace(self, table=table, model=self.model.plain, surrogate=None)
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
     """Linear parameters that are integrated out: ``y = X b + white noise`` for a batch of X.

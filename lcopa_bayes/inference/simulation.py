@@ -11,12 +11,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Flags, Index, Matrix, Vector
-from lcopa_bayes.inference.parameter import COEFFICIENTS, CONSTANTS
+from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.model.effects.declared import Declared
 from lcopa_bayes.model.effects.effect import (
@@ -33,6 +33,7 @@ from lcopa_bayes.model.effects.simulator import Simulator
 from lcopa_bayes.model.forward import ForwardModel, deflections
 
 
+@final
 class Simulated(NamedTuple):
     """One record under a batch of plants."""
 
@@ -44,6 +45,7 @@ class Simulated(NamedTuple):
     """Plants that have a bounded response, (batch,); the others are 0 throughout."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Simulation:
     """The model of a table with the effects of a forward model."""

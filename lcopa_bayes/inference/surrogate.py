@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -28,6 +28,7 @@ _TRIES = 40
 """Draws for each point inside the prior, at most [-]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Surrogate:
     """Quadratic responses of every fit record."""

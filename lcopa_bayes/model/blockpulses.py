@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,6 +126,7 @@ _WRAP = 1e-13
 """r^length: weight of the coefficients that wrap around [-]."""
 
 
+@final
 @dataclass(frozen=True)
 class Circle:
     """Evaluation points for series of `n` coefficients."""

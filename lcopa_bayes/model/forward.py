@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 
@@ -29,6 +29,7 @@ _ABREAST = 8
 """Portions are multiples of this: transforms of so many series run in one vector register."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Dynamics:
     """What shapes unit responses, for a batch of plants."""
@@ -64,6 +65,7 @@ StepResponses = dict[tuple[int, float], StepResponse]
 """Step responses by element and block width."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Experiment:
     """A record prepared for simulation: all that does not depend on parameters."""
@@ -112,6 +114,7 @@ class Experiment:
         return blocks_of(self.mesh.lattice, begin) if begin < np.inf else 0
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class ForwardModel:
     """Unit responses of every experiment: the operational matrices as a function of the dynamics."""

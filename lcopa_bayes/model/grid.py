@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from math import ceil
+from typing import final
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -25,6 +26,7 @@ _ALIGNED = 1e-4
 this wrong moves a response by less than 1e-7 rad at the paper's rates."""
 
 
+@final
 @dataclass(frozen=True)
 class Grid:
     """Equidistant blocks."""
@@ -42,6 +44,7 @@ class Grid:
         return np.asarray(self.start + self.step * np.arange(self.n + 1), dtype=float)
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Reading:
     """Block means -> response at sample times; samples before the first block read 0 (rest)."""
@@ -80,6 +83,7 @@ class Reading:
         return slice(self.blocks.start + shift, self.blocks.stop + shift, self.blocks.step)
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Lattice:
     """Sample times in units of the block width."""
@@ -104,6 +108,7 @@ class Lattice:
         return slice(0, int(self.slots[-1]) + 1, int(gaps[0])) if even else self.slots
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """Blocks of a record and the reading of its sample times."""

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 from lcopa_bayes.core.errors import nearest, refuse_if
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.data.settings import ModelSettings
 
 
+@final
 class ElementSlot(NamedTuple):
     """An element that one or several paths use."""
 
@@ -21,6 +22,7 @@ class ElementSlot(NamedTuple):
     """Number of viscous terms."""
 
 
+@final
 class Unit(NamedTuple):
     """Response of an element to one delayed drive, before any gain."""
 
@@ -29,6 +31,7 @@ class Unit(NamedTuple):
     drive: int
 
 
+@final
 class PathSlot(NamedTuple):
     """A path from a drive to a response."""
 
@@ -40,6 +43,7 @@ class PathSlot(NamedTuple):
     """Of its gain [response unit per drive unit]."""
 
 
+@final
 @dataclass(frozen=True)
 class Layout:
     """Axes of a plant and the slots its paths take their element and delay from."""

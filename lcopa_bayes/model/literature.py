@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from math import pi
+from typing import final
 
 from lcopa_bayes.model.path import TransferPath
 
@@ -18,6 +19,7 @@ _XY = TransferPath(0.005228, _DELAY, etas=(7.3076, 6.9062), orders=(1.8, 0.9), s
 _YX, _YY = replace(_XY, gain=0.003235), replace(_XX, gain=0.100001)
 
 
+@final
 @dataclass(frozen=True)
 class StatedPlant:
     """The identified 2 x 2 model, Eq. 65, in milliseconds and radians; the first letter is the output."""
@@ -33,6 +35,7 @@ class StatedPlant:
         return ((self.xx, self.xy), (self.yx, self.yy))
 
 
+@final
 @dataclass(frozen=True)
 class StatedOptics:
     """Array and liquid crystal, Sections 2, 3.2 and 5.1."""
@@ -77,6 +80,7 @@ class StatedOptics:
     """Claimed upper bound of the relative error of Eq. 24 [-]."""
 
 
+@final
 @dataclass(frozen=True)
 class StepMetrics:
     """A row of Table 1."""
@@ -93,6 +97,7 @@ class StepMetrics:
     """[-], of the steady value."""
 
 
+@final
 @dataclass(frozen=True)
 class StatedRecords:
     """What Section 5 says was measured and how well the models fitted."""
@@ -133,6 +138,7 @@ class StatedRecords:
     """Claimed dominant order [-]."""
 
 
+@final
 @dataclass(frozen=True)
 class Stated:
     """Everything printed that this package uses or tests."""

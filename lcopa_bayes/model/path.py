@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from math import inf, isfinite
-from typing import Self
+from typing import Self, final
 
 from lcopa_bayes.core.errors import InputError, refuse_if
 
@@ -14,6 +14,7 @@ _SAME = 1e-9
 """Orders closer than this are one term [-]."""
 
 
+@final
 class Normalisation(Enum):
     """Which coefficient fixes the common scale of gain, viscosities and stiffness."""
 
@@ -23,6 +24,7 @@ class Normalisation(Enum):
     """The viscosity of the last order, which Eq. 65 prints as 1."""
 
 
+@final
 @dataclass(frozen=True)
 class TransferPath:
     """``gain exp(-delay s) / (sum_i eta_i s^order_i + stiffness)`` (Ta et al. 2026, Eqs. 31, 62, 65).

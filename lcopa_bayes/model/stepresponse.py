@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Literal, final
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.model.blockpulses import Circle, Spectrum, integration_weights, integration_weights_slope
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class TransferSlopes:
     """Derivatives of a transfer function on the circle, one entry per viscous term."""
@@ -176,6 +177,7 @@ def taps(theta: Array, kind: Kind) -> Array:
     return out
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class StepResponse:
     """Unit step responses of a batch of elements and, as further rows, their derivatives.

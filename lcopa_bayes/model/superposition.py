@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import ceil
+from typing import final
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -31,6 +32,7 @@ _ADDED = 10
 """Changes of one phase that are added one by one; more are convolved on the circle."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Phase:
     """Changes of a drive that are whole blocks apart."""
@@ -84,6 +86,7 @@ def blocks_of(lattice: Lattice, begin: float) -> int:
     return ceil((float(lattice.times[-1]) - begin) / lattice.step) + SPARE if lattice.times.size else SPARE
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class _Read:
     """A step response on the lattice of a record."""
@@ -117,6 +120,7 @@ class _Read:
         return np.asarray(windows[:, np.arange(start.size), first][:, :, slots])
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Superposition:
     """Responses of elements to drives, for one batch of plants; what records share is read once."""

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import asin, ceil, floor, isfinite, nan, pi, sin
-from typing import Annotated
+from typing import Annotated, final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,6 +34,7 @@ _ROUNDING = 4 * float(np.finfo(float).eps)
 """A direction cosine beyond 1 by no more than this [-] is end-fire within rounding."""
 
 
+@final
 @dataclass(frozen=True)
 class LinearArray(Ruled):
     """Equally spaced elements in a row; InputError for an impossible array, all problems at once."""
@@ -133,6 +134,7 @@ def intensity(array: LinearArray, u: ArrayLike, step: float) -> Array:
     return np.asarray(array_factor(array, u, step) ** 2 * element_factor(array, u) / main)
 
 
+@final
 @dataclass(frozen=True)
 class LinearPatterns:
     """Patterns of one linear array steered to several targets: the data of Fig. 3."""
@@ -145,6 +147,7 @@ class LinearPatterns:
     """(m, n) [-], 1 at each target."""
 
 
+@final
 @dataclass(frozen=True)
 class PlanarPattern:
     """Pattern of a square array: the data of one panel of Fig. 5."""
@@ -209,6 +212,7 @@ _PER_LOBE = 16
 """Samples per lobe width ``lambda / (N d)`` [-] in a search; refinement follows."""
 
 
+@final
 @dataclass(frozen=True)
 class Lobe:
     """A direction in which all elements add in phase."""
@@ -342,6 +346,7 @@ def largest_linearisation_error(array: LinearArray, phase_limit: float) -> float
     return float(np.abs(linearisation_error(array, [0.0, phase_limit])).max())
 
 
+@final
 @dataclass(frozen=True)
 class GeometryCheck:
     """Whether one pitch agrees with both the simulation and the experiment (claim S4)."""

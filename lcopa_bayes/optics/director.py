@@ -18,7 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 from math import isfinite, pi, sqrt
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, final
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
@@ -33,6 +33,7 @@ PRETILT = Rule(
 )
 
 
+@final
 class Field(Enum):
     """Field inside the cell."""
 
@@ -42,6 +43,7 @@ class Field(Enum):
     """Constant displacement ``D``, ``dV/dz = D / (eps + deps sin^2 th)``, which integrates to V."""
 
 
+@final
 @dataclass(frozen=True)
 class Cell(Ruled):
     """Nematic of positive dielectric anisotropy between parallel plates; InputError for anything else."""
@@ -77,6 +79,7 @@ _PER_LAYER = 4
 """Least grid cells per wall layer ``sqrt(k1 / deps) / V`` [-]; coarser grids do not resolve the wall."""
 
 
+@final
 class NotConverged(RuntimeError):  # noqa: N818 - a state of the iteration, named as such
     """Newton's iteration stopped short; holds the voltage, the residual reached and the iterations."""
 
@@ -88,6 +91,7 @@ class NotConverged(RuntimeError):  # noqa: N818 - a state of the iteration, name
         )
 
 
+@final
 @dataclass(frozen=True)
 class Profile:
     """Equilibrium tilt across the cell at one voltage."""
@@ -114,6 +118,7 @@ class Profile:
         return float(self.tilt.max())
 
 
+@final
 class Expansion(NamedTuple):
     """Energy over ``k1 / thickness`` and its derivatives with respect to the interior tilts."""
 

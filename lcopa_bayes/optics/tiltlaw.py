@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import inf, nextafter, pi
+from typing import final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,6 +15,7 @@ from lcopa_bayes.model.literature import PAPER, StatedOptics
 from lcopa_bayes.optics.director import CELLS, Cell, Field, equilibrium, paper_cell
 
 
+@final
 @dataclass(frozen=True)
 class DirectorCurve:
     """Equilibria of one cell over a range of voltages: the data of Figs. 10 and 11."""
@@ -52,6 +54,7 @@ def director_curve(
     return DirectorCurve(field, volts, profiles[0].position, tilt, mean)
 
 
+@final
 @dataclass(frozen=True)
 class TiltLaw:
     """Two straight branches, ``low u`` below the knee and ``high (u - origin) + start`` from it on."""
@@ -107,6 +110,7 @@ def best_law(curve: DirectorCurve, optics: StatedOptics = PAPER.optics) -> TiltL
     return TiltLaw(low=low, high=float(high), start=float(start), origin=knee, knee=knee, limit=limit)
 
 
+@final
 @dataclass(frozen=True)
 class FitQuality:
     """How a law follows the solved mean tilt over a range of voltages."""
@@ -156,6 +160,7 @@ def fit_quality(curve: DirectorCurve, law: TiltLaw, lower: float, upper: float) 
     )
 
 
+@final
 @dataclass(frozen=True)
 class TiltLawCheck:
     """Numbers behind claim S1; each tuple runs over `RANGES`."""

@@ -6,13 +6,14 @@ Output-error fit of one path: many starts, exact Jacobian, continuous delay.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, final
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.core.arrays import Vector, attributes, plain
+from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError, refuse_if
+from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.core.parallel import Progress, workers
 from lcopa_bayes.data.settings import ModelSettings, NoiseSettings
 from lcopa_bayes.data.study import Study
@@ -79,6 +80,7 @@ def _values(posterior: Posterior, model: TransferPath) -> Vector:
     return out
 
 
+@final
 @dataclass(frozen=True)
 class Identified:
     """A model of a path with its errors on the records it was identified from."""
@@ -97,6 +99,7 @@ class Identified:
     """Least output error among candidates of any sign, over blocks [response unit]."""
 
 
+@final
 @dataclass(frozen=True)
 class Identification:
     """One path of a study, identified by several methods from the same records."""

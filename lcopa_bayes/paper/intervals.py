@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 from math import isfinite
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -21,6 +21,7 @@ MOST_TERMS = 3
 """The paper's element has three viscous terms; a lattice of more orders cannot be scanned."""
 
 
+@final
 class Interval(NamedTuple):
     """Ends of a scanned interval, both included."""
 
@@ -28,6 +29,7 @@ class Interval(NamedTuple):
     high: float
 
 
+@final
 class Candidates(NamedTuple):
     """Candidates of one round of the scan: every row of orders with every delay."""
 
@@ -42,6 +44,7 @@ class Candidates(NamedTuple):
         return int(self.orders.shape[0] * self.delays.size)
 
 
+@final
 @dataclass(frozen=True)
 class Scan:
     """Intervals of a scan. InputError with all problems unless the fields are as they say."""

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import permutations
 from math import floor, log10
+from typing import final
 
 import numpy as np
 
@@ -38,6 +39,7 @@ _LONG = 40.0
 _POINTS = 40001
 
 
+@final
 @dataclass(frozen=True)
 class PrintedModel:
     """The 2 x 2 model of Eq. 65 with the numbers of `stated`."""
@@ -90,6 +92,7 @@ class PrintedModel:
         return truth(single, camera, drive, duration=RECORD_LENGTH, name="printed model")
 
 
+@final
 @dataclass(frozen=True)
 class Rival:
     """The integer-order model that comes closest to the step response of Eq. 65."""

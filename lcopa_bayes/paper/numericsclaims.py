@@ -24,7 +24,7 @@ import timeit
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -44,6 +44,7 @@ from lcopa_bayes.paper.modelclaims import RECORD_LENGTH
 from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict
 
 
+@final
 @dataclass(frozen=True)
 class WaveletBasis:
     """The constant and the wavelets of Eq. 37 with m = 1 on levels 1..K, N = 2^K functions in all.
@@ -132,6 +133,7 @@ def _system(path: TransferPath, integration: Callable[[float], Matrix]) -> Matri
     return system
 
 
+@final
 class FormCost(NamedTuple):
     """What the wavelet form costs and changes against the block-pulse form (claim N1)."""
 
@@ -211,6 +213,7 @@ def whole_blocks(stated: Stated, evidence: Evidence) -> Verdict:
     return Verdict(Kind.of(worst.largest_shift <= TOLERATED_SHIFT), worst.largest_shift, "sd", how)
 
 
+@final
 @dataclass(frozen=True)
 class DelayRounding:
     """Effect of rounding one delay to whole blocks on one record."""

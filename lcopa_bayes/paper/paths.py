@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 from scipy.special import gamma
@@ -40,6 +41,7 @@ _DEPARTED = 3.5
 """A sample this many noise sd from the mean of those before it is no longer at the resting level."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Blocks:
     """One path of one record as block pulses (Ta et al. 2026, Eqs. 43-46), deviations from rest."""
@@ -88,6 +90,7 @@ def _means(grid: Grid, knots: Vector, heights: Vector) -> Vector:
     return np.asarray(np.diff(areas[piece] + into * (heights[piece] + slope * into / 2)) / grid.step)
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class PathRecord:
     """Data of one record for one path."""
@@ -103,6 +106,7 @@ class PathRecord:
     blocks: Blocks
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class PathData:
     """The records of a study from which one path is identified."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import final
 
 import numpy as np
 
@@ -27,6 +28,7 @@ _ROUND = 9
 """Decimals to which exponents are distinguished."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Evaluated:
     """Coefficients and output errors of all candidates of a round, delays varying fastest."""
@@ -53,6 +55,7 @@ class Evaluated:
         return tuple(map(float, self.candidates.orders[row])), float(self.candidates.delays[late])
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class _Ground:
     """Records on equal blocks and their stored series."""
@@ -179,6 +182,7 @@ def _output_squares(grounds: Sequence[_Ground], at: Index, late: Index, coeffici
     return total
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Scanned:
     """The best candidates of a scan."""

@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from math import pi
-from typing import Annotated, Any
+from typing import Annotated, Any, final
 
 import numpy as np
 import pandas as pd
 
-from lcopa_bayes.core.arrays import plain
+from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.rules import Rule, Ruled, is_number, whole, word_of
 from lcopa_bayes.model.literature import PAPER, StatedOptics
 from lcopa_bayes.optics.array import (
@@ -45,6 +45,7 @@ _VOLTS = Rule(
 )
 
 
+@final
 @dataclass(frozen=True)
 class OpticsPlan(Ruled):
     """Array, cell and what to look at, by default the paper's; InputError, all problems at once, for what
@@ -108,6 +109,7 @@ class OpticsPlan(Ruled):
 _CHAIN_POINTS = 241
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class StaticOptics:
     """All that the verb reports and draws."""

@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lcopa_bayes.core.arrays import Vector, plain
+from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.data.drive import AxisDrive, axis_drives, first_change
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study

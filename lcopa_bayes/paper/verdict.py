@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, final
 
-from lcopa_bayes.core.arrays import attributes, plain
+from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.model.literature import Stated
 
 
+@final
 class Kind(Enum):
     """What became of a claim."""
 
@@ -25,6 +26,7 @@ class Kind(Enum):
         return cls.SUPPORTED if holds else cls.CONTRADICTED
 
 
+@final
 @dataclass(frozen=True)
 class Verdict:
     """Outcome of one test."""
@@ -47,6 +49,7 @@ def waiting(stage: str, question: str) -> Verdict:
     return undecided(f"No {stage} is among the evidence; it has to answer: {question}")
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Evidence:
     """What beyond the printed numbers a test may read: the results of other stages, absent until run."""
@@ -61,6 +64,7 @@ Test: TypeAlias = Callable[[Stated, Evidence], Verdict]
 """Computes a verdict from the stated numbers and the evidence alone."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Claim:
     """A sentence of the paper and the test of it: a copy of `Stated` with another number can give another
@@ -73,6 +77,7 @@ class Claim:
     test: Test
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Judged:
     """A claim with its verdict."""

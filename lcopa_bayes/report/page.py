@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, final
 
 from jinja2 import ChoiceLoader, Environment, FileSystemLoader, PackageLoader, StrictUndefined, UndefinedError
 from markupsafe import Markup, escape
@@ -37,6 +37,7 @@ _ADVICE = {
 }
 
 
+@final
 @dataclass(frozen=True)
 class Verdict:
     """Grade, sentence and reason in the box at the top of a page."""
@@ -57,6 +58,7 @@ class Verdict:
         return cls(str(values["grade"]), formatting.stopped(sentence), "" if reason in sentence else reason)
 
 
+@final
 @dataclass
 class Page:
     """What a template puts on a page, in the order it does so."""

@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 import pandas as pd
@@ -56,6 +56,7 @@ _RESULTS = (
 _PROVENANCE = ("command", "seed", "inputs_sha256", "python", "versions")
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class SavedRun:
     """Results, tables and draws read from a run folder."""

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import log10
-from typing import Any, TypeVar
+from typing import Any, TypeVar, final
 
 import matplotlib
 import numpy as np
@@ -215,6 +215,7 @@ def said(size: int) -> str:
     return f"Drawn through the extremes of short stretches: the record has {size} samples."
 
 
+@final
 @dataclass(frozen=True)
 class Drawing:
     """A figure as SVG, with the stem of its file name and its caption."""

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import exp, inf, isfinite, log, sqrt
+from typing import final
 
 import numpy as np
 from scipy.stats import binom
@@ -45,6 +46,7 @@ _FREQUENCY_STEP = 0.01
 _DRAWS = 400
 
 
+@final
 @dataclass(frozen=True)
 class Resonance:
     """An undamped resonance of one element that the samples do not resolve."""
@@ -218,6 +220,7 @@ def limitations(
     )
 
 
+@final
 @dataclass(frozen=True)
 class Coverage:
     """Samples of one axis of one record inside the 90 % band."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, final
 
 import arviz_base
 import numpy as np
@@ -187,6 +187,7 @@ def variable_names(wanted: Sequence[str]) -> list[str]:
     return out
 
 
+@final
 @dataclass(frozen=True)
 class _Series:
     """What was seen of some records, by variable name."""
@@ -217,6 +218,7 @@ class _Series:
         )
 
 
+@final
 @dataclass(frozen=True)
 class _Drives:
     """Drives of some records, by variable name."""

@@ -11,13 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.core.arrays import Flags, Matrix, Vector, attributes
+from lcopa_bayes.core.arrays import Flags, Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of
+from lcopa_bayes.core.estimate import attributes
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.leastsquares import LeastSquares
@@ -48,6 +49,7 @@ _PORTION = 32
 """Draws that one process takes at once [-]."""
 
 
+@final
 @dataclass(frozen=True)
 class Discretisation:
     """Shift of the posterior means by the width of the blocks."""

@@ -9,15 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 import pandas as pd
 from scipy.special import logsumexp
 
-from lcopa_bayes.core.arrays import Estimate, plain
 from lcopa_bayes.core.covariance import root_of
 from lcopa_bayes.core.errors import InputError, refuse_if
+from lcopa_bayes.core.estimate import Estimate, plain
 from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
@@ -51,6 +51,7 @@ _TRIED = 20
 """Batches after which draws outside the prior are replaced no further."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class FirstLook:
     """Least squares of a study with a Gaussian about the best optimum."""

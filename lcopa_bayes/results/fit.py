@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 from xarray import DataTree
 
-from lcopa_bayes.core.arrays import Estimate, Matrix, digest_of
+from lcopa_bayes.core.arrays import Matrix, digest_of
 from lcopa_bayes.core.errors import refuse_if
+from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.core.files import save_json, save_table, writable_folder, write_text, write_whole
 from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.data.study import Study
@@ -47,6 +48,7 @@ _QUICK = 4
 """How many times fewer steps a quick fit takes."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Fit(Predictive):
     """A fitted study: draws of its posterior, what it predicts, and how far both can be trusted."""

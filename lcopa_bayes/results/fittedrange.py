@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Literal, final
 
 import numpy as np
 
@@ -32,6 +32,7 @@ _MOST = 1 << 15
 """Most blocks of a drive whose spectrum is taken."""
 
 
+@final
 @dataclass(frozen=True)
 class Outside:
     """One thing that lies outside the fitted range."""
@@ -48,6 +49,7 @@ class Outside:
         return asdict(self)
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class FittedRange:
     """What the fit records covered."""

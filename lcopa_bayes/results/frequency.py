@@ -5,14 +5,15 @@ At ``s = i 2 pi f`` (Ta et al. 2026, Eq. 31, stiffness divided out)."""
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from lcopa_bayes.core.arrays import Array, Estimate, Matrix, Vector, frozen, plain
+from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import Estimate, plain
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.model.stepresponse import denominator
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS, Bands, named
@@ -33,6 +34,7 @@ _SIGN = 0.05
 """Share of draws with a gain of the other sign from which the phase has two values [-]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class PathResponse:
     """Frequency response of one path."""
@@ -58,6 +60,7 @@ class PathResponse:
         return out | ({"note": self.note} if self.note else {})
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class FrequencyResponse:
     """Gain and phase of every path over frequency."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from lcopa_bayes.results.fit import Fit, fit
 from lcopa_bayes.results.summary import scores
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Rival:
     """A fitted rival beside the fit it rivals."""

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, final
 
 import numpy as np
 import pandas as pd
 
-from lcopa_bayes.core.arrays import Array, Vector, attributes, plain
+from lcopa_bayes.core.arrays import Array, Vector
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.core.files import save_json, save_table, writable_folder
 from lcopa_bayes.data.drive import Drive, drive_of, first_change
 from lcopa_bayes.data.record import Record, load_columns, record_of
@@ -37,6 +38,7 @@ _WEIGHTS = 100
 """Draws behind the median gain that weighs frequencies."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Prediction(Result):
     """Bands of every response axis under one drive."""

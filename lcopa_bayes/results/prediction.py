@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 import pandas as pd
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector, attributes
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.estimate import attributes
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.noise import GaussianNoise, Noise
@@ -30,6 +31,7 @@ _SWEEPS = 20
 """Sweeps after which a Gibbs chain of a level has forgotten its start [-]: 1e-6 of it remains at nu = 1."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Band:
     """Bands of one response axis of one record, at the record's sample times, or under a new drive."""

@@ -9,8 +9,8 @@ import pandas as pd
 from numpy.typing import ArrayLike
 from xarray import DataTree
 
-from lcopa_bayes.core.arrays import attributes
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import attributes
 from lcopa_bayes.data.drive import Drive
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from scipy import signal, stats
 
-from lcopa_bayes.core.arrays import Vector, attributes
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.estimate import attributes
 from lcopa_bayes.inference.noise import Noise
 from lcopa_bayes.results.prediction import Band
 from lcopa_bayes.sampling.draws import Draws
@@ -22,6 +23,7 @@ WHITE_P = 0.01
 """Below this p-value the whitened residual is not white."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Residual:
     """Residual of one axis of one record at the posterior median response."""

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import pandas as pd
 
-from lcopa_bayes.core.arrays import plain
+from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.parallel import meanwhile
 
 

@@ -19,8 +19,8 @@ from typing import IO, Any, overload
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import attributes, plain
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.core.files import save_json, writable_folder, writing
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 import xarray as xr
@@ -37,6 +37,7 @@ _AGAIN = "run `fit` on the study again with this version of lcopa-bayes"
 _CUT = "the run was cut short, or files of two runs are mixed; run `fit` again"
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class SavedFit(Predictive):
     """A fit that was read from its run folder: it predicts as it did after sampling."""

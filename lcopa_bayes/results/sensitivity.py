@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Literal, final
 
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector, plain
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.convergence import Level
 from lcopa_bayes.sampling.draws import Draws
@@ -34,6 +35,7 @@ _RANK: dict[Diagnosis, int] = {
 }
 
 
+@final
 @dataclass(frozen=True)
 class Sensitivity:
     """How fast one parameter's posterior moves with the power of the prior and of the likelihood."""
@@ -151,6 +153,7 @@ def _note(prior: float, prior_error: float, likelihood: float, likelihood_error:
     return "; ".join(words)
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class _Scale:
     """Sensitivity of all parameters to one density."""

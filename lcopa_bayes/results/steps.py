@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Array, Estimate, Flags, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.simulation import Simulation
@@ -40,6 +42,7 @@ _HALF = 0.5
 """Share of the draws from which an element counts as too fast for the sampling [-]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class StepCurves:
     """Responses of every path to a unit step at time 0, over the longest record."""
@@ -202,6 +205,7 @@ def path_metrics(draws: Draws, *, span: float, time_unit: str, path: str | None 
     return [one for one in metrics if path is None or one.name.endswith(f"[{path}]")]
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Metric:
     """One figure of a step response at every draw."""

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
-from lcopa_bayes.core.arrays import plain
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import save_json, writable_folder, write_text
 from lcopa_bayes.results.datatree import POSTERIOR
 from lcopa_bayes.results.predictive import Predictive

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Vector, plain
-from lcopa_bayes.inference.parameter import COEFFICIENTS, CONSTANTS
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.results.residuals import WHITE_P
 from lcopa_bayes.results.steps import share_unsettled

@@ -9,6 +9,7 @@ that no walker of the source was in, such as one excluded by the omitted data, a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import final
 
 import emcee
 import numpy as np
@@ -35,6 +36,7 @@ _THIN = 5
 """... one in this many moves."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Transferred:
     """Draws of the target."""
@@ -88,6 +90,7 @@ def transferred(
     return _judged(np.stack(chains))
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class _Between:
     """Log density between source and target."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import final
 
 import h5py
 import numpy as np
@@ -18,6 +19,7 @@ _WEIGHTED = ("coordinates", "log_density", "raw", "log_weights", "sampled")
 _ARRAYS = ("chain", "log_density", "position", "position_log_density", "accepted", "trail")
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Chain:
     """Progress of a run."""

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 from scipy.special import logsumexp
@@ -28,6 +28,7 @@ _WIDER = 1.1
 _LOG_2PI = float(np.log(2 * np.pi))
 
 
+@final
 class Kept(NamedTuple):
     """One draw for each of a batch of points."""
 
@@ -41,6 +42,7 @@ class Kept(NamedTuple):
     """Effective share of the draws tried, (batch,) [-]."""
 
 
+@final
 class _Block(NamedTuple):
     """Gaussian of a few coordinates given those before them, those after them integrated out."""
 
@@ -173,6 +175,7 @@ def _drawn(
     return x, log_source, exists
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class _Subsets:
     """Draws of the shares of one element, every subset of its times from the prior in turn."""

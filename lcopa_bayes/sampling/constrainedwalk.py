@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import final
 
 import numpy as np
 
@@ -30,6 +31,7 @@ _WANDER = 0.02
 """Deviation added to the differences that slides consist of [-]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Walk:
     """Moves of points within the constraint."""

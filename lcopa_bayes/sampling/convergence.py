@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import ceil
-from typing import Any, Literal
+from typing import Any, Literal, final
 
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 from scipy.stats import chi2, norm, rankdata, spearmanr
 
-from lcopa_bayes.core.arrays import Array, Vector, attributes
+from lcopa_bayes.core.arrays import Array, Vector
+from lcopa_bayes.core.estimate import attributes
 from lcopa_bayes.sampling.modes import Modes
 
 Level = Literal["reliable", "tentative", "unusable"]
@@ -42,6 +43,7 @@ TENTATIVE_SHARES = 0.2
 _RANK: dict[Level, int] = {"reliable": 0, "tentative": 1, "unusable": 2}
 
 
+@final
 @dataclass(frozen=True)
 class Quality:
     """Convergence of one parameter's draws."""
@@ -126,6 +128,7 @@ class Quality:
         return f"{'; '.join(reasons)}; {steps}"
 
 
+@final
 @dataclass(frozen=True)
 class Grade:
     """A grade with the reason for it."""
@@ -139,6 +142,7 @@ class Grade:
         return max(grades, key=lambda grade: _RANK[grade.level])
 
 
+@final
 @dataclass(frozen=True)
 class Limitation:
     """A condition under which intervals hold and that the draws cannot check: no number it concerns is

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import final
 
 import numpy as np
 from scipy.special import expit, log_expit, logit
@@ -18,6 +19,7 @@ from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.moves import Terrain
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Chart:
     """A smooth change of the sampled coordinates, one to one on terms by decreasing order."""

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from scipy.stats import kstwobign, norm
 
-from lcopa_bayes.core.arrays import EQUAL_TAILED, LEVEL, Vector, attributes, plain
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.estimate import EQUAL_TAILED, LEVEL, attributes, plain
 from lcopa_bayes.sampling.convergence import Grade, Level, Limitation
 from lcopa_bayes.sampling.draws import Draws
 from lcopa_bayes.sampling.nested import Nested
@@ -25,6 +26,7 @@ _REMEDY = (
 )
 
 
+@final
 @dataclass(frozen=True)
 class Summary:
     """Marginal of a parameter by one method, in the parameter's unit."""
@@ -52,6 +54,7 @@ class Summary:
         return {"value": self.value} | interval | {"ess": self.ess}
 
 
+@final
 @dataclass(frozen=True)
 class Compared:
     """A parameter by both methods."""
@@ -70,6 +73,7 @@ class Compared:
     """Smallest distance that is called a disagreement [-]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class CrossCheck:
     """A run beside nested sampling of the same posterior."""

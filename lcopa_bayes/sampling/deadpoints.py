@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 from scipy.special import logsumexp
@@ -16,6 +17,7 @@ from scipy.special import logsumexp
 from lcopa_bayes.core.arrays import Flags, Index, Matrix, Vector
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Strands:
     """Dead points of one or more runs by increasing likelihood."""

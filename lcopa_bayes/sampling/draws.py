@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import final
 
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 
-from lcopa_bayes.core.arrays import Array, Estimate, Index, Matrix, Vector, digest_of
+from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector, digest_of
+from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.convergence import (
@@ -38,6 +40,7 @@ _CHUNK = 128
 """Draws completed at a time."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Draws:
     """Draws of every row of the parameter table."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, final
 
 import emcee
 import numpy as np
@@ -15,6 +15,7 @@ from lcopa_bayes.sampling.ridgemoves import emcee_sampler
 from lcopa_bayes.sampling.tempering import temper
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Ensemble:
     """Kept draws of one ensemble and the state it continues from."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from scipy.special import logsumexp
@@ -37,6 +37,7 @@ _SETTLED = 1e-10
 """Change of the log ratio at which the iteration of a bridge stops [nat]."""
 
 
+@final
 @dataclass(frozen=True)
 class Evidence:
     """Log evidence of a posterior."""

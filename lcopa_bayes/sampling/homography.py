@@ -13,6 +13,7 @@ whatever the new orders in A'. The homography from c to c' has the Jacobian
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from lcopa_bayes.core.arrays import Array, Flags, Index, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Element:
     """Columns of an element among the sampled coordinates; all its times are sampled, by logarithm."""

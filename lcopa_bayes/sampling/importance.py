@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import final
 
 import numpy as np
 
@@ -38,6 +39,7 @@ _LIGHT = 0.2
 """Pareto k at which the proposal is fitted no further, if it is efficient [-]."""
 
 
+@final
 @dataclass(frozen=True)
 class Effort:
     """Limits on the work of one attempt."""
@@ -50,6 +52,7 @@ class Effort:
     """Most such rounds."""
 
 
+@final
 @dataclass(frozen=True)
 class ImportancePlan:
     """How much work importance sampling may spend."""
@@ -64,6 +67,7 @@ class ImportancePlan:
     """Whether a good attempt is close to the posterior."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Importance:
     """Weighted draws of a posterior around its optima."""

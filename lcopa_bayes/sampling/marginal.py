@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import ceil
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -91,6 +91,7 @@ _TASK = 64
 """Points of a task."""
 
 
+@final
 class _Point(NamedTuple):
     """What is known at each of a batch of points."""
 
@@ -110,6 +111,7 @@ class _Point(NamedTuple):
     """Effective share of the draws tried [-]."""
 
 
+@final
 class Search:
     """Points, proposals and weights of a search; deterministic given its arguments and what it is asked.
 

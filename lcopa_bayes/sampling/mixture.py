@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -27,6 +27,7 @@ _RIDGE = 1e-6
 """Added to the variance of every direction, relative to the draws' own [-]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Mixture:
     """Multivariate Student components with common degrees of freedom."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 
@@ -23,6 +23,7 @@ def learned(posterior: Posterior, chains: Sequence[Array], seed: int) -> Mixture
     return Mixture.fitted(Chart.of(posterior).usable(pooled)[1], seed)
 
 
+@final
 class MixtureMove(PopulationMove):
     """Independence proposals: a walker goes anywhere in the charted posterior in one step.
 
@@ -48,6 +49,7 @@ class MixtureMove(PopulationMove):
         return self.mixture.log_density(y) + log_volume
 
 
+@final
 class MixtureWalk(PopulationMove):
     """A step as long and as wide as the component a walker belongs to.
 

@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise
 from math import sqrt
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 from scipy.ndimage import gaussian_filter1d
 
-from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector, attributes, frozen, plain
+from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector, frozen
+from lcopa_bayes.core.estimate import attributes, plain
 
 DEPTH = 0.5
 """The minimum between two modes is below this share of the lower of both [-] ..."""
@@ -33,6 +34,7 @@ minima due to noise do not matter, as each has to be certain."""
 _COUNT = {2: "two", 3: "three", 4: "four"}
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Modes:
     """Modes of one parameter's marginal, in increasing order; a single mode without boundaries."""

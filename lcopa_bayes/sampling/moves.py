@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, final
 
 import emcee
 import numpy as np
@@ -19,6 +19,7 @@ LARGEST_ORDER = 2.0
 """Orders lie in (0, LARGEST_ORDER] [-]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Terrain:
     """Properties of a posterior that moves use."""
@@ -122,6 +123,7 @@ def jittered(difference: Matrix, random: Any) -> Matrix:
     return np.asarray(difference * (1 + _JITTER * random.randn(*difference.shape)))
 
 
+@final
 class DifferenceMove(PopulationMove):
     """Differential evolution in the sampled coordinates, in all of them or in a random few."""
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from dynesty import NestedSampler
@@ -41,6 +41,7 @@ _CHUNK = 128
 """Draws completed at a time."""
 
 
+@final
 @dataclass(frozen=True)
 class NestedPlan:
     """How thoroughly to sample."""
@@ -61,6 +62,7 @@ class NestedPlan:
         return cls(8, live // 4 if quick else live, 20 * dimension, seed)
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Nested:
     """What nested sampling gave."""
@@ -177,6 +179,7 @@ def _run(shared: tuple[Posterior, NestedPlan], seed: np.random.SeedSequence) -> 
     return strands, plan.live + int(np.sum(results.ncall))
 
 
+@final
 class _Together:
     """What dynesty takes for its pool of workers: a queue of points is moved as one batch."""
 
@@ -187,6 +190,7 @@ class _Together:
         return [function(argument) for argument in given]
 
 
+@final
 class _ConstrainedSampler(InternalSampler):  # type: ignore[misc]
     """How dynesty finds new live points; see dynesty.internal_samplers.InternalSampler."""
 

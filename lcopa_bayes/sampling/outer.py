@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import final
 
 import numpy as np
 
@@ -34,6 +35,7 @@ def applies(posterior: Posterior) -> bool:
     return bool(conditional.given and conditional.elements and conditional.columns)
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Outer:
     """The parameters that are searched, in their sampled coordinates y."""
@@ -74,6 +76,7 @@ class Outer:
         return out
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class PriorOrders:
     """A proposal: orders from their prior, the rest from a mixture, None where there is no rest."""
@@ -105,6 +108,7 @@ class PriorOrders:
         return total if self.rest is None else total + self.rest.log_density(y[:, ~outer.orders])
 
 
+@final
 @dataclass(frozen=True)
 class Optima:
     """Task: optimum of the rest from `starts`, or from the best of prior draws where these are None."""
@@ -126,6 +130,7 @@ class Optima:
         return at.values, objective, conditional.uncertainty(at)
 
 
+@final
 @dataclass(frozen=True)
 class Draw:
     """Task: optimum of the rest from `starts`, and a draw of it."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, final
 
 import numpy as np
 from scipy.special import logsumexp
@@ -122,6 +122,7 @@ class Proposal(Protocol):
         """Log density, (n,)."""
 
 
+@final
 @dataclass(frozen=True)
 class Blend:
     """A proposal that is in part another."""
@@ -143,6 +144,7 @@ class Blend:
         return np.asarray(np.logaddexp(np.log1p(-self.share) + both[0], np.log(self.share) + both[1]))
 
 
+@final
 @dataclass(frozen=True)
 class Seen:
     """Draws of all proposals so far, weighted as draws of their mixture (Cornuet, Marin, Mira and Robert
@@ -264,6 +266,7 @@ def paraboloid(y: Matrix, log_density: Vector) -> Mixture | None:
     return Mixture(np.ones(1), (centre + scale * (axes @ mode))[None], (scale[:, None] * factor)[None])
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class _Cloud:
     """Weighted draws that components are fitted to."""

@@ -9,7 +9,7 @@ ridge, and one whole term drawn anew. Proposals that leave the support have fact
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, final
 
 import emcee
 import numpy as np
@@ -79,6 +79,7 @@ class RidgeMove(PopulationMove):
         return element if term < 0 else element.holding(term)
 
 
+@final
 class ShapeMove(RidgeMove):
     """Differential evolution in ratios and orders of all elements, or of one, and what they share."""
 
@@ -120,6 +121,7 @@ class ShapeMove(RidgeMove):
         return proposed, total
 
 
+@final
 class OrderSlide(RidgeMove):
     """Orders of one element move, its ratios stay."""
 
@@ -138,6 +140,7 @@ class OrderSlide(RidgeMove):
         return self.rebuilt(proposed, here, element, ratios, frequencies)
 
 
+@final
 class OrderRoam(RidgeMove):
     """One order of one element is drawn anew from (0, 2), its ratios stay."""
 
@@ -154,6 +157,7 @@ class OrderRoam(RidgeMove):
         return self.rebuilt(proposed, here, element, ratios, frequencies)
 
 
+@final
 class TermRedraw(RidgeMove):
     """One term is drawn anew and the others follow: large moves where it is negligible or a spring."""
 

@@ -8,6 +8,7 @@ from functools import cached_property
 from math import ceil
 from pathlib import Path
 from time import monotonic
+from typing import final
 
 import numpy as np
 
@@ -59,6 +60,7 @@ _SURPLUS = 1.12
 """... and effective importance draws: 1.12 and 10 times as many are together worth 1.007 times as many."""
 
 
+@final
 @dataclass(frozen=True)
 class SamplePlan:
     """How long and how wide to sample."""
@@ -108,6 +110,7 @@ class SamplePlan:
         )
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Run:
     """What sampling gave."""
@@ -334,6 +337,7 @@ def _sampled_values(posterior: Posterior, run: Run, *, kept: bool = True) -> Arr
     return values.reshape(*coordinates.shape[:3], -1)
 
 
+@final
 @dataclass(frozen=True)
 class _Birth:
     """Task: a new ensemble of a seed."""
@@ -344,6 +348,7 @@ class _Birth:
         return Ensemble.tempered(posterior, self.walkers, _SWEEPS, seed)
 
 
+@final
 @dataclass(frozen=True)
 class _Round:
     """Task: an ensemble one round further."""

@@ -12,7 +12,7 @@ There one term is held: it keeps its own time constant, and one ratio less fixes
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
 
 
+@final
 class Shape(NamedTuple):
     """An element at given frequencies, for a batch."""
 
@@ -31,6 +32,7 @@ class Shape(NamedTuple):
     """log |d log ratios / d log times|, (batch,)."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class ElementColumns:
     """Columns of an element among the sampled coordinates; its times are sampled by logarithm."""

@@ -9,7 +9,7 @@ emcee moves that sample the posterior (Del Moral, Doucet and Jasra 2006, J. R. S
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, final
 
 import emcee
 import numpy as np
@@ -37,6 +37,7 @@ _TRAVELLED = 0.3
 """Rank correlation with its start at which a population has moved enough at one temperature [-]."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Population:
     """Walkers tempered from the prior to the posterior."""
@@ -106,6 +107,7 @@ def _memory(posterior: Posterior, before: Matrix, after: Matrix) -> float:
     return max(rank_correlation(then[:, k], now[:, k]) for k in range(then.shape[1]))
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class _Tempered:
     """Log density with the likelihood raised to a power."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import final
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from lcopa_bayes.core.arrays import Flags, Index, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class UnitCube:
     """Points of the cube are prior probabilities, one per sampled parameter in its own prior.

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import sqrt
+from typing import final
 
 import numpy as np
 from scipy.special import logsumexp
@@ -31,6 +32,7 @@ _LOOKED_AT = 4_000
 """Resampled draws in which modes are sought."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Weighted:
     """Independent draws with weights; those without density are counted only."""

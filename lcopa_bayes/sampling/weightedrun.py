@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import final
 
 import numpy as np
 from scipy.special import logsumexp
@@ -148,6 +149,7 @@ def _efficiency(posterior: Posterior, z: Matrix, about: Vector, mapped: Mapped) 
     return effective(log_weights - total) / len(z) if np.isfinite(total) else 0.0
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class _Walk:
     """Ensembles of walkers that set out from weighted draws."""

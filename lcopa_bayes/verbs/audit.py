@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import final
 
 import pandas as pd
 
@@ -14,6 +15,7 @@ from lcopa_bayes.verbs.fit import basis
 from lcopa_bayes.verbs.sources import FitLike
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class AuditResult(StoredResult):
     """Identifiability of every free parameter, and what to measure next."""

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 import pandas as pd
@@ -19,7 +19,7 @@ from lcopa_bayes.calibration.calibrate import calibrate as calibrated
 from lcopa_bayes.calibration.ranks import LEVELS, SIMULTANEOUS, Coverage, bin_limits, corridor, p_uniform
 from lcopa_bayes.calibration.replica import ENGINES, RANKED, Engine, Outcome, Quantity
 from lcopa_bayes.calibration.truths import Stated, Truths
-from lcopa_bayes.core.arrays import attributes, plain
+from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.results.discretisation import LARGEST
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.runfolder import opened, provenance
@@ -257,6 +257,7 @@ def tables(calibration: Calibration) -> dict[str, pd.DataFrame]:
     }
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class CalibrationResult(StoredResult):
     """Coverage and ranks of true values over simulated studies."""

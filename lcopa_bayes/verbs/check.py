@@ -8,12 +8,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 import pandas as pd
 
-from lcopa_bayes.core.arrays import Vector, plain
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.data.drive import axis_drives, first_change
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.requirements import unmet
@@ -211,6 +212,7 @@ def _prior(row: Parameter) -> dict[str, Any]:
     }
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class CheckResult(StoredResult):
     """Axes, drives, sampling, noise at rest, onsets and priors of a study."""

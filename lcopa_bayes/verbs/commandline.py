@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import NoReturn
+from typing import NoReturn, final
 
 from lcopa_bayes.core.errors import nearest
 
@@ -32,6 +32,7 @@ def refused(problems: Sequence[str], *, as_json: bool) -> int:
     return USAGE_ERROR
 
 
+@final
 class CommandParser(argparse.ArgumentParser):
     """A parser that names the nearest known word, and complains in JSON where JSON was asked for."""
 
@@ -54,6 +55,7 @@ class CommandParser(argparse.ArgumentParser):
         raise SystemExit(refused([message], as_json="--json" in self.given))
 
 
+@final
 class Version(argparse.Action):
     """Prints the version, which is looked up when it is asked for."""
 

@@ -7,13 +7,14 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import final
 
 import pandas as pd
 
 from lcopa_bayes.comparison.candidatefit import CARD
 from lcopa_bayes.comparison.candidates import candidates_of, of_studies
 from lcopa_bayes.comparison.compare import compare as compared
-from lcopa_bayes.core.arrays import plain
+from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.data.settings import CandidateSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_candidates
@@ -23,6 +24,7 @@ from lcopa_bayes.results.stored import StoredResult
 from lcopa_bayes.verbs.sources import FitLike, study_of
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Comparison(StoredResult):
     """Candidates fitted to the same records, scored and decided."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass
 from pathlib import Path
+from typing import final
 
 import pandas as pd
 
@@ -26,6 +27,7 @@ TEMPLATE = "design/next.csv"
 """File of the winning drive, a record table whose responses are to be filled in."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class DesignResult(StoredResult):
     """Drives compared by the precision they promise, and the one to play next."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import final
 
 import pandas as pd
 
@@ -13,6 +14,7 @@ from lcopa_bayes.results.stored import StoredResult
 from lcopa_bayes.verbs.sources import StudyLike, study_of
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class LookResult(StoredResult):
     """The best of a few least-squares searches, with draws about it."""

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import final
 
 import pandas as pd
 
-from lcopa_bayes.core.arrays import plain
+from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.data.studywriter import write_study
@@ -25,6 +26,7 @@ EXPLAINED = "explained.toml"
 """File of the study with what a loop found."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class LoopResult(StoredResult):
     """What the model of a study lacks."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 import pandas as pd
 
@@ -37,6 +37,7 @@ _SETTINGS = """\
 """
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class NewStudy:
     """Records read from tables, and how these were read."""

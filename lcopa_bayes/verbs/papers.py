@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import final
 
 import pandas as pd
 
@@ -25,6 +26,7 @@ from lcopa_bayes.results.stored import StoredResult
 from lcopa_bayes.verbs.sources import FitLike, study_of
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class OpticsResult(StoredResult):
     """Far field, director and the chain from volts to angle."""
@@ -40,6 +42,7 @@ class OpticsResult(StoredResult):
         return f"{pd.DataFrame(self.values['mean_tilt']).to_string(index=False)}\n\n{super().__str__()}"
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class IdentifyResult(StoredResult):
     """The paper's identification of every path, with the integer rival and its Table 1."""
@@ -66,6 +69,7 @@ class IdentifyResult(StoredResult):
         )
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class ClaimsResult(StoredResult):
     """The paper's claims with their verdicts."""

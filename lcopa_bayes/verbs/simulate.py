@@ -5,7 +5,7 @@ from __future__ import annotations
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 import pandas as pd
@@ -16,6 +16,7 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.results.result import notebook_table
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Simulation:
     """Records of a campaign, and the study of them."""

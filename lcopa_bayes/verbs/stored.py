@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import final
 
 import pandas as pd
 
@@ -24,6 +25,7 @@ from lcopa_bayes.verbs.loop import LoopResult
 from lcopa_bayes.verbs.papers import ClaimsResult, IdentifyResult, OpticsResult
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class SavedPrediction(StoredResult):
     """Bands of every response axis under one drive."""

@@ -29,7 +29,7 @@ from lcopa_bayes.bench.command import step
 from lcopa_bayes.bench.device import Bench, Device, simulate
 from lcopa_bayes.calibration.calibrate import Calibration, calibrate
 from lcopa_bayes.calibration.ranks import LEVELS, Coverage
-from lcopa_bayes.core.arrays import plain
+from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import save_json, writable_folder, write_text
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.data.settings import ModelSettings, NoiseSettings, SamplerSettings

@@ -18,9 +18,10 @@ from lcopa_bayes.comparison.compare import judged, probabilities, stacking_weigh
 from lcopa_bayes.comparison.decision import decided
 from lcopa_bayes.comparison.priorwidth import _scaled
 from lcopa_bayes.comparison.sequentialdensity import CUTS, parts_of, predicted, without
-from lcopa_bayes.core.arrays import Estimate
+from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.inference.parameter import Parameter, Place, Prior
+from lcopa_bayes.inference.parameter import Parameter, Place
+from lcopa_bayes.inference.priors import Prior
 from lcopa_bayes.sampling.bridge import transferred
 
 

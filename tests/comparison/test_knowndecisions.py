@@ -20,7 +20,7 @@ from lcopa_bayes.comparison.candidatefit import DECISIVE, savage_dickey
 from lcopa_bayes.comparison.candidates import candidates_of
 from lcopa_bayes.comparison.compare import compare
 from lcopa_bayes.comparison.sequentialdensity import log_densities
-from lcopa_bayes.core.arrays import Estimate
+from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.inference.noise import AR1
 
 DRAWS = 100

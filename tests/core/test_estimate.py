@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lcopa_bayes.core.arrays import EQUAL_TAILED, Estimate, plain
+from lcopa_bayes.core.estimate import EQUAL_TAILED, Estimate, plain
 
 
 def of(draws: np.ndarray) -> Estimate:

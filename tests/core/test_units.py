@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from lcopa_bayes.core.arrays import TIME_UNITS, in_time_unit
+from lcopa_bayes.core.units import TIME_UNITS, in_time_unit
 from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.inference.assembly import problem_of
 

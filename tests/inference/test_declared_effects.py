@@ -20,9 +20,9 @@ from lcopa_bayes.inference import optimum
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.declared import campaign_places
 from lcopa_bayes.inference.effects import Effected, effected
+from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.optimum import find_optima
-from lcopa_bayes.inference.parameter import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.model.effects import passage
 from lcopa_bayes.model.effects.catalogue import bundled
 

@@ -14,9 +14,9 @@ from scipy import stats
 from small import record
 
 from lcopa_bayes.data.settings import NoiseKind
+from lcopa_bayes.inference.kinds import KINDS
 from lcopa_bayes.inference.noise import AR1, NOISES, Student, White, WhiteAR1
 from lcopa_bayes.inference.observations import Samples, sampling_period
-from lcopa_bayes.inference.parameter import KINDS
 from lcopa_bayes.inference.recursions import equal
 
 gaps_lists = st.lists(st.floats(0.05, 20.0), min_size=1, max_size=12).map(np.array)

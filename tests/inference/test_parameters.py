@@ -16,8 +16,9 @@ from small import TWO, problem, record, study
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.inference.assembly import problem_of
-from lcopa_bayes.inference.parameter import Parameter, Place, Prior
+from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.inference.priors import Prior
 
 TWO_TERMS = {"terms": 2}
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from lcopa_bayes.inference.parameter import Prior
+from lcopa_bayes.inference.priors import Prior
 
 numbers = st.floats(-1e3, 1e3)
 scales = st.floats(1e-3, 1e3)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from small import TRUTH, TWO, draws_of, problem, record, row_values
 
-from lcopa_bayes.core.arrays import Estimate
+from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.results.steps import crossing, settling, share_unsettled, step_curves, step_metrics, too_fast
 
 TIME = 20.0 * np.arange(1, 1001) / 1000

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import ClassVar, Self
+from typing import ClassVar, Self, final
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from lcopa_bayes.model.effects.effect import (
 )
 
 
+@final
 @dataclass(frozen=True)
 class OverdrivePulse(DriveEffect):
     """A frame of exaggerated drive after every change, as display electronics apply it."""
@@ -54,6 +55,7 @@ class OverdrivePulse(DriveEffect):
         return AxisDrive.of_jumps(times, np.concatenate(((1 + psi[0]) * jumps, -psi[0] * jumps))), rest
 
 
+@final
 @dataclass(frozen=True)
 class RefreshHold(DriveEffect):
     """Commands that wait for the next refresh of the drive."""
@@ -111,6 +113,7 @@ def _levels(drive: AxisDrive, rest: float) -> Vector:
     return rest + np.concatenate(([0.0], drive.values))
 
 
+@final
 @dataclass(frozen=True)
 class GreyQuantisation(DriveEffect):
     """Drive in grey levels."""
@@ -147,6 +150,7 @@ class GreyQuantisation(DriveEffect):
         return _mapped(drive, levels + psi[0] * (step * np.round(levels / step) - levels))
 
 
+@final
 @dataclass(frozen=True)
 class Hysteresis(DriveEffect):
     """A part of the drive that lags behind its reversals by a fixed width (play)."""
@@ -181,6 +185,7 @@ class Hysteresis(DriveEffect):
         return _mapped(drive, levels + psi[0] * (played - levels))
 
 
+@final
 class VoltageKnee(DriveEffect):
     """Curve from drive to force after the calibration table."""
 
@@ -203,6 +208,7 @@ class VoltageKnee(DriveEffect):
         return _mapped(drive, levels * (1 + psi[0] * (1 - np.abs(levels) / scene.ranges.drive[axis])))
 
 
+@final
 class FieldDependentDelay(DriveEffect):
     """Delay that falls (e > 0) with the drive that is switched on."""
 
@@ -226,6 +232,7 @@ class FieldDependentDelay(DriveEffect):
         return _shifted(drive, psi[0] * delay * (0.5 - levels)), rest
 
 
+@final
 class SampledDrive(DriveEffect):
     """A drive that was sampled while it moved, not commanded and held: it changes half a period earlier."""
 

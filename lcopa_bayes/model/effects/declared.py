@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import final
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from lcopa_bayes.model.effects.effect import (
 )
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Declared:
     """Kinds of effects with their scales, and what they need to know of every record."""

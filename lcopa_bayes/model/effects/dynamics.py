@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from typing import ClassVar, Self, final
 
 import numpy as np
 
@@ -21,6 +21,7 @@ _SHARP = 3e-4
 """Width of the switch between rise and fall, of ``ymax^2 / speed`` [-]: a jump would not converge."""
 
 
+@final
 class CubicStiffness(ForceEffect):
     """Restoring force that hardens (c > 0) or softens with the deflection."""
 
@@ -40,6 +41,7 @@ class CubicStiffness(ForceEffect):
         return np.asarray(f - psi[0] * y * (y / scene.ranges.column) ** 2)
 
 
+@final
 class RiseFallAsymmetry(ForceEffect):
     """Viscosity that differs between motion away from rest and back."""
 
@@ -61,6 +63,7 @@ class RiseFallAsymmetry(ForceEffect):
         return np.asarray(y + (f - y) / (1.0 + psi[0] * falling))
 
 
+@final
 class LevelDependentSpeed(ForceEffect):
     """Viscosity that falls (e > 0) with the deflection."""
 
@@ -80,6 +83,7 @@ class LevelDependentSpeed(ForceEffect):
         return np.asarray(y + (f - y) / (1.0 + psi[0] * (1.0 - 2.0 * np.abs(y) / scene.ranges.column)))
 
 
+@final
 @dataclass(frozen=True)
 class Overflow(ForceEffect):
     """A loss that saturates as a square root, and a further loss above a level."""
@@ -111,6 +115,7 @@ class Overflow(ForceEffect):
         return np.asarray(f + y - loss - psi[1] * beyond)
 
 
+@final
 class ViscosityDrift(ElementEffect):
     """Time constants that change through the campaign, as viscosity does with temperature."""
 

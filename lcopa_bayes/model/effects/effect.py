@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self, final
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
 from lcopa_bayes.data.drive import AxisDrive
@@ -24,6 +24,7 @@ from lcopa_bayes.model.grid import Grid
 from lcopa_bayes.model.layout import Layout
 
 
+@final
 class UnstableError(ArithmeticError):
     """The plant with its effects has no bounded response; carries the `effects`, `record` and `why`."""
 
@@ -35,6 +36,7 @@ class UnstableError(ArithmeticError):
         return UnstableError, (self.effects, self.record, self.why)
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Ranges:
     """Scales that make coefficients comparable between devices; frozen once, at the base fit."""
@@ -66,6 +68,7 @@ class Ranges:
         return self.response[:, None]
 
 
+@final
 @dataclass(frozen=True)
 class Coefficient:
     """One number that an effect estimates; it vanishes at 0."""
@@ -81,6 +84,7 @@ class Coefficient:
     """Response axis it acts on; None when it acts on several."""
 
 
+@final
 @dataclass(frozen=True)
 class Constant:
     """One internal constant of an effect and where its default prior reaches."""
@@ -96,6 +100,7 @@ class Constant:
     """Positive, of any magnitude; a share from 0 to 1; or no (0) and yes (1)."""
 
 
+@final
 @dataclass(frozen=True)
 class Card:
     """What a reader needs to know about an effect."""
@@ -117,6 +122,7 @@ class Card:
     """Whether it goes on where nothing moves."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Scene:
     """One record as the effects see it."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import ClassVar, final
 
 import numpy as np
 
@@ -17,6 +17,7 @@ _PARTS = (0.3, 1.0, 3.0)
 """Lags of the non-linear class, in response times [-]."""
 
 
+@final
 class UnmodelledLinear(ParallelEffect):
     """Any further linear response of an axis to its own drive."""
 
@@ -50,6 +51,7 @@ class UnmodelledLinear(ParallelEffect):
         return out
 
 
+@final
 class UnmodelledSmooth(ParallelEffect):
     """Any slow addition to a record, whatever the drive does."""
 
@@ -77,6 +79,7 @@ class UnmodelledSmooth(ParallelEffect):
         return np.asarray(waves @ psi.reshape(-1, _WAVES).T)
 
 
+@final
 class UnmodelledNonlinear(ParallelEffect):
     """A further response to powers of the drive, and to its falls."""
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import ceil
 from types import MappingProxyType
-from typing import ClassVar, Self
+from typing import ClassVar, Self, final
 
 import numpy as np
 from scipy.signal import fftconvolve
@@ -106,6 +106,7 @@ def own_responses(scene: Scene, size: float, shape: Callable[[Array], Array]) ->
     return np.stack(columns, axis=1)
 
 
+@final
 @dataclass(frozen=True)
 class IonCreep(ParallelEffect):
     """A slow further deflection under a held drive."""
@@ -134,6 +135,7 @@ class IonCreep(ParallelEffect):
         return own_responses(scene, psi[0], relaxing(self.time))
 
 
+@final
 @dataclass(frozen=True)
 class Backflow(ParallelEffect):
     """A transient kick after changes to smaller (or larger) magnitude."""
@@ -176,6 +178,7 @@ class Backflow(ParallelEffect):
         return np.asarray(0.5 * x**2 * np.exp(-x))
 
 
+@final
 @dataclass(frozen=True)
 class ExtraMode(ParallelEffect):
     """A lightly damped resonance beside the main response."""
@@ -218,6 +221,7 @@ class ExtraMode(ParallelEffect):
         return np.asarray(1 - np.exp(-self.damping * w * t) * wave)
 
 
+@final
 @dataclass(frozen=True)
 class MissingCrossPath(ParallelEffect):
     """A path from one axis to another with dynamics that the model's cross paths do not have."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias, final
 
 import numpy as np
 from scipy import fft
@@ -36,6 +36,7 @@ _SWEEPS = 100
 """Most sweeps of the iteration [-]: what they do not bring to rest is solved by dividing the record."""
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Plant:
     """One plant as numbers."""
@@ -58,6 +59,7 @@ class Plant:
         return b"".join(part.tobytes() for part in (*self.dynamics.times, *self.dynamics.orders))
 
 
+@final
 class Moved(NamedTuple):
     """A record up to its reading."""
 
@@ -122,6 +124,7 @@ def passed(
     return out
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Passage:
     """One record through one plant or many, with what acts between commands and reading.
@@ -232,6 +235,7 @@ class Passage:
         return (level.reshape(rest.shape) - rest).T, np.moveaxis(y, 1, 0), failures
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class _Forced:
     """Forces on the direct paths of plants, a row for every axis of every plant."""

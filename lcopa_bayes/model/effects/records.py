@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import ClassVar, Self
+from typing import ClassVar, Self, final
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from lcopa_bayes.model.effects.effect import (
 )
 
 
+@final
 class GainDrift(ReadoutEffect):
     """Deflection that changes in size through the campaign."""
 
@@ -44,6 +45,7 @@ class GainDrift(ReadoutEffect):
         return np.asarray((1 + psi[0] * scene.epoch) * y)
 
 
+@final
 class ClockSkew(DriveEffect):
     """Driver and camera clocks that run at different speeds."""
 
@@ -68,6 +70,7 @@ class ClockSkew(DriveEffect):
         return AxisDrive.of_jumps(drive.times + psi[0] * (drive.times - start), drive.jumps), rest
 
 
+@final
 class TriggerJitter(DriveEffect):
     """A record whose drive starts late or early as a whole."""
 
@@ -93,6 +96,7 @@ class TriggerJitter(DriveEffect):
         return AxisDrive.of_jumps(drive.times + psi[0], drive.jumps), rest
 
 
+@final
 class PointingOffset(ParallelEffect):
     """A record whose response is shifted as a whole."""
 
@@ -117,6 +121,7 @@ class PointingOffset(ParallelEffect):
         return np.tile(psi, (scene.times.size, 1))
 
 
+@final
 class PointingDrift(ParallelEffect):
     """A record whose response drifts."""
 
@@ -143,6 +148,7 @@ class PointingDrift(ParallelEffect):
         return np.outer((scene.times - middle) / scene.ranges.span, psi)
 
 
+@final
 class Outliers(ScatterEffect):
     """Noise with heavy tails: Student's t instead of the normal distribution."""
 
@@ -171,6 +177,7 @@ def _wave(scene: Scene, frequency: float) -> Matrix:
     return np.stack((np.cos(phase), np.sin(phase)))
 
 
+@final
 @dataclass(frozen=True)
 class Vibration(ParallelEffect):
     """A vibration of the mount, with a phase of its own in every record."""
@@ -206,6 +213,7 @@ class Vibration(ParallelEffect):
         return np.asarray((psi.reshape(-1, 2) @ _wave(scene, self.frequency)).T)
 
 
+@final
 @dataclass(frozen=True)
 class Flicker(ReadoutEffect):
     """A ripple in proportion to the deflection, with a phase of its own in every record."""

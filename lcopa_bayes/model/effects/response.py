@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from typing import ClassVar, Self, final
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from lcopa_bayes.model.layout import Layout
 _STEERING = "diffraction angle against tilt, see lcopa_bayes.optics"
 
 
+@final
 class OddCurvature(ReadoutEffect):
     """Soft saturation, alike in both directions."""
 
@@ -33,6 +34,7 @@ class OddCurvature(ReadoutEffect):
         return np.asarray(y + psi[0] * y * (y / scene.ranges.response) ** 2)
 
 
+@final
 class EvenCurvature(ReadoutEffect):
     """Curvature that differs between the two directions."""
 
@@ -52,6 +54,7 @@ class EvenCurvature(ReadoutEffect):
         return np.asarray(y + psi[0] * y**2 / scene.ranges.response)
 
 
+@final
 class BilinearCrosstalk(ReadoutEffect):
     """Each axis gains by the product of two axes."""
 
@@ -78,6 +81,7 @@ class BilinearCrosstalk(ReadoutEffect):
         return np.asarray(y + psi[0] * scene.ranges.response * part * others)
 
 
+@final
 class AxisRotation(ReadoutEffect):
     """Camera and device axes at an angle."""
 
@@ -102,6 +106,7 @@ class AxisRotation(ReadoutEffect):
         return np.asarray(y @ np.array([[c, s], [-s, c]]))
 
 
+@final
 @dataclass(frozen=True)
 class Clipping(ReadoutEffect):
     """The reading stops at a limit."""
@@ -135,6 +140,7 @@ class Clipping(ReadoutEffect):
         return np.asarray(y - psi[0] * np.sign(y) * beyond)
 
 
+@final
 @dataclass(frozen=True)
 class CentroidLocking(ReadoutEffect):
     """A centroid drawn to the pixels of the camera."""
@@ -164,6 +170,7 @@ class CentroidLocking(ReadoutEffect):
         return np.asarray(y + psi[0] * size * np.sin(2 * np.pi * self.cycles * y / size))
 
 
+@final
 class CrossFade(ReadoutEffect):
     """The far field passes from one diffraction order to the next: the centroid waits, then hurries.
 

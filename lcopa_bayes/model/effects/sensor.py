@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import ClassVar, final
 
 import numpy as np
 from scipy.signal import lfilter
@@ -16,6 +16,7 @@ _SERIES = 24
 """Terms of the moments' series, good to 1e-16 up to an exponent of 2."""
 
 
+@final
 class SensorLag(SensorEffect):
     """First-order lag of sensor or read-out."""
 
@@ -62,6 +63,7 @@ def _moments(rate: float) -> Vector:
     return np.array(moments)
 
 
+@final
 class Exposure(SensorEffect):
     """Camera samples that are means over the exposure before them."""
 

@@ -6,7 +6,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TypeVar
+from typing import TypeVar, final
 
 import numpy as np
 
@@ -32,6 +32,7 @@ UPSTREAM = (DriveEffect, ElementEffect, ForceEffect, SensorEffect)
 _Value = TypeVar("_Value")
 
 
+@final
 class Latest(OrderedDict[bytes, _Value]):
     """The three values used last, so that what acts after the plant is evaluated without simulating it
     again."""
@@ -46,6 +47,7 @@ class Latest(OrderedDict[bytes, _Value]):
         return self[key]
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class Simulator:
     """Responses of every experiment of `model` with `effects`.

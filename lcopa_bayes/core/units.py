@@ -1,0 +1,22 @@
+"""Units of time, each a whole multiple of the one before."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Array
+
+TIME_UNITS: Mapping[str, int] = MappingProxyType(
+    {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000, "min": 60_000_000_000, "h": 3_600_000_000_000}
+)
+"""Nanoseconds in each unit of time by its word."""
+
+
+def in_time_unit(time: Array | float, given: str, wanted: str) -> Array:
+    """`time` [given] in the unit `wanted`; one correctly rounded multiplication or division."""
+    more, fewer = TIME_UNITS[given], TIME_UNITS[wanted]
+    with np.errstate(over="ignore"):  # an infinite time is refused by `Record`
+        return np.asarray(time * float(more // fewer) if more >= fewer else time / float(fewer // more))
