@@ -151,7 +151,7 @@ class SamplerSettings(Ruled):
     thin: Annotated[int | None, whole(1)] = None
     """Steps per kept draw [-]; None: 5."""
     seconds: Annotated[float | None, POSITIVE] = None
-    """Budget: time after which sampling ends with the draws it has, once the round under way is done [s].
+    """Budget: time after which sampling ends with the draws it has, or takes the fewest steps to some [s].
     What they lack, and how much more time would give it, is part of the grade. Importance draws of a plant
     with effects take their own time. None: no limit."""
     method: Method | None = None

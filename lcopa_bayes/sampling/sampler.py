@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import ceil
+from math import ceil, inf
 from pathlib import Path
 from time import monotonic
 from typing import final
@@ -186,8 +186,7 @@ def sample(
 
     def spent() -> float | None:
         """Time taken, where it exceeds the budget."""
-        taken = monotonic() - begin
-        return taken if plan.seconds is not None and taken > plan.seconds else None
+        return monotonic() - begin if _left(plan, begin) < 0.0 else None
 
     known = None if starts is None else around(posterior, starts, plan.seed)
     stored = load_chain(chain_file, fingerprint) if resume and chain_file else Chain()
@@ -211,7 +210,7 @@ def sample(
                 return Run((), plan, weighted, stopped_after=stopped)
             ensembles = _begun(search, plan, seeds)
         with Progress(total=rounds, initial=done, unit="round", quiet=quiet, desc="from the prior") as bar:
-            ensembles = ensembles or tuple(crew.each(_Birth(plan.walkers), seeds))
+            ensembles = ensembles or tuple(crew.each(_Birth(plan.walkers, _left(plan, begin)), seeds))
             if not done:
                 _store(chain_file, Chain(ensembles), fingerprint)
             bar.set_description("sampling")
@@ -240,6 +239,11 @@ def sample(
                 done += 1
                 _store(chain_file, Chain(ensembles), fingerprint)
                 bar.update()
+
+
+def _left(plan: SamplePlan, begin: float) -> float:
+    """What is left of the budget of a plan that was begun then [s]."""
+    return inf if plan.seconds is None else begin + plan.seconds - monotonic()
 
 
 def _points(quiet: bool) -> Progress:
@@ -343,9 +347,11 @@ class _Birth:
     """Task: a new ensemble of a seed."""
 
     walkers: int
+    seconds: float
+    """What is left of the budget [s]."""
 
     def __call__(self, posterior: Posterior, seed: np.random.SeedSequence) -> Ensemble:
-        return Ensemble.tempered(posterior, self.walkers, _SWEEPS, seed)
+        return Ensemble.tempered(posterior, self.walkers, _SWEEPS, seed, self.seconds)
 
 
 @final
