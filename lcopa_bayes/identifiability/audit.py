@@ -40,8 +40,6 @@ from lcopa_bayes.sampling.draws import Draws
 _POINTS, _FEWER = 24, 6
 """Prior draws at which symmetries are sought, besides likely ones, and with effects, whose slopes cost a
 second each."""
-_CURVES = 1_000
-"""Prior draws whose step responses are evaluated [-]."""
 _TRIED = 128
 """Draws at which a surrogate is compared with the posterior [-]."""
 _ASTRAY = 1.0
@@ -144,7 +142,7 @@ def audit(fit: Predictive, *, jobs: int = 1) -> Audit:
             optima = np.array([o.values for o in find_optima(posterior, rng)]).reshape(-1, prior.shape[1])
         starts = np.concatenate([optima, likely])
         peak = max((ground.maximise(v) for v in starts), key=lambda peak: peak.log_likelihood)
-        known = known_best(fit.draws, prior[:_CURVES], fit.problem.scales.span, time_unit=fit.study.time_unit)
+        known = known_best(fit.draws, prior, fit.problem.scales.span, time_unit=fit.study.time_unit)
     profiles, peak = _profiles(ground, peak, np.concatenate([thinned, optima]), jobs)
     count = _POINTS if posterior.simulation is None else _FEWER
     points = _points(landscape, (*prior[:count], *likely[:count])) if landscape.least.columns else []
