@@ -187,10 +187,7 @@ def _near(landscape: Landscape, draws: Draws, rng: np.random.Generator, jobs: in
         exact = np.concatenate(list(crew.map(posterior.joint_log_likelihood, parts)))
     if surrogate is None:
         return None
-    columns = np.stack([landscape.column(k, flat) for k in landscape.free])
-    near = Landscape(
-        replace(posterior, surrogate=surrogate), np.asarray(np.linalg.inv(np.cov(columns)), dtype=float)
-    )
+    near = Landscape.about(replace(posterior, surrogate=surrogate), flat)
     return near if float(np.std(exact - near.log_likelihood(tried))) < _ASTRAY else None
 
 
