@@ -185,8 +185,11 @@ class Criteria:
 
 def criteria(fit: Fit, also: Sequence[Peak] = ()) -> Criteria:
     """From a search that starts at the highest of a few draws, and maxima `also` known."""
-    landscape = Landscape(fit.problem.posterior)
-    peak = max([highest(landscape, fit.draws.thinned(200)), *also], key=lambda one: one.log_likelihood)
+    landscape = Landscape.about(fit.near, fit.draws.flat)
+    own = highest(landscape, fit.draws.thinned(200))
+    if landscape.precision is not None:
+        own = Peak(own.values, float(landscape.exact(own.values[None])[0]))
+    peak = max([own, *also], key=lambda one: one.log_likelihood)
     return Criteria(peak.values, peak.log_likelihood, len(landscape.free), fit.problem.posterior.size)
 
 

@@ -110,7 +110,7 @@ def predictions(fit: Fit, *, held_out_only: bool = False) -> tuple[Predicted, ..
     records come from the draws as they are. What was fitted is taken away again by importance weights when
     their Pareto k is at most 0.7 and 100 draws or more stay effective, else by a refit (`bridge`).
     """
-    posterior, study = fit.problem.posterior, fit.study
+    posterior, study = fit.near, fit.study
     positions = _walkers(fit)
     out: list[Predicted] = []
     source = posterior

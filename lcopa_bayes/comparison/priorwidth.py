@@ -63,7 +63,7 @@ def widths(fit: Fit) -> tuple[Width, ...]:
 
 
 def _width(fit: Fit, factor: float) -> Width:
-    posterior, weighed = fit.problem.posterior, fit.evidence
+    posterior, weighed = fit.near, fit.evidence
     assert weighed is not None
     rows = tuple(_scaled(row, factor) for row in posterior.table.rows)
     changed = [

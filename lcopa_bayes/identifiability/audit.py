@@ -55,8 +55,6 @@ from lcopa_bayes.sampling.draws import Draws
 _POINTS, _FEWER = 24, 6
 """Prior draws at which symmetries are sought, besides likely ones, and with effects, whose slopes cost a
 second each."""
-_CURVES = 1_000
-"""Prior draws whose step responses are evaluated [-]."""
 _TRIED = 128
 """Draws at which a surrogate is compared with the posterior [-]."""
 _ASTRAY = 1.0
@@ -157,7 +155,7 @@ def audit(fit: Predictive, *, jobs: int = 1) -> Audit:
             optima = np.array([o.values for o in find_optima(posterior, rng)]).reshape(-1, prior.shape[1])
         starts = np.concatenate([optima, likely])
         peak = max((ground.maximise(v) for v in starts), key=lambda peak: peak.log_likelihood)
-        known = known_best(fit.draws, prior[:_CURVES], fit.problem.scales.span, time_unit=fit.study.time_unit)
+        known = known_best(fit.draws, prior, fit.problem.scales.span, time_unit=fit.study.time_unit)
     profiles, peak = _profiles(ground, peak, np.concatenate([thinned, optima]), jobs)
     count = _POINTS if posterior.simulation is None else _FEWER
     points = _points(landscape, (*prior[:count], *likely[:count])) if landscape.least.columns else []
@@ -212,10 +210,7 @@ def _near(landscape: Landscape, draws: Draws, rng: np.random.Generator, jobs: in
         exact = np.concatenate(list(crew.map(posterior.joint_log_likelihood, parts)))
     if surrogate is None:
         return None
-    columns = np.stack([landscape.column(k, flat) for k in landscape.free])
-    near = Landscape(
-        replace(posterior, surrogate=surrogate), np.asarray(np.linalg.inv(np.cov(columns)), dtype=float)
-    )
+    near = Landscape.about(replace(posterior, surrogate=surrogate), flat)
     return near if float(np.std(exact - near.log_likelihood(tried))) < _ASTRAY else None
 
 

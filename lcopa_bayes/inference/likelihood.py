@@ -59,6 +59,15 @@ class Landscape:
     """Of the free parameters in their coordinates, (free, free), with a surrogate, whose maxima are sought in
     all parameters at once; None without."""
 
+    @classmethod
+    def about(cls, posterior: Posterior, values: Matrix) -> Landscape:
+        """With the precision of draws (draws, rows) where a surrogate stands for the posterior."""
+        plain = cls(posterior)
+        if posterior.surrogate is None:
+            return plain
+        columns = np.stack([plain.column(k, values) for k in plain.free])
+        return replace(plain, precision=np.asarray(np.linalg.inv(np.cov(columns)), dtype=float))
+
     @cached_property
     def free(self) -> tuple[int, ...]:
         """Table positions of the free parameters."""
