@@ -289,6 +289,13 @@ def pooled_rmse(scores: Sequence[Score], axis: str) -> float:
     return float(np.sqrt(total / sum(score.time.size for score in chosen)))
 
 
+def risen(before: Sequence[Score], after: Sequence[Score]) -> float:
+    """Largest root mean square error of any axis over that before [-]; NaN without samples."""
+    axes = sorted({one.axis for one in before})
+    ratios = [pooled_rmse(after, axis) / (pooled_rmse(before, axis) or 1.0) for axis in axes]
+    return max(ratios, default=float("nan"))
+
+
 def pooled_coverage(scores: Sequence[Score]) -> float:
     """Over all axes and records [-]; NaN without a band."""
     weights = np.array([score.banded * score.time.size for score in scores])

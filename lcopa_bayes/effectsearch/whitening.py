@@ -17,7 +17,7 @@ from lcopa_bayes.inference.observations import PlausibleNoise, Samples
 _PER_LAW = 4
 """Draws of noise from each plausible law [-]."""
 _SEED = 7
-_SHORTER = 0.9
+_SHORTER = 0.5
 """Share of the likeliest law's memory below which a residual's own is another [-]."""
 
 
@@ -124,9 +124,8 @@ class Whitening:
             return (columns.T @ columns)[None]
         back, k = self.adjoint(columns.T), columns.shape[1]
         rng, out = np.random.default_rng(_SEED), np.zeros((count, k, k))
-        for axis, posterior in enumerate(self.posterior):
-            shorter = self._shorter(axis)
-            drawn = np.tile(shorter, (count, 1)) if shorter else posterior.draw(count, rng)
+        for axis in range(len(self.posterior)):
+            drawn = self._plausible(axis, count, rng)
             rho, which = np.unique(drawn[:, 2], return_inverse=True)
             white, correlated = np.zeros((k, k)), np.zeros((rho.size, k, k))
             for part, gaps in self._filled:
@@ -137,19 +136,17 @@ class Whitening:
             out += drawn[:, 1, None, None] ** 2 * correlated[which]
         return out
 
-    def _shorter(self, axis: int) -> tuple[float, float, float] | None:
-        """The law of an axis, as `WhiteAR1` takes it, where its residual remembers less than the plausible
-        laws; else None.
+    def _plausible(self, axis: int, count: int, rng: np.random.Generator) -> Matrix:
+        """Plausible laws of an axis, as `WhiteAR1` takes them, (count, 3).
 
         From sample to sample a smooth misfit looks like a random walk. Where its own autocorrelations sum up
-        to less than those of the likeliest law, ``sum_k rho^2k = (1 + rho^2) / (1 - rho^2)`` has that sum.
+        to less than those of the likeliest law, that law is used whose ``sum_k rho^2k = (1 + rho^2) / (1 -
+        rho^2)`` has their sum.
         """
-        if not self.dependence:
-            return None
-        own, likeliest = self.dependence[axis], Law.of(self.posterior[axis])
-        if own >= _SHORTER * likeliest.correlated(self.size):
-            return None
-        return 0.0, self.noise[axis].sd, float(np.sqrt((own - 1) / (own + 1)))
+        own = self.dependence[axis] if self.dependence else np.inf
+        if own >= _SHORTER * Law.of(self.posterior[axis]).correlated(self.size):
+            return self.posterior[axis].draw(count, rng)
+        return np.tile([0.0, self.noise[axis].sd, np.sqrt((own - 1) / (own + 1))], (count, 1))
 
     @cached_property
     def effective(self) -> float:
@@ -178,8 +175,8 @@ class Whitening:
             return rng.standard_normal((self.size, count))
         raw = np.empty((count, self.size))
         several = -(-count // _PER_LAW)
-        for axis, posterior in enumerate(self.posterior):
-            drawn = np.repeat(posterior.draw(several, rng), _PER_LAW, axis=0)[:count]
+        for axis in range(len(self.posterior)):
+            drawn = np.repeat(self._plausible(axis, several, rng), _PER_LAW, axis=0)[:count]
             for part, gaps in self._filled:
                 if part.axis == axis:
                     raw[:, part.rows] = WhiteAR1().draw(drawn, gaps, rng)
