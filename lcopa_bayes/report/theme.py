@@ -172,7 +172,7 @@ def extremes(*curves: Vector, most: int = MOST) -> Index:
     size = curves[0].size
     if any(curve.size != size for curve in curves) or most < 2 * len(curves):
         raise ValueError(f"need curves of one length and room for 2 points of each; got {most} points")
-    if size <= MOST:
+    if size <= most:
         return np.arange(size)
     stretches = most // (2 * len(curves))
     edges = np.linspace(0, size, stretches + 1).astype(int)[:-1]
@@ -208,7 +208,7 @@ def draw_bands(
         draw_band(panel, x, lower, upper, color=colour, alpha=alpha, label=name)
 
 
-def said(size: int) -> str:
+def extremes_note(size: int) -> str:
     """A sentence for the caption when a record of `size` samples is longer than what is drawn."""
     if size <= MOST:
         return ""
