@@ -145,6 +145,10 @@ class SamplerSettings(Ruled):
     """Effective sample size [-] at which sampling stops."""
     thin: Annotated[int | None, whole(1)] = None
     """Steps per kept draw [-]; None: 5."""
+    seconds: Annotated[float | None, POSITIVE] = None
+    """Budget: time after which sampling ends with the draws it has, once the round under way is done [s].
+    What they lack, and how much more time would give it, is part of the grade. Importance draws of a plant
+    with effects take their own time. None: no limit."""
     method: Method | None = None
     """"auto": importance draws where a proposal gives enough of them, else ensembles;
     "ensembles": these in any case. None: ensembles where `steps` or `thin` is stated, which concern them

@@ -7,22 +7,18 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-from scipy.linalg.lapack import dpttrf, dpttrs
+from scipy.linalg.lapack import dpttrs
 from scipy.special import gammaln
 from scipy.stats import t as student_t
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.parameter import Prior
+from lcopa_bayes.inference.recursions import correlated, differences, equal, factors, scalar_products
 
 if TYPE_CHECKING:
     from lcopa_bayes.inference.defaultpriors import Scales
 
 LOG_2PI = float(np.log(2 * np.pi))
-_HEAD, _STEADY = 64, 1e-15
-"""Samples after which innovation variances of equally spaced samples have mostly settled, and the relative
-change from one sample to the next below which they have [-]."""
-_FEW = 8
-"""Columns from which a product of matrices is faster than scalar products [-]."""
 _SLIGHT = 0.1
 """A correlation, or a correlated part over the white one, that hardly shows [-]."""
 
@@ -109,7 +105,7 @@ class White(GaussianNoise):
     def products(self, columns: Array, parameters: Matrix, gaps: Vector) -> tuple[Array, Vector]:
         """Scalar products of whitened columns, (batch, k, k), and the sum of log innovation sd, (batch,)."""
         sigma = parameters[:, 0]
-        return _scalar_products(columns, columns) / (sigma**2)[:, None, None], gaps.size * np.log(sigma)
+        return scalar_products(columns, columns) / (sigma**2)[:, None, None], gaps.size * np.log(sigma)
 
     def log_scales(self, parameters: Matrix, gaps: Vector) -> Matrix:
         """Log standard deviation, (batch, 1)."""
@@ -153,12 +149,12 @@ class AR1(GaussianNoise):
         """Scalar products of whitened columns, (batch, k, k), and the sum of log innovation sd, (batch,)."""
         if gaps.size < 2 or not equal(gaps):
             white, scales = self.whiten(columns, parameters, gaps)
-            return _scalar_products(white, white), scales
+            return scalar_products(white, white), scales
         link, scales = self._transition(parameters, gaps[:2])
         later = columns[..., 1:] - link[:, :, None] * columns[..., :-1]
         first = columns[..., :1] * np.exp(-scales[:, :1, None])
         later_scale = np.exp(2 * scales[:, 1])[:, None, None]
-        products = _scalar_products(later, later) / later_scale + _scalar_products(first, first)
+        products = scalar_products(later, later) / later_scale + scalar_products(first, first)
         return products, scales[:, 0] + (gaps.size - 1) * scales[:, 1]
 
     def log_scales(self, parameters: Matrix, gaps: Vector) -> Matrix:
@@ -168,7 +164,7 @@ class AR1(GaussianNoise):
     def draw(self, parameters: Matrix, gaps: Vector, rng: np.random.Generator) -> Matrix:
         """Noise for each parameter set, (batch, n) [response unit]."""
         link, scales = self._transition(parameters, gaps)
-        return _correlated(np.exp(scales) * rng.standard_normal(scales.shape), link)
+        return correlated(np.exp(scales) * rng.standard_normal(scales.shape), link)
 
     @staticmethod
     def priors(scales: Scales, axis: int) -> Mapping[str, Prior]:
@@ -214,8 +210,8 @@ class WhiteAR1(GaussianNoise):
         batch, k, n = np.broadcast_shapes(columns.shape, (parameters.shape[0], 1, gaps.size))
         if n == 0:
             return np.empty((batch, k, 0)), np.zeros(parameters.shape[0])
-        link, variances, lower = self._factors(np.broadcast_to(parameters, (batch, 3)), gaps)
-        work = _differences(columns, link, (k, batch, n))
+        link, variances, lower = factors(np.broadcast_to(parameters, (batch, 3)), gaps)
+        work = differences(columns, link, (k, batch, n))
         # LAPACK solves L D L' x = w for the whole batch at once; innovations are D L' x
         solved = dpttrs(variances, lower, work.reshape(k, batch * n).T, overwrite_b=1)[0].T
         out = solved.copy()
@@ -229,15 +225,15 @@ class WhiteAR1(GaussianNoise):
         batch, k, n = columns.shape
         if n == 0:
             return np.zeros((batch, k, k)), np.zeros(batch)
-        link, variances, lower = self._factors(parameters, gaps)
-        work = _differences(columns, link, (k, batch, n))
+        link, variances, lower = factors(parameters, gaps)
+        work = differences(columns, link, (k, batch, n))
         solved = dpttrs(variances, lower, work.reshape(k, batch * n).T)[0].T.reshape(k, batch, n)
         logs = 0.5 * np.log(variances).reshape(batch, n).sum(axis=1)
-        return _scalar_products(work.swapaxes(0, 1), solved.swapaxes(0, 1)), logs
+        return scalar_products(work.swapaxes(0, 1), solved.swapaxes(0, 1)), logs
 
     def adjoint(self, columns: Matrix, parameters: Vector, gaps: Vector) -> Matrix:
         """Adjoint of `whiten` at one parameter set (3,): columns (k, n), same shape [1 / response unit]."""
-        link, variances, lower = self._factors(parameters[None], gaps)
+        link, variances, lower = factors(parameters[None], gaps)
         work = columns * np.sqrt(variances)
         work[:, 1:] += lower[: gaps.size - 1] * work[:, :-1]
         out = np.asarray(dpttrs(variances, lower, work.T)[0].T)
@@ -245,16 +241,16 @@ class WhiteAR1(GaussianNoise):
 
     def log_scales(self, parameters: Matrix, gaps: Vector) -> Matrix:
         """Log innovation sd of each sample, (batch, n)."""
-        variances = self._factors(parameters, gaps)[1] if gaps.size else np.empty(0)
+        variances = factors(parameters, gaps)[1] if gaps.size else np.empty(0)
         return 0.5 * np.log(variances).reshape(parameters.shape[0], gaps.size)
 
     def draw(self, parameters: Matrix, gaps: Vector, rng: np.random.Generator) -> Matrix:
         """Noise for each parameter set, (batch, n) [response unit]."""
         sigma, sigma_ar, rho = (parameters[:, k : k + 1] for k in range(3))
-        link = rho ** gaps[1:]
+        link = rho ** (gaps[1:2] if equal(gaps) else gaps[1:])
         out = sigma_ar * rng.standard_normal((parameters.shape[0], gaps.size))
         out[:, 1:] *= np.sqrt(1 - link**2)
-        out = _correlated(out, link)
+        out = correlated(out, link)
         return out + sigma * rng.standard_normal(out.shape)
 
     @staticmethod
@@ -284,39 +280,6 @@ class WhiteAR1(GaussianNoise):
             "sigma_ar": float(np.sqrt(correlated / count)),
             "rho": second / first,
         }
-
-    @staticmethod
-    def _factors(parameters: Matrix, gaps: Vector) -> tuple[Matrix, Vector, Vector]:
-        """Correlation with the previous sample, (batch, n - 1), or (batch, 1) where samples are equally
-        spaced; of the whole batch in one row, innovation variances, (batch n,), and what the next sample
-        takes of an innovation, (batch n - 1,)."""
-        white, correlated, rho = parameters[:, :1] ** 2, parameters[:, 1:2] ** 2, parameters[:, 2:]
-        with np.errstate(divide="ignore"):  # no correlation: minus infinity, whose exponential is zero
-            steps = np.log(rho) * (gaps[1:2] if equal(gaps) else gaps[1:])
-        link = np.exp(steps)
-        if steps.shape[1] == 1 and gaps.size > 2 * _HEAD:
-            _, variances, lower = WhiteAR1._factors(parameters, gaps[:_HEAD])
-            head = variances.reshape(-1, _HEAD)
-            if (np.abs(head[:, -1] - head[:, -2]) <= _STEADY * head[:, -1]).all():
-                rest = gaps.size - _HEAD
-                innovations = np.append(lower, 0.0).reshape(-1, _HEAD)
-                innovations[:, -1] = innovations[:, -2]
-                variances, lower = (
-                    np.concatenate([each, np.repeat(each[:, -1:], rest, axis=1)], axis=1)
-                    for each in (head, innovations)
-                )
-                lower[:, -1] = 0.0
-                return link, variances.ravel(), lower.ravel()[:-1]
-        diagonal = np.empty((parameters.shape[0], gaps.size))
-        diagonal[:, :1] = correlated + white
-        diagonal[:, 1:] = white * (1 + link**2) - correlated * np.expm1(2 * steps)
-        beside = np.zeros(diagonal.shape)  # zero from one member of the batch to the next
-        beside[:, :-1] = -white * link
-        off = beside.ravel()[: max(1, diagonal.size - 1)]  # LAPACK's wrapper wants one where there is none
-        variances, lower, failed = dpttrf(diagonal.ravel(), off, 1, 1)
-        if failed:
-            raise FloatingPointError(f"noise without a positive innovation variance among {parameters}")
-        return link, variances, lower
 
 
 class Student(Noise):
@@ -355,37 +318,6 @@ class Student(Noise):
 
 NOISES: dict[str, type[Noise]] = {noise.kind: noise for noise in (White, AR1, WhiteAR1, Student)}
 """Noise models by the name a study gives them."""
-
-
-def equal(gaps: Vector) -> bool:
-    """Whether samples are equally spaced; the first gap is not used."""
-    return bool((gaps[2:] == gaps[1:2]).all())
-
-
-def _scalar_products(a: Array, b: Array) -> Array:
-    """Of columns (batch, k, n) of one with columns of another, (batch, k, k)."""
-    if a.shape[1] < _FEW:
-        return np.asarray(np.vecdot(a[:, :, None], b[:, None]))
-    return np.asarray(a @ b.swapaxes(1, 2))
-
-
-def _differences(columns: Array, link: Matrix, shape: tuple[int, int, int]) -> Array:
-    """What each sample of columns (batch, k, n) adds to `link` times the one before, (k, batch, n)."""
-    work, taken = np.empty(shape), columns.swapaxes(0, 1)
-    work[..., 0] = taken[..., 0]
-    np.multiply(link, taken[..., :-1], out=work[..., 1:])
-    np.subtract(taken[..., 1:], work[..., 1:], out=work[..., 1:])
-    return work
-
-
-def _correlated(innovations: Matrix, link: Matrix) -> Matrix:
-    """Sums of innovations (batch, n), each with `link` (batch, n - 1) times the sum before."""
-    out, links = np.ascontiguousarray(innovations.T), np.ascontiguousarray(link.T)
-    part = np.empty(out.shape[1:])
-    for k, factor in enumerate(links):
-        np.multiply(factor, out[k], out=part)
-        out[k + 1] += part
-    return out.T
 
 
 def _root_mean_square(residuals: Sequence[Vector]) -> float:

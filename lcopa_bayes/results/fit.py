@@ -33,7 +33,7 @@ from lcopa_bayes.results.steps import StepCurves, step_curves, step_metrics, too
 from lcopa_bayes.results.summary import results, verdict
 from lcopa_bayes.results.tables import tables
 from lcopa_bayes.sampling.crosscheck import CrossCheck
-from lcopa_bayes.sampling.draws import Draws, gather
+from lcopa_bayes.sampling.draws import Draws, gather, shortfall
 from lcopa_bayes.sampling.evidence import Evidence, evidence_of
 from lcopa_bayes.sampling.nested import NestedPlan, nested
 from lcopa_bayes.sampling.sampler import Run, SamplePlan, sample
@@ -159,6 +159,7 @@ def fit(
             optima=optima,
         )
         draws = gather(problem.posterior, run)
+        draws = draws.limited(shortfall(run, draws))
     check = None
     weighed = evidence_of(problem.posterior, run, draws.ess)
     if cross_check:
@@ -220,6 +221,7 @@ def plan_of(problem: Problem, *, quick: bool) -> SamplePlan:
         steps=wanted.steps,
         thin=wanted.thin,
         target_ess=wanted.target_ess,
+        seconds=wanted.seconds,
         method=wanted.method or ("auto" if wanted.steps is None and wanted.thin is None else "ensembles"),
     )
     if not quick:

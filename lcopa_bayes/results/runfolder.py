@@ -184,12 +184,15 @@ def settings_of(study: Study) -> dict[str, Any]:
 
 
 def fingerprint(study: Study, plan: SamplePlan) -> str:
-    """Hash of everything the draws depend on: inputs, settings, plan and this package's version."""
+    """Hash of everything the draws depend on: inputs, settings, plan and this package's version; not the
+    budget of time, so that a run may be resumed with another."""
+    settings, planned = settings_of(study), asdict(plan) | {"seconds": None}
+    settings["sampler"] |= {"seconds": None}
     basis = {
         "inputs": dict(study.inputs),
         "records": [digest(record) for record in study.fit],
-        "settings": settings_of(study),
-        "plan": asdict(plan),
+        "settings": settings,
+        "plan": planned,
         "version": version("lcopa-bayes"),
     }
     return hashlib.sha256(json.dumps(basis, sort_keys=True, default=str).encode()).hexdigest()

@@ -13,7 +13,7 @@ draws look good would take a mode that was not met for none.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import ceil
 from typing import NamedTuple
@@ -114,7 +114,7 @@ class Search:
     """Points, proposals and weights of a search; deterministic given its arguments and what it is asked.
 
     `bar` counts points and names what is being done; `optima` are least-squares optima to begin with, by
-    default those of a few searches.
+    default those of a few searches. Once it is `late` a search ends with the draws it has.
     """
 
     def __init__(
@@ -124,8 +124,10 @@ class Search:
         crew: Workers[Posterior],
         bar: Progress,
         optima: Sequence[Optimum] = (),
+        late: Callable[[], bool] = lambda: False,
     ) -> None:
         self.posterior = posterior
+        self._late = late
         self._optima = tuple(optima)
         self._bar = bar
         self.outer = Outer(posterior)
@@ -167,6 +169,8 @@ class Search:
         """The same from a first proposal, whose points begin at the nearest of the table values `starts`."""
         proposal, count, failed = first, _LEARNING * self._difficulty, 0
         for number in range(_ROUNDS):
+            if self._late():
+                return None
             self._bar.set_description(f"searching for modes, round {number + 1}")
             own = self._round(proposal, count, starts if number == 0 else None)
             log_weights = self._seen.log_weights() if own is not None else np.empty(0)
@@ -218,7 +222,8 @@ class Search:
             count += more
             weighted = self._weighted(self._points[before:], proposal, count)
             worth = weighted.smallest_ess(self._rng) if weighted.ess > 2.0 else 0.0
-            if worth >= wanted and weighted.pareto_k <= usable_k(count):
+            enough = worth >= wanted or (self._late() and worth >= _FEW)
+            if enough and weighted.pareto_k <= usable_k(count):
                 return None if self._misses(proposal, weighted, walked) else weighted
             needed = max(_SPARE * count * wanted / max(worth, 1.0), count + 1.0)
         return None

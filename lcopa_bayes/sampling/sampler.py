@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from math import ceil
 from pathlib import Path
+from time import monotonic
 
 import numpy as np
 
@@ -34,6 +35,8 @@ _SWEEPS = 80
 """Most moves of every walker at each temperature of the tempering path."""
 _LEAST = 5
 """Rounds before sampling may stop: the draws kept of them come after the proposal was first adapted."""
+_FEWEST = 2
+"""Rounds before a budget may end sampling."""
 _AS_LONG = 0.4
 """Sampling takes at least this share of the moves that tempering took: a posterior that was hard to reach
 has modes that fill slowly [-]."""
@@ -73,6 +76,8 @@ class SamplePlan:
     """Root of all randomness of the run."""
     method: Method = "ensembles"
     """Importance draws where their weights converge, or ensembles in any case."""
+    seconds: float | None = None
+    """Time after which sampling ends with what it has [s]; None: no limit."""
 
     @classmethod
     def of(
@@ -86,6 +91,7 @@ class SamplePlan:
         thin: int | None = None,
         target_ess: float = 400,
         method: Method = "ensembles",
+        seconds: float | None = None,
     ) -> SamplePlan:
         """A plan with unset entries chosen from the number of sampled parameters."""
         least = 2 * dimension + 2
@@ -97,6 +103,7 @@ class SamplePlan:
             target_ess,
             seed,
             method,
+            seconds,
         )
 
 
@@ -111,6 +118,8 @@ class Run:
     unconfirmed: tuple[str, ...] = ()
     """Parameters with modes that filled while the ensembles ran, whose shares importance draws could not
     confirm."""
+    stopped_after: float | None = None
+    """Time that sampling had taken when its budget ended it [s]; None: it ended by itself."""
 
     @cached_property
     def chosen(self) -> Index | None:
@@ -163,8 +172,17 @@ def sample(
     The draws depend on the arguments alone, not on `jobs` nor on interruptions: with `resume`, a run killed
     at any moment continues from the last complete round in `chain_file`. `starts`, table values (starts,
     rows), are modes known from elsewhere, which moves propose too (`knownmodes`); InputError when none lies
-    inside the prior. `optima` are least-squares optima that a search begins with, by default its own.
+    inside the prior. With a budget of `plan.seconds` they depend on the speed of the machine too, and
+    sampling goes on, resumed, for as long again. `optima` are least-squares optima that a search begins with,
+    by default its own.
     """
+    begin = monotonic()
+
+    def spent() -> float | None:
+        """Time taken, where it exceeds the budget."""
+        taken = monotonic() - begin
+        return taken if plan.seconds is not None and taken > plan.seconds else None
+
     known = None if starts is None else around(posterior, starts, plan.seed)
     stored = load_chain(chain_file, fingerprint) if resume and chain_file else Chain()
     if stored.weighted is not None:
@@ -178,11 +196,13 @@ def sample(
         seeds = np.random.SeedSequence(plan.seed).spawn(plan.ensembles)
         if not ensembles and searched and known is None:
             with _points(quiet) as bar:
-                search = Search(posterior, plan.seed, crew, bar, optima)
+                search = Search(posterior, plan.seed, crew, bar, optima, lambda: spent() is not None)
                 weighted = search.run(wanted)
             if weighted is not None:
-                _store(chain_file, Chain((), weighted), fingerprint)
-                return Run((), plan, weighted)
+                stopped = spent()
+                if stopped is None:
+                    _store(chain_file, Chain((), weighted), fingerprint)
+                return Run((), plan, weighted, stopped_after=stopped)
             ensembles = _begun(search, plan, seeds)
         with Progress(total=rounds, initial=done, unit="round", quiet=quiet, desc="from the prior") as bar:
             ensembles = ensembles or tuple(crew.each(_Birth(plan.walkers), seeds))
@@ -194,6 +214,9 @@ def sample(
             least = max(_LEAST, round(_AS_LONG * hardest / (_ROUND * plan.thin)))
             while True:
                 run = Run(ensembles, plan)
+                stopped = spent() if done >= _FEWEST else None
+                if stopped is not None:
+                    return replace(run, stopped_after=stopped)
                 last = done >= rounds or (done >= least and finished(posterior, run, bar))
                 filling = _filling(posterior, run) if searched and last else ()
                 if filling or (searched and not last and done >= _CONFIRMED_AFTER and due(done)):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 
 from lcopa_bayes.core.parallel import meanwhile
@@ -14,6 +13,7 @@ from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.fit import fit as sampled
 from lcopa_bayes.results.integerrival import integer_rival
 from lcopa_bayes.results.predictive import Predictive
+from lcopa_bayes.results.result import write_page
 from lcopa_bayes.results.runfolder import opened, provenance
 from lcopa_bayes.verbs.look import look_result
 from lcopa_bayes.verbs.sources import FitLike, StudyLike, finished, study_of
@@ -48,7 +48,7 @@ def fit(
         if place is not None and not (quiet or resume or wanted.effects.use):
             seen = first_look(wanted)
             look_result(seen).save(place)
-            drawn = meanwhile(_first_page, place, _announced, jobs=jobs)
+            drawn = meanwhile(write_page, ("look", place, 1), _announced, jobs=jobs)
         with drawn:
             fitted = sampled(
                 wanted,
@@ -65,11 +65,6 @@ def fit(
         if place is not None:
             fitted.save(place)
     return fitted
-
-
-def _first_page(place: Path) -> Path:
-    page: Path = import_module("lcopa_bayes.report.pages").write_page_of("look", place)
-    return page
 
 
 def _announced(page: Path) -> None:

@@ -117,6 +117,7 @@ def search_of(log_density, seed: int) -> Search:
     search = Search.__new__(Search)
     search.posterior, search._rng = toy, np.random.default_rng(seed)
     search._seen, search._points, search._bar = Seen(), [], Progress(quiet=True)
+    search._late = lambda: False
     every = lambda y: np.ones(len(y), dtype=bool)  # noqa: E731
     search.outer = SimpleNamespace(values=lambda y: y, y=lambda y: y, inside=every, orders=np.zeros(2))
     search._evaluated = lambda y, values, starts: marginal._Point(
