@@ -14,12 +14,7 @@ from lcopa_bayes.core.estimate import LEVEL
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.basefit import BaseFit
-from lcopa_bayes.effectsearch.explained import (
-    coordinates_of,
-    declarable,
-    explained_draws,
-    explained_study,
-)
+from lcopa_bayes.effectsearch.explained import coordinates_of, declarable, explained_draws, explained_study
 from lcopa_bayes.effectsearch.heldouteffects import missed, unseen_share
 from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
 from lcopa_bayes.effectsearch.outliers import Outlying, outlying

@@ -222,14 +222,14 @@ class Conditional:
 
     def expanded(self, values: Matrix) -> Expanded:
         """Expansions about table values."""
-        found = expanded(self.posterior, values, self.columns)
+        expansion = expanded(self.posterior, values, self.columns)
         steep = self.steepness(values)
         return Expanded(
             values=values,
             x=self.x(values),
-            log_likelihood=found.log_likelihood,
-            gradient=(steep.swapaxes(1, 2) @ found.gradient[..., None])[..., 0],
-            information=steep.swapaxes(1, 2) @ found.information @ steep,
+            log_likelihood=expansion.log_likelihood,
+            gradient=(steep.swapaxes(1, 2) @ expansion.gradient[..., None])[..., 0],
+            information=steep.swapaxes(1, 2) @ expansion.information @ steep,
             steepness=steep,
         )
 

@@ -250,9 +250,9 @@ class LeastSquares:
         UnstableError where effects leave no bounded response at the start.
         """
         bounds = self.bounds_around(values)
-        found = self.search(np.clip(self.coordinates(values), *bounds), values, bounds)
-        solution = self.posterior.table.canonical(self.values(found.x, values)[None])[0]
-        return solution, np.asarray(found.jac)
+        optimum = self.search(np.clip(self.coordinates(values), *bounds), values, bounds)
+        solution = self.posterior.table.canonical(self.values(optimum.x, values)[None])[0]
+        return solution, np.asarray(optimum.jac)
 
     def search(
         self,

@@ -205,7 +205,7 @@ class Landscape:
             if not np.isfinite(both(start, slopes=False)[0]).all():
                 return values
             functions = (lambda x: both(x, slopes=False)[0]), start, lambda x: both(x)[1]
-        found = least_squares(
+        optimum = least_squares(
             *functions,
             bounds=(ends[0], ends[1]),
             x_scale="jac",
@@ -214,7 +214,7 @@ class Landscape:
             xtol=1e-7,
             gtol=1e-7,
         )
-        whole[moving] = found.x
+        whole[moving] = optimum.x
         raw = least.values(whole, values)
         # a held time or order stays that of its own term: merged terms must not change places
         own = held is not None and table.rows[held].kind in ("time", "order")
@@ -291,7 +291,7 @@ class Landscape:
             start = [
                 float(np.clip(self.coordinate(k, out[k]), *e)) for k, e in zip(moving, ends, strict=True)
             ]
-            found = minimize(cost, start, method="L-BFGS-B", bounds=ends, options={"ftol": 1e-12})
-            for k, coordinate in zip(moving, found.x, strict=True):
+            optimum = minimize(cost, start, method="L-BFGS-B", bounds=ends, options={"ftol": 1e-12})
+            for k, coordinate in zip(moving, optimum.x, strict=True):
                 out[k] = self.value(k, float(coordinate))
         return out

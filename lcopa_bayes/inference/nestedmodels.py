@@ -94,8 +94,8 @@ class _Lift:
         own, theirs = getattr(self.large.layout, of), getattr(self.small.layout, of)
         paths = [(i, j) for i, line in enumerate(own) for j, used in enumerate(line) if used == slot]
         acting = [(i, j) for i, j in paths if self.small.rows[self.small.at("gain", i, j)].value != 0.0]
-        found = {theirs[i][j] for i, j in acting or paths}
-        return found.pop() if len(found) == 1 else None
+        elements = {theirs[i][j] for i, j in acting or paths}
+        return elements.pop() if len(elements) == 1 else None
 
     def _gains(self, values: Matrix, out: Matrix) -> bool:
         for k in self.large.of_kind("gain"):

@@ -94,7 +94,7 @@ class NoiseFit:
         if not self.free or power == 0.0:
             return template
         sd = float(np.sqrt(power / sum(residual.size for residual in self.residuals)))
-        found = [
+        optima = [
             minimize(
                 self._cost,
                 self._start(estimates),
@@ -105,7 +105,7 @@ class NoiseFit:
             )
             for estimates in (self.noise.estimate(self.residuals), self.noise.nearly_white(sd))
         ]
-        x = min(found, key=lambda one: float(one.fun)).x
+        x = min(optima, key=lambda one: float(one.fun)).x
         return np.asarray(self.values(x[None], template)[0])
 
     def covariance(self, values: Vector) -> Matrix:

@@ -208,7 +208,7 @@ def draw_bands(
         draw_band(panel, x, lower, upper, color=colour, alpha=alpha, label=name)
 
 
-def said(size: int) -> str:
+def extremes_note(size: int) -> str:
     """A sentence for the caption when a record of `size` samples is longer than what is drawn."""
     if size <= MOST:
         return ""

@@ -18,7 +18,7 @@ from typing import Any, final
 import numpy as np
 import xarray as xr
 
-from lcopa_bayes.core.arrays import Array
+from lcopa_bayes.core.arrays import Array, plain
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.files import writable_folder, write_whole
 from lcopa_bayes.data.studywriter import study_from_json, study_to_json
@@ -87,16 +87,7 @@ def fit_to_json(problem: Problem, draws: Draws) -> dict[str, Any]:
         "target_ess": draws.target_ess,
         "qualities": [_texts(asdict(one)) for one in draws.qualities],
         "limitations": [one.as_json() for one in draws.limitations],
-        "modes": [
-            {
-                "parameter": one.parameter,
-                "unit": one.unit,
-                "boundaries": list(one.boundaries),
-                "shares": one.shares.tolist(),
-                "errors": one.errors.tolist(),
-            }
-            for one in draws.modes
-        ],
+        "modes": [plain(asdict(one)) for one in draws.modes],
         "study": study_to_json(problem.study),
     }
 

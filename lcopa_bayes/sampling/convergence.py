@@ -163,10 +163,7 @@ class Limitation:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        return {
-            **attributes(self, "level", "reason", "remedy"),
-            "parameters": list(self.parameters),
-        }
+        return {**attributes(self, "level", "reason", "remedy"), "parameters": list(self.parameters)}
 
 
 def limited(grade: Grade, limitations: Sequence[Limitation]) -> Grade:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, final
 
@@ -43,13 +43,14 @@ _COVERED = ("parameter", "step response")
 def results(calibration: Calibration) -> dict[str, Any]:
     """Every number of a calibration as plain JSON values; only `seconds` differs from run to run."""
     replication = calibration.replication
-    study, truths = replication.problem.study, replication.truths
+    study, truths, plan = replication.problem.study, replication.truths, replication.plan
     reliable = [outcome for outcome in calibration.outcomes if outcome.grade == "reliable"]
     everything = over(calibration.outcomes, replication.quantities)
     grade, reason = graded(calibration, len(reliable))
     spent = np.array([outcome.seconds for outcome in calibration.outcomes])
     gaps = np.array([outcome.gap for outcome in calibration.outcomes])
-    values: dict[str, Any] = {
+    sampler = attributes(plan, "ensembles", "walkers") | {"most_steps": plan.steps}
+    values = {
         "study": study.name,
         "verdict": verdict(everything, calibration),
         "grade": grade,
@@ -61,11 +62,11 @@ def results(calibration: Calibration) -> dict[str, Any]:
         "reliable": over(reliable, replication.quantities) if reliable else None,
         "grades": grades(calibration),
         "not_reliable": [
-            {"replica": o.replica, "seed": o.seed, "grade": o.grade, "reason": o.reason}
+            attributes(o, "replica", "seed", "grade", "reason")
             for o in calibration.outcomes
             if o.grade != "reliable"
         ],
-        "failures": [{"replica": f.replica, "seed": f.seed, "error": f.error} for f in calibration.failures],
+        "failures": [asdict(f) for f in calibration.failures],
         "truths": {
             "from": _origin(truths),
             "folder": truths.folder or None,
@@ -88,14 +89,7 @@ def results(calibration: Calibration) -> dict[str, Any]:
             "largest_refinement": max(outcome.refinement for outcome in calibration.outcomes),
         },
         "seconds": {"total": spent.sum(), "median": np.median(spent), "largest": spent.max()},
-    }
-    plan = replication.plan
-    values["sampler"] = {
-        "ensembles": plan.ensembles,
-        "walkers": plan.walkers,
-        "most_steps": plan.steps,
-        "thin": plan.thin,
-        "target_ess": plan.target_ess,
+        "sampler": sampler | attributes(plan, "thin", "target_ess"),
     }
     return plain(values)
 

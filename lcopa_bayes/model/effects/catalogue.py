@@ -14,15 +14,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from lcopa_bayes.core.errors import InputError, nearest, refuse_if
-from lcopa_bayes.model.effects import (
-    commands,
-    dynamics,
-    generic,
-    parallel,
-    records,
-    response,
-    sensor,
-)
+from lcopa_bayes.model.effects import commands, dynamics, generic, parallel, records, response, sensor
 from lcopa_bayes.model.effects.effect import Card, Effect
 
 GROUP = "lcopa_bayes.effects"

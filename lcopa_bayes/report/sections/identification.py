@@ -18,10 +18,10 @@ from lcopa_bayes.report.theme import (
     Drawing,
     blank,
     draw_line,
+    extremes_note,
     label,
     legend_above,
     plain,
-    said,
     svg_of,
 )
 
@@ -42,7 +42,7 @@ def drawing(entry: Values, samples: pd.DataFrame, time_unit: str) -> Drawing:
     use = "held out of the identification" if entry["held_out"] else "used for identification where it can be"
     caption = (
         f"Record {entry['record']}, axis {entry['axis']}, {use}. {where}{level}RMSE [{entry['unit']}]: "
-        f"{errors}. {said(len(samples))}"
+        f"{errors}. {extremes_note(len(samples))}"
     )
     mark = "held out" if entry["held_out"] else ""
     return Drawing(Path(entry["samples"]).stem, _drawn(entry, samples, time_unit), caption, mark=mark)

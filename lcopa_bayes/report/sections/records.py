@@ -25,11 +25,11 @@ from lcopa_bayes.report.theme import (
     draw_bands,
     draw_line,
     extremes,
+    extremes_note,
     headed,
     label,
     legend_above,
     plain,
-    said,
     svg_of,
 )
 from lcopa_bayes.results.bands import POINTWISE
@@ -144,7 +144,7 @@ def _described(score: Mapping[str, Any], record: str, axis: str, size: int, *, h
             f"{score['samples']} samples lie in the {POINTWISE} 90 % band with noise, "
             f"{percent(score['coverage_50'])} in the 50 % band. Offset: {score['offset_from']}."
         )
-    return " ".join([*parts, *filter(None, [said(size)])])
+    return " ".join([*parts, *filter(None, [extremes_note(size)])])
 
 
 def _before(run: SavedRun, rows: pd.DataFrame, record: str) -> str:
@@ -211,4 +211,4 @@ def _tested(run: SavedRun, record: str, axis: str, size: int, *, held: bool) -> 
             if p is not None:
                 judged = "not white" if p < WHITE_P else "no sign that it is not white"
                 parts.append(f"Ljung-Box test of the whitened residual: {probability(p)}, {judged}.")
-    return " ".join([*parts, *filter(None, [said(size)])])
+    return " ".join([*parts, *filter(None, [extremes_note(size)])])
