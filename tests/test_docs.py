@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+import lcopa_bayes
 from lcopa_bayes.cli import main
 from lcopa_bayes.comparison.candidates import KNOWN, VARIANTS
 from lcopa_bayes.core.errors import InputError
@@ -26,7 +27,7 @@ from lcopa_bayes.data.studyfile import load_candidates, load_study
 from lcopa_bayes.identifiability import verdict as audit
 from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS, KINDS
 from lcopa_bayes.model.effects.catalogue import bundled
-from lcopa_bayes.results import adequacy, discretisation, resonance
+from lcopa_bayes.results import adequacy, discretisation
 from lcopa_bayes.sampling import convergence, evidence
 from lcopa_bayes.sampling.sampler import SamplePlan
 
@@ -155,8 +156,8 @@ def test_documented_limits_of_grades_are_those_of_the_code():
     assert numbers(warnings["noise at the end of its prior"][0]) == [100 * adequacy._END]
     assert f"{discretisation.LARGEST:g} sd" in warnings["blocks too wide"][0]
     assert f"{discretisation.UNUSABLE:g} sd" in warnings["blocks too wide"][0]
-    assert numbers(warnings["resonance faster than the samples"][0]) == [100 * resonance.SHARE]
-    assert resonance.MOST == 0.5
+    assert numbers(warnings["resonance faster than the samples"][0]) == [100 * adequacy.RESONANCE_SHARE]
+    assert adequacy.DISTURBANCE_SHARE == 0.5
     told = numbers(sections(ROOT / "docs" / "statistics.md")["Evidence"])
     assert {evidence._RELIABLE, evidence._TENTATIVE} <= set(told)
 
@@ -256,3 +257,10 @@ def test_no_candidate_key_is_read_and_dropped(tmp_path):
     (tmp_path / "candidates.toml").write_text('[[candidates]]\nname = "a"\nimproper = ["gain"]\n')
     with pytest.raises(InputError, match="unknown key 'improper'"):
         load_candidates(tmp_path / "candidates.toml")
+
+
+def test_every_public_name_is_on_its_page():
+    listed = re.findall(
+        r"^\.\. auto\w+:: lcopa_bayes\.(\w+)$", (ROOT / "docs" / "api.md").read_text("utf-8"), re.M
+    )
+    assert sorted(listed) == lcopa_bayes.__all__

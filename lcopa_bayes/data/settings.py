@@ -17,17 +17,7 @@ from scipy import stats
 from scipy.stats.distributions import rv_frozen
 
 from lcopa_bayes.core.errors import nearest
-from lcopa_bayes.core.rules import (
-    FLAG,
-    FOLDER,
-    POSITIVE,
-    Rule,
-    Ruled,
-    is_number,
-    texts,
-    whole,
-    word_of,
-)
+from lcopa_bayes.core.rules import FLAG, FOLDER, POSITIVE, Rule, Ruled, is_number, texts, whole, word_of
 from lcopa_bayes.core.units import TIME_UNITS
 
 Share: TypeAlias = Literal["paper", "all", "none"]
@@ -160,6 +150,10 @@ class SamplerSettings(Ruled):
     """Effective sample size [-] at which sampling stops."""
     thin: Annotated[int | None, whole(1)] = None
     """Steps per kept draw [-]; None: 5."""
+    seconds: Annotated[float | None, POSITIVE] = None
+    """Budget: time after which sampling ends with the draws it has, or takes the fewest steps to some [s].
+    What they lack, and how much more time would give it, is part of the grade. Importance draws of a plant
+    with effects take their own time. None: no limit."""
     method: Method | None = None
     """"auto": importance draws where a proposal gives enough of them, else ensembles;
     "ensembles": these in any case. None: ensembles where `steps` or `thin` is stated, which concern them

@@ -70,7 +70,8 @@ def explained_draws(study: Study, *, jobs: int = 1, quick: bool = False) -> tupl
     if result is None:
         return None
     draws = result[1]
-    return draws.limited(discretisation(problem, draws).limitations), problem.posterior.noise
+    width = discretisation(problem, draws, jobs=jobs)
+    return draws.limited(width.limitations), problem.posterior.noise
 
 
 def coordinates_of(model: ExtendedModel, draws: Draws) -> Matrix:

@@ -62,12 +62,7 @@ class ExtendedModel:
             return self.plant
         simulator = self.effected.simulator
         return with_effects(
-            self.plant,
-            self.effects,
-            simulator.ranges,
-            simulator.epochs,
-            free=self.loose,
-            wider=self.wider,
+            self.plant, self.effects, simulator.ranges, simulator.epochs, free=self.loose, wider=self.wider
         )
 
     def least(self, held: tuple[Vector, ...] = ()) -> LeastSquares:
@@ -149,21 +144,11 @@ class ExtendedModel:
 
     def bounds_about(self, x: Vector) -> tuple[Vector, Vector]:
         """Bounds within which the orders of every element with unlike priors stay decreasing and terms
-        resolved: a free neighbour comes no closer than the middle, and merged orders stay apart; a term
-        crosses 1 in its order, or the shortest resolved time, only where the other allows it."""
+        resolved (`LeastSquares.bounds_around`), where merged orders stay apart."""
         low, high = self._least.bounds_around(self._least.values(x, self.template))
         for ends, other in zip((low, high), self.bounds, strict=True):
             merged = (ends != other) & (np.abs(x - ends) < _MERGED)
             ends[merged] = x[merged]
-        table, shortest = self.plant.table, np.log(self.plant.table.resolution or 1.0)
-        for t, o in table.limited:
-            time = self.columns.index(t)
-            order = self.columns.index(o) if table.rows[o].free else None
-            steep = (table.rows[o].value if order is None else x[order]) > 1.0
-            if steep or x[time] > shortest + _MERGED:
-                low[time] = max(low[time], shortest)
-            elif order is not None:
-                high[order] = min(high[order], 1.0)
         return low, high
 
     def canonical(self, x: Vector) -> Vector:

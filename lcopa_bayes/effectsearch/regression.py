@@ -10,6 +10,7 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Flags, Matrix, Vector
+from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.whitening import Whitening
 
@@ -66,7 +67,7 @@ class Optimum:
     @cached_property
     def covariance(self) -> Matrix:
         """Laplace covariance of the coordinates, (k, k)."""
-        return np.asarray(np.linalg.pinv(self.information, hermitian=True))
+        return covariance_of(self.information)
 
     @property
     def sd(self) -> Vector:

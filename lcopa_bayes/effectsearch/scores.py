@@ -10,7 +10,8 @@ import numpy as np
 from scipy.stats import norm
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.core.estimate import LEVEL
+from lcopa_bayes.core.covariance import covariance_of
+from lcopa_bayes.core.estimate import LEVEL, attributes
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.crossvalidation import groups, shifts
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
@@ -85,10 +86,7 @@ class Score:
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
         return {
-            "record": self.record,
-            "axis": self.axis,
-            "unit": self.unit,
-            "held_out": self.held_out,
+            **attributes(self, "record", "axis", "unit", "held_out"),
             "samples": self.time.size,
             "rmse": self.rmse,
             "noise_sd": self.noise_sd,
@@ -186,7 +184,7 @@ def _laplace(state: State, seed: int) -> tuple[Draws, Noise]:
     coordinates at an end of their support stay there."""
     model, optimum, rng = state.model, state.optimum, np.random.default_rng([seed, 14])
     free = np.flatnonzero(~optimum.stuck)
-    covariance = np.linalg.pinv(optimum.information[np.ix_(free, free)], hermitian=True)
+    covariance = covariance_of(optimum.information[np.ix_(free, free)])
     x = np.tile(optimum.x, (_TRIES * _DRAWS, 1))
     x[:, free] += rng.multivariate_normal(np.zeros(free.size), covariance, len(x), method="eigh")
     low, high = model.bounds
@@ -289,6 +287,13 @@ def pooled_rmse(scores: Sequence[Score], axis: str) -> float:
         return float("nan")
     total = sum(score.rmse**2 * score.time.size for score in chosen)
     return float(np.sqrt(total / sum(score.time.size for score in chosen)))
+
+
+def risen(before: Sequence[Score], after: Sequence[Score]) -> float:
+    """Largest root mean square error of any axis over that before [-]; NaN without samples."""
+    axes = sorted({one.axis for one in before})
+    ratios = [pooled_rmse(after, axis) / (pooled_rmse(before, axis) or 1.0) for axis in axes]
+    return max(ratios, default=float("nan"))
 
 
 def pooled_coverage(scores: Sequence[Score]) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import final
@@ -24,11 +24,13 @@ QUANTILE = 0.99
 LEVEL = 0.5
 """Difference of log evidence up to which instances of an effect are level [nat]."""
 _DRAWS = 2000
-"""Chance residuals: the probability beyond the threshold is known to 0.002 [-]."""
+"""Chance residuals at most: the probability beyond the threshold is known to 0.002 [-]."""
+_CLEAR = 2.0
+"""Distance of the largest evidence from the interval of the threshold at which no more are drawn [nat]."""
 _TAIL = 0.05
 """Probability outside the interval of a threshold [-]."""
-_BATCH = 200
-"""Chance residuals drawn at once [-]."""
+_BATCH = 400
+"""Chance residuals drawn at once [-]: with so many the threshold is known to about half a nat."""
 _NONE = 0.5
 """Prior probability that nothing is missing [-]; the effects share the rest evenly."""
 MOST_COMMANDS = 400
@@ -82,7 +84,7 @@ class Trace:
     p_value: float
     """Share of chance maxima at or above `largest`, no less than 1 / (draws + 1) [-]."""
     draws: int
-    """Chance maxima drawn [-]."""
+    """Chance maxima drawn [-]: more where the largest evidence is close to the threshold."""
     residual: Vector
     """Whitened, projected residual, (n,) [-]."""
     scale: Scale
@@ -162,12 +164,35 @@ def trace(
             found.append(Traced(kind.card, (), -np.inf, 0, why))
             continue
         found.append(_traced(state, project, residual, scale, kind))
-    maxima = _chance(project, whitening, found, rng, draws, scale)
     found.sort(key=lambda one: -one.log_bayes_factor)
-    threshold, low, high = threshold_of(maxima)
-    held = Trace(tuple(found), threshold, (low, high), np.nan, draws, residual, scale)
-    beaten = int(np.count_nonzero(maxima >= held.largest))
-    return replace(held, p_value=(beaten + 1) / (draws + 1))
+    return against_chance(
+        Trace(tuple(found), LEAST, (LEAST, LEAST), np.nan, 0, residual, scale),
+        lambda count: _chance(project, whitening, found, rng, count, scale),
+        draws,
+    )
+
+
+def against_chance(seen: Trace, chance: Callable[[int], Vector], most: int) -> Trace:
+    """The trace with its threshold: `chance` draws so many maxima [nat], at most `most` where it is close."""
+    maxima = np.zeros(0)
+    while maxima.size < most and not _clear(seen):
+        maxima = np.concatenate((maxima, chance(min(_BATCH, most - maxima.size))))
+        threshold, low, high = threshold_of(maxima)
+        beaten = int(np.count_nonzero(maxima >= seen.largest))
+        seen = replace(
+            seen,
+            threshold=threshold,
+            between=(low, high),
+            p_value=(beaten + 1) / (maxima.size + 1),
+            draws=maxima.size,
+        )
+    return seen
+
+
+def _clear(seen: Trace) -> bool:
+    """Whether more chance residuals could not bring the threshold to the largest evidence."""
+    low, high = seen.between
+    return seen.draws > 0 and not low - _CLEAR < seen.largest < high + _CLEAR
 
 
 def threshold_of(maxima: Vector) -> tuple[float, float, float]:
@@ -215,28 +240,23 @@ def _chance(
     """Largest log Bayes factor of each of `draws` residuals of the base model alone, (draws,) [nat]."""
     listed = [one for traced in found for one in traced.signatures]
     if not listed:
-        return np.zeros(0)
+        return np.zeros(draws)
     spans = [one.span for one in listed]
     edges = np.cumsum([0, *(span.shape[1] for span in spans)])
     every = np.concatenate(spans, axis=1).T
-    maxima = []
-    for first in range(0, draws, _BATCH):
-        z = whitening.chance(min(_BATCH, draws - first), rng)
-        left = project(z)
-        inner = (every @ left.astype(np.float32)).astype(float)
-        known = Scale(scale.quiet, scale.freedom, np.einsum("nd,nd->d", left, left))
-        scatters = any(one.scatters for one in found)
-        scatter = [scatter_evidence(column) for column in z.T] if scatters else None
-        evidence = [
-            one.evidence(inner[a:b], known) for one, a, b in zip(listed, edges[:-1], edges[1:], strict=True)
-        ]
-        start, by_effect = 0, []
-        for traced in found:
-            count = len(traced.signatures)
-            if count:
-                by_effect.append(logsumexp(evidence[start : start + count], axis=0) - np.log(count))
-            start += count
-        if scatter is not None:
-            by_effect.append(np.array(scatter))
-        maxima.append(np.max(by_effect, axis=0))
-    return np.concatenate(maxima)
+    z = whitening.chance(draws, rng)
+    left = project(z)
+    inner = (every @ left.astype(np.float32)).astype(float)
+    known = Scale(scale.quiet, scale.freedom, np.einsum("nd,nd->d", left, left))
+    evidence = [
+        one.evidence(inner[a:b], known) for one, a, b in zip(listed, edges[:-1], edges[1:], strict=True)
+    ]
+    start, by_effect = 0, []
+    for traced in found:
+        count = len(traced.signatures)
+        if count:
+            by_effect.append(logsumexp(evidence[start : start + count], axis=0) - np.log(count))
+        start += count
+    if any(one.scatters for one in found):
+        by_effect.append(np.array([scatter_evidence(column) for column in z.T]))
+    return np.asarray(np.max(by_effect, axis=0))

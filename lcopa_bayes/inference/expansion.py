@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -15,6 +15,7 @@ _PORTION = 64
 """Parameter sets expanded at once."""
 
 
+@final
 class Expansion(NamedTuple):
     """``log_likelihood + gradient x - x' information x / 2`` for small x, for a batch."""
 
@@ -39,7 +40,8 @@ def expanded(posterior: Posterior, values: Matrix, columns: Sequence[int]) -> Ex
         parts = [expanded(posterior, part, columns) for part in portions]
         return Expansion(*(np.concatenate(each) for each in zip(*parts, strict=True)))
     table, batch, size = posterior.table, len(values), len(columns)
-    slopes = posterior.model.unit_slopes(table.dynamics(values))
+    in_orders = any(table.rows[k].kind == "order" for k in columns)
+    slopes = posterior.model.unit_slopes(table.dynamics(values), in_orders=in_orders)
     units = [unit for unit, _ in slopes]
     total, gradient = np.zeros(batch), np.zeros((batch, size))
     information = np.zeros((batch, size, size))
@@ -74,14 +76,15 @@ def expanded(posterior: Posterior, values: Matrix, columns: Sequence[int]) -> Ex
             residual = posterior.residual(axis, r, observed, centre, units[r])
             stacked[:, -1] = residual
             if isinstance(posterior.noise, GaussianNoise):
-                white, scale = posterior.noise.whiten(stacked, noise, observed.gaps)
+                products, scale = posterior.noise.products(stacked, noise, observed.gaps)
                 total -= scale + 0.5 * observed.values.size * LOG_2PI
             else:
                 total += posterior.noise.pointwise(residual, noise, observed.gaps).sum(axis=1)
                 sigma, nu = noise[:, 0, None, None], noise[:, 1, None]
                 weight = np.sqrt((nu + 1) / (nu + (residual / sigma[:, 0]) ** 2))
                 white = stacked / sigma * weight[:, None, :]
-            normal += white @ white.swapaxes(1, 2)
+                products = white @ white.swapaxes(1, 2)
+            normal += products
         combine = np.zeros((batch, len(series), size))
         if block:
             inner, rest = normal[:, : len(block), : len(block)], normal[:, : len(block), len(block) :]
@@ -101,6 +104,7 @@ def expanded(posterior: Posterior, values: Matrix, columns: Sequence[int]) -> Ex
     return Expansion(total, gradient, information)
 
 
+@final
 class _Series(NamedTuple):
     """A derivative of a response axis, or what a unit of a gain or an offset adds to it."""
 

@@ -66,11 +66,19 @@ class LeastSquares:
             high.append(b - edge)
         return np.array(low), np.array(high)
 
+    @property
+    def prior_precision(self) -> Vector:
+        """Of uniform laws between the bounds; 0 for coordinates without: no direction is wider than its
+        prior."""
+        width = self.bounds[1] - self.bounds[0]
+        return np.where(np.isfinite(width), 12.0 / np.where(width > 0, width, 1.0) ** 2, 0.0)
+
     def bounds_around(self, values: Vector) -> tuple[Vector, Vector]:
-        """Bounds that also keep orders decreasing where terms cannot be exchanged.
+        """Bounds that also keep orders decreasing where terms cannot be exchanged, and terms resolved.
 
         An order stays on its own side of the middle between its start and a free neighbour's, and of
-        the value of a fixed neighbour.
+        the value of a fixed neighbour. A term crosses 1 in its order, or the shortest resolved time, only
+        where the other allows it.
         """
         low, high = (ends.copy() for ends in self.bounds)
         table = self.posterior.table
@@ -84,6 +92,13 @@ class LeastSquares:
                         limit = float(table.rows[k].coordinate(wall))
                         position = self.columns.index(k)
                         ends[position] = choose(ends[position], limit)
+        for t, o in table.limited:
+            if values[o] > 1.0 or values[t] > table.resolution * (1.0 + _EDGE):
+                position = self.columns.index(t)
+                low[position] = max(low[position], float(table.rows[t].coordinate(table.resolution)))
+            elif table.rows[o].free:
+                position = self.columns.index(o)
+                high[position] = min(high[position], 1.0)
         return low, high
 
     def coordinates(self, values: Vector) -> Vector:
@@ -169,10 +184,7 @@ class LeastSquares:
             elif row.kind == "time" and not row.log_scale:
                 jacobian[:, k] /= raw[k]
         rows, prior = self._prior_rows(raw)
-        return (
-            np.concatenate([*parts, prior]),
-            np.concatenate([jacobian, rows])[:, self.columns],
-        )
+        return (np.concatenate([*parts, prior]), np.concatenate([jacobian, rows])[:, self.columns])
 
     def _plain(self, values: Matrix) -> Iterator[tuple[int, Observed, Matrix, Vector]]:
         """Response axis, samples, slopes in the table's rows (times in their logarithms) and misfit (model
@@ -238,9 +250,9 @@ class LeastSquares:
         UnstableError where effects leave no bounded response at the start.
         """
         bounds = self.bounds_around(values)
-        found = self.search(np.clip(self.coordinates(values), *bounds), values, bounds)
-        solution = self.posterior.table.canonical(self.values(found.x, values)[None])[0]
-        return solution, np.asarray(found.jac)
+        optimum = self.search(np.clip(self.coordinates(values), *bounds), values, bounds)
+        solution = self.posterior.table.canonical(self.values(optimum.x, values)[None])[0]
+        return solution, np.asarray(optimum.jac)
 
     def search(
         self,

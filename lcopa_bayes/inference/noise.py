@@ -7,12 +7,13 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar, final
 
 import numpy as np
-from scipy.linalg.lapack import dpttrf, dpttrs
+from scipy.linalg.lapack import dpttrs
 from scipy.special import gammaln
 from scipy.stats import t as student_t
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.priors import Prior
+from lcopa_bayes.inference.recursions import correlated, differences, equal, factors, scalar_products
 
 if TYPE_CHECKING:
     from lcopa_bayes.inference.defaultpriors import Scales
@@ -71,6 +72,11 @@ class GaussianNoise(Noise):
     def whiten(self, columns: Array, parameters: Matrix, gaps: Vector) -> tuple[Array, Vector]:
         """Whitened columns (batch, k, n) and the sum over samples of log innovation sd, (batch,)."""
 
+    @abstractmethod
+    def products(self, columns: Array, parameters: Matrix, gaps: Vector) -> tuple[Array, Vector]:
+        """Scalar products of the whitened columns (batch, k, n) with each other, (batch, k, k), and the sum
+        over samples of log innovation sd, (batch,): what a density needs, without the whitened columns."""
+
     def pointwise(self, residual: Matrix, parameters: Matrix, gaps: Vector) -> Matrix:
         """Log density of each sample given those before it, (batch, n)."""
         white = self.standard(residual, parameters, gaps)
@@ -96,6 +102,11 @@ class White(GaussianNoise):
         """Whitened columns (batch, k, n) and the sum over samples of log innovation sd, (batch,)."""
         sigma = parameters[:, 0]
         return columns * (1 / sigma)[:, None, None], gaps.size * np.log(sigma)
+
+    def products(self, columns: Array, parameters: Matrix, gaps: Vector) -> tuple[Array, Vector]:
+        """Scalar products of whitened columns, (batch, k, k), and the sum of log innovation sd, (batch,)."""
+        sigma = parameters[:, 0]
+        return scalar_products(columns, columns) / (sigma**2)[:, None, None], gaps.size * np.log(sigma)
 
     def log_scales(self, parameters: Matrix, gaps: Vector) -> Matrix:
         """Log standard deviation, (batch, 1)."""
@@ -136,6 +147,18 @@ class AR1(GaussianNoise):
         out /= np.exp(scales)[:, None, :]
         return out, scales.sum(axis=1)
 
+    def products(self, columns: Array, parameters: Matrix, gaps: Vector) -> tuple[Array, Vector]:
+        """Scalar products of whitened columns, (batch, k, k), and the sum of log innovation sd, (batch,)."""
+        if gaps.size < 2 or not equal(gaps):
+            white, scales = self.whiten(columns, parameters, gaps)
+            return scalar_products(white, white), scales
+        link, scales = self._transition(parameters, gaps[:2])
+        later = columns[..., 1:] - link[:, :, None] * columns[..., :-1]
+        first = columns[..., :1] * np.exp(-scales[:, :1, None])
+        later_scale = np.exp(2 * scales[:, 1])[:, None, None]
+        products = scalar_products(later, later) / later_scale + scalar_products(first, first)
+        return products, scales[:, 0] + (gaps.size - 1) * scales[:, 1]
+
     def log_scales(self, parameters: Matrix, gaps: Vector) -> Matrix:
         """Log innovation sd of each sample, (batch, n)."""
         return self._transition(parameters, gaps)[1]
@@ -143,10 +166,7 @@ class AR1(GaussianNoise):
     def draw(self, parameters: Matrix, gaps: Vector, rng: np.random.Generator) -> Matrix:
         """Noise for each parameter set, (batch, n) [response unit]."""
         link, scales = self._transition(parameters, gaps)
-        out = np.exp(scales) * rng.standard_normal(scales.shape)
-        for k in range(1, gaps.size):
-            out[:, k] += link[:, k - 1] * out[:, k - 1]
-        return out
+        return correlated(np.exp(scales) * rng.standard_normal(scales.shape), link)
 
     @staticmethod
     def priors(scales: Scales, axis: int) -> Mapping[str, Prior]:
@@ -193,12 +213,8 @@ class WhiteAR1(GaussianNoise):
         batch, k, n = np.broadcast_shapes(columns.shape, (parameters.shape[0], 1, gaps.size))
         if n == 0:
             return np.empty((batch, k, 0)), np.zeros(parameters.shape[0])
-        link, variances, lower = self._factors(np.broadcast_to(parameters, (batch, 3)), gaps)
-        work = np.empty((k, batch, n))
-        taken = columns.swapaxes(0, 1)
-        work[..., 0] = taken[..., 0]
-        np.multiply(link, taken[..., :-1], out=work[..., 1:])
-        np.subtract(taken[..., 1:], work[..., 1:], out=work[..., 1:])
+        link, variances, lower = factors(np.broadcast_to(parameters, (batch, 3)), gaps)
+        work = differences(columns, link, (k, batch, n))
         # LAPACK solves L D L' x = w for the whole batch at once; innovations are D L' x
         solved = dpttrs(variances, lower, work.reshape(k, batch * n).T, overwrite_b=1)[0].T
         out = solved.copy()
@@ -207,9 +223,20 @@ class WhiteAR1(GaussianNoise):
         logs = 0.5 * np.log(variances).reshape(batch, n).sum(axis=1)
         return out.reshape(k, batch, n).swapaxes(0, 1), logs[: parameters.shape[0]]
 
+    def products(self, columns: Array, parameters: Matrix, gaps: Vector) -> tuple[Array, Vector]:
+        """Scalar products of whitened columns, (batch, k, k), and the sum of log innovation sd, (batch,)."""
+        batch, k, n = columns.shape
+        if n == 0:
+            return np.zeros((batch, k, k)), np.zeros(batch)
+        link, variances, lower = factors(parameters, gaps)
+        work = differences(columns, link, (k, batch, n))
+        solved = dpttrs(variances, lower, work.reshape(k, batch * n).T)[0].T.reshape(k, batch, n)
+        logs = 0.5 * np.log(variances).reshape(batch, n).sum(axis=1)
+        return scalar_products(work.swapaxes(0, 1), solved.swapaxes(0, 1)), logs
+
     def adjoint(self, columns: Matrix, parameters: Vector, gaps: Vector) -> Matrix:
         """Adjoint of `whiten` at one parameter set (3,): columns (k, n), same shape [1 / response unit]."""
-        link, variances, lower = self._factors(parameters[None], gaps)
+        link, variances, lower = factors(parameters[None], gaps)
         work = columns * np.sqrt(variances)
         work[:, 1:] += lower[: gaps.size - 1] * work[:, :-1]
         out = np.asarray(dpttrs(variances, lower, work.T)[0].T)
@@ -217,16 +244,16 @@ class WhiteAR1(GaussianNoise):
 
     def log_scales(self, parameters: Matrix, gaps: Vector) -> Matrix:
         """Log innovation sd of each sample, (batch, n)."""
-        variances = self._factors(parameters, gaps)[1] if gaps.size else np.empty(0)
+        variances = factors(parameters, gaps)[1] if gaps.size else np.empty(0)
         return 0.5 * np.log(variances).reshape(parameters.shape[0], gaps.size)
 
     def draw(self, parameters: Matrix, gaps: Vector, rng: np.random.Generator) -> Matrix:
         """Noise for each parameter set, (batch, n) [response unit]."""
         sigma, sigma_ar, rho = (parameters[:, k : k + 1] for k in range(3))
-        link = rho ** gaps[1:]
+        link = rho ** (gaps[1:2] if equal(gaps) else gaps[1:])
         out = sigma_ar * rng.standard_normal((parameters.shape[0], gaps.size))
-        for k in range(1, gaps.size):
-            out[:, k] = link[:, k - 1] * out[:, k - 1] + np.sqrt(1 - link[:, k - 1] ** 2) * out[:, k]
+        out[:, 1:] *= np.sqrt(1 - link**2)
+        out = correlated(out, link)
         return out + sigma * rng.standard_normal(out.shape)
 
     @staticmethod
@@ -256,25 +283,6 @@ class WhiteAR1(GaussianNoise):
             "sigma_ar": float(np.sqrt(correlated / count)),
             "rho": second / first,
         }
-
-    @staticmethod
-    def _factors(parameters: Matrix, gaps: Vector) -> tuple[Matrix, Vector, Vector]:
-        """Correlation with the previous sample, (batch, n - 1); of the whole batch in one row, innovation
-        variances, (batch n,), and what the next sample takes of an innovation, (batch n - 1,)."""
-        white, correlated, rho = parameters[:, :1] ** 2, parameters[:, 1:2] ** 2, parameters[:, 2:]
-        with np.errstate(divide="ignore"):  # no correlation: minus infinity, whose exponential is zero
-            steps = np.log(rho) * gaps[1:]
-        link = np.exp(steps)
-        diagonal = np.empty((parameters.shape[0], gaps.size))
-        diagonal[:, :1] = correlated + white
-        diagonal[:, 1:] = white * (1 + link**2) - correlated * np.expm1(2 * steps)
-        beside = np.zeros(diagonal.shape)  # zero from one member of the batch to the next
-        beside[:, :-1] = -white * link
-        off = beside.ravel()[: max(1, diagonal.size - 1)]  # LAPACK's wrapper wants one where there is none
-        variances, lower, failed = dpttrf(diagonal.ravel(), off, 1, 1)
-        if failed:
-            raise FloatingPointError(f"noise without a positive innovation variance among {parameters}")
-        return link, variances, lower
 
 
 @final

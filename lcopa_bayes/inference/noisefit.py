@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from scipy.special import log_expit
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.inference.noise import Noise
+from lcopa_bayes.inference.noise import GaussianNoise, Noise
 from lcopa_bayes.inference.parameter import Parameter
 
 _TAIL = 1e-9
@@ -74,7 +74,11 @@ class NoiseFit:
         total = np.zeros(len(x))
         for residual, gaps in zip(self.residuals, self.gaps, strict=True):
             seen = np.broadcast_to(residual, (len(x), residual.size))
-            total += self.noise.pointwise(seen, values, gaps).sum(axis=1)
+            if isinstance(self.noise, GaussianNoise):
+                squares, scales = self.noise.products(seen[:, None], values, gaps)
+                total -= 0.5 * squares[:, 0, 0] + scales
+            else:
+                total += self.noise.pointwise(seen, values, gaps).sum(axis=1)
         for column, k in enumerate(self.free):
             row, at = self.rows[k], x[:, column]
             total += row.log_prior(values[:, k])
@@ -90,18 +94,18 @@ class NoiseFit:
         if not self.free or power == 0.0:
             return template
         sd = float(np.sqrt(power / sum(residual.size for residual in self.residuals)))
-        found = [
+        optima = [
             minimize(
                 self._cost,
-                self._start(told),
+                self._start(estimates),
                 args=(template,),
                 jac=True,
                 method="L-BFGS-B",
                 bounds=list(zip(*self.ends, strict=True)),
             )
-            for told in (self.noise.estimate(self.residuals), self.noise.nearly_white(sd))
+            for estimates in (self.noise.estimate(self.residuals), self.noise.nearly_white(sd))
         ]
-        x = min(found, key=lambda one: float(one.fun)).x
+        x = min(optima, key=lambda one: float(one.fun)).x
         return np.asarray(self.values(x[None], template)[0])
 
     def covariance(self, values: Vector) -> Matrix:
@@ -120,12 +124,12 @@ class NoiseFit:
         sizes = np.maximum(sizes, 12 / np.square(high - low).max(initial=0.0))
         return np.asarray(directions / sizes @ directions.T)
 
-    def _start(self, told: Mapping[str, float]) -> Vector:
+    def _start(self, estimates: Mapping[str, float]) -> Vector:
         """Coordinates of starting values, moved inside the ends of the search."""
         out = []
         for column, k in enumerate(self.free):
             row, ends = self.rows[k], [end[column] for end in self.ends]
-            value = np.array([told[self.noise.names[k]]])
+            value = np.array([estimates[self.noise.names[k]]])
             inside = row.domain[0] < value[0] < row.domain[1]
             at = row.coordinate(value)[0] if inside else ends[int(value[0] >= row.domain[1])]
             out.append(float(np.clip(at, *ends)))

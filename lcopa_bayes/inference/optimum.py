@@ -9,19 +9,24 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.leastsquares import LeastSquares
+from lcopa_bayes.inference.parameter import Parameter
+from lcopa_bayes.inference.poles import regressed
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.effects.effect import UnstableError
 
 _SCREENED = 1024
 """Prior draws whose misfit is looked at."""
 _SAME = 1e-2
-"""Optima closer than this in every sampled coordinate are one [natural log or parameter unit]."""
+"""Optima closer than this in every sampled coordinate are one [natural log, or sd of the prior]."""
 _WEIGHTLESS = 30.0
 """Log density below the best from which an optimum has no weight [nat]."""
+_HOPELESS = 300.0
+"""The same of a start that slopes of the plant alone led to, which end some nats below the optimum [nat]."""
 _DISTINCT = 0.5
-"""Starts closer than this in every sampled coordinate count as one [natural log or parameter unit]."""
+"""Starts closer than this in every sampled coordinate count as one [natural log, or sd of the prior]."""
 _PLANTS = 3
 """Optima of the plant alone from which effects are started [-]."""
 _TRIED = 48
@@ -48,8 +53,8 @@ class Optimum:
 def find_optima(
     posterior: Posterior, rng: np.random.Generator, *, starts: int = 12, near: Sequence[Vector] = ()
 ) -> tuple[Optimum, ...]:
-    """Local optima from the best of many prior draws, best first, duplicates removed; `near` are further
-    table values, (rows,), looked at like draws.
+    """Local optima from the best of many prior draws and of poles from a regression, best first, duplicates
+    removed; `near` are further table values, (rows,), looked at like draws.
 
     Screening and a first solve treat the residual as nearly white; a second solve uses the noise model with
     its parameters estimated from the first residual. With effects the plant alone is searched first, and its
@@ -60,7 +65,7 @@ def find_optima(
         alone = find_optima(posterior.without_effects, rng, starts=starts)
         return _kept(posterior, _descended(posterior, _near(posterior, effect_starts(posterior, alone, rng))))
     drawn = table.draw(_SCREENED, rng)
-    drawn[: len(near)] = np.array(near).reshape(-1, len(table.rows))
+    drawn = np.vstack([*near, regressed(posterior, drawn), drawn])
     for axis, scale in enumerate(_spread(posterior)):
         for name, value in posterior.noise.nearly_white(0.05 * scale).items():
             if table.rows[table.at(name, axis)].free:
@@ -82,7 +87,7 @@ def again(posterior: Posterior, optima: Sequence[Optimum]) -> tuple[Optimum, ...
 
 def _near(posterior: Posterior, starts: Sequence[Vector]) -> list[Vector]:
     """Table values to which effects and plant descend by slopes of the plant alone, fifty times cheaper than
-    those with the effects in place; duplicates removed."""
+    those with the effects in place; duplicates removed, and those far below the best."""
     rough, kept = LeastSquares(posterior, exact=False), list[Vector]()
     for start in starts:
         values = posterior.complete(posterior.coordinates(start[None]), None)[0]
@@ -90,10 +95,11 @@ def _near(posterior: Posterior, starts: Sequence[Vector]) -> list[Vector]:
             values = rough.with_noise(rough.solve(values)[0])
         except UnstableError:
             continue
-        here = posterior.coordinates(values[None])[0]
-        if all(np.abs(here - posterior.coordinates(v[None])[0]).max() > _SAME for v in kept):
+        if all(_apart(posterior, values, other) > _SAME for other in kept):
             kept.append(values)
-    return kept
+    density = [float(posterior.log_density(posterior.coordinates(v[None]))[0]) for v in kept]
+    best = max(density, default=0.0)
+    return [v for v, level in zip(kept, density, strict=True) if level >= best - _HOPELESS]
 
 
 def _descended(posterior: Posterior, starts: Sequence[Vector], *, rounds: int = 2) -> list[Optimum]:
@@ -119,16 +125,24 @@ def _kept(posterior: Posterior, optima: list[Optimum]) -> tuple[Optimum, ...]:
     optima.sort(key=lambda optimum: -optimum.log_density)
     kept: list[Optimum] = []
     for optimum in optima:
-        close = (
-            np.abs(_plain(posterior, optimum) - _plain(posterior, other)).max() < _SAME for other in kept
-        )
-        if np.isfinite(optimum.log_density) and not any(close):
+        alone = all(_apart(posterior, optimum.values, other.values) >= _SAME for other in kept)
+        if np.isfinite(optimum.log_density) and alone:
             kept.append(optimum)
     return tuple(kept)
 
 
-def _plain(posterior: Posterior, optimum: Optimum) -> Vector:
-    return np.asarray(posterior.coordinates(optimum.values[None])[0])
+def _apart(posterior: Posterior, one: Vector, other: Vector) -> float:
+    """Largest difference between table values in a sampled coordinate [natural log, or sd of the prior]."""
+    first, second = posterior.coordinates(np.stack((one, other)))
+    sizes = [_size(posterior.table.rows[k]) for k in posterior.sampled]
+    return float((np.abs(first - second) / np.array(sizes)).max(initial=0.0))
+
+
+def _size(row: Parameter) -> float:
+    if row.prior is None or row.log_scale or row.logit_scale:
+        return 1.0
+    sd = float(row.prior.frozen.std())
+    return sd if 0.0 < sd < np.inf else 1.0
 
 
 def _spread(posterior: Posterior) -> list[float]:
@@ -142,8 +156,7 @@ def _distinct(posterior: Posterior, ranked: Matrix, count: int) -> list[Vector]:
     """The first `count` rows that differ from each other."""
     kept: list[Vector] = []
     for values in ranked:
-        here = posterior.coordinates(values[None])[0]
-        if all(np.abs(here - posterior.coordinates(v[None])[0]).max() > _DISTINCT for v in kept):
+        if all(_apart(posterior, values, other) > _DISTINCT for other in kept):
             kept.append(values)
         if len(kept) == count:
             break
@@ -154,10 +167,8 @@ def _describe(posterior: Posterior, problem: LeastSquares, values: Vector, jacob
     """Optimum with the covariance of the sampled coordinates: the plant's at this noise, the noise's at this
     plant."""
     coordinates = posterior.coordinates(values[None])
-    information = jacobian.T @ jacobian
-    widths = np.where(np.isfinite(problem.bounds[1] - problem.bounds[0]), 1.0, np.inf)
-    information += np.diag(1.0 / np.minimum(widths, 1e9) ** 2)  # no direction wider than a unit prior
-    blocks = [(problem.columns, np.linalg.pinv(information, hermitian=True))]
+    information = jacobian.T @ jacobian + np.diag(problem.prior_precision)
+    blocks = [(problem.columns, covariance_of(information))]
     for axis, fit in enumerate(problem.noise_fits(values)):
         where = [posterior.table.at(name, axis) for name in posterior.noise.names]
         if fit.free:

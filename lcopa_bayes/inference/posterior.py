@@ -242,9 +242,8 @@ class Posterior:
             for slot, (p, column) in enumerate(columns):
                 np.multiply(sd[p], column, out=stacked[:, slot])
             stacked[:, -1] = self.residual(axis, r, observed, centre, units[r])
-            white, scale = self.noise.whiten(stacked, parameters, observed.gaps)
-            place = [p for p, _ in columns]
-            equations.add(white[:, :-1], white[:, -1], place)
+            products, scale = self.noise.products(stacked, parameters, observed.gaps)
+            equations.add(products, [p for p, _ in columns])
             log_scale += scale
             count += observed.values.size
         return equations, log_scale, count
@@ -315,13 +314,14 @@ class NormalEquations:
         """Before any data: the prior alone."""
         return cls(np.tile(np.eye(p), (batch, 1, 1)), np.zeros((batch, p)), np.zeros(batch))
 
-    def add(self, columns: Array, target: Matrix, place: list[int]) -> None:
-        """Add whitened columns (batch, k, n) standing at `place`, and their target (batch, n)."""
+    def add(self, products: Array, place: list[int]) -> None:
+        """Add scalar products of whitened columns at `place` and, last, of their target with each other,
+        (batch, k + 1, k + 1)."""
         rows = np.array(place, dtype=int)
         if rows.size:
-            self.gram[:, rows[:, None], rows] += columns @ columns.swapaxes(1, 2)
-            self.moment[:, rows] += (columns @ target[..., None])[..., 0]
-        self.square[:] += np.einsum("bn,bn->b", target, target)
+            self.gram[:, rows[:, None], rows] += products[:, :-1, :-1]
+            self.moment[:, rows] += products[:, :-1, -1]
+        self.square[:] += products[:, -1, -1]
 
     def log_marginal(self) -> Vector:
         """Log of the Gaussian integral over b, without the white noise's normalisation, (batch,)."""

@@ -28,11 +28,12 @@ from lcopa_bayes.model.effects.effect import (
     Scene,
     UnstableError,
 )
-from lcopa_bayes.model.effects.passage import Moved, Passage, Plant, Spectra
+from lcopa_bayes.model.effects.passage import Moved, Plant, forced
 from lcopa_bayes.model.effects.simulator import Simulator
 from lcopa_bayes.model.forward import ForwardModel, deflections
 
 
+@final
 class Simulated(NamedTuple):
     """One record under a batch of plants."""
 
@@ -199,20 +200,20 @@ class Simulation:
 
     def _forced(self, values: Matrix, out: list[Simulated], bounded: Flags) -> None:
         """Write the responses of plants under forces, all at once."""
-        declared, layout, table = self.declared, self.table.layout, self.table
-        axes, gains, dynamics = len(layout.responses), table.gains(values), table.dynamics(values)
+        declared, axes = self.declared, len(self.table.layout.responses)
+        gains, dynamics = self.table.gains(values), self.table.dynamics(values)
         forces = []
         for kind, rows, constants in zip(declared.kinds, self.coefficients, self.constants, strict=True):
             if issubclass(kind, ForceEffect):
                 psi = np.repeat(values[:, rows].T, axes, axis=1)[..., None]
                 own = [np.repeat(values[:, k], axes)[:, None] for k in constants]
                 forces.append((kind(*(c if np.ptp(c) else float(c[0, 0]) for c in own)), psi))
-        simulator, spectra = self.simulator(self.effects(values[0])), Spectra()
-        for r, units in enumerate(self.model.plain.unit_responses(dynamics)):
-            scene, experiment = simulator.scene(r, self.plant(values[0])), self.model.experiments[r]
-            change, failures = Passage(layout, experiment, scene, gains, dynamics, forces, spectra).change()
+        simulator, plant = self.simulator(self.effects(values[0])), self.plant(values[0])
+        scenes = [simulator.scene(r, plant) for r in range(len(out))]
+        records = forced(self.model.plain, scenes, gains, dynamics, forces)
+        for record, (deflection, failures) in zip(out, records, strict=True):
             bounded[list(failures)] = False
-            out[r].base[...] = deflections(layout, scene.rest, gains, units) + change
+            record.base[...] = deflection
         if len(forces) < len(declared.kinds):
             for b in np.flatnonzero(bounded).tolist():
                 simulator = self.simulator(self.effects(values[b]))

@@ -13,6 +13,7 @@ from typing import Any, final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
+from lcopa_bayes.core.covariance import root_of
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.simulation import Simulated
@@ -63,8 +64,7 @@ class Surrogate:
         rows = posterior.table.rows
         columns = tuple(c for c, k in enumerate(posterior.sampled) if not rows[k].noise)
         centre = posterior.coordinates(optimum.values[None])[0]
-        spread, vectors = np.linalg.eigh(optimum.covariance[np.ix_(columns, columns)])
-        root = vectors * np.sqrt(np.maximum(spread, 1e-12 * spread.max()))
+        root = root_of(optimum.covariance[np.ix_(columns, columns)])
         late = tuple(p for p, c in enumerate(columns) if rows[posterior.sampled[c]].kind == "delay")
         sd = np.sqrt(np.diag(optimum.covariance)[list(columns)])
         terms = _features(np.zeros((1, len(columns))), np.zeros((1, len(columns))), late).shape[1]
@@ -76,7 +76,7 @@ class Surrogate:
         known = np.concatenate([np.asarray(part[0].bounded) for part in parts])
         if known.sum() < terms:
             return None
-        inverse = np.linalg.inv(root)
+        inverse = np.linalg.inv(root).astype(float)
         apart = points[:, columns] - centre[list(columns)]
         features = _features(apart @ inverse.T, apart / sd, late)[known]
         solve = np.linalg.pinv(features)

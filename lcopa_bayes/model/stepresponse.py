@@ -8,23 +8,126 @@ Below two and a half of the narrowest blocks the leading power of the onset take
 Measured against high-precision inversions of the Laplace transform for orders 0.3 to 2 and blocks of 0.03 of
 the time constant: 1e-4 of the step or better right after the onset for orders above 0.5, where the same
 blocks laid over the onset and read by a parabola are off by several percent.
+
+An element as a quotient of power series, with its exact derivatives.
+
+Numerator and denominator are both multiplied by ``1 - z``, z one block of delay. The weights of an
+integral of order above 1 grow; cut off after n blocks they would put zeros of the denominator inside
+the circle and spoil up to four digits of every block. Their differences do not grow up to order 2.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
-from lcopa_bayes.model.powerseries import Circle, Spectrum
-from lcopa_bayes.model.transfer import transfer, transfer_slopes
+from lcopa_bayes.model.blockpulses import Circle, Spectrum, integration_weights, integration_weights_slope
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class TransferSlopes:
+    """Derivatives of a transfer function on the circle, one entry per viscous term."""
+
+    log_times: tuple[Spectrum, ...]
+    """In the logarithm of each time constant."""
+    orders: tuple[Spectrum, ...]
+    """In each order, where wanted."""
+
+
+def denominator(times: Matrix, orders: Matrix, angular: Vector) -> Spectrum:
+    """``1 + sum_i (i w T_i)^order_i``, (batch, frequencies), at angular frequencies w (frequencies,).
+
+    Parameters: times [time unit] and orders [-], (batch, terms); angular [1 / time unit].
+    Its terms have arguments within ``pi order / 2 <= pi``, so that it stays in one half plane: its principal
+    argument is the continuous one.
+    """
+    out = np.ones((times.shape[0], angular.size), dtype=np.complex128)
+    for time, order in zip(times.T, orders.T, strict=True):
+        out += (1j * angular * time[:, None]) ** order[:, None]
+    return out
+
+
+def transfer(times: Array, orders: Matrix, circle: Circle, step: float) -> Spectrum:
+    r"""``1 / (1 + sum_i (T_i s)^order_i)`` integrated order_1 times (Ta et al. 2026, Eqs. 59-61).
+
+    :math:`P^{a_1} / (P^{a_1} + \sum_i T_i^{a_i} P^{a_1 - a_i})` with block-pulse integrals P^a,
+    evaluated on the circle.
+
+    Parameters: times (..., batch, terms) [time unit] and orders (batch, terms) [-], not increasing along a
+    row; step [time unit] block width. Returns: (..., batch, length // 2 + 1).
+    Accuracy: the dense matrix quotient to 2e-9 (typically 1e-12); the true response to O(step^2).
+    Both are useless for an element whose time constants are all below about 0.3 step when its top
+    order exceeds 1: the block-pulse scheme is then unstable and needs shorter blocks.
+    """
+    top, denominator, _ = _parts(times, orders, circle, step)
+    return top / denominator
+
+
+def transfer_slopes(
+    times: Array, orders: Matrix, circle: Circle, step: float, *, in_orders: bool = True
+) -> tuple[Spectrum, TransferSlopes]:
+    """`transfer` and its exact derivatives in every log time constant and, unless `in_orders` is false, every
+    order."""
+    top, denominator, integrals = _parts(times, orders, circle, step)
+    value = top / denominator
+    scale = _scale(times, orders, step)
+
+    def slope(order: Vector) -> Spectrum:
+        return _differenced(integration_weights_slope(order, circle.n, 1.0), circle)
+
+    by_time = tuple(
+        -value * (orders[:, i, None] * scale[i]) * integral / denominator
+        for i, integral in enumerate(integrals)
+    )
+    if not in_orders:
+        return value, TransferSlopes(by_time, ())
+    logs = np.log(times / step)
+    log_times = [logs[..., i, None] for i in range(orders.shape[1])]
+    by_order = []
+    leading = slope(orders[:, 0]) * (1.0 - value) - value * scale[0] * log_times[0] * integrals[0]
+    for i in range(1, orders.shape[1]):
+        bent = slope(orders[:, 0] - orders[:, i])
+        leading = leading - value * scale[i] * bent
+        by_order.append(-value * scale[i] * (log_times[i] * integrals[i] - bent) / denominator)
+    return value, TransferSlopes(by_time, (leading / denominator, *by_order))
+
+
+def _parts(
+    times: Array, orders: Matrix, circle: Circle, step: float
+) -> tuple[Spectrum, Spectrum, list[Spectrum]]:
+    """P^a1, the denominator, and P^(a1 - ai) of every term, all times ``1 - z``, in blocks of width 1."""
+    scale = _scale(times, orders, step)
+    integrated = np.concatenate((orders[:, :1], orders[:, :1] - orders[:, 1:]), axis=1)
+    weights = integration_weights(integrated.ravel(), circle.n, 1.0)
+    spectra = _differenced(weights, circle).reshape(*orders.shape, -1)
+    integrals = [circle.difference[None], *(spectra[:, i] for i in range(1, orders.shape[1]))]
+    denominator = spectra[:, 0] + scale[0] * integrals[0]
+    for i in range(1, orders.shape[1]):
+        denominator += scale[i] * integrals[i]
+    return spectra[:, 0], denominator, integrals
+
+
+def _scale(times: Array, orders: Matrix, step: float) -> list[Array]:
+    """``(T / step)^order`` of every term, each (..., batch, 1) [-]."""
+    powers = (times / step) ** orders
+    return [powers[..., i, None] for i in range(orders.shape[1])]
+
+
+def _differenced(weights: Matrix, circle: Circle) -> Spectrum:
+    """``1 - z`` times the series of these weights, which are overwritten."""
+    weights[:, 1:] -= weights[:, :-1]
+    return circle.spectrum(weights)
+
 
 Kind = Literal["integral", "value", "slope"]
 """What is read: the running integral from the onset [blocks], the value, or the derivative [per block]."""
-
+Slopes = Literal["times", "all"] | None
+"""Derivatives beside a response: none, in the logarithms of the time constants, or in the orders too."""
 _RATIO = 4
 """Blocks of a level in one block of the next coarser level."""
 _LEVELS = 3
@@ -80,7 +183,7 @@ class StepResponse:
     """Unit step responses of a batch of elements and, as further rows, their derivatives.
 
     Times are counted in blocks from the onset. Rows: the response; with derivatives also one row per
-    logarithm of a time constant and one per order.
+    logarithm of a time constant and, where wanted, one per order.
     """
 
     coarse: Array
@@ -90,12 +193,8 @@ class StepResponse:
     onset is read from the coarse blocks."""
     orders: Vector
     """Leading order of each element, (batch,) [-]."""
-
-    @property
-    def _leading(self) -> int | None:
-        """Row of the derivative in the leading order."""
-        rows = self.coarse.shape[0]
-        return None if rows == 1 else 1 + (rows - 1) // 2
+    leading: int | None = None
+    """Row of the derivative in the leading order, if there is one."""
 
     @cached_property
     def _sums(self) -> Array:
@@ -107,22 +206,22 @@ class StepResponse:
         """The same for the finer levels [blocks of the level]."""
         return _running(self.fine)
 
-    def on_lattice(self, theta: Vector, kind: Kind = "value") -> Array:
-        """Readings at ``k + theta``, k = 0 .. n - 3, (rows, batch, n - 2).
+    def on_lattice(self, theta: Matrix, kind: Kind = "value") -> Array:
+        """Readings at ``k + theta``, k = 0 .. n - 3, (rows, places, batch, n - 2).
 
-        Parameters: theta (batch,) in [0, 1) [blocks], one for each element.
+        Parameters: theta (places, batch) in [0, 1) [blocks], one column for each element.
         """
         n = self.coarse.shape[2] - _SIDE
-        weights = taps(theta, kind)
-        out = np.zeros((*self.coarse.shape[:2], n))
-        inner = out[:, :, _SIDE:]
+        weights = taps(theta, kind)[..., None]
+        out = np.zeros((self.coarse.shape[0], *theta.shape, n))
+        inner = out[..., _SIDE:]
+        coarse = self.coarse[:, None]
         for weight, shift in zip(weights, range(2 * _SIDE + 1), strict=True):
-            inner += weight[:, None] * self.coarse[:, :, shift : shift + n - _SIDE]
+            inner += weight * coarse[..., shift : shift + n - _SIDE]
         if kind == "integral":
-            inner += self._sums[:, :, _SIDE:n]
+            inner += self._sums[:, None, :, _SIDE:n]
         first = min(_NEAR, n)
-        near = theta[:, None] + np.arange(first)
-        out[:, :, :first] = self._near(near, kind)
+        out[..., :first] = self._near(theta[..., None] + np.arange(first), kind)
         return out
 
     def at(self, x: Matrix, kind: Kind = "value") -> Array:
@@ -146,20 +245,25 @@ class StepResponse:
         out[:, near[0], near[1]] = self._read_fine(near[0], x[near], kind)
         return out
 
+    @cached_property
+    def alone(self) -> StepResponse:
+        """The same without derivatives."""
+        return replace(self, coarse=self.coarse[:1], fine=self.fine[:1], leading=None)
+
     def first(self, n: int) -> StepResponse:
         """The first `n` blocks."""
         if n == self.coarse.shape[2]:
             return self
-        return StepResponse(self.coarse[:, :, :n], self.fine, self.orders)
+        return replace(self, coarse=self.coarse[:, :, :n])
 
     def beyond(self, means: Array) -> StepResponse:
         """Other responses of these elements, as block means alone, (rows, batch, n)."""
-        return StepResponse(means, self.fine[:, :0], self.orders)
+        return replace(self, coarse=means, fine=self.fine[:, :0])
 
-    def _near(self, x: Matrix, kind: Kind) -> Array:
-        """Readings at positions below _NEAR, (rows, batch, positions)."""
-        elements = np.repeat(np.arange(x.shape[0]), x.shape[1])
-        return self._read_fine(elements, x.ravel(), kind).reshape(-1, *x.shape)
+    def _near(self, x: Array, kind: Kind) -> Array:
+        """Readings at positions below _NEAR, (places, batch, positions) -> (rows, *x.shape)."""
+        elements = np.broadcast_to(np.arange(x.shape[1])[:, None], x.shape)
+        return self._read_fine(elements.ravel(), x.ravel(), kind).reshape(-1, *x.shape)
 
     def _read_fine(self, element: Index, x: Vector, kind: Kind) -> Array:
         """Readings of single elements at positions below _NEAR, (rows, positions)."""
@@ -204,8 +308,8 @@ class StepResponse:
         else:
             scale, by_order = growth, log
         response = edge * scale
-        if self._leading is not None:
-            response[self._leading] += edge[0] * scale * by_order
+        if self.leading is not None:
+            response[self.leading] += edge[0] * scale * by_order
         values[:, chosen] = np.where(after, response, 0.0)
 
 
@@ -219,12 +323,12 @@ _FINE_CIRCLE = Circle(_FINE)
 
 
 def step_response(
-    times: Matrix, orders: Matrix, circle: Circle, step: float, *, slopes: bool = False
+    times: Matrix, orders: Matrix, circle: Circle, step: float, *, slopes: Slopes = None
 ) -> StepResponse:
     """Step responses of ``1 / (1 + sum_i (T_i s)^order_i)`` on `circle.n` blocks of width `step`.
 
     Parameters: times [time unit] and orders [-], (batch, terms), orders not increasing along a row; step
-    [time unit]; with `slopes` the derivatives in every log time constant and order are rows too.
+    [time unit]; `slopes` are rows too: the derivatives in every log time constant, and in every order.
     Accuracy: second order in `step` away from the onset; see the module for the onset itself. What the
     blocks are too wide for, `transfer` says.
     """
@@ -234,7 +338,7 @@ def step_response(
     for level in range(_LEVELS - 2, -1, -1):
         _hand_over(fine[:, level + 1], fine[:, level])
     _hand_over(fine[:, 0], coarse)
-    return StepResponse(coarse, fine, orders[:, 0])
+    return StepResponse(coarse, fine, orders[:, 0], 1 + times.shape[-1] if slopes == "all" else None)
 
 
 def _hand_over(narrow: Array, wide: Array) -> None:
@@ -244,11 +348,11 @@ def _hand_over(narrow: Array, wide: Array) -> None:
     wide[..., :count] = parts.mean(axis=-1)
 
 
-def _means(times: Array, orders: Matrix, circle: Circle, *, slopes: bool) -> Array:
+def _means(times: Array, orders: Matrix, circle: Circle, *, slopes: Slopes) -> Array:
     """Block means of the step responses, (rows, ..., n); times in blocks."""
-    if not slopes:
+    if slopes is None:
         return _stepped(transfer(times, orders, circle, 1.0), circle)[None]
-    value, parts = transfer_slopes(times, orders, circle, 1.0)
+    value, parts = transfer_slopes(times, orders, circle, 1.0, in_orders=slopes == "all")
     return np.stack([_stepped(row, circle) for row in (value, *parts.log_times, *parts.orders)])
 
 

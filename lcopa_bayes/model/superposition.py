@@ -10,10 +10,10 @@ from typing import final
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from lcopa_bayes.core.arrays import Array, Index, Vector
+from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.data.drive import AxisDrive
+from lcopa_bayes.model.blockpulses import Circle, Spectrum
 from lcopa_bayes.model.grid import Lattice
-from lcopa_bayes.model.powerseries import Circle, Spectrum
 from lcopa_bayes.model.stepresponse import Kind, StepResponse
 
 SPARE = 5
@@ -25,6 +25,9 @@ _ROUNDED = 1e-4
 _PHASES = 24
 """Phases of a drive that are kept apart; more changes off the lattice than this are shared out between the
 two blocks around them, as block means of the drive would be."""
+_PLACES = round(1.0 / _SAME_PHASE)
+_TOGETHER = 1 << 17
+"""Numbers of a step response times phases that are read at once; more no longer fit the cache."""
 _ADDED = 10
 """Changes of one phase that are added one by one; more are convolved on the circle."""
 
@@ -110,8 +113,10 @@ class _Read:
 
         Parameters: start (batch,); slots increasing from 0, the last of them length - 1.
         """
+        first = np.clip(start + self.size, 0, self.padded.shape[2] - length)
+        if start.size == 1:
+            return self.padded[:, :, first[0] : first[0] + length][:, :, slots]
         windows = sliding_window_view(self.padded, length, axis=2)
-        first = np.clip(start + self.size, 0, windows.shape[2] - 1)
         return np.asarray(windows[:, np.arange(start.size), first][:, :, slots])
 
 
@@ -123,6 +128,7 @@ class Superposition:
     circle: Circle
     """Of the step responses' blocks."""
     kept: dict[tuple[object, ...], _Read] = field(default_factory=dict)
+    """Readings by what they are of and by the place of the samples in a block."""
 
     def __call__(
         self,
@@ -138,25 +144,23 @@ class Superposition:
         Parameters: delays (batch,) [time unit]; key: element and delay slot, the same for the same
         `response` and `delays`; kind "slope" reads the derivative per block instead.
         """
-        shape = (*response.coarse.shape[:2], lattice.times.size)
-        out = np.zeros(shape if kind == "value" else (1, *shape[1:]))
+        out = np.zeros((*response.coarse.shape[:2], lattice.times.size))
         if not lattice.times.size:
             return out
-        for phase in changes:
-            if lattice.slots is None:
+        if lattice.slots is None:
+            for phase in changes:
                 self._add_anywhere(out, response, phase, lattice, delays, kind)
-            else:
-                self._add_on_lattice(out, response, phase, lattice, delays, key, kind)
+            return out
+        begins = np.array([phase.time for phase in changes])
+        origins = (lattice.times[0] - begins[:, None] - delays) / lattice.step
+        for phase, origin, read in zip(
+            changes, origins, self._reads(response, origins, lattice, key, kind), strict=True
+        ):
+            self._add_on_lattice(out, phase, origin, read, lattice)
         return out
 
     def _add_anywhere(
-        self,
-        out: Array,
-        response: StepResponse,
-        phase: Phase,
-        lattice: Lattice,
-        delays: Vector,
-        kind: Kind,
+        self, out: Array, response: StepResponse, phase: Phase, lattice: Lattice, delays: Vector, kind: Kind
     ) -> None:
         """Add the response to one phase at sample times of any spacing."""
         x = (lattice.times - phase.time - delays[:, None]) / lattice.step
@@ -171,7 +175,7 @@ class Superposition:
             else:
                 before: Kind = "value" if kind == "slope" else "integral"
                 reading = (source.at(reached, before) - source.at(reached - width, before)) / width
-            out += jump * reading[: out.shape[0]]
+            out += jump * reading
 
     def _convolved(self, response: StepResponse, phase: Phase) -> StepResponse:
         """Response to all changes of a phase as block means; its onsets are read as the blocks have them."""
@@ -186,18 +190,9 @@ class Superposition:
         return self.circle.spectrum(train)
 
     def _add_on_lattice(
-        self,
-        out: Array,
-        response: StepResponse,
-        phase: Phase,
-        lattice: Lattice,
-        delays: Vector,
-        key: tuple[int, int],
-        kind: Kind,
+        self, out: Array, phase: Phase, origin: Vector, read: _Read, lattice: Lattice
     ) -> None:
-        """Add the response to one phase at equidistant sample times."""
-        origin = (lattice.times[0] - phase.time - delays) / lattice.step
-        read = self._read(response, origin, lattice, (*key, kind))
+        """Add the response to one phase at equidistant sample times, the first at `origin` of it."""
         # a reading of another record or phase may be a whole number of blocks away
         start = np.floor(read.origin).astype(int) + round(float(origin[0] - read.origin[0]))
         assert lattice.slots is not None
@@ -211,28 +206,38 @@ class Superposition:
         for shift, jump in zip(phase.blocks, phase.jumps, strict=True):
             out += jump * read.take(start - shift, lattice.chosen, length)
 
-    def _read(
-        self, response: StepResponse, origin: Vector, lattice: Lattice, key: tuple[object, ...]
-    ) -> _Read:
-        """The step response at the phase that the samples have after the onset."""
-        key = (*key, lattice.step, lattice.exposure)
-        for other, read in self.kept.items():
-            if other[:-1] == key:
-                apart = float(origin[0] - read.origin[0])
-                if abs(apart - round(apart)) < _SAME_PHASE:
-                    return read
-        theta = origin - np.floor(origin)
+    def _reads(
+        self, response: StepResponse, origins: Matrix, lattice: Lattice, key: tuple[int, int], kind: Kind
+    ) -> list[_Read]:
+        """The step response at the place that the samples have in a block, for each of (phases, batch)."""
+        places = [
+            (*key, kind, lattice.step, lattice.exposure, round(float(place) / _SAME_PHASE) % _PLACES)
+            for place in origins[:, 0] % 1.0
+        ]
+        absent = [k for k, place in enumerate(places) if place not in self.kept and place not in places[:k]]
+        together = max(1, _TOGETHER // response.coarse.size)
+        for first in range(0, len(absent), together):
+            some = absent[first : first + together]
+            readings = _readings(response, origins[some], lattice, kind)
+            for k, reading in zip(some, readings.swapaxes(0, 1), strict=True):
+                self.kept[places[k]] = _Read.of(origins[k], reading)
+        return [self.kept[place] for place in places]
+
+
+def _readings(response: StepResponse, origins: Matrix, lattice: Lattice, kind: Kind) -> Array:
+    """Readings of a step response from its onset on, (rows, phases, batch, n), for samples at `origins`."""
+    theta = origins - np.floor(origins)
+    if lattice.exposure == 0.0:
+        readings = response.on_lattice(theta, kind)
+    else:
         width = lattice.exposure / lattice.step
-        if lattice.exposure == 0.0:
-            readings = response.on_lattice(theta, key[2])  # type: ignore[arg-type]
-        else:
-            before: Kind = "value" if key[2] == "slope" else "integral"
-            late = response.on_lattice(theta, before)
-            opened = theta - width
-            whole = np.floor(opened)
-            early = _Read.of(opened, response.on_lattice(opened - whole, before))
-            readings = (late - early.take(whole.astype(int), slice(None), early.size)) / width
-        if key[2] == "slope":
-            readings = readings[:1]
-        self.kept[(*key, len(self.kept))] = reading = _Read.of(origin, readings)
-        return reading
+        before: Kind = "value" if kind == "slope" else "integral"
+        late = response.on_lattice(theta, before)
+        opened = theta - width
+        whole = np.floor(opened)
+        early = response.on_lattice(opened - whole, before)
+        # the shutter opens whole blocks before the block in which it closes
+        for k, blocks in np.ndenumerate(-whole.astype(int)):
+            late[:, *k, blocks:] -= early[:, *k, : early.shape[-1] - blocks]
+        readings = late / width
+    return readings

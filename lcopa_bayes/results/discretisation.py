@@ -17,6 +17,9 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.arrays import Flags, Matrix, Vector
+from lcopa_bayes.core.covariance import covariance_of
+from lcopa_bayes.core.estimate import attributes
+from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.optimum import Optimum, again, find_optima
@@ -39,8 +42,11 @@ _MOST_CELLS = 1 << 15
 """Blocks of all records together beyond which they are not narrowed: a fit takes as many times longer."""
 _STARTS = 2
 """Starts of the search for the optimum."""
-_DRAWS = 400
-"""Draws behind the measurement after sampling."""
+_DRAWS, _FEWER = 400, 128
+"""Draws behind the measurement after sampling, and with effects, whose responses on narrow blocks cost more
+than the sampling did; the error of the measurement says what they are worth."""
+_PORTION = 32
+"""Draws that one process takes at once [-]."""
 
 
 @final
@@ -100,9 +106,7 @@ class Discretisation:
             "parameter": self.parameter,
             "shift_sd": self.shift,
             "shift_error_sd": self.error,
-            "refinement": self.refinement,
-            "blocks": self.blocks,
-            "negligible": self.negligible,
+            **attributes(self, "refinement", "blocks", "negligible"),
             "moved": list(self.moved),
         }
 
@@ -113,23 +117,28 @@ def resolved(problem: Problem, optima: Sequence[Optimum] | None = None) -> Probl
     The same problem gives the same blocks; see `narrowed`. `optima` are its own, best first, where they are
     known already.
     """
-    rng = np.random.default_rng([problem.study.seed, 6])
     with threadpool_limits(1):  # matrices are small: more threads only wait for each other
         if optima is None:
-            optima = find_optima(problem.posterior, rng, starts=_STARTS)
+            optima = optima_of(problem)
         if not optima:
             return problem
         best = optima[0].values
         return narrowed(problem, lambda each: optimum_shift(each, best))
 
 
-def resolved_optima(problem: Problem, *, starts: int) -> tuple[Problem, tuple[Optimum, ...]]:
-    """`resolved`, and the optima there: with effects a search from the prior is too dear to be made twice."""
-    rng = np.random.default_rng([problem.study.seed, 6])
+def optima_of(problem: Problem, *, starts: int = _STARTS) -> tuple[Optimum, ...]:
+    """Least-squares optima of a study, best first: what the first look, the width of the blocks and sampling
+    begin with. The same problem gives the same optima."""
     with threadpool_limits(1):
-        optima = find_optima(problem.posterior, rng, starts=starts)
-        narrow = resolved(problem, optima)
-        return narrow, optima if narrow is problem else again(narrow.posterior, optima)
+        rng = np.random.default_rng([problem.study.seed, 6])
+        return find_optima(problem.posterior, rng, starts=starts)
+
+
+def resolved_optima(problem: Problem, optima: Sequence[Optimum]) -> tuple[Problem, tuple[Optimum, ...]]:
+    """`resolved`, and the optima there."""
+    narrow = resolved(problem, optima)
+    with threadpool_limits(1):
+        return narrow, tuple(optima) if narrow is problem else again(narrow.posterior, optima)
 
 
 def narrowed(problem: Problem, shift: Callable[[Problem], float]) -> Problem:
@@ -159,8 +168,7 @@ def optimum_shift(problem: Problem, values: Vector) -> float:
     here = LeastSquares(problem.posterior)
     x = here.coordinates(values)
     residual, jacobian = here.residual(x, values)
-    precision = jacobian.T @ jacobian + _prior_precision(here)
-    covariance = np.asarray(np.linalg.pinv(precision, hermitian=True), dtype=float)
+    covariance = covariance_of(jacobian.T @ jacobian + np.diag(here.prior_precision))
     finer = [LeastSquares(problem.refined(factor).posterior) for factor in FACTORS]
     changes = [each.misfit(x, values) - residual for each in finer]  # slopes with effects cost most
     return largest_shift(covariance, jacobian, changes)
@@ -177,18 +185,17 @@ def largest_shift(covariance: Matrix, jacobian: Matrix, changes: Sequence[Vector
     return float(np.max(shifts)) * _REST
 
 
-def _prior_precision(problem: LeastSquares) -> Matrix:
-    """No direction is wider than its prior: precision of a uniform law between the bounds."""
-    low, high = problem.bounds
-    width = high - low
-    return np.diag(np.where(np.isfinite(width), 12.0 / np.where(width > 0, width, 1.0) ** 2, 0.0))
-
-
-def discretisation(problem: Problem, draws: Draws) -> Discretisation:
-    """Shift of the posterior mean of every free parameter on blocks four times narrower."""
-    finer = problem.refined(FACTORS[-1]).posterior
-    values = draws.thinned(_DRAWS)
-    change = finer.joint_log_likelihood(values) - problem.posterior.joint_log_likelihood(values)
+def discretisation(problem: Problem, draws: Draws, *, jobs: int = 1) -> Discretisation:
+    """Shift of the posterior mean of every free parameter on blocks four times narrower; with effects on
+    `jobs` processes."""
+    finer, used = problem.refined(FACTORS[-1]).posterior, problem.posterior
+    values = draws.thinned(_DRAWS if used.simulation is None else _FEWER)
+    parts = np.array_split(values, max(1, len(values) // _PORTION))
+    with workers(None, jobs=1 if used.simulation is None else jobs) as crew:
+        there, here = (
+            np.concatenate(list(crew.map(each.joint_log_likelihood, parts))) for each in (finer, used)
+        )
+    change = there - here
     weights = np.exp(change - change.max())
     weights /= weights.sum()
     rows = [k for k, row in enumerate(draws.table.rows) if row.free]
@@ -200,12 +207,12 @@ def discretisation(problem: Problem, draws: Draws) -> Discretisation:
     worst = int(np.abs(shifts).argmax())
     names = [draws.table.names[k] for k in rows]
     return Discretisation(
-        names[worst],
-        float(shifts[worst]),
-        float(errors[worst]),
-        problem.refinement,
-        _cells(problem),
-        tuple(names[k] for k in np.flatnonzero(~_negligible(shifts, errors))),
+        parameter=names[worst],
+        shift=float(shifts[worst]),
+        error=float(errors[worst]),
+        refinement=problem.refinement,
+        blocks=_cells(problem),
+        moved=tuple(names[k] for k in np.flatnonzero(~_negligible(shifts, errors))),
     )
 
 

@@ -15,13 +15,15 @@ import numpy as np
 import pandas as pd
 from scipy.special import logsumexp
 
+from lcopa_bayes.core.covariance import root_of
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.estimate import Estimate, plain
 from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
-from lcopa_bayes.inference.optimum import Optimum, find_optima
+from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.results.discretisation import optima_of
 from lcopa_bayes.results.prediction import Band, study_bands
 from lcopa_bayes.results.residuals import WHITE_P, Residual, residuals
 from lcopa_bayes.results.summary import fixed_values, scores
@@ -33,8 +35,6 @@ TABLES = ("bands", "drives", "residuals", "autocorrelation", "spectrum")
 """Tables of a first look."""
 GRADE = "tentative"
 """No first look has a better grade."""
-_STARTS = 2
-"""Starts of the search for optima [-]."""
 _DRAWS = 2_000
 """Draws of the Gaussian ..."""
 _SIMULATED = 200
@@ -57,7 +57,8 @@ class FirstLook:
     """Least squares of a study with a Gaussian about the best optimum."""
 
     problem: Problem
-    optimum: Optimum
+    optima: tuple[Optimum, ...]
+    """Best first."""
     draws: Draws
     """Of the Gaussian, cut to the support of the priors and weighted by the posterior where enough of them
     count, (1, draws, rows)."""
@@ -67,6 +68,11 @@ class FirstLook:
     """50 and 90 % bands of every response axis of every record, fitted ones first [response unit]."""
     residuals: tuple[Residual, ...]
     """What the optimum leaves of each of these [response unit], tested for whiteness."""
+
+    @property
+    def optimum(self) -> Optimum:
+        """The best one."""
+        return self.optima[0]
 
     @property
     def reason(self) -> str:
@@ -143,7 +149,7 @@ def first_look(study: Study) -> FirstLook:
     refuse_if(unmet(study))
     problem = problem_of(study)
     rng = np.random.default_rng([study.seed, _STREAM])
-    optima = find_optima(problem.posterior, rng, starts=_STARTS)
+    optima = optima_of(problem)
     if not optima:
         raise InputError(
             f"{study.name}: no least-squares search leads to a plant inside the priors; widen them or "
@@ -155,7 +161,7 @@ def first_look(study: Study) -> FirstLook:
     same = np.tile(optima[0].values, (1, 4, 1))  # a simultaneous band needs four draws
     best = Draws(posterior.table, same, np.zeros((1, 4)), (), 1.0)
     remaining = residuals(best, study_bands(problem, best), posterior.noise, problem.scales.period)
-    return FirstLook(problem, optima[0], draws, share, tuple(shown), tuple(remaining))
+    return FirstLook(problem, optima, draws, share, tuple(shown), tuple(remaining))
 
 
 def _near(posterior: Posterior, optimum: Optimum, rng: np.random.Generator) -> tuple[Draws, float]:
@@ -163,8 +169,7 @@ def _near(posterior: Posterior, optimum: Optimum, rng: np.random.Generator) -> t
     where enough of its draws count, else draws of the Gaussian; and the effective share of these [-]."""
     count = _DRAWS if posterior.simulation is None else _SIMULATED
     centre = posterior.coordinates(optimum.values[None])[0]
-    values, vectors = np.linalg.eigh(optimum.covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    root = root_of(optimum.covariance)
     kept = [np.zeros((1, centre.size))]
     for _ in range(_TRIED):
         standard = rng.standard_normal((count, centre.size))

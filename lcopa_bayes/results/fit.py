@@ -17,15 +17,17 @@ from lcopa_bayes.core.files import save_json, save_table, writable_folder, write
 from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.inference.optimum import Optimum
+from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.results.adequacy import limitations
 from lcopa_bayes.results.datatree import POSTERIOR, posterior_tree, save_tree
-from lcopa_bayes.results.discretisation import Discretisation, discretisation, resolved, resolved_optima
+from lcopa_bayes.results.discretisation import Discretisation, discretisation, optima_of, resolved_optima
+from lcopa_bayes.results.firstlook import FirstLook
 from lcopa_bayes.results.frequency import FrequencyResponse, frequency_response
 from lcopa_bayes.results.prediction import Band, study_bands
 from lcopa_bayes.results.predictive import Predictive
-from lcopa_bayes.results.provenance import fingerprint, provenance
 from lcopa_bayes.results.residuals import Residual, residuals
-from lcopa_bayes.results.runfolder import add_origin, opened
+from lcopa_bayes.results.runfolder import add_origin, fingerprint, opened, provenance
 from lcopa_bayes.results.savedfit import NAME as SAVED
 from lcopa_bayes.results.savedfit import fit_to_json
 from lcopa_bayes.results.sensitivity import Sensitivity, sensitivity
@@ -33,7 +35,7 @@ from lcopa_bayes.results.steps import StepCurves, step_curves, step_metrics, too
 from lcopa_bayes.results.summary import results, verdict
 from lcopa_bayes.results.tables import tables
 from lcopa_bayes.sampling.crosscheck import CrossCheck
-from lcopa_bayes.sampling.draws import Draws, gather
+from lcopa_bayes.sampling.draws import Draws, gather, shortfall
 from lcopa_bayes.sampling.evidence import Evidence, evidence_of
 from lcopa_bayes.sampling.nested import NestedPlan, nested
 from lcopa_bayes.sampling.sampler import Run, SamplePlan, sample
@@ -79,6 +81,11 @@ class Fit(Predictive):
     """The same study with integer orders, and how it predicts; None when none was fitted."""
 
     @property
+    def near(self) -> Posterior:
+        """The posterior, with effects by what the draws were made with: a response costs a hundredth."""
+        return replace(self.problem.posterior, surrogate=self.run.surrogate)
+
+    @property
     def verdict(self) -> str:
         """What was learned, how far it can be trusted, what is wrong with it."""
         return verdict(self)
@@ -119,12 +126,13 @@ def fit(
     cross_check: bool = False,
     quiet: bool = True,
     starts: Matrix | None = None,
+    look: FirstLook | None = None,
 ) -> Fit:
     """Sample the posterior of a study and derive what it predicts.
 
     `starts`, table values (starts, rows), are modes known from elsewhere that sampling proposes too. A plant
     with effects is sampled by importance around its optima (`weightedrun`) where the method is "auto" and its
-    weights hold.
+    weights hold. A first `look` of the study spares the search for optima, and changes no number.
 
     With `folder`, sampling is stored there in `chain.h5` and `resume` goes on from it; the result is
     the same as without interruption. With `cross_check` the posterior is also sampled by nested sampling,
@@ -134,15 +142,16 @@ def fit(
     its records, these do not meet the requirements of a fit (`requirements`), or the folder cannot be written
     to; then nothing is written.
     """
-    refuse_if(unmet(study))
-    problem = problem_of(study)
+    if look is None:
+        refuse_if(unmet(study))
+    problem = look.problem if look else problem_of(study)
     if folder:
         writable_folder(folder)
-    plan, weighted_result = plan_of(problem, quick=quick), None
+    plan, weighted_result, optima = plan_of(problem, quick=quick), None, tuple[Optimum, ...]()
     if problem.posterior.simulation is not None and plan.method == "auto":
         problem, weighted_result = weighted_fit(problem, plan, jobs=jobs, quick=quick)
     else:
-        problem = resolved(problem)
+        problem, optima = resolved_optima(problem, look.optima if look else optima_of(problem))
     if weighted_result is not None:
         run, draws = weighted_result
     else:
@@ -155,8 +164,10 @@ def fit(
             resume=resume,
             quiet=quiet,
             starts=starts,
+            optima=optima,
         )
         draws = gather(problem.posterior, run)
+        draws = draws.limited(shortfall(run, draws))
     check = None
     weighed = evidence_of(problem.posterior, run, draws.ess)
     if cross_check:
@@ -168,7 +179,7 @@ def fit(
             log_evidence_sd=weighed.sd if weighed else None,
         )
         draws = draws.limited(check.limitations(draws.grade))
-    width = discretisation(problem, draws)
+    width = discretisation(problem, draws, jobs=jobs)
     curves = step_curves(draws, problem.scales.span)
     draws = draws.limited([*width.limitations, *too_fast(draws, curves, problem.scales.period)])
     shown = study_bands(problem, draws)
@@ -177,23 +188,23 @@ def fit(
         limitations(problem, draws, shown, remaining, np.random.default_rng([plan.seed, 4]))
     )
     metrics = step_metrics(draws, curves, time_unit=study.time_unit)
-    moved = sensitivity(draws, problem.posterior)
+    moved = sensitivity(draws, replace(problem.posterior, surrogate=run.surrogate))
     response = frequency_response(
         draws, span=problem.scales.span, period=problem.scales.period, time_unit=study.time_unit
     )
     return Fit(
-        problem,
-        run,
-        draws,
-        tuple(shown),
-        tuple(remaining),
-        curves,
-        tuple(metrics),
-        moved,
-        weighed,
-        width,
-        response,
-        check,
+        problem=problem,
+        run=run,
+        draws=draws,
+        bands=tuple(shown),
+        residuals=tuple(remaining),
+        curves=curves,
+        metrics=tuple(metrics),
+        sensitivity=moved,
+        evidence=weighed,
+        discretisation=width,
+        frequency=response,
+        cross_check=check,
     )
 
 
@@ -202,7 +213,8 @@ def weighted_fit(
 ) -> tuple[Problem, tuple[Run, Draws] | None]:
     """A plant with effects on blocks as narrow as its records need, and weighted draws of it with their run;
     no draws where importance sampling does not hold."""
-    problem, optima = resolved_optima(problem, starts=QUICK_STARTS if quick else STARTS)
+    optima = optima_of(problem, starts=QUICK_STARTS if quick else STARTS)
+    problem, optima = resolved_optima(problem, optima)
     return problem, weighted_run(problem.posterior, plan, jobs=jobs, quick=quick, optima=optima)
 
 
@@ -217,6 +229,7 @@ def plan_of(problem: Problem, *, quick: bool) -> SamplePlan:
         steps=wanted.steps,
         thin=wanted.thin,
         target_ess=wanted.target_ess,
+        seconds=wanted.seconds,
         method=wanted.method or ("auto" if wanted.steps is None and wanted.thin is None else "ensembles"),
     )
     if not quick:

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import pandas as pd
 
 from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.parallel import meanwhile
 
 
 class Result(ABC):
@@ -45,15 +46,16 @@ class Result(ABC):
     def verdict(self) -> str:
         """The result in a sentence or a few."""
 
-    def report(self, folder: Path | str) -> Path:
+    def report(self, folder: Path | str, *, jobs: int = 1) -> Path:
         """Write the page of the result into a run folder, saving the result there first if it is not there
-        yet; returns the path of the page. InputError as `save`."""
+        yet, its figures in `jobs` processes; returns the path of the page. InputError as `save`."""
         folder = Path(folder)
         if not self.is_in(folder):
             self.save(folder)
-        # pages read results, and results import no page: it is looked up when wanted
-        page: Path = import_module("lcopa_bayes.report.pages").write_page_of(self.verb, folder)
-        return page
+        written: list[Path] = []
+        with meanwhile(write_page, (self.verb, folder, jobs), written.append, jobs=jobs):
+            pass
+        return written[0]
 
     def is_in(self, folder: Path) -> bool:
         """Whether a run folder holds this very result."""
@@ -72,6 +74,17 @@ class Result(ABC):
 
         table = self.summary()
         return f"<p>{escape(self.verdict)}</p>" + (notebook_table(table) if len(table) else "")
+
+
+def write_page(wanted: tuple[str, Path, int]) -> Path:
+    """Write the page of a verb's result into its run folder in so many processes; returns its path.
+
+    Pages read results, and results import no page: it is looked up when wanted, and where a process of its
+    own writes it this one need not load what draws figures.
+    """
+    verb, folder, jobs = wanted
+    page: Path = import_module("lcopa_bayes.report.pages").write_page_of(verb, folder, jobs=jobs)
+    return page
 
 
 def notebook_table(table: pd.DataFrame) -> str:

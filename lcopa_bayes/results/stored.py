@@ -13,9 +13,8 @@ from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import save_json, writable_folder, write_text
 from lcopa_bayes.results.datatree import POSTERIOR
 from lcopa_bayes.results.predictive import Predictive
-from lcopa_bayes.results.provenance import provenance
 from lcopa_bayes.results.result import Result
-from lcopa_bayes.results.runfolder import add_origin, opened, origins
+from lcopa_bayes.results.runfolder import add_origin, opened, origins, provenance
 from lcopa_bayes.results.savedfit import NAME, load_fit
 
 R = TypeVar("R", bound="StoredResult")
@@ -66,12 +65,13 @@ class StoredResult(Result):
             add_origin(path, self.verb, self.origin)
         return path
 
-    def report(self, folder: Path | str) -> Path:
+    def report(self, folder: Path | str, *, jobs: int = 1) -> Path:
         """Write the page of the result, and that of the fit it rests on, into a run folder, saving both there
-        first where they are not there yet; returns the path of the page. InputError as `save`."""
+        first where they are not there yet, figures in `jobs` processes; returns the path of the page.
+        InputError as `save`."""
         if self.fit is not None:
-            self.fit.report(folder)
-        return super().report(folder)
+            self.fit.report(folder, jobs=jobs)
+        return super().report(folder, jobs=jobs)
 
     @classmethod
     def load(cls: type[R], folder: Path) -> R:
@@ -95,8 +95,7 @@ class StoredResult(Result):
 
 def origin_of(fit: Predictive, verb: str) -> dict[str, Any]:
     """Provenance of a result that rests on a fit."""
-    values: dict[str, Any] = plain(provenance(fit.study, verb) | {"draws_sha256": fit.draws.sha256})
-    return values
+    return plain(provenance(fit.study, verb) | {"draws_sha256": fit.draws.sha256})
 
 
 def stored_values(

@@ -34,6 +34,8 @@ _MEASURED = 12_000
 """Draws on which the convergence of the linear parameters is measured."""
 _PER_ENSEMBLE = 500
 """Draws delivered per ensemble."""
+_AT_LEAST = 0.5
+"""Least further time that is asked for, over the time taken [-]: enough draws that disagree need more too."""
 _CHUNK = 128
 """Draws completed at a time."""
 
@@ -111,12 +113,28 @@ class Draws:
                 self.column(quality.name),
                 ess=quality.ess,
                 grade=self.level(
-                    quality.name,
-                    Grade.worst([quality.grade(self.target_ess), *shares.get(quality.name, [])]),
+                    quality.name, Grade.worst([quality.grade(self.target_ess), *shares.get(quality.name, [])])
                 ),
             )
             for quality in self.qualities
         )
+
+
+def shortfall(run: Run, draws: Draws) -> tuple[Limitation, ...]:
+    """What the draws of a run that its budget ended lack, and how much more time would give it; nothing where
+    they lack nothing."""
+    if run.stopped_after is None or draws.sampling_grade.level == "reliable":
+        return ()
+    target, rhat = run.plan.target_ess, float(np.max([quality.rhat for quality in draws.qualities]))
+    more = run.stopped_after * max(target / max(draws.ess, 1.0) - 1.0, _AT_LEAST)
+    return (
+        Limitation(
+            "tentative",
+            f"the budget of {run.plan.seconds:g} s ended sampling: the smallest effective sample size is "
+            f"{draws.ess:.0f} where {target:g} are wanted, the largest R-hat {rhat:.3f}",
+            f"give it about {more:.0f} s more by [sampler] seconds",
+        ),
+    )
 
 
 def gather(posterior: Posterior, run: Run) -> Draws:

@@ -55,12 +55,13 @@ class Ensemble:
         walkers: int,
         sweeps: int,
         seed: np.random.SeedSequence,
+        seconds: float = np.inf,
     ) -> Ensemble:
         """A population tempered from the prior; emcee needs a legacy generator, seeded here and nowhere
-        else."""
+        else; `seconds` as `temper`."""
         draw, moves = seed.spawn(2)
         random = tuple(np.random.RandomState(np.random.MT19937(moves)).get_state())
-        population, random = temper(posterior, walkers, sweeps, np.random.default_rng(draw), random)
+        population, random = temper(posterior, walkers, sweeps, np.random.default_rng(draw), random, seconds)
         return cls(
             np.empty((0, walkers, posterior.dimension)),
             np.empty((0, walkers)),

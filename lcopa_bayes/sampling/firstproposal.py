@@ -36,10 +36,12 @@ NEIGHBOURS = 6
 """Nearest points among which that of the best optimum gives the start."""
 
 
-def first_proposal(outer: Outer, rng: np.random.Generator, done: Done) -> tuple[Product, Matrix]:
+def first_proposal(
+    outer: Outer, rng: np.random.Generator, done: Done, known: Sequence[Optimum] = ()
+) -> tuple[Product, Matrix]:
     """A proposal from the prior of the orders and estimates of delays and noise, in part around
     least-squares optima; and table values of points to start from. `done` performs a task at table values
-    from others."""
+    from others; `known` are the optima where these are known."""
     posterior = outer.posterior
     values = _nearly_white(posterior, posterior.table.draw(_PILOT, rng))
     pilot = Optima(pilot=True)
@@ -52,10 +54,10 @@ def first_proposal(outer: Outer, rng: np.random.Generator, done: Done) -> tuple[
     if not outer.orders.all():
         rest, chosen = _rest(outer, rng, done, values, objective)
         values = np.concatenate([values, chosen])
-    optima: Sequence[Optimum] = weighty(find_optima(posterior, rng, starts=_OPTIMA))
+    optima: Sequence[Optimum] = weighty(known or find_optima(posterior, rng, starts=_OPTIMA))
     for _ in range(_AGAIN):  # plant and correlated noise, found in turn, draw each other along
         optima = again(posterior, optima)
-    known = np.array([one.values for one in optima]).reshape(-1, values.shape[1])
+    at = np.array([one.values for one in optima]).reshape(-1, values.shape[1])
     shapes = np.array([one.covariance[np.ix_(outer.places, outer.places)] for one in optima])
     parts = list[Proposal]()
     for group in outer.groups:
@@ -69,11 +71,11 @@ def first_proposal(outer: Outer, rng: np.random.Generator, done: Done) -> tuple[
                 np.linalg.cholesky(inside + 1e-9 * size[:, None, :] * np.eye(len(group))), dtype=float
             )
             equal = np.full(len(optima), 1 / len(optima))
-            around = Mixture(equal, outer.y(known)[:, group], factors)
+            around = Mixture(equal, outer.y(at)[:, group], factors)
             wider = replace(around, factors=_WIDER * around.factors)
             part = Blend(part, around.blended(wider, 0.5), _AROUND)
         parts.append(part)
-    return Product(outer.groups, tuple(parts)), np.concatenate([values, known])
+    return Product(outer.groups, tuple(parts)), np.concatenate([values, at])
 
 
 def _rest(

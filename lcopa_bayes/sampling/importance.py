@@ -63,6 +63,8 @@ class ImportancePlan:
     """Starts of the least-squares search."""
     wanted: float = 400.0
     """Effective draws of a good attempt."""
+    efficient: bool = True
+    """Whether a good attempt is close to the posterior."""
 
 
 @final
@@ -76,10 +78,11 @@ class Importance:
     evaluations: int
     """Evaluations of the density, those of the optimisation not counted."""
 
-    def good(self, wanted: float) -> bool:
-        """Whether averages converge, the proposal is close to the posterior, and enough draws count."""
-        own = self.weighted
-        if own.pareto_k > usable_k(own.count) or own.ess < max(wanted, LEAST_EFFICIENCY * own.count):
+    def good(self, wanted: float, *, efficient: bool = True) -> bool:
+        """Whether averages converge, the proposal is close to the posterior where it has to be `efficient`,
+        and enough draws count."""
+        own, least = self.weighted, LEAST_EFFICIENCY if efficient else 0.0
+        if own.pareto_k > usable_k(own.count) or own.ess < max(wanted, least * own.count):
             return False
         return bool(min(own.centre_ess.min(), own.tail_ess.min()) >= _SURPLUS * wanted)
 
@@ -115,10 +118,10 @@ def importance(
         y = proposal.draw(effort.draws, rng)
         density = charted_density(posterior, chart, y, mapped)
         weighted = _weighed(posterior, chart, y, density, density - proposal.log_density(y))
-        if weighted.good(plan.wanted):
+        if good := weighted.good(plan.wanted, efficient=plan.efficient):
             break
         seen = seen.joined(proposal, len(y), y, density)
-    spent = sum(map(len, seen.points)) + (len(y) if weighted.good(plan.wanted) else 0)
+    spent = sum(map(len, seen.points)) + (len(y) if good else 0)
     return replace(weighted, modes=len(chosen), evaluations=spent)
 
 

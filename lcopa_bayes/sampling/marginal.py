@@ -18,7 +18,7 @@ to stop where draws look good would take a mode that was not met for none.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import ceil
 from typing import NamedTuple, final
 
@@ -26,8 +26,8 @@ import numpy as np
 from scipy.special import logsumexp
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.core.parallel import Workers
-from lcopa_bayes.core.progress import Progress
+from lcopa_bayes.core.parallel import Progress, Workers
+from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.firstproposal import NEIGHBOURS, best_near, first_proposal, nearest
 from lcopa_bayes.sampling.importanceweights import effective, usable_k
@@ -84,6 +84,7 @@ _TASK = 64
 """Points of a task."""
 
 
+@final
 class _Point(NamedTuple):
     """What is known at each of a batch of points."""
 
@@ -107,11 +108,22 @@ class _Point(NamedTuple):
 class Search:
     """Points, proposals and weights of a search; deterministic given its arguments and what it is asked.
 
-    `bar` counts points and names what is being done.
+    `bar` counts points and names what is being done; `optima` are least-squares optima to begin with, by
+    default those of a few searches. Once it is `late` a search ends with the draws it has.
     """
 
-    def __init__(self, posterior: Posterior, seed: int, crew: Workers[Posterior], bar: Progress) -> None:
+    def __init__(
+        self,
+        posterior: Posterior,
+        seed: int,
+        crew: Workers[Posterior],
+        bar: Progress,
+        optima: Sequence[Optimum] = (),
+        late: Callable[[], bool] = lambda: False,
+    ) -> None:
         self.posterior = posterior
+        self._late = late
+        self._optima = tuple(optima)
         self._bar = bar
         self.outer = Outer(posterior)
         self._crew = crew
@@ -124,7 +136,7 @@ class Search:
         """Weighted draws equivalent to `wanted` independent ones for the centre, the tails and the shares of
         modes of every sampled parameter, from a search of the whole prior; None where no number of draws in
         reach gives them: ensembles may then start from the `population`."""
-        return self._improved(*first_proposal(self.outer, self._rng, self._done), wanted)
+        return self._improved(*first_proposal(self.outer, self._rng, self._done, self._optima), wanted)
 
     def around(self, z: Matrix, wanted: float) -> Weighted | None:
         """The same from points (n, dimension) of the sampled coordinates where ensembles have been."""
@@ -151,6 +163,8 @@ class Search:
         proposal: Proposal = first
         seen, count, walked = Seen(), _LEARNING * self._difficulty, None
         for number in range(_ROUNDS):
+            if self._late():
+                return None
             self._bar.set_description(f"searching for modes, round {number + 1}")
             rounds = self._round([seen], [proposal], count, starts if number == 0 else None)
             if not rounds:
@@ -190,10 +204,13 @@ class Search:
             drawn += count
             weighted = self._weighted(halves, len(seen.counts), since)
             worth = weighted.smallest_ess(self._rng) if weighted.ess > 2.0 else 0.0
-            if worth >= wanted and weighted.pareto_k <= usable_k(weighted.count):
+            enough = worth >= wanted or (self._late() and worth >= _FEW)
+            if enough and weighted.pareto_k <= usable_k(weighted.count):
                 if not self._misses(proposals[0], weighted, self._walked(), halves[0]):
                     return weighted
                 since, worth = len(halves[0].counts), 0.0
+            if self._late():
+                return None
         return None
 
     @property

@@ -13,6 +13,7 @@ from sklearn.cluster import KMeans
 from sklearn.exceptions import ConvergenceWarning
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
+from lcopa_bayes.core.covariance import root_of
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.coordinates import Chart
@@ -77,8 +78,7 @@ def around(
     means, factors = [], []
     for optimum in optima:
         centre = posterior.coordinates(optimum.values[None])[0]
-        spread, vectors = np.linalg.eigh(optimum.covariance)
-        root = vectors * np.sqrt(np.maximum(spread, 1e-12 * spread.max()))
+        root = root_of(optimum.covariance)
         standard = rng.standard_normal((_AROUND, centre.size))
         near, wide = (
             _charted(posterior, chart, centre + scale * standard @ root.T) for scale in (_SMALL, 1.0)

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import ceil
+from math import ceil, inf
 from pathlib import Path
+from time import monotonic
 from typing import final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix
-from lcopa_bayes.core.parallel import workers
-from lcopa_bayes.core.progress import Progress
+from lcopa_bayes.core.parallel import Progress, workers
 from lcopa_bayes.data.settings import Method
+from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.simulation import Simulated
 from lcopa_bayes.sampling.chainfile import Chain, load_chain, save_chain
 from lcopa_bayes.sampling.convergence import CERTAIN, Quality, drifts, qualities
 from lcopa_bayes.sampling.ensemble import Ensemble, advance
@@ -35,6 +37,8 @@ _SWEEPS = 80
 """Most moves of every walker at each temperature of the tempering path."""
 _LEAST = 5
 """Rounds before sampling may stop: the draws kept of them come after the proposal was first adapted."""
+_FEWEST = 2
+"""Rounds before a budget may end sampling."""
 _AS_LONG = 0.4
 """Sampling takes at least this share of the moves that tempering took: a posterior that was hard to reach
 has modes that fill slowly [-]."""
@@ -72,6 +76,8 @@ class SamplePlan:
     """Root of all randomness of the run."""
     method: Method = "ensembles"
     """Importance draws where their weights converge, or ensembles in any case."""
+    seconds: float | None = None
+    """Time after which sampling ends with what it has [s]; None: no limit."""
 
     @classmethod
     def of(
@@ -85,6 +91,7 @@ class SamplePlan:
         thin: int | None = None,
         target_ess: float = 400,
         method: Method = "ensembles",
+        seconds: float | None = None,
     ) -> SamplePlan:
         """A plan with unset entries chosen from the number of sampled parameters."""
         least = 2 * dimension + 2
@@ -96,6 +103,7 @@ class SamplePlan:
             target_ess,
             seed,
             method,
+            seconds,
         )
 
 
@@ -111,6 +119,10 @@ class Run:
     unconfirmed: tuple[str, ...] = ()
     """Parameters with modes that filled while the ensembles ran, whose shares importance draws could not
     confirm."""
+    surrogate: Callable[[Matrix], Sequence[Simulated]] | None = None
+    """What stands for the responses of a plant with effects where the draws are; None without."""
+    stopped_after: float | None = None
+    """Time that sampling had taken when its budget ended it [s]; None: it ended by itself."""
 
     @cached_property
     def chosen(self) -> Index | None:
@@ -152,6 +164,7 @@ def sample(
     resume: bool = False,
     quiet: bool = True,
     starts: Matrix | None = None,
+    optima: Sequence[Optimum] = (),
 ) -> Run:
     """Sample a posterior, as the plan allows by importance draws from a search over orders, delays and noise
     (`marginal`). Where their weights do not converge, rounds of emcee go on from the points of the search;
@@ -162,8 +175,16 @@ def sample(
     The draws depend on the arguments alone, not on `jobs` nor on interruptions: with `resume`, a run killed
     at any moment continues from the last complete round in `chain_file`. `starts`, table values (starts,
     rows), are modes known from elsewhere, which moves propose too (`knownmodes`); InputError when none lies
-    inside the prior.
+    inside the prior. With a budget of `plan.seconds` they depend on the speed of the machine too, and
+    sampling goes on, resumed, for as long again. `optima` are least-squares optima that a search begins with,
+    by default its own.
     """
+    begin = monotonic()
+
+    def spent() -> float | None:
+        """Time taken, where it exceeds the budget."""
+        return monotonic() - begin if _left(plan, begin) < 0.0 else None
+
     known = None if starts is None else around(posterior, starts, plan.seed)
     stored = load_chain(chain_file, fingerprint) if resume and chain_file else Chain()
     if stored.weighted is not None:
@@ -177,14 +198,16 @@ def sample(
         seeds = np.random.SeedSequence(plan.seed).spawn(plan.ensembles)
         if not ensembles and searched and known is None:
             with _points(quiet) as bar:
-                search = Search(posterior, plan.seed, crew, bar)
+                search = Search(posterior, plan.seed, crew, bar, optima, lambda: spent() is not None)
                 weighted = search.run(wanted)
             if weighted is not None:
-                _store(chain_file, Chain((), weighted), fingerprint)
-                return Run((), plan, weighted)
+                stopped = spent()
+                if stopped is None:
+                    _store(chain_file, Chain((), weighted), fingerprint)
+                return Run((), plan, weighted, stopped_after=stopped)
             ensembles = _begun(search, plan, seeds)
         with Progress(total=rounds, initial=done, unit="round", quiet=quiet, desc="from the prior") as bar:
-            ensembles = ensembles or tuple(crew.each(_Birth(plan.walkers), seeds))
+            ensembles = ensembles or tuple(crew.each(_Birth(plan.walkers, _left(plan, begin)), seeds))
             if not done:
                 _store(chain_file, Chain(ensembles), fingerprint)
             bar.set_description("sampling")
@@ -193,6 +216,9 @@ def sample(
             least = max(_LEAST, round(_AS_LONG * hardest / (_ROUND * plan.thin)))
             while True:
                 run = Run(ensembles, plan)
+                stopped = spent() if done >= _FEWEST else None
+                if stopped is not None:
+                    return replace(run, stopped_after=stopped)
                 last = done >= rounds or (done >= least and finished(posterior, run, bar))
                 filling = _filling(posterior, run) if searched and last else ()
                 if filling and (known is not None or not hardest):
@@ -210,6 +236,11 @@ def sample(
                 done += 1
                 _store(chain_file, Chain(ensembles), fingerprint)
                 bar.update()
+
+
+def _left(plan: SamplePlan, begin: float) -> float:
+    """What is left of the budget of a plan that was begun then [s]."""
+    return inf if plan.seconds is None else begin + plan.seconds - monotonic()
 
 
 def _points(quiet: bool) -> Progress:
@@ -313,9 +344,11 @@ class _Birth:
     """Task: a new ensemble of a seed."""
 
     walkers: int
+    seconds: float
+    """What is left of the budget [s]."""
 
     def __call__(self, posterior: Posterior, seed: np.random.SeedSequence) -> Ensemble:
-        return Ensemble.tempered(posterior, self.walkers, _SWEEPS, seed)
+        return Ensemble.tempered(posterior, self.walkers, _SWEEPS, seed, self.seconds)
 
 
 @final

@@ -9,6 +9,7 @@ emcee moves that sample the posterior (Del Moral, Doucet and Jasra 2006, J. R. S
 from __future__ import annotations
 
 from dataclasses import dataclass
+from time import monotonic
 from typing import Any, final
 
 import emcee
@@ -58,15 +59,17 @@ def temper(
     sweeps: int,
     rng: np.random.Generator,
     random: tuple[Any, ...],
+    seconds: float = np.inf,
 ) -> tuple[Population, tuple[Any, ...]]:
     """A population of the posterior and the state of emcee's generator afterwards.
 
     At each temperature every walker makes moves until the population has lost its correlation with its start,
     at most `sweeps` of them and a third while the temperature is low. `_CROWD` times as many walkers come
-    from the prior as are kept; those with a likelihood of 0 are drawn again. Deterministic given `rng` and
-    `random`. InputError when no draw of the prior has a likelihood above 0.
+    from the prior as are kept; those with a likelihood of 0 are drawn again. After `seconds` the moves at
+    each temperature are the fewest. Deterministic given `rng` and `random` where it takes less. InputError
+    when no draw of the prior has a likelihood above 0.
     """
-    crowd = _CROWD * walkers
+    crowd, begin = _CROWD * walkers, monotonic()
     position = posterior.coordinates(posterior.table.draw(crowd, rng))
     prior = posterior.log_prior(position)
     likelihood = posterior.log_density(position) - prior
@@ -88,7 +91,8 @@ def temper(
         for _ in range(max(1, (sweeps if heat > _WARM else sweeps // 3) // _BLOCK)):
             state = sampler.run_mcmc(state, _BLOCK, skip_initial_state_check=True, store=False)
             moves += _CROWD * _BLOCK
-            if _memory(posterior, position, state.coords) <= _TRAVELLED:
+            late = monotonic() - begin > seconds
+            if late or _memory(posterior, position, state.coords) <= _TRAVELLED:
                 break
         random = tuple(sampler.random_state)
         position = np.array(state.coords)

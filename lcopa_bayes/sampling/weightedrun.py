@@ -9,11 +9,13 @@ and ensembles follow where weights fail.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import final
 
 import numpy as np
+from scipy.special import logsumexp
 
-from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.inference.optimum import Optimum, find_optima
 from lcopa_bayes.inference.posterior import Posterior
@@ -23,7 +25,7 @@ from lcopa_bayes.sampling.draws import Draws, gather
 from lcopa_bayes.sampling.ensemble import Ensemble, advance
 from lcopa_bayes.sampling.evidence import Mapped, spread
 from lcopa_bayes.sampling.importance import LEAST_EFFICIENCY, Effort, ImportancePlan, importance
-from lcopa_bayes.sampling.importanceweights import usable_k
+from lcopa_bayes.sampling.importanceweights import effective, usable_k
 from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.mixturemoves import learned
 from lcopa_bayes.sampling.proposal import weighty
@@ -40,16 +42,24 @@ _STREAM = 12
 """Marks the randomness of such a run."""
 _FEWEST = 100.0
 """Effective draws below which weights are not used [-]."""
-_EXACT = 8.0
-"""Draws of a surrogate that are weighted by the posterior itself, over the effective draws wanted [-]."""
+_EVEN = 0.9
+"""Effective draws per draw from which weights are so even that their largest ones do not matter, whatever the
+shape of their tail [-]."""
+_TRIED = 128
+"""Draws at which a surrogate is compared with the posterior before more is spent on it [-]."""
+_SURPLUS = 2.5
+"""Effective draws of a surrogate that are weighted by the posterior itself, over those wanted [-]: the error
+of a quantile is uncertain itself, and resampling costs the rest."""
+_LEAST = 1_500.0
+"""Such draws at least [-]: with fewer the means of their four parts scatter too much to show that they agree
+(`convergence.RELIABLE_SCATTER`)."""
 _WALKERS = 64
-"""Walkers of an ensemble that moves draws of a surrogate on, at least [-]."""
+"""Walkers of an ensemble that moves weighted draws on, at least [-]."""
 _ROUNDS, _KEPT, _THIN = 24, 20, 5
 """Most rounds of such moves, draws kept of each, and steps per draw [-]."""
-_WALKED = 2000.0
-"""Effective draws at which they end [-]."""
-_SMALL = 0.5
-"""Largest Pareto k of the weights of a surrogate [-]: their variance is finite below it."""
+_MOVED = 0.15
+"""Change of a mean by a round of moves from which walkers do not rest, and by all of them from which the
+weights missed part of a posterior [sd]."""
 
 
 def weighted_run(
@@ -82,7 +92,7 @@ def weighted_run(
             share = weighted.ess / weighted.count
     if not usable(weighted):
         return None
-    run = Run((), plan, weighted)
+    run = Run((), plan, weighted, surrogate=near.surrogate)
     draws = gather(near, run)
     if share < LEAST_EFFICIENCY:
         draws = draws.limited(
@@ -100,7 +110,8 @@ def weighted_run(
 
 def usable(weighted: Weighted) -> bool:
     """Whether averages converge and enough draws count."""
-    return weighted.pareto_k <= usable_k(weighted.count) and weighted.ess >= _FEWEST
+    converging = weighted.pareto_k <= usable_k(weighted.count) or weighted.ess >= _EVEN * weighted.count
+    return converging and weighted.ess >= _FEWEST
 
 
 def _by_surrogate(
@@ -112,61 +123,97 @@ def _by_surrogate(
     if surrogate is None:
         return posterior, None, 0.0
     near = replace(posterior, surrogate=surrogate)
-    first = importance(near, [optimum], rng, plan, mapped).weighted
+    enough = replace(plan, wanted=_SURPLUS * plan.wanted, efficient=False)  # walkers show what it misses
+    first = importance(near, [optimum], rng, enough, mapped).weighted
     if not usable(first):
         return posterior, None, 0.0
-    count, share = int(_EXACT * plan.wanted), first.ess / first.count
+    tried = first.batches(_TRIED // BATCHES, rng).ravel()
+    held = _efficiency(posterior, first.coordinates[tried], first.log_density[tried], mapped)
+    if held < LEAST_EFFICIENCY:
+        return posterior, None, 0.0
+    count, share = int(max(_SURPLUS * plan.wanted, _LEAST) / held), first.ess / first.count
+    drawn = first.batches(max(1, int(min(count, first.ess)) // BATCHES), rng).ravel()
+    z, about = first.coordinates[drawn], first.log_density[drawn]
     if share < LEAST_EFFICIENCY:
-        z, about, share = _walked(near, first, count, rng, mapped)
-    else:
-        drawn = first.batches(int(min(count, first.ess)) // BATCHES, rng).ravel()
-        z, about = first.coordinates[drawn], first.log_density[drawn]
+        walk = _walked(near, first, rng, mapped)
+        share = 1.0 if walk.agree else share
+        if walk.moved > _MOVED:
+            z, about = walk.draws(count, rng)
     exact = spread(posterior, z, mapped)
     inside = np.isfinite(exact)
     raw = (exact - about)[inside] + first.log_evidence
     weighted = Weighted.of(posterior, z[inside], exact[inside], raw, len(z), smooth=True)
-    if not (weighted.pareto_k <= _SMALL and weighted.ess >= LEAST_EFFICIENCY * weighted.count):
+    if not (usable(weighted) and weighted.ess >= LEAST_EFFICIENCY * weighted.count):
         return posterior, None, 0.0
     error = float(np.hypot(weighted.log_evidence_sd, first.log_evidence_sd))
     return near, replace(weighted, log_evidence_sd=error), share
 
 
-def _walked(
-    near: Posterior, first: Weighted, most: int, rng: np.random.Generator, mapped: Mapped
-) -> tuple[Matrix, Vector, float]:
-    """Draws of weighted ones moved on as ensembles of walkers, as many as they are worth and `most` at most;
-    log densities, and 1 where the ensembles agree, else the efficiency of the weights.
+def _efficiency(posterior: Posterior, z: Matrix, about: Vector, mapped: Mapped) -> float:
+    """Effective draws of the posterior per draw of a density that is `about` at coordinates z [-]."""
+    log_weights = spread(posterior, z, mapped) - about
+    total = logsumexp(log_weights)
+    return effective(log_weights - total) / len(z) if np.isfinite(total) else 0.0
 
-    Resampling and moving (Gilks and Berzuini 2001, J. R. Statist. Soc. B 63): where the proposal is far from
-    the posterior the walkers leave it, and their agreement tells whether they have arrived.
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Walk:
+    """Ensembles of walkers that set out from weighted draws."""
+
+    chain: Array
+    """Kept coordinates, (ensembles, walkers, draws, dimension)."""
+    log_density: Array
+    """(ensembles, walkers, draws)."""
+    worth: float
+    """Independent draws by the scatter within ensembles [-]."""
+    agree: bool
+    """Whether the ensembles do."""
+    moved: float
+    """Largest change of a mean from that of the weighted draws [sd]."""
+
+    def draws(self, most: int, rng: np.random.Generator) -> tuple[Matrix, Vector]:
+        """As many as they are worth and `most` at most, as many of every ensemble, and log densities."""
+        flat = self.chain.reshape(len(self.chain), -1, self.chain.shape[-1])
+        order = rng.permutation(flat.shape[1])[: max(1, int(min(most, self.worth)) // len(flat))]
+        about = self.log_density.reshape(len(flat), -1)[:, order].ravel()
+        return flat[:, order].reshape(-1, flat.shape[-1]), about
+
+
+def _walked(near: Posterior, first: Weighted, rng: np.random.Generator, mapped: Mapped) -> _Walk:
+    """Draws of weighted ones moved on as ensembles of walkers until these agree and rest.
+
+    Resampling and moving (Gilks and Berzuini 2001, J. R. Statist. Soc. B 63): where the proposal misses part
+    of the posterior the walkers leave for it, and the means move; their agreement tells whether they have
+    arrived. In many dimensions walkers are worth less than the weights, which stay where nothing moves.
     """
     walkers = max(_WALKERS, 2 * near.dimension + 2)
     ensembles = []
     for chosen in first.batches(walkers, rng):
-        position, density = first.coordinates[chosen], first.log_density[chosen]
-        random = tuple(np.random.RandomState(rng.integers(2**32)).get_state())
-        nothing = np.empty((0, walkers, near.dimension)), np.empty((0, walkers))
-        still = np.zeros(walkers)
-        ensembles.append(Ensemble(*nothing, position, density, still, 0, random, position, 0))
+        seed = np.random.SeedSequence(int(rng.integers(2**32)))
+        position = first.coordinates[chosen]
+        ensembles.append(Ensemble.started(position, first.log_density[chosen], position, seed))
     mixture = learned(near, [one.position[None] for one in ensembles], int(rng.integers(2**31)))
     names = [near.table.names[k] for k in near.sampled]
+    mean = start = np.exp(first.log_weights) @ first.coordinates
     for _ in range(_ROUNDS):
         tasks = [(near, one, _KEPT, _THIN, mixture) for one in ensembles]
         ensembles = list(mapped(_advanced, tasks))
         chain = np.stack([one.chain for one in ensembles])
         kept = chain[:, 2 * chain.shape[1] // 5 :].swapaxes(1, 2)
         measured = qualities(names, kept)
-        if all(quality.grade(_WALKED).level == "reliable" for quality in measured):
+        agree = all(quality.grade(_FEWEST).level == "reliable" for quality in measured)
+        # they set out together, so that they may agree on their way
+        before, mean, sd = mean, kept.mean(axis=(0, 1, 2)), kept.std(axis=(0, 1, 2))
+        if agree and np.all(np.abs(mean - before) <= _MOVED * sd):
             break
-    agree = all(quality.grade(_FEWEST).level == "reliable" for quality in measured)
-    worth = float(np.min([quality.ess for quality in measured]))
-    log_density = np.stack([one.log_density for one in ensembles])[:, -kept.shape[2] :].swapaxes(1, 2)
-    flat = kept.reshape(len(ensembles), -1, near.dimension)
-    count = max(1, int(min(most, worth)) // BATCHES)
-    order = rng.permutation(flat.shape[1])[:count]
-    z = flat[:, order].reshape(-1, near.dimension)
-    about = log_density.reshape(len(ensembles), -1)[:, order].ravel()
-    return z, about, 1.0 if agree else first.ess / first.count
+    return _Walk(
+        kept,
+        np.stack([one.log_density for one in ensembles])[:, -kept.shape[2] :].swapaxes(1, 2),
+        float(np.min([(quality.ess_bulk, quality.ess_tail) for quality in measured])),
+        agree,
+        float(np.max(np.abs(mean - start) / sd)),
+    )
 
 
 def _advanced(task: tuple[Posterior, Ensemble, int, int, Mixture]) -> Ensemble:

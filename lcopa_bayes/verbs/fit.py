@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import sys
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
+from lcopa_bayes.core.parallel import meanwhile
+from lcopa_bayes.results.firstlook import FirstLook, first_look
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.fit import fit as sampled
 from lcopa_bayes.results.integerrival import integer_rival
 from lcopa_bayes.results.predictive import Predictive
-from lcopa_bayes.results.provenance import provenance
-from lcopa_bayes.results.runfolder import opened
-from lcopa_bayes.verbs.look import look
+from lcopa_bayes.results.result import write_page
+from lcopa_bayes.results.runfolder import opened, provenance
+from lcopa_bayes.verbs.look import look_result
 from lcopa_bayes.verbs.sources import FitLike, StudyLike, finished, study_of
 
 
@@ -40,18 +43,23 @@ def fit(
     """
     wanted = study_of(study)
     with opened(folder, provenance(wanted, "fit")) as place:
+        seen: FirstLook | None = None
+        drawn: AbstractContextManager[None] = nullcontext()
         if place is not None and not (quiet or resume or wanted.effects.use):
-            page = look(wanted).report(place)
-            print(f"first look: {page}", file=sys.stderr)
-        fitted = sampled(
-            wanted,
-            jobs=jobs,
-            folder=place,
-            resume=resume,
-            quick=quick,
-            cross_check=cross_check,
-            quiet=quiet,
-        )
+            seen = first_look(wanted)
+            look_result(seen).save(place)
+            drawn = meanwhile(write_page, ("look", place, 1), _announced, jobs=jobs)
+        with drawn:
+            fitted = sampled(
+                wanted,
+                jobs=jobs,
+                folder=place,
+                resume=resume,
+                quick=quick,
+                cross_check=cross_check,
+                quiet=quiet,
+                look=seen,
+            )
         if rival:
             fitted = replace(fitted, rival=integer_rival(fitted, jobs=jobs, quick=quick, quiet=quiet))
         if place is not None:
@@ -59,14 +67,12 @@ def fit(
     return fitted
 
 
+def _announced(page: Path) -> None:
+    print(f"first look: {page}", file=sys.stderr)
+
+
 def basis(
-    source: FitLike,
-    *,
-    jobs: int,
-    folder: Path | str | None,
-    resume: bool,
-    quick: bool,
-    quiet: bool,
+    source: FitLike, *, jobs: int, folder: Path | str | None, resume: bool, quick: bool, quiet: bool
 ) -> Predictive:
     """The finished fit that is given or named, else the fit of the study that is; parameters as `fit`."""
     result = finished(source)

@@ -8,8 +8,8 @@ from typing import final
 
 import pandas as pd
 
-from lcopa_bayes.results.firstlook import first_look
-from lcopa_bayes.results.provenance import provenance
+from lcopa_bayes.results.firstlook import FirstLook, first_look
+from lcopa_bayes.results.runfolder import provenance
 from lcopa_bayes.results.stored import StoredResult
 from lcopa_bayes.verbs.sources import StudyLike, study_of
 
@@ -35,10 +35,13 @@ def look(study: StudyLike, *, folder: Path | str | None = None) -> LookResult:
     of a few searches, intervals and bands are of draws about it, which know of no other mode. InputError as
     `fit`, and where no search leads to a plant inside the priors.
     """
-    wanted = study_of(study)
-    seen = first_look(wanted)
-    texts = {f"tables/look_{name}.csv": table.to_csv(index=False) for name, table in seen.tables().items()}
-    result = LookResult(seen.to_json(), provenance(wanted, "look"), texts)
+    result = look_result(first_look(study_of(study)))
     if folder is not None:
         result.save(folder)
     return result
+
+
+def look_result(seen: FirstLook) -> LookResult:
+    """A first look as the result that is saved and shown."""
+    texts = {f"tables/look_{name}.csv": table.to_csv(index=False) for name, table in seen.tables().items()}
+    return LookResult(seen.to_json(), provenance(seen.problem.study, "look"), texts)

@@ -38,7 +38,7 @@ LIKELIHOOD = {
 """Methods whose time is that of the likelihood, by module."""
 PLANTS: dict[str, Callable[..., int]] = {
     "ForwardModel.unit_responses": lambda model, dynamics, *more: dynamics.batch,
-    "ForwardModel.unit_slopes": lambda model, dynamics: dynamics.batch,
+    "ForwardModel.unit_slopes": lambda model, dynamics, **wanted: dynamics.batch,
     "Simulation.__call__": lambda simulation, values: len(values),
     "ExtendedModel.predict": lambda model, x: 1,
     "ExtendedModel.tangents": lambda model, x: 1,
@@ -51,7 +51,8 @@ STAGES = {
     "lcopa_bayes.results.fit": {
         "problem_of": "reading",
         "unmet": "reading",
-        "resolved": "refinement check",
+        "optima_of": "least squares",
+        "resolved_optima": "refinement check",
         "weighted_fit": "search and draws",
         "sample": "search and draws",
         "gather": "diagnostics",

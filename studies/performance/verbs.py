@@ -9,6 +9,7 @@ be compared between machines, and between hours of one machine.
 from __future__ import annotations
 
 import argparse
+import ctypes
 import json
 import os
 import resource
@@ -238,11 +239,18 @@ def options_of(verb: str) -> str:
     return parser.format_help()
 
 
+_SUBREAPER = 36
+"""Option of `prctl` that makes a process the parent of orphans among its descendants."""
+
+
 def observed(
     command: Sequence[str], environment: Mapping[str, str], folder: Path, limit: float, remaining: float
 ) -> tuple[tuple[float, float], int | None, str, str]:
     """Wall and CPU seconds of a command with what it started, its exit code (None: it was stopped, after
     `limit` seconds of CPU time or `remaining` seconds), and what it wrote."""
+    if sys.platform == "linux":  # what outlives the command becomes a child of this process, and is counted
+        ctypes.CDLL(None).prctl(_SUBREAPER, 1, 0, 0, 0)
+    before, others = resource.getrusage(resource.RUSAGE_CHILDREN), children()
     begin, most = time.perf_counter(), int(np.ceil(min(limit, 1e6)))
     with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as problems:
         process = subprocess.Popen(
@@ -255,7 +263,7 @@ def observed(
         )
         stopped = False
         while True:
-            ended, status, used = os.wait4(process.pid, 0 if stopped else os.WNOHANG)
+            ended, status = os.waitpid(process.pid, 0 if stopped else os.WNOHANG)
             if ended:
                 break
             if time.perf_counter() - begin > remaining:
@@ -267,9 +275,18 @@ def observed(
         process.returncode = code = os.waitstatus_to_exitcode(status)
         for file in (out, problems):
             file.seek(0)
-        spent = wall, used.ru_utime + used.ru_stime
+        while left := children() - others:
+            os.waitpid(left.pop(), 0)
+        used = resource.getrusage(resource.RUSAGE_CHILDREN)
+        spent = wall, used.ru_utime + used.ru_stime - before.ru_utime - before.ru_stime
         stopped = stopped or code in (-signal.SIGXCPU, -signal.SIGKILL)
         return spent, None if stopped else code, out.read(), problems.read()
+
+
+def children() -> set[int]:
+    """Processes whose parent this one is, where the system lists them."""
+    listed = Path(f"/proc/self/task/{os.getpid()}/children")
+    return {int(one) for one in listed.read_text().split()} if listed.is_file() else set()
 
 
 def fit_results(said: str) -> dict[str, Any]:

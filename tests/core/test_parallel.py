@@ -106,23 +106,28 @@ def children(process: int) -> list[int]:
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="reads the process table")
 def test_workers_end_when_the_process_that_started_them_is_killed(tmp_path):
+    """Nothing of a killed run goes on after two seconds: neither workers nor what they were forked from."""
     (tmp_path / "napping.py").write_text("import time\n\ndef nap(shared, one):\n    time.sleep(300)\n")
     script = tmp_path / "script.py"
     script.write_text("from napping import nap\n" + SCRIPT.format(length=0, task="nap"))
     parent = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE)
     try:
-        wait_for(lambda: len(started(parent.pid)) == 2)
-        workers_of = started(parent.pid)
+        wait_for(lambda: len(working(parent.pid)) == 2)
+        all_of_it = descendants(parent.pid)
+        assert {*working(parent.pid)} <= {*all_of_it}
     finally:
         parent.kill()
         parent.communicate()
-    wait_for(lambda: not any(alive(one) for one in workers_of))
+    wait_for(lambda: not any(alive(one) for one in all_of_it), most=2.0)
 
 
-def started(parent: int) -> list[int]:
+def descendants(process: int) -> list[int]:
+    return [one for child in children(process) for one in (child, *descendants(child))]
+
+
+def working(parent: int) -> list[int]:
     """Workers that have taken up their work: they have a thread that watches the parent."""
-    spawned = [one for one in children(parent) if b"spawn_main" in Path(f"/proc/{one}/cmdline").read_bytes()]
-    return [one for one in spawned if len(list(Path(f"/proc/{one}/task").iterdir())) > 1]
+    return [one for one in descendants(parent) if len(list(Path(f"/proc/{one}/task").iterdir())) > 1]
 
 
 def alive(process: int) -> bool:

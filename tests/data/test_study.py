@@ -232,6 +232,7 @@ def test_every_setting_arrives(tmp_path):
         ("[sampler]\nsteps = 0", ["[sampler]", "`steps`", "at least 1"]),
         ('[sampler]\ntarget_ess = "many"', ["[sampler]", "`target_ess`", "'many'"]),
         ("[sampler]\nthin = 0", ["[sampler]", "`thin`", "at least 1"]),
+        ("[sampler]\nseconds = 0", ["[sampler]", "`seconds`", "0"]),
         ("[sampler]\nwalker = 8", ["[sampler]", "'walker'", "'walkers'"]),
         ("[stages.fits]\na = 1", ["[stages]", "'fits'", "'fit'"]),
         ('stages = ["fit", "fitt"]', ["[stages]", "'fitt'", "'fit'"]),

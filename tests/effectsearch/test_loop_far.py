@@ -7,16 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import step
-from lcopa_bayes.bench.device import Device
+from lcopa_bayes.bench.device import Bench, Device, simulate
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_study
-from lcopa_bayes.effectsearch.basefit import base_fit, regressed
+from lcopa_bayes.effectsearch.basefit import base_fit
 from lcopa_bayes.effectsearch.crossvalidation import PARTS, groups
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.loop import loop
@@ -28,6 +27,7 @@ from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.noise import WhiteAR1
 from lcopa_bayes.inference.observations import Observed
+from lcopa_bayes.inference.poles import regressed
 from lcopa_bayes.model.effects import parallel
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.path import TransferPath
@@ -141,6 +141,16 @@ def test_a_regression_gives_the_poles_of_a_resonance():
     assert first[table.at("order", 0, 0)] == 2.0
     assert first[table.at("time", 0, 0)] == pytest.approx(1 / omega, rel=0.03)
     assert first[table.at("time", 0, 1)] == pytest.approx(2 * damping / omega, rel=0.05)
+
+
+def test_a_regression_gives_the_order_of_a_resonance_of_one_term():
+    """``(T s)^a + 1`` of an order below 2 rings with damping ``-cos(pi / a)``."""
+    study, omega, damping = resonant()
+    posterior = problem_of(replace(study, model=replace(study.model, terms=1))).posterior
+    first = regressed(posterior, posterior.table.draw(8, np.random.default_rng(0)))[1]
+    order = first[posterior.table.at("order", 0, 0)]
+    assert -np.cos(np.pi / order) == pytest.approx(damping, rel=0.05)
+    assert first[posterior.table.at("time", 0, 0)] == pytest.approx(1 / omega, rel=0.03)
 
 
 def test_a_base_fit_finds_a_resonance():

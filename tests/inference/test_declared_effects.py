@@ -16,6 +16,7 @@ from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.settings import EffectsSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_study
+from lcopa_bayes.inference import optimum
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.declared import campaign_places
 from lcopa_bayes.inference.effects import Effected, effected
@@ -297,6 +298,18 @@ def test_the_optimum_of_a_simulated_stiffness():
     off = best.values.copy()
     off[k] = 0.0
     assert posterior.log_likelihood(best.values[None])[0] > posterior.log_likelihood(off[None])[0] + 20
+
+
+def test_starts_far_below_the_best_are_not_followed(monkeypatch: pytest.MonkeyPatch):
+    """Each descent with the effects in place costs as much as the search before it."""
+    made, good = with_effect(one_axis(camera=0.05), ["cubic_stiffness"], PLANT | {"coefficient": 0.3})
+    posterior = problem_of(made).posterior
+    far, close = good.copy(), good.copy()
+    time = posterior.table.at("time", 0, 0)
+    far[time], close[time] = 3.0 * good[time], 1.02 * good[time]
+    monkeypatch.setattr(LeastSquares, "solve", lambda self, values: (values, None))
+    kept = optimum._near(posterior, [good, close, far])
+    assert [values[time] for values in kept] == [good[time], close[time]]
 
 
 def test_scales_of_a_fit_and_of_the_records_give_the_same_model():

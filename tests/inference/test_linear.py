@@ -14,8 +14,13 @@ LOG_2PI = np.log(2 * np.pi)
 
 def equations(columns: np.ndarray, target: np.ndarray) -> NormalEquations:
     out = NormalEquations.of_columns(columns.shape[0], columns.shape[1])
-    out.add(columns, target, list(range(columns.shape[1])))
+    add(out, columns, target, list(range(columns.shape[1])))
     return out
+
+
+def add(parts: NormalEquations, columns: np.ndarray, target: np.ndarray, place: list[int]) -> None:
+    stacked = np.concatenate([columns, target[:, None]], axis=1)
+    parts.add(stacked @ stacked.swapaxes(1, 2), place)
 
 
 @pytest.fixture
@@ -36,8 +41,8 @@ def test_marginal_is_the_dense_normal_one(case):
 def test_records_may_be_added_one_after_another_each_with_its_own_columns(case):
     columns, target = case
     parts = NormalEquations.of_columns(4, 3)
-    parts.add(columns[:, [2, 0], :6], target[:, :6], [2, 0])  # the second column does not act here
-    parts.add(columns[..., 6:], target[:, 6:], [0, 1, 2])
+    add(parts, columns[:, [2, 0], :6], target[:, :6], [2, 0])  # the second column does not act here
+    add(parts, columns[..., 6:], target[:, 6:], [0, 1, 2])
     whole = columns.copy()
     whole[:, 1, :6] = 0.0
     assert_allclose(parts.log_marginal(), equations(whole, target).log_marginal(), rtol=1e-12)

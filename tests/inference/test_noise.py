@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import get_args
 
 import numpy as np
@@ -10,10 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy import stats
+from small import record
 
 from lcopa_bayes.data.settings import NoiseKind
 from lcopa_bayes.inference.kinds import KINDS
 from lcopa_bayes.inference.noise import AR1, NOISES, Student, White, WhiteAR1
+from lcopa_bayes.inference.observations import Samples, sampling_period
+from lcopa_bayes.inference.recursions import equal
 
 gaps_lists = st.lists(st.floats(0.05, 20.0), min_size=1, max_size=12).map(np.array)
 sigmas = st.floats(1e-6, 1e3)
@@ -133,6 +137,44 @@ def test_white_and_correlated_noise_without_either_part_is_the_other(sigma, rho,
     for found, exact in ((alone, white), (faint, ar1)):
         assert_allclose(found[0], exact[0], rtol=1e-9, atol=1e-9)
         assert_allclose(found[1], exact[1], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("columns", [1, 3, 9])
+@pytest.mark.parametrize("gaps", [*SPACINGS.values(), np.ones(200)], ids=[*SPACINGS.keys(), "many"])
+def test_scalar_products_are_those_of_the_whitened_columns(gaps, columns):
+    """And those of the dense covariance; after many equal steps one correlation has settled, one has not."""
+    parameters = np.array([[0.4, 0.9, 0.97], [0.02, 0.7, 0.3], [3.0, 0.01, 0.999]])
+    data = np.random.default_rng(5).normal(size=(3, columns, gaps.size))
+    for noise, own in ((White(), [0]), (AR1(), [0, 2]), (WhiteAR1(), [0, 1, 2])):
+        products, logs = noise.products(data, parameters[:, own], gaps)
+        white, wanted = noise.whiten(data, parameters[:, own], gaps)
+        assert_allclose(logs, wanted, rtol=1e-12)
+        assert_allclose(products, white @ white.swapaxes(1, 2), rtol=1e-10, atol=1e-12 * products.max())
+    for one, found in zip(range(3), products, strict=True):
+        covariance = mixed(*parameters[one], gaps)
+        assert_allclose(found, data[one] @ np.linalg.solve(covariance, data[one].T), rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.parametrize("settling", [0.02, 3.0])
+def test_innovation_variances_settle_where_samples_are_equally_spaced(settling):
+    """Against the factor of the dense covariance at every sample, before and after they have."""
+    gaps, parameters = np.ones(150), np.array([[settling, 0.7, 0.9], [0.1, 0.5, 0.2]])
+    scales = WhiteAR1().log_scales(parameters, gaps)
+    for told, own in zip(scales, parameters, strict=True):
+        exact = np.log(np.diagonal(np.linalg.cholesky(mixed(*own, gaps))))
+        assert_allclose(told, exact, rtol=1e-11, atol=1e-11)
+
+
+def test_samples_at_rounded_time_stamps_are_equally_spaced():
+    assert equal(np.array([0.3, 1.0, 1.0, 1.0]))
+    assert not equal(np.array([1.0, 1.0, 1.001, 1.0]))
+    one = record(1, camera=0.2)
+    late = one.time.copy()
+    late[1:] += 1e-7 * np.random.default_rng(3).normal(size=late.size - 1)
+    period = sampling_period([one])
+    for time, rounded in ((late, True), (np.sinh(one.time / one.time[-1]), False)):
+        gaps = Samples.of(replace(one, time=time), period).axes[0].gaps
+        assert (gaps == np.round(gaps)).all() == rounded
 
 
 def test_one_column_is_whitened_for_many_parameter_sets_and_many_columns_for_one():

@@ -367,6 +367,16 @@ def test_every_derivative_agrees_with_differences(share, delay, seed):
                 assert_allclose(difference[index], wanted, rtol=0, atol=3e-6)
 
 
+def test_slopes_without_orders_are_the_same_times_and_delays(rng):
+    model, dynamics = two_axes("none", "path", rng)
+    some = model.unit_slopes(dynamics, in_orders=False)
+    for (value, parts), (wanted, every) in zip(some, model.unit_slopes(dynamics), strict=True):
+        assert_allclose(value, wanted, rtol=0, atol=1e-12)
+        for index, unit in enumerate(model.layout.units):
+            assert_allclose(parts[index][[0, 1, -1]], every[index][[0, 1, -1]], rtol=0, atol=1e-12)
+            assert np.isnan(parts[index][2:4]).any() == value[index].any(), unit
+
+
 def test_slopes_of_a_resting_drive_are_zero(rng):
     model, dynamics = two_axes("paper", "shared", rng)
     value, parts = model.unit_slopes(dynamics)[1]

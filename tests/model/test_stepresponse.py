@@ -12,12 +12,12 @@ from lcopa_bayes.bench.inversion import unit_ramp, unit_step
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.data.settings import ModelSettings
+from lcopa_bayes.model.blockpulses import Circle
 from lcopa_bayes.model.forward import Dynamics, Experiment, ForwardModel
 from lcopa_bayes.model.grid import Mesh
 from lcopa_bayes.model.layout import Layout
 from lcopa_bayes.model.path import TransferPath
-from lcopa_bayes.model.powerseries import Circle
-from lcopa_bayes.model.stepresponse import StepResponse, step_response, taps
+from lcopa_bayes.model.stepresponse import Slopes, StepResponse, step_response, taps
 from lcopa_bayes.model.superposition import phases
 
 STEP, BLOCKS = 0.1, 160
@@ -39,7 +39,7 @@ def exact(element: Element, time: np.ndarray, integral: bool = False) -> np.ndar
     return (unit_ramp if integral else unit_step)(path, time)
 
 
-def solved(element: Element, *, step: float = STEP, slopes: bool = False) -> StepResponse:
+def solved(element: Element, *, step: float = STEP, slopes: Slopes = None) -> StepResponse:
     times, orders = (np.array([part]) for part in element)
     return step_response(times, orders, Circle(round(BLOCKS * STEP / step)), step, slopes=slopes)
 
@@ -61,7 +61,7 @@ def test_reading_is_exact_for_quartics(theta):
 @pytest.mark.parametrize("theta", [1e-3, 0.01, 0.03, 0.1, 0.5, 0.97])
 def test_the_onset_is_read_as_it_is(element, theta):
     """Wherever the first sample falls after it: within 2e-4 of the step, a tenth of a noise of 0.2 %."""
-    read = solved(element).on_lattice(np.array([theta]))[0, 0]
+    read = solved(element).on_lattice(np.array([[theta]]))[0, 0, 0]
     time = STEP * (np.arange(read.size) + theta)
     assert np.abs(read - exact(element, time))[:12].max() < (2e-4 if element[1][0] < 0.7 else 5e-5)
 
@@ -70,7 +70,7 @@ def test_the_onset_is_read_as_it_is(element, theta):
 def test_the_integral_is_that_of_the_bench(element):
     response = solved(element)
     for theta in (0.02, 0.6):
-        read = response.on_lattice(np.array([theta]), "integral")[0, 0] * STEP
+        read = response.on_lattice(np.array([[theta]]), "integral")[0, 0, 0] * STEP
         time = STEP * (np.arange(read.size) + theta)
         assert np.abs(read - exact(element, time, integral=True)).max() < 4e-4
 
@@ -87,11 +87,15 @@ def test_errors_fall_with_the_square_of_the_width(element):
 
 
 @settings(max_examples=25, deadline=None)
-@given(theta=st.floats(0.0, 0.999), element=st.sampled_from(ELEMENTS), slopes=st.booleans())
+@given(
+    theta=st.floats(0.0, 0.999),
+    element=st.sampled_from(ELEMENTS),
+    slopes=st.sampled_from([None, "times", "all"]),
+)
 def test_both_readings_agree(theta, element, slopes):
     response = solved(element, slopes=slopes)
     for kind in ("value", "integral", "slope"):
-        lattice = response.on_lattice(np.array([theta]), kind)
+        lattice = response.on_lattice(np.array([[theta]]), kind)[:, 0]
         x = np.arange(lattice.shape[2])[None] + theta
         assert_allclose(response.at(x, kind), lattice, rtol=1e-12, atol=1e-12)
 
@@ -108,7 +112,7 @@ def test_nothing_before_the_onset():
 def test_slopes_are_differences_also_right_after_the_onset(element):
     times, orders = np.array([element[0]]), np.array([element[1]])
     x = np.array([[0.004, 0.02, 0.1, 0.7, 1.6, 5.3, 9.2, 60.3]])
-    rows = solved(element, slopes=True).at(x)
+    rows = solved(element, slopes="all").at(x)
     nudge = 1e-5
 
     def at(t: np.ndarray, o: np.ndarray) -> np.ndarray:

@@ -11,10 +11,11 @@ from scipy import stats
 from small import ONE, TRUTH, TWO, draws_of, problem, record, row_values
 
 from lcopa_bayes.bench.command import Command, on_off, quiet, step
-from lcopa_bayes.data.record import Record
+from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.results.prediction import Band, bands, responses
 
+AXIS = Axis("x", "V")
 KNOWN = TRUTH | {"rho": 0.6, "nu": 4.0}
 
 
@@ -115,6 +116,21 @@ def test_an_offset_is_read_from_samples_before_the_drive_acts():
     error = TRUTH["sigma"] / np.sqrt(21)
     assert drawn[2] == pytest.approx(quiet_samples.mean(), abs=4 * 1.25 * error / np.sqrt(2000))
     assert drawn[4] - drawn[0] == pytest.approx(2 * 1.645 * error, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("held", "early", "given"), [(1, False, 200), (4, False, 200), (1, True, 2), (9, False, 10)]
+)
+def test_the_first_samples_of_a_drive_that_keeps_moving_show_no_level(held, early, given):
+    """It may have moved before the record too, unless an early row states what it rested under, or it holds
+    for 8 samples and more."""
+    drive = np.repeat(np.random.default_rng(0).normal(size=200), held)[:200]
+    response = np.cumsum(drive)
+    response[0] = np.nan if early else 1.0
+    moving = Record("noise", np.arange(200) * 0.1, drive[:, None], response[:, None], (AXIS,), (AXIS,), "ms")
+    used, source = Samples.of(moving, 0.1).level_samples(0)
+    assert used.sum() == (1 if early else given)
+    assert ("moves from the start" in source) == (given == 200)
 
 
 def test_an_offset_without_quiet_samples_is_integrated_out():

@@ -11,8 +11,7 @@ from scipy import stats
 from scipy.special import logsumexp
 from small import TRUTH, Toy, problem, record
 
-from lcopa_bayes.core.parallel import workers
-from lcopa_bayes.core.progress import Progress
+from lcopa_bayes.core.parallel import Progress, workers
 from lcopa_bayes.inference.conditional import Conditional, Expanded
 from lcopa_bayes.sampling import marginal, outer
 from lcopa_bayes.sampling.conditionaldraws import Kept, kept
@@ -121,7 +120,7 @@ def search_of(log_density, seed: int, groups=BOTH) -> Search:
     search = Search.__new__(Search)
     search.posterior, search._rng = toy, np.random.default_rng(seed)
     search._points, search._bar = [], Progress(quiet=True)
-    search._seeds = np.random.SeedSequence(seed)
+    search._seeds, search._late = np.random.SeedSequence(seed), lambda: False
     search._crew = SimpleNamespace(each=lambda task, inputs: [task(toy, one) for one in inputs])
     every = lambda y: np.ones(len(y), dtype=bool)  # noqa: E731
     search.outer = SimpleNamespace(

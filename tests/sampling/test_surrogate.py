@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.special import logsumexp
 from small import record, study, with_effect
 
 from lcopa_bayes.bench.command import staircase
@@ -16,7 +18,10 @@ from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.surrogate import Surrogate
 from lcopa_bayes.results.fit import plan_of
 from lcopa_bayes.sampling import weightedrun
+from lcopa_bayes.sampling.importance import importance
+from lcopa_bayes.sampling.importanceweights import LARGEST_K, effective
 from lcopa_bayes.sampling.sampler import SamplePlan
+from lcopa_bayes.sampling.weighted import BATCHES, Weighted, tail_smoothed
 from lcopa_bayes.sampling.weightedrun import weighted_run
 
 TRUTH = {
@@ -88,6 +93,79 @@ def test_weights_make_up_for_a_surrogate_that_is_wrong(stiff: tuple[Posterior, O
     )
     assert abs(columns[0].mean() - columns[1].mean()) < 4 * error
     assert columns[0].std() == pytest.approx(columns[1].std(), rel=0.15)
+
+
+@pytest.fixture(scope="module")
+def weighted(stiff: tuple[Posterior, Optimum]) -> tuple[Posterior, Weighted]:
+    """A surrogate's posterior and weighted draws of it."""
+    posterior, optimum = stiff
+    near = replace(posterior, surrogate=Surrogate.of(posterior, optimum, np.random.default_rng(2)))
+    return near, importance(near, [optimum], np.random.default_rng(3)).weighted
+
+
+def test_walkers_end_as_soon_as_they_agree(weighted: tuple[Posterior, Weighted], monkeypatch):
+    """Walks to a number of effective draws that the scatter of four ensembles hardly ever shows took all
+    rounds: ten times what the weights cost."""
+    rounds = []
+    advanced = weightedrun._advanced
+    monkeypatch.setattr(weightedrun, "_advanced", lambda task: rounds.append(1) or advanced(task))
+    near, first = weighted
+    walk = weightedrun._walked(near, first, np.random.default_rng(5), map)
+    assert walk.agree
+    assert len(rounds) <= 3 * BATCHES
+    assert walk.moved < weightedrun._MOVED
+    # the walkers' mean is that of the weights, by the errors of both
+    mean, sd = np.exp(first.log_weights) @ first.coordinates, walk.chain.std(axis=(0, 1, 2))
+    error = sd * np.sqrt(1 / walk.worth + 1 / first.centre_ess)
+    assert np.all(np.abs(walk.chain.mean(axis=(0, 1, 2)) - mean) < 4 * error)
+
+
+def test_walkers_leave_weights_that_miss_a_part(weighted: tuple[Posterior, Weighted]):
+    near, first = weighted
+    column = first.coordinates[:, 1]
+    whole = np.exp(first.log_weights)
+    mean = whole @ column
+    missing = replace(first, log_weights=np.where(column < mean, first.log_weights, -40.0))
+    missing = replace(missing, log_weights=missing.log_weights - logsumexp(missing.log_weights))
+    walk = weightedrun._walked(near, missing, np.random.default_rng(5), map)
+    assert walk.moved > weightedrun._MOVED
+    z, about = walk.draws(400, np.random.default_rng(6))
+    assert len(z) >= 300
+    assert_allclose(about, near.log_density(z))
+    sd = np.sqrt(whole @ (column - mean) ** 2)
+    assert abs(z[:, 1].mean() - mean) < 4 * sd * np.sqrt(1 / len(z) + 1 / walk.worth)
+
+
+def test_the_posterior_itself_is_asked_for_as_much_as_is_wanted(
+    stiff: tuple[Posterior, Optimum], monkeypatch
+):
+    """Beside the points of the surrogate: enough for the draws wanted, not for a fixed number of them."""
+    asked, spread = [], weightedrun.spread
+
+    def counted(posterior: Posterior, z: np.ndarray, mapped) -> np.ndarray:
+        asked.append(len(z))
+        assert posterior.surrogate is None
+        return spread(posterior, z, mapped)
+
+    monkeypatch.setattr(weightedrun, "spread", counted)
+    posterior, optimum = stiff
+    plan = SamplePlan.of(posterior.dimension, seed=3, target_ess=400)
+    found = weighted_run(posterior, plan, optima=[optimum])
+    assert found is not None
+    assert found[1].grade.level == "reliable", found[1].grade.reason
+    assert sum(asked) < 5 * plan.target_ess
+
+
+def test_even_weights_are_used_whatever_their_tail():
+    """A surrogate that is right to 0.01 nat but at one draw was discarded by the Pareto k of its weights."""
+    rng = np.random.default_rng(1)
+    raw = 1e-3 * rng.standard_normal(1000)
+    raw[::100] += np.geomspace(0.01, 1.0, 10)
+    log_weights, k = tail_smoothed(raw)
+    assert k > LARGEST_K
+    assert weightedrun.usable(SimpleNamespace(pareto_k=k, ess=effective(log_weights), count=1000))
+    few = SimpleNamespace(pareto_k=k, ess=800.0, count=1000)
+    assert not weightedrun.usable(few)
 
 
 def test_a_run_is_reproducible():

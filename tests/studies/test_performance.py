@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -203,6 +204,25 @@ def test_time_goes_to_the_innermost_stage_and_to_the_likelihood_within_it():
     assert found["stages"] == {"start": [3.0, 2.0], "sampling": [2.0, 3.0], "page": [1.0, 0.0]}
     assert (found["likelihood_s"], found["process_s"]) == (5.0, 11.0)
     assert (found["plants"], found["plants_with_slopes"]) == (7, 4)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere workers are children of the command")
+def test_what_workers_take_is_counted(tmp_path):
+    """Two that are busy for half a second each, forks of a process that outlives the command."""
+    (tmp_path / "busy.py").write_text(
+        "import time\n\ndef busy(shared, one):\n    while time.process_time() < 0.5: pass\n"
+    )
+    code = (
+        "from busy import busy\nfrom lcopa_bayes.core.parallel import workers\n"
+        "with workers(None, jobs=2) as crew: list(crew.each(busy, range(2)))"
+    )
+    environment = dict(os.environ) | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    idle = "import lcopa_bayes.core.parallel"
+    (_, alone), *_ = verbs.observed([sys.executable, "-c", idle], environment, tmp_path, 60, 60)
+    command = [sys.executable, "-c", code]
+    (_, spent), ended, _, problems = verbs.observed(command, environment, tmp_path, 60, 60)
+    assert (ended, problems) == (0, "")
+    assert spent > alone + 0.9
 
 
 def test_what_is_watched_is_there():

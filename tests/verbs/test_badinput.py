@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import re
 from dataclasses import replace
 
@@ -9,13 +10,18 @@ import numpy as np
 import pytest
 from small import problem, record, study
 
+from lcopa_bayes import cli
 from lcopa_bayes.cli import main
+from lcopa_bayes.core import parallel
 from lcopa_bayes.data.record import save_record
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.forward import Dynamics, ForwardModel
 from lcopa_bayes.results.fit import Fit, fit
 from lcopa_bayes.results.summary import results
+from lcopa_bayes.sampling import marginal, sampler
+from lcopa_bayes.sampling.draws import shortfall
 from lcopa_bayes.sampling.sampler import SamplePlan, sample
+from lcopa_bayes.sampling.tempering import temper
 
 PLAN = SamplePlan(2, 12, 200, 1, 100.0, 1)
 SLOW = 3.0
@@ -106,6 +112,67 @@ def test_what_is_derived_from_too_few_draws_is_graded_no_better(hasty):
     graded = [*told["parameters"], *told["step_metrics"]]
     assert len(graded) > len(told["parameters"]) > 0
     assert {one["grade"] for one in graded} <= {"tentative", "unusable"}
+
+
+def test_a_budget_of_time_ends_sampling_and_says_what_more_would_give(tmp_path, monkeypatch):
+    """Time is up after the fewest rounds there may be; resumed without a budget, all draws are the same."""
+    settings = {"ensembles": 2, "walkers": 12, "steps": 80, "thin": 1, "target_ess": 5000, "seconds": 1e3}
+    task = study(record(camera=0.6), sampler=settings)
+    clock = iter([0.0, 1.0])  # begun, and tempering begins
+    monkeypatch.setattr(sampler, "monotonic", lambda: next(clock, 2e3))
+    short = fit(task, folder=tmp_path)
+    assert short.run.stopped_after == 2e3
+    assert short.run.ensembles[0].steps == 2 * 20
+    told = results(short)
+    assert told["grade"] in ("tentative", "unusable")
+    assert "the budget of 1000 s ended sampling: the smallest effective" in told["grade_reason"]
+    assert "s more by [sampler] seconds" in told["grade_reason"]
+    unlimited = replace(task, sampler=replace(task.sampler, seconds=None))
+    resumed, whole = fit(unlimited, folder=tmp_path, resume=True), fit(unlimited)
+    assert resumed.run.stopped_after is None
+    assert "budget" not in results(resumed)["grade_reason"]
+    np.testing.assert_array_equal(resumed.draws.values, whole.draws.values)
+
+
+def test_a_search_that_its_budget_ends_gives_the_draws_it_has(monkeypatch):
+    """Time is up once the first draws are there, a tenth of those wanted."""
+    task = study(record(camera=0.6), sampler={"target_ess": 3000, "seconds": 1.0})
+    clock = iter([0.0, 0.5])
+    monkeypatch.setattr(sampler, "monotonic", lambda: next(clock, 2.0))
+    monkeypatch.setattr(marginal, "_SPARE", 0.1)
+    fitted = fit(task)
+    assert fitted.run.weighted is not None
+    assert fitted.run.stopped_after == 2.0
+    assert fitted.draws.ess < 3000
+    assert "the budget of 1 s ended sampling" in results(fitted)["grade_reason"]
+
+
+def test_tempering_takes_the_fewest_moves_once_time_is_up():
+    posterior = problem(record(camera=0.6)).posterior
+    random = tuple(np.random.RandomState(1).get_state())
+    moves = [
+        temper(posterior, 16, 40, np.random.default_rng(1), random, seconds)[0].moves
+        for seconds in (0.0, np.inf)
+    ]
+    assert 0 < 3 * moves[0] < moves[1]
+
+
+@pytest.mark.parametrize(("ess", "more"), [(100.0, 180.0), (399.0, 30.0)])
+def test_more_time_is_asked_for_in_proportion_to_what_is_missing(ess, more, hasty):
+    """Effective draws grow like the time: 100 of 400 in 60 s take 180 s more; half as long again at least."""
+    quality = replace(hasty.draws.qualities[0], ess_bulk=ess, ess_tail=900.0, rhat=1.5)
+    quality = replace(quality, ess_between=np.inf, ess_drift=np.inf)
+    plan = replace(hasty.run.plan, target_ess=400.0, seconds=60.0)
+    run = replace(hasty.run, plan=plan, stopped_after=60.0)
+    (said,) = shortfall(run, replace(hasty.draws, qualities=(quality,), target_ess=400.0))
+    assert f"about {more:.0f} s more" in said.remedy
+    assert shortfall(replace(run, stopped_after=None), hasty.draws) == ()
+
+
+def test_no_more_processes_than_cores(monkeypatch):
+    for available, asked, used in ((1, 8, 1), (1, None, 1), (4, 10**6, 4), (4, 2, 2), (4, None, 4)):
+        monkeypatch.setattr(parallel, "cores", lambda available=available: available)
+        assert cli._jobs(argparse.Namespace(jobs=asked)) == used
 
 
 @pytest.mark.slow

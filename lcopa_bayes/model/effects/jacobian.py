@@ -78,25 +78,29 @@ def plant_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[dict[N
     Exact without effects. What acts on elements, forces or before the sensor is differenced to one side
     (1e-5 of each number); of everything else only the part that does not pass through the plant.
     """
-    exact = _linear_slopes(simulator, plant, psi)
     if not simulator.effects:
-        return exact
-    upstream = simulator.bends(psi)
-    delayed = any(isinstance(effect, DriveEffect) for effect in simulator.effects)  # commands may use it
+        return _linear_slopes(simulator, plant, psi)
+    numbers = list(_numbers(simulator, plant))
+    others = [_shifted(plant, number, step) for number, step in numbers]
     base = simulator.moved(plant, psi)
     here = simulator.finished(base, psi)
-    out: list[dict[Number, Matrix]] = [{} for _ in exact]
-    for number, step in _numbers(simulator, plant):
-        other = _shifted(plant, number, step)
-        if upstream or (number[0] == "delay" and delayed):
-            moved = simulator.moved(other, psi)
-        else:
-            scenes = simulator.scenes(other, psi)
-            moved = [
+    out: list[dict[Number, Matrix]] = [{} for _ in here]
+    if simulator.bends(psi):
+        moved = simulator.moved_together(others, psi)
+    else:
+        exact = _linear_slopes(simulator, plant, psi)
+        delayed = any(isinstance(effect, DriveEffect) for effect in simulator.effects)  # commands may use it
+        moved = [
+            simulator.moved(other, psi)
+            if number[0] == "delay" and delayed
+            else [
                 Moved(scene, y.deflection + step * slope[number])
-                for scene, y, slope in zip(scenes, base, exact, strict=True)
+                for scene, y, slope in zip(simulator.scenes(other, psi), base, exact, strict=True)
             ]
-        for r, there in enumerate(simulator.finished(moved, psi)):
+            for (number, step), other in zip(numbers, others, strict=True)
+        ]
+    for (number, step), each in zip(numbers, moved, strict=True):
+        for r, there in enumerate(simulator.finished(each, psi)):
             out[r][number] = (there - here[r]) / step
     return out
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple, TypeAlias, final
@@ -11,6 +11,7 @@ import numpy as np
 from scipy import fft
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
+from lcopa_bayes.model.blockpulses import Spectrum
 from lcopa_bayes.model.effects.balance import RunawayError, balanced, earlier, iterated, resting
 from lcopa_bayes.model.effects.effect import (
     Effect,
@@ -22,8 +23,7 @@ from lcopa_bayes.model.effects.effect import (
 )
 from lcopa_bayes.model.forward import Dynamics, Experiment, ForwardModel, StepResponses, deflections
 from lcopa_bayes.model.layout import Layout
-from lcopa_bayes.model.powerseries import Spectrum
-from lcopa_bayes.model.transfer import transfer
+from lcopa_bayes.model.stepresponse import transfer
 
 Acting: TypeAlias = Sequence[tuple[Effect, Vector]]
 """Effects with their coefficients."""
@@ -59,6 +59,7 @@ class Plant:
         return b"".join(part.tobytes() for part in (*self.dynamics.times, *self.dynamics.orders))
 
 
+@final
 class Moved(NamedTuple):
     """A record up to its reading."""
 
@@ -77,6 +78,20 @@ def linear(
         Moved(scene, deflections(model.layout, scene.rest, plant.gains[None], units)[:, 0].T)
         for scene, units in zip(scenes, responses, strict=True)
     ]
+
+
+def forced(
+    model: ForwardModel, scenes: Sequence[Scene], gains: Array, dynamics: Dynamics, forces: Forces
+) -> Iterator[tuple[Array, dict[int, str]]]:
+    """Of every record, deflections of many plants under forces, (axes, batch, samples) [response unit], and
+    why some of the plants, by number, have no bounded response."""
+    spectra: Spectra = {}
+    for experiment, scene, units in zip(
+        model.experiments, scenes, model.unit_responses(dynamics), strict=True
+    ):
+        passage = Passage(model.layout, experiment, scene, gains, dynamics, forces, spectra)
+        change, failures = passage.change()
+        yield deflections(model.layout, scene.rest, gains, units) + change, failures
 
 
 def passed(

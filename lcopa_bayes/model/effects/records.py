@@ -67,7 +67,7 @@ class ClockSkew(DriveEffect):
     ) -> tuple[AxisDrive, float]:
         """All changes are stretched."""
         start = scene.times[0]
-        return AxisDrive(drive.times + psi[0] * (drive.times - start), drive.values), rest
+        return AxisDrive.of_jumps(drive.times + psi[0] * (drive.times - start), drive.jumps), rest
 
 
 @final
@@ -93,7 +93,7 @@ class TriggerJitter(DriveEffect):
         self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
     ) -> tuple[AxisDrive, float]:
         """All changes are shifted alike."""
-        return AxisDrive(drive.times + psi[0], drive.values), rest
+        return AxisDrive.of_jumps(drive.times + psi[0], drive.jumps), rest
 
 
 @final

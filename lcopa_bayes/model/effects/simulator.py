@@ -21,9 +21,10 @@ from lcopa_bayes.model.effects.effect import (
     ReadoutEffect,
     Scene,
     SensorEffect,
+    UnstableError,
 )
-from lcopa_bayes.model.effects.passage import Moved, Plant, linear, passed
-from lcopa_bayes.model.forward import ForwardModel, StepResponses
+from lcopa_bayes.model.effects.passage import Moved, Plant, forced, linear, passed
+from lcopa_bayes.model.forward import ForwardModel, StepResponses, joined
 
 UPSTREAM = (DriveEffect, ElementEffect, ForceEffect, SensorEffect)
 """Places before the reading."""
@@ -140,6 +141,34 @@ class Simulator:
         if any(acting):
             return passed(model, scenes, plant, [self._acting(acting, psi, r) for r in range(len(scenes))])
         return linear(model, scenes, plant, self.step_responses.get_or(plant.elements, dict))
+
+    def moved_together(self, plants: Sequence[Plant], psi: Vector) -> list[list[Moved]]:
+        """`moved` of many plants: at once where all that acts before the reading are forces that take many.
+
+        Raises UnstableError.
+        """
+        acting = [
+            (effect, psi[part])
+            for effect, part in zip(self.effects, self._slices, strict=True)
+            if isinstance(effect, UPSTREAM) and psi[part].any()
+        ]
+        forces = [
+            (effect, own)
+            for effect, own in acting
+            if isinstance(effect, ForceEffect) and effect.batched and not effect.card.per_record
+        ]
+        if not acting or len(forces) < len(acting):
+            return [self.moved(plant, psi) for plant in plants]
+        scenes = [self.scenes(plant, psi) for plant in plants]
+        gains, dynamics = np.array([plant.gains for plant in plants]), joined([p.dynamics for p in plants])
+        out: list[list[Moved]] = [[] for _ in plants]
+        for r, (deflection, failures) in enumerate(forced(self.model, scenes[0], gains, dynamics, forces)):
+            if failures:
+                names = tuple(effect.name for effect, _ in forces)
+                raise UnstableError(names, self.model.experiments[r].name, next(iter(failures.values())))
+            for b, own in enumerate(out):
+                own.append(Moved(scenes[b][r], deflection[:, b].T))
+        return out
 
     def _bending(self, psi: Vector) -> list[bool]:
         """Of each effect, whether it acts between commands and reading."""
