@@ -42,11 +42,17 @@ class MixtureMove(PopulationMove):
         proposed[~exists] = here[~exists]
         before, after = self._log_density(here), self._log_density(proposed)
         exists &= np.isfinite(before) & np.isfinite(after)
-        return proposed, np.where(exists, before - after, -np.inf)
+        factor = np.full(len(here), -np.inf)
+        factor[exists] = before[exists] - after[exists]
+        return proposed, factor
 
     def _log_density(self, z: Matrix) -> Vector:
+        """Minus infinity at an end of a range, where the chart is infinite."""
         y, log_volume = self.chart.charted(z)
-        return self.mixture.log_density(y) + log_volume
+        inner = np.isfinite(y).all(axis=1) & np.isfinite(log_volume)
+        out = np.full(len(z), -np.inf)
+        out[inner] = self.mixture.log_density(y[inner]) + log_volume[inner]
+        return out
 
 
 @final
@@ -66,6 +72,7 @@ class MixtureWalk(PopulationMove):
         """See `PopulationMove.proposal`."""
         rows, dimension = np.arange(len(here)), here.shape[1]
         y, log_volume = self.chart.charted(here)
+        y[~np.isfinite(y).all(axis=1)] = 0.0  # at an end of a range, where the log volume is infinite too
         shares = self.mixture.log_shares(y)
         component = np.argmax(shares + random.gumbel(size=shares.shape), axis=0)
         steps = np.einsum("nij,nj->ni", self.mixture.factors[component], random.randn(*here.shape))
@@ -74,6 +81,9 @@ class MixtureWalk(PopulationMove):
         )
         proposed[~exists] = here[~exists]
         new_y, new_log_volume = self.chart.charted(proposed)
-        factor = self.mixture.log_shares(new_y)[component, rows] - shares[component, rows]
-        exists &= np.isfinite(log_volume) & np.isfinite(new_log_volume) & np.isfinite(factor)
-        return proposed, np.where(exists, log_volume - new_log_volume + factor, -np.inf)
+        new_y[~np.isfinite(new_y).all(axis=1)] = 0.0
+        ratio = self.mixture.log_shares(new_y)[component, rows] - shares[component, rows]
+        exists &= np.isfinite(log_volume) & np.isfinite(new_log_volume) & np.isfinite(ratio)
+        factor = np.full(len(here), -np.inf)
+        factor[exists] = log_volume[exists] - new_log_volume[exists] + ratio[exists]
+        return proposed, factor
