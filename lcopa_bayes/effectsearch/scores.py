@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of
-from lcopa_bayes.core.estimate import LEVEL
+from lcopa_bayes.core.estimate import LEVEL, attributes
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.crossvalidation import groups, shifts
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
@@ -86,10 +86,7 @@ class Score:
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
         return {
-            "record": self.record,
-            "axis": self.axis,
-            "unit": self.unit,
-            "held_out": self.held_out,
+            **attributes(self, "record", "axis", "unit", "held_out"),
             "samples": self.time.size,
             "rmse": self.rmse,
             "noise_sd": self.noise_sd,

@@ -12,8 +12,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.effectsearch.noise import Law
 from lcopa_bayes.inference.noise import WhiteAR1
-from lcopa_bayes.inference.observations import Samples
-from lcopa_bayes.inference.restnoise import PlausibleNoise
+from lcopa_bayes.inference.observations import PlausibleNoise, Samples
 
 _PER_LAW = 4
 """Draws of noise from each plausible law [-]."""

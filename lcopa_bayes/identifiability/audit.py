@@ -1,4 +1,7 @@
-"""The verb `audit`: what the records of a study determine, combined from four methods."""
+"""The verb `audit`: what the records of a study determine, combined from four methods.
+
+Radial test: a fit far from the maximum, whose likelihood shows whether a direction is free.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.identifiability.contraction import (
     Known,
@@ -20,20 +23,32 @@ from lcopa_bayes.identifiability.contraction import (
     prior_draws,
     prior_spread,
 )
-from lcopa_bayes.identifiability.curvature import Curvature, Sensitivities, curvature, sensitivities
-from lcopa_bayes.identifiability.delays import Delays, delays
-from lcopa_bayes.identifiability.printedform import printed_structure
+from lcopa_bayes.identifiability.curvature import (
+    Curvature,
+    Delays,
+    Sensitivities,
+    curvature,
+    delays,
+    sensitivities,
+)
 from lcopa_bayes.identifiability.profile import Profile, profile
 from lcopa_bayes.identifiability.radial import Radial, radial
-from lcopa_bayes.identifiability.symmetries import DIFFERENCED, TOLERANCES, Structure, exchanges, structure
+from lcopa_bayes.identifiability.symmetries import (
+    DIFFERENCED,
+    TOLERANCES,
+    Structure,
+    exchanges,
+    printed_structure,
+    structure,
+)
 from lcopa_bayes.identifiability.verdict import Finding, judged
 from lcopa_bayes.inference.likelihood import Landscape, Peak
 from lcopa_bayes.inference.optimum import Optimum, find_optima
 from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.inference.surrogate import Surrogate
 from lcopa_bayes.model.effects.effect import UnstableError
+from lcopa_bayes.results.adequacy import unresolved
 from lcopa_bayes.results.predictive import Predictive
-from lcopa_bayes.results.resonance import unresolved
 from lcopa_bayes.results.sensitivity import sensitivity
 from lcopa_bayes.sampling.draws import Draws
 
@@ -119,9 +134,7 @@ class Audit:
 
 def _structure(structure: Structure) -> dict[str, Any]:
     return {
-        "parameters": structure.parameters,
-        "rank": structure.rank,
-        "certain": structure.certain,
+        **attributes(structure, "parameters", "rank", "certain"),
         "singular_values": structure.singular,
         "symmetries": [symmetry.as_json() for symmetry in structure.symmetries],
     }
@@ -170,7 +183,17 @@ def audit(fit: Predictive, *, jobs: int = 1) -> Audit:
         for profile, belief, row in zip(profiles, believed, rows, strict=True)
     )
     apart = delays(fit.study, posterior.table, peak.values)
-    return Audit(fit, findings, symmetric, printed, curved, moved, known, apart, peak)
+    return Audit(
+        fit=fit,
+        findings=findings,
+        structure=symmetric,
+        printed=printed,
+        curvature=curved,
+        radial=moved,
+        known=known,
+        delays=apart,
+        peak=peak,
+    )
 
 
 def _near(landscape: Landscape, draws: Draws, rng: np.random.Generator, jobs: int) -> Landscape | None:

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.stats import chi2, t
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.core.estimate import LEVEL, plain
+from lcopa_bayes.core.estimate import LEVEL, attributes, plain
 from lcopa_bayes.inference.likelihood import Landscape, Peak
 from lcopa_bayes.inference.posterior import Posterior
 
@@ -157,9 +157,7 @@ class Profile:
                 "searched": self.ends,
                 "nuisance_at_bound": self.at_bound,
                 "nuisance_moving": self.moving,
-                "parts": self.parts,
-                "values": self.values,
-                "fall": self.fall,
+                **attributes(self, "parts", "values", "fall"),
             }
         )
 
@@ -174,6 +172,7 @@ def profile(landscape: Landscape, k: int, peak: Peak, witnesses: Matrix, first_s
     return _Path(landscape, k, peak, witnesses).run(first_step)
 
 
+@final
 class _Path:
     """Points of one profile under construction."""
 

@@ -184,10 +184,7 @@ class LeastSquares:
             elif row.kind == "time" and not row.log_scale:
                 jacobian[:, k] /= raw[k]
         rows, prior = self._prior_rows(raw)
-        return (
-            np.concatenate([*parts, prior]),
-            np.concatenate([jacobian, rows])[:, self.columns],
-        )
+        return (np.concatenate([*parts, prior]), np.concatenate([jacobian, rows])[:, self.columns])
 
     def _plain(self, values: Matrix) -> Iterator[tuple[int, Observed, Matrix, Vector]]:
         """Response axis, samples, slopes in the table's rows (times in their logarithms) and misfit (model

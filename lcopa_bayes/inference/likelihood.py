@@ -275,8 +275,8 @@ class Landscape:
                 at = out.copy()
                 for k, coordinate in zip(moving, x, strict=True):
                     at[k] = self.value(k, coordinate)
-                told = [posterior.noise.pointwise(part, at[None, rows], gaps) for part, gaps in left]
-                return -float(sum(density.sum() for density in told))
+                densities = [posterior.noise.pointwise(part, at[None, rows], gaps) for part, gaps in left]
+                return -float(sum(density.sum() for density in densities))
 
             ends = [self.search(k) for k in moving]
             start = [

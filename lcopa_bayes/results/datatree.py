@@ -21,7 +21,7 @@ from lcopa_bayes.core.files import enduring
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.results.prediction import record_draws, responses
-from lcopa_bayes.results.provenance import settings_of
+from lcopa_bayes.results.runfolder import settings_of
 
 if TYPE_CHECKING:
     from lcopa_bayes.results.fit import Fit

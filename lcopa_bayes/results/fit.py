@@ -26,9 +26,8 @@ from lcopa_bayes.results.firstlook import FirstLook
 from lcopa_bayes.results.frequency import FrequencyResponse, frequency_response
 from lcopa_bayes.results.prediction import Band, study_bands
 from lcopa_bayes.results.predictive import Predictive
-from lcopa_bayes.results.provenance import fingerprint, provenance
 from lcopa_bayes.results.residuals import Residual, residuals
-from lcopa_bayes.results.runfolder import add_origin, opened
+from lcopa_bayes.results.runfolder import add_origin, fingerprint, opened, provenance
 from lcopa_bayes.results.savedfit import NAME as SAVED
 from lcopa_bayes.results.savedfit import fit_to_json
 from lcopa_bayes.results.sensitivity import Sensitivity, sensitivity
@@ -194,18 +193,18 @@ def fit(
         draws, span=problem.scales.span, period=problem.scales.period, time_unit=study.time_unit
     )
     return Fit(
-        problem,
-        run,
-        draws,
-        tuple(shown),
-        tuple(remaining),
-        curves,
-        tuple(metrics),
-        moved,
-        weighed,
-        width,
-        response,
-        check,
+        problem=problem,
+        run=run,
+        draws=draws,
+        bands=tuple(shown),
+        residuals=tuple(remaining),
+        curves=curves,
+        metrics=tuple(metrics),
+        sensitivity=moved,
+        evidence=weighed,
+        discretisation=width,
+        frequency=response,
+        cross_check=check,
     )
 
 

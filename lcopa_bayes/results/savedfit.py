@@ -26,8 +26,7 @@ from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.results.datatree import POSTERIOR, load_tree, posterior_draws
 from lcopa_bayes.results.predictive import Predictive
-from lcopa_bayes.results.provenance import provenance
-from lcopa_bayes.results.runfolder import add_origin, opened, origins
+from lcopa_bayes.results.runfolder import add_origin, opened, origins, provenance
 from lcopa_bayes.sampling.convergence import Limitation, Quality
 from lcopa_bayes.sampling.draws import Draws
 from lcopa_bayes.sampling.modes import Modes

@@ -13,8 +13,7 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix
-from lcopa_bayes.core.parallel import workers
-from lcopa_bayes.core.progress import Progress
+from lcopa_bayes.core.parallel import Progress, workers
 from lcopa_bayes.data.settings import Method
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior

@@ -20,6 +20,7 @@ from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
 
 
+@final
 class Shape(NamedTuple):
     """An element at given frequencies, for a batch."""
 

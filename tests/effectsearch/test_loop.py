@@ -8,9 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import on_off, staircase, step
-from lcopa_bayes.bench.device import Device
+from lcopa_bayes.bench.device import Bench, Device, simulate
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from scipy.stats import binom, chi2, kstest, norm
 from scipy.stats import t as student
 
-from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import on_off, staircase, step
-from lcopa_bayes.bench.device import Device
+from lcopa_bayes.bench.device import Bench, Device, simulate
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
@@ -26,8 +25,7 @@ from lcopa_bayes.effectsearch.trace import Trace, Traced, against_chance, thresh
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.noise import WhiteAR1
-from lcopa_bayes.inference.observations import Observed, Samples
-from lcopa_bayes.inference.restnoise import PlausibleNoise
+from lcopa_bayes.inference.observations import Observed, PlausibleNoise, Samples
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.path import TransferPath
 

@@ -11,15 +11,14 @@ from numpy.testing import assert_allclose
 from small import record, study, with_effect
 
 from lcopa_bayes.bench.command import Command, staircase
-from lcopa_bayes.calibration.simulation import exact_responses, model_gap
+from lcopa_bayes.calibration.replica import exact_responses, model_gap
 from lcopa_bayes.calibration.truths import Truths
 from lcopa_bayes.cli import main
 from lcopa_bayes.comparison.candidates import candidates_of, derived, known_settings
 from lcopa_bayes.data.settings import EffectsSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studywriter import write_study
-from lcopa_bayes.experiments.information import Bench
-from lcopa_bayes.experiments.refit import EffectedDevice, device_of, refit
+from lcopa_bayes.experiments.information import Bench, EffectedDevice, device_of, refit
 from lcopa_bayes.identifiability import audit
 from lcopa_bayes.identifiability.curvature import sensitivities
 from lcopa_bayes.identifiability.profile import profile
