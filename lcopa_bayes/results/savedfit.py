@@ -18,8 +18,9 @@ from typing import Any, final
 import numpy as np
 import xarray as xr
 
-from lcopa_bayes.core.arrays import Array, plain
+from lcopa_bayes.core.arrays import Array
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import writable_folder, write_whole
 from lcopa_bayes.data.studywriter import study_from_json, study_to_json
 from lcopa_bayes.inference.assembly import Problem, problem_of
