@@ -7,7 +7,7 @@ import gc
 import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, final
@@ -16,9 +16,8 @@ import lcopa_bayes
 
 # verbs are imported when they run, so that help and refusals come at once
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.verbs import choices
-from lcopa_bayes.verbs.choices import EXAMPLES, RUNS
-from lcopa_bayes.verbs.commandline import PROGRAM, CommandParser, Version, refused
+from lcopa_bayes.verbs import commandline
+from lcopa_bayes.verbs.commandline import EXAMPLES, PROGRAM, RUNS, CommandParser, Version, refused
 
 if TYPE_CHECKING:
     from lcopa_bayes.paper.intervals import Scan
@@ -92,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _outcome(options: argparse.Namespace, command: Sequence[str]) -> Outcome:
-    from lcopa_bayes.results.provenance import commanded
+    from lcopa_bayes.results.runfolder import commanded
 
     with commanded(command):
         return VERBS[options.verb].perform(options)
@@ -184,8 +183,7 @@ def _on_study(
         source = _source(options)
         source = study_of(source) if anew else source
         function = getattr(import_module(f"lcopa_bayes.verbs.{module}") if module else lcopa_bayes, verb)
-        given = {key: getattr(options, key) for key in keys}
-        given |= {key: of(options, source) for key, of in derived.items()}
+        given = _given(options, *keys) | {key: of(options, source) for key, of in derived.items()}
         given |= {"jobs": jobs} if hasattr(options, "jobs") else {}
         folder = _folder(options, source, *filter(None, [inside]))
         return _reported(function(source, folder=folder, **given), folder, jobs)
@@ -203,19 +201,15 @@ def _truth(options: argparse.Namespace, study: Any) -> object:
     return stated_values(options.truth)
 
 
+def _given(options: argparse.Namespace, *keys: str) -> dict[str, Any]:
+    """Options by the names under which a public function takes them."""
+    return {key: getattr(options, key) for key in keys}
+
+
 def _new(options: argparse.Namespace) -> Outcome:
+    keys = ("held_out", "time", "drives", "responses", "time_unit", "decimal", "time_format", "sheet")
     result = lcopa_bayes.new(
-        options.folder,
-        options.files,
-        held_out=options.held_out,
-        time=options.time,
-        drives=options.drive,
-        responses=options.response,
-        time_unit=options.time_unit,
-        decimal=options.decimal,
-        time_format=options.time_format,
-        sheet=options.sheet,
-        overwrite=options.overwrite,
+        options.folder, options.files, overwrite=options.overwrite, **_given(options, *keys)
     )
     after = f"lcopa-bayes check {options.folder}"
     return Outcome(result.to_json() | {"folder": str(options.folder)}, f"{result}\n\nnext: {after}")
@@ -235,19 +229,10 @@ def _predict(options: argparse.Namespace) -> Outcome:
 
 
 def _optics(options: argparse.Namespace) -> Outcome:
-    from lcopa_bayes.paper.opticsplan import OpticsPlan
+    from lcopa_bayes.paper.staticoptics import OpticsPlan
     from lcopa_bayes.verbs.papers import optics
 
-    plan = OpticsPlan(
-        elements=options.elements,
-        pitch=options.pitch,
-        wavelength=options.wavelength,
-        fill_factor=options.fill_factor,
-        targets_deg=tuple(options.targets),
-        voltages=tuple(options.voltages),
-        pretilt=options.pretilt,
-        field=options.field,
-    )
+    plan = OpticsPlan(**_given(options, *(one.name for one in fields(OpticsPlan))))
     return _reported(optics(plan), options.out)
 
 
@@ -308,46 +293,48 @@ def _scan(options: argparse.Namespace, study: Any) -> Scan:
 _SAMPLING = ("resume", "quick", "quiet")
 """Options of every verb that samples."""
 VERBS: Mapping[str, Verb] = {
-    "new": Verb("records and a study from spreadsheets and loggers' tables", choices.new, _new),
+    "new": Verb("records and a study from spreadsheets and loggers' tables", commandline.new, _new),
     "check": Verb(
-        "what was understood of a study, without fitting it", choices.study, _on_study("check", anew=True)
+        "what was understood of a study, without fitting it", commandline.study, _on_study("check", anew=True)
     ),
     "look": Verb(
         "least squares and residual within seconds, before sampling",
-        choices.study,
+        commandline.study,
         _on_study("look", anew=True),
     ),
     "run": Verb(
         "all stages the study names, then the report",
-        choices.fit,
+        commandline.fit,
         _on_study("fit", *_SAMPLING, "cross_check", anew=True, rival=_rival),
     ),
     "fit": Verb(
         "posterior, bands and step metrics, with a report",
-        choices.fit,
+        commandline.fit,
         _on_study("fit", *_SAMPLING, "cross_check", anew=True),
     ),
     "audit": Verb(
-        "what the records determine, parameter by parameter", choices.sampled, _on_study("audit", *_SAMPLING)
+        "what the records determine, parameter by parameter",
+        commandline.sampled,
+        _on_study("audit", *_SAMPLING),
     ),
     "design": Verb(
         "which drive to measure next",
-        choices.design,
+        commandline.design,
         _on_study("design", *_SAMPLING, "bench_time", "repeats", "amplitude", "refresh", "with_prior"),
     ),
     "compare": Verb(
         "integer against fractional orders, number of terms",
-        choices.compare,
+        commandline.compare,
         _on_study("compare", *_SAMPLING, "candidates", "described"),
     ),
     "loop": Verb(
         "what the model lacks: residual, effect, errors after",
-        choices.loop,
+        commandline.loop,
         _on_study("loop", "quick", "as_stated"),
     ),
     "calibrate": Verb(
         "simulation-based calibration and coverage of the whole inference of a study, with a report",
-        choices.calibrate,
+        commandline.calibrate,
         _on_study(
             "calibrate",
             *_SAMPLING,
@@ -357,17 +344,21 @@ VERBS: Mapping[str, Verb] = {
             truth=_truth,
         ),
     ),
-    "predict": Verb("bands for a drive nobody has measured, by a finished fit", choices.predict, _predict),
+    "predict": Verb(
+        "bands for a drive nobody has measured, by a finished fit", commandline.predict, _predict
+    ),
     "identify": Verb(
         "the paper's own least-squares scan, with a report",
-        choices.identify,
+        commandline.identify,
         _on_study("identify", "posterior", "quiet", module="papers", scan=_scan),
     ),
-    "optics": Verb("far field, director, chain from volts to angle, with figures", choices.optics, _optics),
-    "claims": Verb("the paper's claims, each with a computed verdict", choices.claims, _claims),
-    "explain": Verb("what a term means, with an example from the last fit", choices.explain, _explain),
-    "report": Verb("render the pages of a run folder again", choices.report, _report),
-    "simulate": Verb("measure a campaign file on the virtual bench", choices.simulate, _simulate),
+    "optics": Verb(
+        "far field, director, chain from volts to angle, with figures", commandline.optics, _optics
+    ),
+    "claims": Verb("the paper's claims, each with a computed verdict", commandline.claims, _claims),
+    "explain": Verb("what a term means, with an example from the last fit", commandline.explain, _explain),
+    "report": Verb("render the pages of a run folder again", commandline.report, _report),
+    "simulate": Verb("measure a campaign file on the virtual bench", commandline.simulate, _simulate),
 }
 """Every verb by name, in the order of the help."""
 

@@ -17,10 +17,9 @@ import numpy as np
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
-from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.arrays import Vector, finite
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.optics.cell import Cell, Field
-from lcopa_bayes.optics.checks import finite
+from lcopa_bayes.optics.director import Cell, Field
 
 
 @final

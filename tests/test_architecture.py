@@ -30,6 +30,8 @@ own room."""
 LOOSE = {"cli"}
 """Modules that stand in no room."""
 PLOTTING = {"matplotlib", "corner"}
+OPEN = {"InputError", "Ruled", "RidgeMove", "ScatterEffect", "StoredResult"}
+"""Classes that others derive from though no method of their own is abstract."""
 LONGEST = 400
 
 
@@ -113,6 +115,49 @@ def test_what_model_and_bench_share_calculates_no_response(name: str):
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_modules_are_one_sitting_long(path: Path):
     assert len(path.read_text().splitlines()) <= LONGEST
+
+
+def concrete_bases(sources: list[str]) -> set[str]:
+    """Classes without an abstract method of their own from which another class derives."""
+    classes = [
+        node for source in sources for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ClassDef)
+    ]
+    bases = {node.name: {ast.unparse(base).partition("[")[0] for base in node.bases} for node in classes}
+    abstract = {
+        node.name
+        for node in classes
+        if bases[node.name] & {"ABC", "Protocol"}
+        or any("abstractmethod" in map(ast.unparse, getattr(one, "decorator_list", ())) for one in node.body)
+    }
+    return {base for each in bases.values() for base in each if base in bases} - abstract
+
+
+def undecorated(sources: list[str]) -> set[str]:
+    """Classes from which none derives and that do not say so."""
+    classes = [
+        node for source in sources for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ClassDef)
+    ]
+    bases = {ast.unparse(base).partition("[")[0] for node in classes for base in node.bases}
+    return {
+        node.name
+        for node in classes
+        if node.name not in bases
+        and "Protocol" not in map(ast.unparse, node.bases)
+        and "final" not in map(ast.unparse, node.decorator_list)
+    }
+
+
+def test_every_class_is_abstract_or_final():
+    """Nothing concrete is overridden: what a class does is read in one place."""
+    sources = [path.read_text() for path in MODULES]
+    assert concrete_bases(sources) == OPEN
+    assert undecorated(sources) == set()
+
+
+def test_a_concrete_base_is_seen():
+    assert concrete_bases(["class A: ...", "class B(A): ..."]) == {"A"}
+    assert concrete_bases(["class A(ABC): ...", "class B(A): ..."]) == set()
+    assert undecorated(["class A(ABC): ...", "class B(A): ..."]) == {"B"}
 
 
 def test_importing_has_no_side_effects():

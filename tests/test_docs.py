@@ -27,7 +27,7 @@ from lcopa_bayes.data.studyfile import load_candidates, load_study
 from lcopa_bayes.identifiability import verdict as audit
 from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS, KINDS
 from lcopa_bayes.model.effects.catalogue import bundled
-from lcopa_bayes.results import adequacy, discretisation, resonance
+from lcopa_bayes.results import adequacy, discretisation
 from lcopa_bayes.sampling import convergence, evidence
 from lcopa_bayes.sampling.sampler import SamplePlan
 
@@ -156,8 +156,8 @@ def test_documented_limits_of_grades_are_those_of_the_code():
     assert numbers(warnings["noise at the end of its prior"][0]) == [100 * adequacy._END]
     assert f"{discretisation.LARGEST:g} sd" in warnings["blocks too wide"][0]
     assert f"{discretisation.UNUSABLE:g} sd" in warnings["blocks too wide"][0]
-    assert numbers(warnings["resonance faster than the samples"][0]) == [100 * resonance.SHARE]
-    assert resonance.MOST == 0.5
+    assert numbers(warnings["resonance faster than the samples"][0]) == [100 * adequacy.RESONANCE_SHARE]
+    assert adequacy.DISTURBANCE_SHARE == 0.5
     told = numbers(sections(ROOT / "docs" / "statistics.md")["Evidence"])
     assert {evidence._RELIABLE, evidence._TENTATIVE} <= set(told)
 

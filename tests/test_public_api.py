@@ -22,9 +22,8 @@ import lcopa_bayes as lb
 from lcopa_bayes.bench.command import on_off
 from lcopa_bayes.cli import main
 from lcopa_bayes.data.record import save_record
-from lcopa_bayes.results.provenance import provenance
-from lcopa_bayes.results.runfolder import LOCK, opened
-from lcopa_bayes.verbs.choices import RUNS
+from lcopa_bayes.results.runfolder import LOCK, opened, provenance
+from lcopa_bayes.verbs.commandline import RUNS
 
 README = Path(__file__).parents[1] / "README.md"
 TINY = {"ensembles": 2, "walkers": 16, "steps": 60, "thin": 1, "target_ess": 50}
@@ -361,7 +360,7 @@ def test_a_folder_of_another_study_is_refused(folder, tmp_path):
 HOLDER = """
 import sys, time
 from small import study, record
-from lcopa_bayes.results.provenance import provenance
+from lcopa_bayes.results.runfolder import provenance
 from lcopa_bayes.results.runfolder import opened
 with opened(sys.argv[1], provenance(study(record()), "fit")):
     print("held", flush=True)

@@ -37,12 +37,11 @@ from typing import Any, ClassVar, final
 
 import numpy as np
 
-from lcopa_bayes.bench.acquisition import PAPER_BENCH, Bench, simulate
 from lcopa_bayes.bench.command import Command, on_off, prbs, quiet, staircase, step
-from lcopa_bayes.bench.device import PAPER_DEVICE, Device
+from lcopa_bayes.bench.device import PAPER_BENCH, PAPER_DEVICE, Bench, Device, simulate
 from lcopa_bayes.bench.inversion import unsuited
 from lcopa_bayes.bench.undeclared import UndeclaredPlan
-from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.core.errors import InputError, nearest, refuse_if
 from lcopa_bayes.core.files import read_tables, writable_folder, write_text, writing
 from lcopa_bayes.core.rules import FLAG, Rule, is_number, whole
 from lcopa_bayes.data.record import Axis, Record, save_record
@@ -112,8 +111,7 @@ def load_plan(path: Path) -> Plan | UndeclaredPlan:
         for name in ("path", "record")
         if not isinstance(tables.get(name, []), list)
     ]
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     name, seed = heading.get("name", path.stem), heading.get("seed", 0)
     if "undeclared" in tables:
         return _undeclared(path, tables, name, seed)
@@ -123,8 +121,7 @@ def load_plan(path: Path) -> Plan | UndeclaredPlan:
         problems += _wrong(f"{path}: [[path]] {number}", entry, _PATH, _PATH)
     if not records:
         problems.append(f"{path}: has no [[record]]; add one with `name`, `duration` and a drive")
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     with _about(path):
         bench = replace(PAPER_BENCH, **_tuples(settings))
     device = _device(path, paths)
@@ -135,8 +132,7 @@ def load_plan(path: Path) -> Plan | UndeclaredPlan:
         for axis in device.drive_axes:
             if isinstance(entry, dict) and isinstance(entry.get(axis.name), dict):
                 problems += _wrong_drive(f"{where}, {axis.name}", entry[axis.name])
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     return Plan(name, seed, device, bench, tuple(records))
 
 
@@ -148,8 +144,7 @@ def _undeclared(path: Path, tables: Mapping[str, Any], name: str, seed: int) -> 
         for key in ("bench", "path", "record")
         if key in tables
     ]
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     with _about(path):
         return UndeclaredPlan(name, seed, **_tuples(tables["undeclared"]))
 
@@ -276,8 +271,7 @@ def write_campaign(
         for path in targets
         if path.exists() and not overwrite
     ]
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     lines = ["[study]", f"name = {json.dumps(name, ensure_ascii=False)}"]
     lines += [f'time_unit = "{records[0].time_unit}"', f"seed = {seed}", "", "[records]"]
     roles = {"fit": fit, "held_out": [each for each in names if each in held_out]}

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.errors import InputError, refuse_if
 
 
 @final
@@ -38,8 +38,7 @@ class Command:
             problems.append(f"`values` must have shape {(times.size, rest.size)}; got {values.shape}")
         if (np.diff(times) <= 0).any():
             problems.append("`times` must increase")
-        if problems:
-            raise InputError(problems)
+        refuse_if(problems)
         for name, value in (("times", times), ("values", values), ("rest", rest)):
             object.__setattr__(self, name, value)
 

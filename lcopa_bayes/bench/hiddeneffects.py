@@ -25,6 +25,7 @@ _CLOSE = 1e-13
 """Change of a deflection that ends the iteration of a step, over the largest force [-]."""
 
 
+@final
 class MarchError(ArithmeticError):
     """The deflection is unbounded; holds the `time` reached."""
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 from math import inf, isfinite, pi
+from typing import final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,6 +31,7 @@ _BLOCK = 1 << 15
 """Times treated at once."""
 
 
+@final
 class InversionError(ArithmeticError):
     """Two contours disagree; holds the worst `time`, the `difference` there and the `allowed` difference."""
 
@@ -41,6 +43,7 @@ class InversionError(ArithmeticError):
         )
 
 
+@final
 class PoleSearchError(ArithmeticError):
     """The poles `located` are not as many as the argument principle `counted`."""
 

@@ -12,9 +12,8 @@ from typing import ClassVar, Literal, final
 import numpy as np
 
 from lcopa_bayes.bench import driveeffects, planteffects, readingeffects, unnamedeffects
-from lcopa_bayes.bench.acquisition import Bench, truth
 from lcopa_bayes.bench.command import Command, quiet, two_axis
-from lcopa_bayes.bench.device import Device
+from lcopa_bayes.bench.device import Bench, Device, truth
 from lcopa_bayes.bench.driveeffects import joined
 from lcopa_bayes.bench.hiddeneffects import STEPS, Hidden, HiddenDevice, Shot
 from lcopa_bayes.core.arrays import Matrix

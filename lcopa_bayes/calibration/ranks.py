@@ -16,6 +16,7 @@ import numpy as np
 from scipy import stats
 
 from lcopa_bayes.core.arrays import Array, Index, Vector
+from lcopa_bayes.core.estimate import attributes
 
 SIMULTANEOUS = 0.95
 """Probability that all that one band is drawn for lies inside it [-]."""
@@ -25,6 +26,7 @@ _HALVINGS = 14
 """Bisections of the logarithm of a pointwise tail probability."""
 
 
+@final
 class Limits(NamedTuple):
     """Smallest and largest number that lies inside, one per rank value or per bin."""
 
@@ -69,9 +71,9 @@ def corridor(replicas: int, values: int, level: float = SIMULTANEOUS) -> Limits:
     return _inside(tails, float(np.exp(low)))
 
 
-def bin_limits(replicas: int, bins: int, level: float = SIMULTANEOUS) -> tuple[int, int]:
+def bin_limits(replicas: int, bins: int) -> tuple[int, int]:
     """Limits on the counts of `bins` equal bins of uniform ranks, by Bonferroni's inequality."""
-    tail = (1 - level) / (2 * bins)
+    tail = (1 - SIMULTANEOUS) / (2 * bins)
     ends = stats.binom(replicas, 1 / bins)
     return int(ends.ppf(tail)), int(ends.ppf(1 - tail))
 
@@ -165,12 +167,7 @@ class Coverage:
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
         return {
-            "parameter": self.parameter,
-            "kind": self.kind,
-            "level": self.level,
-            "observed": self.observed,
-            "lower": self.lower,
-            "upper": self.upper,
+            **attributes(self, "parameter", "kind", "level", "observed", "lower", "upper"),
             "band": BAND,
             "confidence": self.confidence,
             "within": self.holds,

@@ -1,4 +1,7 @@
-"""The verb `compare`: candidates fitted side by side, scored and decided."""
+"""The verb `compare`: candidates fitted side by side, scored and decided.
+
+Cards of all candidates joined: probabilities, weights, differences, and the decision.
+"""
 
 from __future__ import annotations
 
@@ -7,15 +10,139 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from scipy.special import logsumexp
+
+from lcopa_bayes.comparison.averaging import averaged, stretches, total_sd
 from lcopa_bayes.comparison.candidatefit import Contender, contender
 from lcopa_bayes.comparison.candidates import Candidate
 from lcopa_bayes.comparison.containment import Check
-from lcopa_bayes.comparison.judgement import judged
+from lcopa_bayes.comparison.decision import decided
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.errors import InputError, refuse_if
+from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import writable_folder
-from lcopa_bayes.core.parallel import workers
-from lcopa_bayes.core.progress import Progress
+from lcopa_bayes.core.parallel import Progress, workers
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
+
+_ROUNDS = 2_000
+_SETTLED = 1e-10
+_SIMULATED = 4_000
+
+_KEPT_APART = ("pointwise", "curves", "starts", "quantiles")
+"""Entries of a card that stay in the folder of their candidate."""
+
+Card = Mapping[str, Any]
+
+
+def judged(cards: Sequence[Card], study: Study) -> dict[str, Any]:
+    """The result of `compare` as plain values.
+
+    Unusable candidates keep their card and the reason, but are ranked nowhere.
+    """
+    rows = [dict(card) for card in cards]
+    _evidences(rows, study.seed)
+    _predictions(rows)
+    result = decided(rows)
+    fractional = [row for row in rows if not row["integer"]]
+    return plain(
+        {
+            "study": study.name,
+            "time_unit": study.time_unit,
+            "seed": study.seed,
+            "fit": [record.name for record in study.fit],
+            "held_out": [record.name for record in study.held_out],
+            **result,
+            "averaged": averaged(rows),
+            "order_is_integer": [
+                {"model": row["name"]} | dict(one) for row in fractional for one in row["order_is_integer"]
+            ],
+            "models": [{key: value for key, value in row.items() if key not in _KEPT_APART} for row in rows],
+        }
+    )
+
+
+def _evidences(rows: Sequence[dict[str, Any]], seed: int) -> None:
+    """Posterior probabilities, and Bayes factors against the most probable, into the rows."""
+    ranked = [row for row in rows if row["usable"] and row["log_evidence"] is not None]
+    for row in rows:
+        row |= {"probability": None, "probability_sd": None, "log_bayes_factor": None}
+        row |= {"log_bayes_factor_sd": None, "widths": []}
+    if not ranked:
+        return
+    values = np.array([row["log_evidence"] for row in ranked])
+    errors = np.array([row["log_evidence_sd"] for row in ranked])
+    shares, spread = probabilities(values, errors, np.random.default_rng([seed, 9]))
+    best = int(np.argmax(values))
+    for k, row in enumerate(ranked):
+        row["probability"], row["probability_sd"] = float(shares[k]), float(spread[k])
+        row["log_bayes_factor"] = float(values[k] - values[best])
+        row["log_bayes_factor_sd"] = float(np.hypot(errors[k], errors[best])) if k != best else 0.0
+
+
+def _predictions(rows: Sequence[dict[str, Any]]) -> None:
+    """Totals of log predictive densities, differences from the best, and stacking weights, into the rows."""
+    for row in rows:
+        row |= {"elpd": None, "elpd_sd": None, "elpd_difference": None, "elpd_difference_sd": None}
+        row |= {"elpd_monte_carlo_sd": None, "stacking": None, "held_out_rmse": _rmse(row)}
+    ranked = [row for row in rows if row["usable"] and row["pointwise"]["log_density"]]
+    if not ranked:
+        return
+    columns: Matrix = np.array([row["pointwise"]["log_density"] for row in ranked]).T
+    where = stretches(ranked[0]["pointwise"])
+    sums = np.array([columns[where == block].sum(axis=0) for block in np.unique(where)])
+    totals = columns.sum(axis=0)
+    best = int(np.argmax(totals))
+    weights = stacking_weights(columns)
+    for k, row in enumerate(ranked):
+        row["elpd"], row["elpd_sd"] = float(totals[k]), total_sd(sums[:, k])
+        row["elpd_difference"] = float(totals[k] - totals[best])
+        row["elpd_difference_sd"] = total_sd(sums[:, k] - sums[:, best])
+        own = [one["monte_carlo_sd"] for one in row["predictions"]]
+        row["elpd_monte_carlo_sd"] = float(np.sqrt(np.sum(np.square(own))))
+        row["stacking"] = float(weights[k])
+
+
+def _rmse(row: Card) -> dict[str, float]:
+    """Held-out error of each response axis over all its records [response unit]."""
+    pooled: dict[str, list[tuple[float, int]]] = {}
+    for one in row["held_out"]:
+        pooled.setdefault(one["axis"], []).append((one["rmse"] ** 2 * one["samples"], one["samples"]))
+    return {
+        axis: float(np.sqrt(sum(s for s, _ in parts) / sum(n for _, n in parts)))
+        for axis, parts in pooled.items()
+    }
+
+
+def stacking_weights(log_density: Matrix) -> Vector:
+    """Weights of the mixture of candidates that predicts best, (candidates,) [-].
+
+    ``max_w sum_i log sum_k w_k p_k(y_i)`` (Yao et al. 2018, Bayesian Analysis 13), a concave problem, by
+    expectation maximisation. `log_density` is (samples, candidates).
+    """
+    weights = np.full(log_density.shape[1], 1.0 / log_density.shape[1])
+    before = -np.inf
+    for _ in range(_ROUNDS):
+        with np.errstate(divide="ignore"):
+            joint = log_density + np.log(weights)
+        total = logsumexp(joint, axis=1)
+        weights = np.exp(joint - total[:, None]).mean(axis=0)
+        if total.sum() - before < _SETTLED * abs(total.sum()):
+            break
+        before = float(total.sum())
+    return np.asarray(weights / weights.sum())
+
+
+def probabilities(log_evidence: Vector, sd: Vector, rng: np.random.Generator) -> tuple[Vector, Vector]:
+    """Posterior probabilities of candidates that were equally likely before, and their Monte Carlo error.
+
+    Both (candidates,) [-]; the error is the spread when log evidences err normally by `sd` [nat].
+    """
+    weights = np.exp(log_evidence - logsumexp(log_evidence))
+    drawn = log_evidence + sd * rng.standard_normal((_SIMULATED, log_evidence.size))
+    spread = np.exp(drawn - logsumexp(drawn, axis=1, keepdims=True)).std(axis=0)
+    return np.asarray(weights), np.asarray(spread)
 
 
 def compare(

@@ -6,7 +6,16 @@ from collections.abc import Sequence
 from math import hypot
 from typing import Any
 
-from lcopa_bayes.comparison.gains import ERRORS, STRONG, TIE, Gain, Row, by_evidence, by_prediction, simplest
+from lcopa_bayes.comparison.averaging import (
+    ERRORS,
+    STRONG,
+    TIE,
+    Gain,
+    Row,
+    by_evidence,
+    by_prediction,
+    simplest,
+)
 from lcopa_bayes.comparison.priorwidth import FACTORS
 
 

@@ -8,17 +8,20 @@ from typing import Any, Literal, final
 import numpy as np
 from scipy.special import logsumexp
 
-from lcopa_bayes.comparison.folds import Part, parts_of, predicted, without
 from lcopa_bayes.comparison.sequentialdensity import (
     LevelFrom,
+    Part,
     applies,
     known_before,
     level_of,
     linear_densities,
     log_densities,
+    parts_of,
+    predicted,
+    without,
 )
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
-from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.inference.observations import Observed, Samples
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.forward import ForwardModel
@@ -93,12 +96,7 @@ class Predicted:
                 "samples": self.time.size,
                 "elpd": float(self.log_density.sum()),
                 "monte_carlo_sd": self.error,
-                "in_sample": self.in_sample,
-                "plausible": self.plausible,
-                "method": self.method,
-                "pareto_k": self.pareto_k,
-                "ess": self.ess,
-                "rhat": self.rhat,
+                **attributes(self, "in_sample", "plausible", "method", "pareto_k", "ess", "rhat"),
                 "level_from": list(dict.fromkeys(self.level_from)),
             }
         )
@@ -112,7 +110,7 @@ def predictions(fit: Fit, *, held_out_only: bool = False) -> tuple[Predicted, ..
     records come from the draws as they are. What was fitted is taken away again by importance weights when
     their Pareto k is at most 0.7 and 100 draws or more stay effective, else by a refit (`bridge`).
     """
-    posterior, study = fit.problem.posterior, fit.study
+    posterior, study = fit.near, fit.study
     positions = _walkers(fit)
     out: list[Predicted] = []
     source = posterior
@@ -206,16 +204,16 @@ class _Scored:
         every = np.concatenate(densities, axis=1) if densities else np.empty((len(values), 0))
         level = np.full(len(values), -np.log(len(values))) if log_weights is None else log_weights
         return Predicted(
-            self.part,
-            tuple(axes),
-            np.concatenate(times) if times else np.empty(0),
-            logsumexp(every + level[:, None], axis=0),
-            _error(every, level),
-            method,
-            k,
-            min(effective(level), ess if ess is not None else self.fit.draws.ess),
-            rhat,
-            tuple(sources),
+            part=self.part,
+            axis=tuple(axes),
+            time=np.concatenate(times) if times else np.empty(0),
+            log_density=logsumexp(every + level[:, None], axis=0),
+            error=_error(every, level),
+            method=method,
+            pareto_k=k,
+            ess=min(effective(level), ess if ess is not None else self.fit.draws.ess),
+            rhat=rhat,
+            level_from=tuple(sources),
         )
 
     def _axis(
@@ -240,8 +238,9 @@ class _Scored:
         return each, level.source, index[first:]
 
 
-def _error(every: Matrix, level: Vector, groups: int = 4) -> float:
+def _error(every: Matrix, level: Vector) -> float:
     """Standard error of the sum of log means by its spread over groups of draws."""
+    groups = 4
     if not every.shape[1]:
         return 0.0
     parts = np.array_split(np.arange(len(every)), groups)

@@ -63,7 +63,7 @@ def widths(fit: Fit) -> tuple[Width, ...]:
 
 
 def _width(fit: Fit, factor: float) -> Width:
-    posterior, weighed = fit.problem.posterior, fit.evidence
+    posterior, weighed = fit.near, fit.evidence
     assert weighed is not None
     rows = tuple(_scaled(row, factor) for row in posterior.table.rows)
     changed = [
@@ -97,7 +97,7 @@ def _width(fit: Fit, factor: float) -> Width:
     positions = fit.run.kept()[0][:, :, -1]
     if not np.isfinite(target.log_density(positions.reshape(-1, posterior.dimension))).any():
         return Width(factor, None, None, "undefined", 0.0, k_hat, names)
-    return _refit(posterior, target, fit, factor, k_hat, names)
+    return _refit(posterior=posterior, target=target, fit=fit, factor=factor, k_hat=k_hat, names=names)
 
 
 def _refit(

@@ -50,23 +50,24 @@ class Estimate:
         tail = (1 - LEVEL) / 2
         lower, middle, upper = (float(quantile(draws, q)) for q in (tail, 0.5, 1 - tail))
         mean, sd = (float(draws.mean()), float(draws.std(ddof=1))) if finite else (np.nan, np.nan)
-        return cls(name, middle, unit, lower, upper, ess, grade, mean, sd, note=note)
+        return cls(
+            name=name,
+            value=middle,
+            unit=unit,
+            lower=lower,
+            upper=upper,
+            ess=ess,
+            grade=grade,
+            mean=mean,
+            sd=sd,
+            note=note,
+        )
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; what is infinite or undefined is None."""
-        out: dict[str, Any] = {
-            "name": self.name,
-            "value": self.value,
-            "unit": self.unit,
-            "mean": self.mean,
-            "sd": self.sd,
-            "lower": self.lower,
-            "upper": self.upper,
-            "level": self.level,
-            "interval": self.interval,
-            "ess": self.ess,
-            "grade": self.grade,
-        }
+        out: dict[str, Any] = attributes(
+            self, "name", "value", "unit", "mean", "sd", "lower", "upper", "level", "interval", "ess", "grade"
+        )
         return plain(out | ({"note": self.note} if self.note else {}))
 
 
@@ -74,6 +75,11 @@ def quantile(values: Array, probability: float) -> Array:
     """Quantile along the first axis that does not interpolate between a finite and an infinite entry."""
     method = "linear" if np.isfinite(values).all() else "higher"
     return np.asarray(np.quantile(values, probability, axis=0, method=method))  # type: ignore[call-overload]
+
+
+def attributes(one: object, *names: str) -> dict[str, Any]:
+    """Some attributes of an object, by their names."""
+    return {name: getattr(one, name) for name in names}
 
 
 def plain(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,7 @@
-"""Workers: independent tasks done in this process, in several of one thread each, or on a Dask cluster."""
+"""Workers: independent tasks done in this process, in several of one thread each, or on a Dask cluster.
+
+Progress of long work: a bar on a terminal, plain lines now and then where there is none.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +9,12 @@ import ctypes
 import os
 import signal
 import sys
-from abc import ABC, abstractmethod
+import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import CancelledError, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from functools import partial
 from importlib import import_module
 from multiprocessing import forkserver, parent_process
 from multiprocessing.context import BaseContext, SpawnContext, SpawnProcess
@@ -18,6 +22,7 @@ from threading import Thread
 from typing import Any, Generic, TypeVar, final
 
 from threadpoolctl import threadpool_limits
+from tqdm import tqdm
 
 from lcopa_bayes.core.errors import InputError
 
@@ -32,14 +37,19 @@ CONNECT = 5.0
 _ADVICE = "what was finished is stored; go on with --resume"
 
 
-class Workers(ABC, Generic[S]):
+@final
+class Workers(Generic[S]):
     """What does tasks `task(shared, one)`; the results do not depend on who it is."""
 
-    @abstractmethod
+    def __init__(self, submit: Callable[..., Any], as_finished: Callable[..., Iterator[Any]]) -> None:
+        """By what gives a task and its input to a worker, a future, and what gives futures as they finish."""
+        self._submit, self._as_finished = submit, as_finished
+
     def each(self, task: Callable[[S, T], R], inputs: Sequence[T]) -> Iterator[R]:
         """Results in the order of the inputs."""
+        futures = [self._submit(task, one) for one in inputs]
+        return (future.result() for future in futures)
 
-    @abstractmethod
     def finished(
         self,
         task: Callable[[S, T], R],
@@ -48,10 +58,29 @@ class Workers(ABC, Generic[S]):
     ) -> Iterator[R]:
         """Results in the order in which they are finished. Where a task ends in an error, on a cluster also
         where it is lost with its worker, `failed` gives its result; without it the error is raised."""
+        futures = {self._submit(task, one): one for one in inputs}
+        for future in self._as_finished(futures):
+            try:
+                result = future.result()
+            except (BrokenProcessPool, CancelledError):
+                raise
+            except Exception as error:
+                if failed is None:
+                    raise
+                result = failed(futures[future], error)
+            yield result
 
     def map(self, function: Callable[[T], R], inputs: Sequence[T]) -> Iterator[R]:
         """Results of a function that needs nothing shared, in the order of the inputs."""
         return self.each(_Alone(function), inputs)
+
+
+@final
+class _Later:
+    """A task of this process, done when its result is asked for."""
+
+    def __init__(self, task: Callable[[S, T], Any], shared: S, one: T) -> None:
+        self.result = partial(task, shared, one)
 
 
 @contextmanager
@@ -68,11 +97,11 @@ def workers(shared: S, *, jobs: int = 1, dask: str | None = None) -> Iterator[Wo
             yield cluster
     elif jobs <= 1:
         with threadpool_limits(1):
-            yield _Here(shared)
+            yield Workers(lambda task, one: _Later(task, shared, one), iter)
     else:
         pool = _pool(jobs, shared)
         try:
-            yield _Processes(pool)
+            yield Workers(lambda task, one: pool.submit(_perform, task, one), as_completed)
         except BrokenProcessPool:
             raise InputError(
                 f"a worker process ended, perhaps for want of memory, or because it was given what the main "
@@ -127,86 +156,8 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
-@final
-class _Here(Workers[S]):
-    """This process."""
-
-    def __init__(self, shared: S) -> None:
-        self._shared = shared
-
-    def each(self, task: Callable[[S, T], R], inputs: Sequence[T]) -> Iterator[R]:
-        return (task(self._shared, one) for one in inputs)
-
-    def finished(
-        self,
-        task: Callable[[S, T], R],
-        inputs: Sequence[T],
-        failed: Callable[[T, BaseException], R] | None = None,
-    ) -> Iterator[R]:
-        for one in inputs:
-            try:
-                result = task(self._shared, one)
-            except Exception as error:
-                if failed is None:
-                    raise
-                result = failed(one, error)
-            yield result
-
-
-@final
-class _Processes(Workers[S]):
-    """Other processes on this machine."""
-
-    def __init__(self, pool: ProcessPoolExecutor) -> None:
-        self._pool = pool
-
-    def each(self, task: Callable[[S, T], R], inputs: Sequence[T]) -> Iterator[R]:
-        return self._pool.map(_perform, [task] * len(inputs), inputs)
-
-    def finished(
-        self,
-        task: Callable[[S, T], R],
-        inputs: Sequence[T],
-        failed: Callable[[T, BaseException], R] | None = None,
-    ) -> Iterator[R]:
-        futures = {self._pool.submit(_perform, task, one): one for one in inputs}
-        for future in as_completed(futures):
-            error = future.exception()
-            if error is None or failed is None or isinstance(error, BrokenProcessPool):
-                yield future.result()
-            else:
-                yield failed(futures[future], error)
-
-
-@final
-class _Cluster(Workers[S]):
-    """The workers of a Dask scheduler."""
-
-    def __init__(self, client: Any, shared: S) -> None:
-        # sent once; a worker that needs it takes it from another
-        self._client, self._shared = client, client.submit(_same, shared, pure=False)
-
-    def each(self, task: Callable[[S, T], R], inputs: Sequence[T]) -> Iterator[R]:
-        futures = [self._client.submit(task, self._shared, one, pure=False) for one in inputs]
-        return (future.result() for future in futures)
-
-    def finished(
-        self,
-        task: Callable[[S, T], R],
-        inputs: Sequence[T],
-        failed: Callable[[T, BaseException], R] | None = None,
-    ) -> Iterator[R]:
-        futures = {self._client.submit(task, self._shared, one, pure=False): one for one in inputs}
-        as_finished = import_module("distributed").as_completed
-        for future in as_finished(futures, loop=self._client.loop):
-            if future.status == "error" and failed is not None:
-                yield failed(futures[future], future.exception())
-            else:
-                yield future.result()
-
-
 @contextmanager
-def _cluster(shared: S, address: str) -> Iterator[_Cluster[S]]:
+def _cluster(shared: S, address: str) -> Iterator[Workers[S]]:
     try:
         distributed = import_module("distributed")
     except ImportError:
@@ -220,7 +171,12 @@ def _cluster(shared: S, address: str) -> Iterator[_Cluster[S]]:
         ) from None
     try:
         with client:
-            yield _Cluster(client, shared)
+            # sent once; a worker that needs it takes it from another
+            held = client.submit(_same, shared, pure=False)
+            yield Workers(
+                lambda task, one: client.submit(task, held, one, pure=False),
+                partial(distributed.as_completed, loop=client.loop),
+            )
     except distributed.client.FutureCancelledError as error:
         raise InputError(f"--dask {address}: the scheduler was lost ({error}); {_ADVICE}") from None
 
@@ -253,6 +209,7 @@ def _main_hidden() -> Iterator[None]:
         main.update(seen)
 
 
+@final
 class _Spawned(SpawnProcess):
     """A process of its own."""
 
@@ -262,6 +219,7 @@ class _Spawned(SpawnProcess):
             super().start()
 
 
+@final
 class _SpawnContext(SpawnContext):
     """Starts workers as processes of their own."""
 
@@ -271,6 +229,7 @@ class _SpawnContext(SpawnContext):
 if sys.platform == "linux":  # elsewhere system libraries do not outlast a fork
     from multiprocessing.context import ForkServerContext, ForkServerProcess
 
+    @final
     class _Forked(ForkServerProcess):
         """A process forked from one that has imported what it needs."""
 
@@ -279,6 +238,7 @@ if sys.platform == "linux":  # elsewhere system libraries do not outlast a fork
             with _main_hidden():
                 super().start()
 
+    @final
     class _ForkContext(ForkServerContext):
         """Starts workers as forks of one process, which imports the package once for all of them."""
 
@@ -332,3 +292,52 @@ def _end_with_parent() -> None:
 
 def _perform(task: Callable[[Any, T], R], one: T) -> R:
     return task(_shared, one)
+
+
+_LINES = 10.0
+"""Least time between two lines of one task in a log [s]."""
+_LINE = "{desc}: {n_fmt}/{total_fmt} {unit}s, {elapsed} so far, {remaining} left{postfix}"
+_COUNT = "{desc}: {n_fmt} {unit}s, {elapsed} so far{postfix}"
+
+
+@final
+class Progress(tqdm):  # type: ignore[type-arg]
+    """`tqdm` that writes lines a log can hold where standard error is no terminal.
+
+    Takes what `tqdm` takes; `quiet` shows nothing. A new description, and the end, are shown at once.
+    """
+
+    def __init__(self, *args: Any, quiet: bool = False, **options: Any) -> None:
+        self._plain = not sys.stderr.isatty()
+        self._last, self._due = "", 0.0
+        if self._plain:
+            line = _LINE if options.get("total") else _COUNT
+            options = {"mininterval": _LINES, "bar_format": line} | options
+        super().__init__(*args, disable=quiet, **options)  # type: ignore[call-overload]
+
+    def display(self, msg: str | None = None, pos: int | None = None) -> None:
+        """Show the bar, or a line where there is no terminal and the last one is old enough."""
+        if not self._plain:
+            super().display(msg, pos)
+        elif time.monotonic() >= self._due:
+            self._write(str(self) if msg is None else msg)
+
+    def set_description(self, desc: str | None = None, refresh: bool | None = True) -> None:
+        """Name what is being done."""
+        if not self._plain:
+            super().set_description(desc, refresh)
+        elif not self.disable and desc != self.desc:  # the line has a colon of its own
+            self._due = 0.0
+            self.set_description_str(desc, refresh)
+
+    def close(self) -> None:
+        """End with a last line."""
+        if self._plain and not self.disable:
+            self._write(str(self))
+            self._due, self.leave = float("inf"), False
+        super().close()
+
+    def _write(self, text: str) -> None:
+        if text != self._last:
+            print(text, file=sys.stderr, flush=True)
+            self._last, self._due = text, time.monotonic() + _LINES

@@ -10,14 +10,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Array
 
 TIME_UNITS: Mapping[str, int] = MappingProxyType(
-    {
-        "ns": 1,
-        "us": 1_000,
-        "ms": 1_000_000,
-        "s": 1_000_000_000,
-        "min": 60_000_000_000,
-        "h": 3_600_000_000_000,
-    }
+    {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000, "min": 60_000_000_000, "h": 3_600_000_000_000}
 )
 """Nanoseconds in each unit of time by its word."""
 

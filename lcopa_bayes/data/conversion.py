@@ -17,8 +17,8 @@ from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError, nearest, refuse_if
 from lcopa_bayes.core.units import TIME_UNITS
 from lcopa_bayes.data.cells import CellTable
-from lcopa_bayes.data.notation import decimal_sign, numbers, seconds
 from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.data.spreadsheet import decimal_sign, numbers, seconds
 
 _TIME = re.compile(
     r"(?<![a-z])(time|times|timestamp|date|datetime|datum|zeit|uhrzeit|elapsed|clock|temps|tiempo|tempo|t)(?![a-z\d])"

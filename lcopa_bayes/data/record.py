@@ -194,7 +194,7 @@ def load_columns(path: Path, time_unit: str | None = None, *, responses: bool = 
 
 def _columns(table: CellTable, time_unit: str | None, *, responses: bool) -> Columns:
     """Columns of a table's cells; InputError with everything wrong in them."""
-    n_rows = len(table.rows) if not table.problems else 2  # rows of another length are told already
+    n_rows = len(table.rows) if not table.problems else 2  # rows of another length are problems already
     given, axes = _roles(table, _ROLES if responses else _ROLES[:2])
     values = {role: [_numbers(table, j, missing=role == "response") for j in axes[role]] for role in _ROLES}
     for column, time in zip(axes["time"], values["time"], strict=True):

@@ -17,17 +17,7 @@ from scipy import stats
 from scipy.stats.distributions import rv_frozen
 
 from lcopa_bayes.core.errors import nearest
-from lcopa_bayes.core.rules import (
-    FLAG,
-    FOLDER,
-    POSITIVE,
-    Rule,
-    Ruled,
-    is_number,
-    texts,
-    whole,
-    word_of,
-)
+from lcopa_bayes.core.rules import FLAG, FOLDER, POSITIVE, Rule, Ruled, is_number, texts, whole, word_of
 from lcopa_bayes.core.units import TIME_UNITS
 
 Share: TypeAlias = Literal["paper", "all", "none"]

@@ -97,13 +97,13 @@ def _record(record: Record) -> dict[str, Any]:
 def _record_of(values: Mapping[str, Any]) -> Record:
     response = [[np.nan if v is None else v for v in column] for column in values["response"]]
     return Record(
-        values["name"],
-        np.array(values["time"], dtype=float),
-        np.array(values["drive"], dtype=float).T,
-        np.array(response, dtype=float).T,
-        tuple(Axis(*axis) for axis in values["drive_axes"]),
-        tuple(Axis(*axis) for axis in values["response_axes"]),
-        values["time_unit"],
+        name=values["name"],
+        time=np.array(values["time"], dtype=float),
+        drive=np.array(values["drive"], dtype=float).T,
+        response=np.array(response, dtype=float).T,
+        drive_axes=tuple(Axis(*axis) for axis in values["drive_axes"]),
+        response_axes=tuple(Axis(*axis) for axis in values["response_axes"]),
+        time_unit=values["time_unit"],
     )
 
 

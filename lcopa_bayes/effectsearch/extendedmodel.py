@@ -62,12 +62,7 @@ class ExtendedModel:
             return self.plant
         simulator = self.effected.simulator
         return with_effects(
-            self.plant,
-            self.effects,
-            simulator.ranges,
-            simulator.epochs,
-            free=self.loose,
-            wider=self.wider,
+            self.plant, self.effects, simulator.ranges, simulator.epochs, free=self.loose, wider=self.wider
         )
 
     def least(self, held: tuple[Vector, ...] = ()) -> LeastSquares:

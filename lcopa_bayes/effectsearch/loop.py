@@ -14,25 +14,42 @@ from lcopa_bayes.core.estimate import LEVEL
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.basefit import BaseFit
-from lcopa_bayes.effectsearch.explained import (
-    coordinates_of,
-    declarable,
-    explained_draws,
-    explained_study,
-)
+from lcopa_bayes.effectsearch.explained import coordinates_of, declarable, explained_draws, explained_study
 from lcopa_bayes.effectsearch.heldouteffects import missed, unseen_share
 from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
 from lcopa_bayes.effectsearch.outliers import Outlying, outlying
 from lcopa_bayes.effectsearch.rounds import CLEAR, SINGLE, Round, search
-from lcopa_bayes.effectsearch.scores import WIDTH, Score, State, fit_scores, held_out_scores, left_out_scores
+from lcopa_bayes.effectsearch.scores import (
+    WIDTH,
+    Score,
+    State,
+    fit_scores,
+    held_out_scores,
+    left_out_scores,
+    risen,
+)
 from lcopa_bayes.effectsearch.terms import fitted_base
 from lcopa_bayes.effectsearch.trace import Trace
-from lcopa_bayes.effectsearch.verdict import ALONE, EXPLAINED, Findings, Verdict, beside, decide, widened
+from lcopa_bayes.effectsearch.verdict import (
+    ALONE,
+    EXPLAINED,
+    RISEN,
+    Findings,
+    Verdict,
+    beside,
+    decide,
+    widened,
+)
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.effect import Effect
 from lcopa_bayes.sampling.convergence import Grade
 from lcopa_bayes.sampling.draws import Draws
+
+_ASTRAY = (
+    "the draws of the study predict the records held out worse than its optimum does and are not used: "
+    "intervals and bands are those of a Laplace approximation there"
+)
 
 
 @final
@@ -202,6 +219,7 @@ def _looped(
             unseen=unseen_share(study, before.unseen, reached.unseen, searched.state)
             if study.held_out
             else np.nan,
+            risen=risen(before.unseen, reached.unseen) if study.held_out else np.nan,
         )
     )
     if outliers is not None:
@@ -216,9 +234,17 @@ def _looped(
     if sample and declarable(study, last_state.model.effects):
         explained = explained_study(problem.study, last_state.model, outliers)
         sampled = explained_draws(explained, jobs=jobs, quick=quick)
+    after = reached if named else before
+    if last_state is not (searched.state if named else start) and sampled is None:
+        after = _side(problem, last_state)
     if sampled is not None:
-        covariance = np.cov(coordinates_of(last_state.model, sampled[0]).T)
-        last_state = replace(last_state, covariance=np.asarray(covariance), sampled=sampled)
+        covariance = np.asarray(np.cov(coordinates_of(last_state.model, sampled[0]).T))
+        drawn = _side(problem, replace(last_state, covariance=covariance, sampled=sampled))
+        if study.held_out and risen(after.unseen, drawn.unseen) > RISEN:
+            cautions, sampled = (*cautions, _ASTRAY), None
+            after = _side(problem, last_state)
+        else:
+            after = drawn
     return Loop(
         problem,
         base,
@@ -228,7 +254,7 @@ def _looped(
         searched.groups if named else (),
         verdict,
         before,
-        reached if last_state is searched.state else _side(problem, last_state),
+        after,
         not study.held_out,
         cautions,
         sampled[0] if sampled is not None else None,

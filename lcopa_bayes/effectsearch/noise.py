@@ -19,8 +19,7 @@ from scipy.stats import chi2
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.noise import WhiteAR1
-from lcopa_bayes.inference.observations import Observed, Samples
-from lcopa_bayes.inference.restnoise import PlausibleNoise, mixed_shapes
+from lcopa_bayes.inference.observations import Observed, PlausibleNoise, Samples, mixed_shapes
 
 FEWEST = 50
 """Fewer quiet samples than this know the noise scale to worse than a tenth [-]."""

@@ -10,7 +10,7 @@ from typing import Any, final
 import numpy as np
 from scipy.stats import chi2
 
-from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.effectsearch.basefit import renewed
 from lcopa_bayes.effectsearch.crossvalidation import groups, log_scores
@@ -125,12 +125,30 @@ class Refit:
         return replace(self, model=model, optimum=optimum, before=before, whitening=whitening, paid=paid)
 
     def wald(self, name: str) -> float:
-        """p-value of an effect's coefficients being zero, over all noise that is plausible [-].
+        """p-value of an effect's coefficients being zero, over all noise that is plausible [-]."""
+        psi, count = self.optimum.x[self.places(name)], len(self.places(name))
+        power = [psi @ np.linalg.solve(one, psi) for one in self._scatter(name)[1]]
+        return float(np.mean(chi2.sf(power, count)))
 
-        Their covariance is that of the estimate under the noise as it is, not as it was weighted: larger
-        where noise is as slow as the tangents (White 1982, Econometrica 50). Other coordinates that an end of
-        their support holds, or would hold if the coefficients vanished, stay where they are: a delay that
-        cannot shrink is no alias.
+    def ratio(self, name: str) -> float:
+        """The same by the likelihood ratio of the plant with the one new effect and without [-].
+
+        Of an effect whose slope fades with its size, as that of a loss which already limits, the coefficients
+        are uncertain though the effect is not. Noise other than it was weighted makes the ratio larger by as
+        much as it makes variances of the coefficients, at most.
+        """
+        naive, noise = self._scatter(name)
+        twice = 2 * (self.before.cost - self.optimum.cost)
+        larger = np.array([np.linalg.eigvals(np.linalg.solve(naive, one)).real.max() for one in noise])
+        return float(np.mean(chi2.sf(twice / larger, len(naive))))
+
+    def _scatter(self, name: str) -> tuple[Matrix, list[Matrix]]:
+        """Covariance of an effect's coefficients under the noise as it was weighted, and under each of the
+        plausible ones.
+
+        That of the estimate under the noise as it is: larger where noise is as slow as the tangents (White
+        1982, Econometrica 50). Other coordinates that an end of their support holds, or would hold if the
+        coefficients vanished, stay where they are: a delay that cannot shrink is no alias.
         """
         where, x, information = self.places(name), self.optimum.x, self.optimum.information
         psi, own = x[where], np.isin(np.arange(x.size), where)
@@ -148,8 +166,7 @@ class Refit:
         tangents = self.optimum.jacobian[:, free]
         held = information[np.ix_(free, free)] - tangents.T @ tangents  # what priors say
         noise = self.whitening.covariances(tangents @ gain, _PROCESSES)
-        power = [psi @ np.linalg.solve(one + gain.T @ held @ gain, psi) for one in noise]
-        return float(np.mean(chi2.sf(power, len(where))))
+        return np.asarray(gain[at]), [one + gain.T @ held @ gain for one in noise]
 
     def places(self, name: str) -> list[int]:
         """Coordinates of an effect's coefficients."""
@@ -166,8 +183,11 @@ class Refit:
 
     @cached_property
     def significant(self) -> bool:
-        """Whether all new effects are three standard deviations or more away from zero."""
-        return all(self.wald(name) < SIGNIFICANT for name in self.added)
+        """Whether all new effects are three standard deviations or more away from zero, or a single one is by
+        its likelihood ratio."""
+        if all(self.wald(name) < SIGNIFICANT for name in self.added):
+            return True
+        return len(self.added) == 1 and self.ratio(self.added[0]) < SIGNIFICANT
 
 
 def refit(

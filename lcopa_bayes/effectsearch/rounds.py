@@ -179,8 +179,7 @@ def _paired(start: State, state: State, seen: Trace) -> Refit | None:
     """
     named = [one for one in seen.traced if one.card.place != "generic" and one.signatures][:_PAIRED]
     ranked = sorted(
-        combinations(named, 2),
-        key=lambda pair: -pair_evidence(_best(pair[0]), _best(pair[1]), seen.residual),
+        combinations(named, 2), key=lambda pair: -pair_evidence(_best(pair[0]), _best(pair[1]), seen.residual)
     )
     have = {effect.name for effect in state.model.effects}
     choice = float(np.log(max(len(ranked), 1)))

@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of
-from lcopa_bayes.core.estimate import LEVEL
+from lcopa_bayes.core.estimate import LEVEL, attributes
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.crossvalidation import groups, shifts
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
@@ -86,10 +86,7 @@ class Score:
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
         return {
-            "record": self.record,
-            "axis": self.axis,
-            "unit": self.unit,
-            "held_out": self.held_out,
+            **attributes(self, "record", "axis", "unit", "held_out"),
             "samples": self.time.size,
             "rmse": self.rmse,
             "noise_sd": self.noise_sd,
@@ -290,6 +287,13 @@ def pooled_rmse(scores: Sequence[Score], axis: str) -> float:
         return float("nan")
     total = sum(score.rmse**2 * score.time.size for score in chosen)
     return float(np.sqrt(total / sum(score.time.size for score in chosen)))
+
+
+def risen(before: Sequence[Score], after: Sequence[Score]) -> float:
+    """Largest root mean square error of any axis over that before [-]; NaN without samples."""
+    axes = sorted({one.axis for one in before})
+    ratios = [pooled_rmse(after, axis) / (pooled_rmse(before, axis) or 1.0) for axis in axes]
+    return max(ratios, default=float("nan"))
 
 
 def pooled_coverage(scores: Sequence[Score]) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 from scipy.optimize import minimize
@@ -23,6 +23,7 @@ _STEPS = 8
 """Evaluations of the descent at each level tried [-]."""
 
 
+@final
 class Mended(NamedTuple):
     """A study whose base model lost an assumption that its records contradict."""
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.effectsearch.crossvalidation import in_turn
 from lcopa_bayes.effectsearch.loop import Loop, Side
 from lcopa_bayes.effectsearch.residuals import View, views
@@ -42,13 +42,8 @@ def results(found: Loop) -> dict[str, Any]:
             {
                 "axis": axis.name,
                 "unit": axis.unit,
-                "sigma": one.law.sigma,
-                "sigma_ar": one.law.sigma_ar,
-                "rho": one.law.rho,
-                "sd": one.law.sd,
-                "samples": one.samples,
-                "source": one.source,
-                "sentence": one.sentence,
+                **attributes(one.law, "sigma", "sigma_ar", "rho", "sd"),
+                **attributes(one, "samples", "source", "sentence"),
             }
             for axis, one in zip(found.problem.study.response_axes, found.base.noise, strict=True)
         ],
@@ -70,15 +65,13 @@ def results(found: Loop) -> dict[str, Any]:
         },
         "seed": found.problem.study.seed,
     }
-    values: dict[str, Any] = plain(numbers)
-    return values
+    return plain(numbers)
 
 
 def drawn(found: Loop) -> dict[str, Any]:
     """What the figures need beyond `results`: residual views and residuals before and after."""
     shown = {when: [view.as_json() for view in each] for when, each in _views(found).items()}
-    values: dict[str, Any] = plain({"views": shown, "curves": _curves(found)})
-    return values
+    return plain({"views": shown, "curves": _curves(found)})
 
 
 def _views(found: Loop) -> dict[str, list[View]]:
@@ -113,9 +106,7 @@ def _effects(found: Loop, chances: dict[str, float]) -> list[dict[str, Any]]:
         out.append(
             {
                 "name": effect.name,
-                "place": effect.card.place,
-                "formula": effect.card.formula,
-                "source": effect.card.source,
+                **attributes(effect.card, "place", "formula", "source"),
                 "group": list(found.groups[number]),
                 "nearest": _nearest(found, effect.name),
                 "probability": chances.get(effect.name),
@@ -181,9 +172,7 @@ def _evidence(found: Loop) -> dict[str, Any]:
 
 def _round(one: Round) -> dict[str, Any]:
     return {
-        "largest": one.trace.largest,
-        "threshold": one.trace.threshold,
-        "p_value": one.trace.p_value,
+        **attributes(one.trace, "largest", "threshold", "p_value"),
         "leading": [
             {"name": each.name, "log_bayes_factor": each.log_bayes_factor} for each in one.trace.traced[:6]
         ],
@@ -213,10 +202,7 @@ def _curves(found: Loop) -> list[dict[str, Any]]:
 def _curve(before: Score, after: Score, most: int = 1500) -> dict[str, Any]:
     step = max(1, -(-before.time.size // most))
     return {
-        "record": before.record,
-        "axis": before.axis,
-        "unit": before.unit,
-        "held_out": before.held_out,
+        **attributes(before, "record", "axis", "unit", "held_out"),
         "time": before.time[::step],
         "observed": before.observed[::step],
         "noise_sd": before.noise_sd,

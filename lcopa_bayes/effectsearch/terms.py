@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import refuse_if
-from lcopa_bayes.data.requirements import unmet_apart_from_rest
-from lcopa_bayes.data.rest import not_at_rest
+from lcopa_bayes.data.requirements import not_at_rest, unmet_apart_from_rest
 from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basefit import BaseFit, base_fit
@@ -43,6 +42,7 @@ _AT_END = 1e-2
 """Closer to the end of its prior than this share, a delay is at it [-]."""
 
 
+@final
 class Base(NamedTuple):
     """A study's base fit, perhaps with more viscous terms than it states."""
 

@@ -17,6 +17,8 @@ ALONE = 0.8
 """The same from a single record, whose smaller effects are not named [-]."""
 UNSEEN = 0.5
 """Share of the error beyond noise on held-out records that named effects may leave [-]."""
+RISEN = 1.05
+"""Error on held-out records with effects, or of draws, over that without from which neither is used [-]."""
 MARGIN = 3.0
 """Log evidence by which a generic class or another set must win [nat]."""
 
@@ -73,6 +75,9 @@ class Findings:
     unseen: float = math.nan
     """Squared error beyond noise on held-out records, with the effects over without [-]; NaN where it says
     nothing: no such records, no such error, or effects that differ from record to record."""
+    risen: float = math.nan
+    """Largest error of any axis on held-out records with the effects over that without [-]; NaN without such
+    records."""
 
 
 def decide(found: Findings) -> Verdict:
@@ -115,6 +120,13 @@ def decide(found: Findings) -> Verdict:
             f"The nearest effect ({named}) takes up what the fitted records leave, but "
             f"{_percent(found.unseen)} of the squared error beyond noise stays on the records held out: no "
             "name is forced.",
+        )
+    if found.risen > RISEN:
+        return Verdict(
+            "unexplained",
+            confidence,
+            f"The nearest effect ({named}) takes up what the fitted records leave, but the error on the "
+            f"records held out is {found.risen:.2f} times as large with it: no name is forced.",
         )
     rest = (
         f" What remains is significant ({found.remaining_name}, {found.remaining:.0f} nat) but small: "

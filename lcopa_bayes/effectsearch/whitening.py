@@ -12,12 +12,13 @@ import numpy as np
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.effectsearch.noise import Law
 from lcopa_bayes.inference.noise import WhiteAR1
-from lcopa_bayes.inference.observations import Samples
-from lcopa_bayes.inference.restnoise import PlausibleNoise
+from lcopa_bayes.inference.observations import PlausibleNoise, Samples
 
 _PER_LAW = 4
 """Draws of noise from each plausible law [-]."""
 _SEED = 7
+_SHORTER = 0.5
+"""Share of the likeliest law's memory below which a residual's own is another [-]."""
 
 
 @final
@@ -115,13 +116,16 @@ class Whitening:
 
     def covariances(self, columns: Matrix, count: int) -> Array:
         """Covariance of products of whitened noise with columns (n, k), under `count` plausible laws,
-        (count, k, k) [-]; the estimate is right once where the noise is known, (1, k, k)."""
+        (count, k, k) [-]; the estimate is right once where the noise is known, (1, k, k).
+
+        None remembers longer than the residual that it was fitted to.
+        """
         if not self.posterior:
             return (columns.T @ columns)[None]
         back, k = self.adjoint(columns.T), columns.shape[1]
         rng, out = np.random.default_rng(_SEED), np.zeros((count, k, k))
-        for axis, posterior in enumerate(self.posterior):
-            drawn = posterior.draw(count, rng)
+        for axis in range(len(self.posterior)):
+            drawn = self._plausible(axis, count, rng)
             rho, which = np.unique(drawn[:, 2], return_inverse=True)
             white, correlated = np.zeros((k, k)), np.zeros((rho.size, k, k))
             for part, gaps in self._filled:
@@ -131,6 +135,18 @@ class Whitening:
             out += drawn[:, 0, None, None] ** 2 * white
             out += drawn[:, 1, None, None] ** 2 * correlated[which]
         return out
+
+    def _plausible(self, axis: int, count: int, rng: np.random.Generator) -> Matrix:
+        """Plausible laws of an axis, as `WhiteAR1` takes them, (count, 3).
+
+        From sample to sample a smooth misfit looks like a random walk. Where its own autocorrelations sum up
+        to less than those of the likeliest law, that law is used whose ``sum_k rho^2k = (1 + rho^2) / (1 -
+        rho^2)`` has their sum.
+        """
+        own = self.dependence[axis] if self.dependence else np.inf
+        if own >= _SHORTER * Law.of(self.posterior[axis]).correlated(self.size):
+            return self.posterior[axis].draw(count, rng)
+        return np.tile([0.0, self.noise[axis].sd, np.sqrt((own - 1) / (own + 1))], (count, 1))
 
     @cached_property
     def effective(self) -> float:
@@ -159,8 +175,8 @@ class Whitening:
             return rng.standard_normal((self.size, count))
         raw = np.empty((count, self.size))
         several = -(-count // _PER_LAW)
-        for axis, posterior in enumerate(self.posterior):
-            drawn = np.repeat(posterior.draw(several, rng), _PER_LAW, axis=0)[:count]
+        for axis in range(len(self.posterior)):
+            drawn = np.repeat(self._plausible(axis, several, rng), _PER_LAW, axis=0)[:count]
             for part, gaps in self._filled:
                 if part.axis == axis:
                     raw[:, part.rows] = WhiteAR1().draw(drawn, gaps, rng)

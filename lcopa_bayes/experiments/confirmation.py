@@ -10,14 +10,13 @@ from typing import Any, final
 import numpy as np
 from scipy.stats import chi2
 
-from lcopa_bayes.bench.acquisition import Bench as VirtualBench
-from lcopa_bayes.bench.acquisition import truth
+from lcopa_bayes.bench.device import Bench as VirtualBench
+from lcopa_bayes.bench.device import truth
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
-from lcopa_bayes.core.estimate import LEVEL, plain
+from lcopa_bayes.core.estimate import LEVEL, attributes, plain
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.experiments.design import LINEAR, Design
-from lcopa_bayes.experiments.information import Bench
-from lcopa_bayes.experiments.refit import Trial, device_of
+from lcopa_bayes.experiments.information import Bench, Trial, device_of
 
 REPLICAS = 12
 """Records simulated and fitted per drive."""
@@ -102,9 +101,7 @@ class Confirmation:
         """Plain values; infinite ones are None."""
         return plain(
             {
-                "confirmed": self.confirmed,
-                "sentence": self.sentence,
-                "where": self.where,
+                **attributes(self, "confirmed", "sentence", "where"),
                 "replicas": self.winner.errors.shape[0],
                 "factor": {
                     "value": self.factor,
@@ -213,7 +210,17 @@ def _confirmed(design: Design, chosen: int, where: str, replicas: int, jobs: int
     factor, low, high = _factor(winner.errors, step.errors, design.determined, rng)
     columns = [design.fit.draws.table.names.index(name) for name in design.names]
     at = design.draws[chosen, columns]
-    return Confirmation(where, design.names, design.determined, at, winner, step, factor, low, high)
+    return Confirmation(
+        where=where,
+        names=design.names,
+        among=design.determined,
+        truth=at,
+        winner=winner,
+        step=step,
+        factor=factor,
+        lower=low,
+        upper=high,
+    )
 
 
 def _factor(

@@ -10,8 +10,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import Estimate, plain, quantile
-from lcopa_bayes.experiments.design import Design, design
-from lcopa_bayes.experiments.precision import Promise
+from lcopa_bayes.experiments.design import Design, Promise, design
 from lcopa_bayes.results.predictive import Predictive
 
 

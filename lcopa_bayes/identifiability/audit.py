@@ -1,4 +1,7 @@
-"""The verb `audit`: what the records of a study determine, combined from four methods."""
+"""The verb `audit`: what the records of a study determine, combined from four methods.
+
+Radial test: a fit far from the maximum, whose likelihood shows whether a direction is free.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.identifiability.contraction import (
     Known,
@@ -20,23 +23,42 @@ from lcopa_bayes.identifiability.contraction import (
     prior_draws,
     prior_spread,
 )
-from lcopa_bayes.identifiability.curvature import Curvature, Sensitivities, curvature, sensitivities
-from lcopa_bayes.identifiability.delays import Delays, delays
-from lcopa_bayes.identifiability.printedform import printed_structure
+from lcopa_bayes.identifiability.curvature import (
+    Curvature,
+    Delays,
+    Sensitivities,
+    curvature,
+    delays,
+    sensitivities,
+)
 from lcopa_bayes.identifiability.profile import Profile, profile
 from lcopa_bayes.identifiability.radial import Radial, radial
-from lcopa_bayes.identifiability.symmetries import DIFFERENCED, TOLERANCES, Structure, exchanges, structure
+from lcopa_bayes.identifiability.symmetries import (
+    DIFFERENCED,
+    TOLERANCES,
+    Structure,
+    exchanges,
+    printed_structure,
+    structure,
+)
 from lcopa_bayes.identifiability.verdict import Finding, judged
 from lcopa_bayes.inference.likelihood import Landscape, Peak
-from lcopa_bayes.inference.optimum import find_optima
+from lcopa_bayes.inference.optimum import Optimum, find_optima
 from lcopa_bayes.inference.parameter import Parameter
+from lcopa_bayes.inference.surrogate import Surrogate
 from lcopa_bayes.model.effects.effect import UnstableError
+from lcopa_bayes.results.adequacy import unresolved
 from lcopa_bayes.results.predictive import Predictive
-from lcopa_bayes.results.resonance import unresolved
 from lcopa_bayes.results.sensitivity import sensitivity
+from lcopa_bayes.sampling.draws import Draws
 
-_POINTS = 24
-"""Prior draws at which symmetries are sought, besides likely ones."""
+_POINTS, _FEWER = 24, 6
+"""Prior draws at which symmetries are sought, besides likely ones, and with effects, whose slopes cost a
+second each."""
+_TRIED = 128
+"""Draws at which a surrogate is compared with the posterior [-]."""
+_ASTRAY = 1.0
+"""Standard deviation of the difference of their log likelihoods from which it is not used [nat]."""
 _WITNESSES = 400
 """Draws that profiles are started from."""
 _CLIMBED = 8
@@ -110,9 +132,7 @@ class Audit:
 
 def _structure(structure: Structure) -> dict[str, Any]:
     return {
-        "parameters": structure.parameters,
-        "rank": structure.rank,
-        "certain": structure.certain,
+        **attributes(structure, "parameters", "rank", "certain"),
         "singular_values": structure.singular,
         "symmetries": [symmetry.as_json() for symmetry in structure.symmetries],
     }
@@ -125,14 +145,20 @@ def audit(fit: Predictive, *, jobs: int = 1) -> Audit:
     with threadpool_limits(1):
         prior = prior_draws(landscape, rng)
         spread = prior_spread(landscape, prior)
-        optima = np.array([o.values for o in find_optima(posterior, rng)]).reshape(-1, prior.shape[1])
         thinned = fit.draws.thinned(_WITNESSES)
-        likely = thinned[np.argsort(-landscape.log_likelihood(thinned))[:_CLIMBED]]
+        near = None if posterior.simulation is None else _near(landscape, fit.draws, rng, jobs)
+        ground = near or landscape
+        ranked = thinned[np.argsort(-ground.log_likelihood(thinned))]
+        likely = ranked[:_CLIMBED]
+        optima = np.empty((0, prior.shape[1]))
+        if near is None:
+            optima = np.array([o.values for o in find_optima(posterior, rng)]).reshape(-1, prior.shape[1])
         starts = np.concatenate([optima, likely])
-        peak = max((landscape.maximise(v) for v in starts), key=lambda peak: peak.log_likelihood)
+        peak = max((ground.maximise(v) for v in starts), key=lambda peak: peak.log_likelihood)
         known = known_best(fit.draws, prior, fit.problem.scales.span, time_unit=fit.study.time_unit)
-    profiles, peak = _profiles(landscape, peak, np.concatenate([thinned, optima]), jobs)
-    points = _points(landscape, (*prior[:_POINTS], *likely)) if landscape.least.columns else []
+    profiles, peak = _profiles(ground, peak, np.concatenate([thinned, optima]), jobs)
+    count = _POINTS if posterior.simulation is None else _FEWER
+    points = _points(landscape, (*prior[:count], *likely[:count])) if landscape.least.columns else []
     symmetric, curved, moved, printed = Structure((), 0, 0, True, np.empty(0)), None, None, None
     if points:
         tolerances = TOLERANCES if posterior.simulation is None else DIFFERENCED
@@ -143,7 +169,7 @@ def audit(fit: Predictive, *, jobs: int = 1) -> Audit:
         printed = printed_structure(points, rng)
         curved = curvature(landscape, peak.values, spread)
         moved = radial(landscape, peak, spread, curved.directions[-1], _RADIUS)
-    believed = beliefs(landscape, fit.draws, spread, sensitivity(fit.draws, posterior))
+    believed = beliefs(landscape, fit.draws, spread, sensitivity(fit.draws, ground.posterior))
     rows = [posterior.table.rows[k] for k in landscape.free]
     scales = fit.problem.scales
     fast = unresolved(fit.draws, scales.period)
@@ -155,7 +181,37 @@ def audit(fit: Predictive, *, jobs: int = 1) -> Audit:
         for profile, belief, row in zip(profiles, believed, rows, strict=True)
     )
     apart = delays(fit.study, posterior.table, peak.values)
-    return Audit(fit, findings, symmetric, printed, curved, moved, known, apart, peak)
+    return Audit(
+        fit=fit,
+        findings=findings,
+        structure=symmetric,
+        printed=printed,
+        curvature=curved,
+        radial=moved,
+        known=known,
+        delays=apart,
+        peak=peak,
+    )
+
+
+def _near(landscape: Landscape, draws: Draws, rng: np.random.Generator, jobs: int) -> Landscape | None:
+    """The likelihood of a plant with effects by a surrogate about its draws; None where it does not hold.
+
+    A profile asks for the likelihood 100 000 times; its points are evaluated by the posterior itself.
+    """
+    posterior, flat = landscape.posterior, draws.flat
+    z = posterior.coordinates(flat)
+    best = flat[np.argmax(draws.log_density.ravel())]
+    about = Optimum(best, np.cov(z.T), float(draws.log_density.max()))
+    tried = draws.thinned(_TRIED)
+    with workers(None, jobs=jobs) as crew:
+        surrogate = Surrogate.of(posterior, about, rng, crew.map)
+        parts = np.array_split(tried, max(1, _TRIED // 16))
+        exact = np.concatenate(list(crew.map(posterior.joint_log_likelihood, parts)))
+    if surrogate is None:
+        return None
+    near = Landscape.about(replace(posterior, surrogate=surrogate), flat)
+    return near if float(np.std(exact - near.log_likelihood(tried))) < _ASTRAY else None
 
 
 def _points(landscape: Landscape, values: Iterable[Vector]) -> list[Sensitivities]:
@@ -187,7 +243,7 @@ def _profiles(landscape: Landscape, peak: Peak, witnesses: Matrix, jobs: int) ->
         better = top.best - peak.log_likelihood
         if better > 0:
             peak = Peak(top.top, top.best)
-        if better <= _BETTER:
+        if better <= _BETTER or landscape.precision is not None:
             break
     return [replace(profile, best=max(peak.log_likelihood, profile.best)) for profile in profiles], peak
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import rankdata
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.core.estimate import Estimate, plain
+from lcopa_bayes.core.estimate import Estimate, attributes, plain
 from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.likelihood import Landscape
 from lcopa_bayes.inference.parameter import Parameter
@@ -120,11 +120,7 @@ class Known:
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
         fields: dict[str, Any] = self.estimate.as_json() | plain(
-            {
-                "relative_width": self.relative_width,
-                "prior_relative_width": self.prior_relative_width,
-                "verdict": self.verdict,
-            }
+            attributes(self, "relative_width", "prior_relative_width", "verdict")
         )
         return fields
 
@@ -173,13 +169,13 @@ def beliefs(
         order = [q for q in np.argsort(-np.abs(spearman[p])) if q != p and abs(spearman[p, q]) >= _COMPANION]
         out.append(
             Belief(
-                name,
-                float(1 - columns[:, p].var() / prior_sd[k] ** 2),
-                tuple(names[q] for q in order),
-                tuple(float(spearman[p, q]) for q in order),
-                modes.get(name, 1),
-                by_name.get(name),
-                estimates[name],
+                parameter=name,
+                contraction=float(1 - columns[:, p].var() / prior_sd[k] ** 2),
+                companions=tuple(names[q] for q in order),
+                correlations=tuple(float(spearman[p, q]) for q in order),
+                modes=modes.get(name, 1),
+                sensitivity=by_name.get(name),
+                estimate=estimates[name],
             )
         )
     return tuple(out)

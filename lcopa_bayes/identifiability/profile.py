@@ -12,7 +12,7 @@ import numpy as np
 from scipy.stats import chi2, t
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.core.estimate import LEVEL, plain
+from lcopa_bayes.core.estimate import LEVEL, attributes, plain
 from lcopa_bayes.inference.likelihood import Landscape, Peak
 from lcopa_bayes.inference.posterior import Posterior
 
@@ -157,9 +157,7 @@ class Profile:
                 "searched": self.ends,
                 "nuisance_at_bound": self.at_bound,
                 "nuisance_moving": self.moving,
-                "parts": self.parts,
-                "values": self.values,
-                "fall": self.fall,
+                **attributes(self, "parts", "values", "fall"),
             }
         )
 
@@ -174,6 +172,7 @@ def profile(landscape: Landscape, k: int, peak: Peak, witnesses: Matrix, first_s
     return _Path(landscape, k, peak, witnesses).run(first_step)
 
 
+@final
 class _Path:
     """Points of one profile under construction."""
 
@@ -195,12 +194,18 @@ class _Path:
             self.extend(self.start, side, first_step)
             self.seek(side)
         self.refine()
-        for at in (sorted(self.points), sorted(self.points, reverse=True)):
-            for near, far in pairwise(at):  # from either end through to the other
-                self.improve(far, self.points[near].values)
-        self.from_draws()
-        self.extend_ends()
-        self.refine()
+        if self.landscape.precision is None:  # else of one mode, and from the posterior itself at the end
+            for at in (sorted(self.points), sorted(self.points, reverse=True)):
+                for near, far in pairwise(at):  # from either end through to the other
+                    self.improve(far, self.points[near].values)
+            self.from_draws()
+            self.extend_ends()
+            self.refine()
+        else:
+            points = list(self.points.values())
+            levels = self.landscape.exact(np.array([point.values for point in points])).tolist()
+            renewed = [Peak(point.values, level) for point, level in zip(points, levels, strict=True)]
+            self.points = dict(zip(self.points, renewed, strict=True))
         return self.profile()
 
     def solve(self, u: float, start: Vector, *, most: int = 60) -> Peak:

@@ -7,7 +7,7 @@ from typing import Any, Literal, final
 
 import numpy as np
 
-from lcopa_bayes.core.estimate import LEVEL, plain
+from lcopa_bayes.core.estimate import LEVEL, attributes, plain
 from lcopa_bayes.identifiability.contraction import Belief, Tolerance
 from lcopa_bayes.identifiability.curvature import Curvature
 from lcopa_bayes.identifiability.profile import Profile
@@ -51,9 +51,7 @@ class Finding:
             {
                 "name": self.profile.parameter,
                 "unit": self.profile.unit,
-                "verdict": self.verdict,
-                "reason": self.reason,
-                "partners": self.partners,
+                **attributes(self, "verdict", "reason", "partners"),
                 "profile": self.profile.as_json(),
                 "contraction": self.belief.contraction,
                 "relative_sd": self.relative_sd,

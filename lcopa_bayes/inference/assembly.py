@@ -53,8 +53,8 @@ class Problem:
         """The study's effects with their scales stated, so that other records do not change these."""
         if self.ranges is None:
             return self.study.effects
-        told = dict(zip(self.ranges.names, self.ranges.response.tolist(), strict=True))
-        return replace(self.study.effects, deflection=told, speed=self.ranges.speed)
+        deflections = dict(zip(self.ranges.names, self.ranges.response.tolist(), strict=True))
+        return replace(self.study.effects, deflection=deflections, speed=self.ranges.speed)
 
     def driven(self, drive: Driven, times: Vector) -> ForwardModel:
         """The model that simulates a drive, read at `times` [time unit], in the middle of the campaign."""

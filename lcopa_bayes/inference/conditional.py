@@ -32,6 +32,7 @@ _QUARTERS = (0.1587, 0.8413)
 """Quantiles of a prior one standard deviation apart from the middle, were it normal."""
 
 
+@final
 class Element(NamedTuple):
     """An element of the plant among the coordinates."""
 
@@ -50,6 +51,7 @@ class Element(NamedTuple):
         return slice(self.first, self.first + len(self.free))
 
 
+@final
 class Expanded(NamedTuple):
     """Expansions of the log likelihood about points, (batch, ...)."""
 
@@ -220,15 +222,15 @@ class Conditional:
 
     def expanded(self, values: Matrix) -> Expanded:
         """Expansions about table values."""
-        found = expanded(self.posterior, values, self.columns)
+        expansion = expanded(self.posterior, values, self.columns)
         steep = self.steepness(values)
         return Expanded(
-            values,
-            self.x(values),
-            found.log_likelihood,
-            (steep.swapaxes(1, 2) @ found.gradient[..., None])[..., 0],
-            steep.swapaxes(1, 2) @ found.information @ steep,
-            steep,
+            values=values,
+            x=self.x(values),
+            log_likelihood=expansion.log_likelihood,
+            gradient=(steep.swapaxes(1, 2) @ expansion.gradient[..., None])[..., 0],
+            information=steep.swapaxes(1, 2) @ expansion.information @ steep,
+            steepness=steep,
         )
 
     def _objective(self, at: Expanded) -> tuple[Vector, Matrix, Array]:

@@ -120,13 +120,13 @@ def record_ranges(study: Study, layout: Layout, scales: Scales) -> Ranges:
     speeds = [speed for one in samples for i in range(response.size) if (speed := _speed(one, i)) > 0]
     speed = study.effects.speed or min(speeds, default=scales.span)
     return Ranges(
-        drive,
-        np.where(response > 0, response, 1.0),
-        scales.period,
-        scales.span,
-        float(speed),
-        direct,
-        tuple(axis.name for axis in layout.responses),
+        drive=drive,
+        response=np.where(response > 0, response, 1.0),
+        period=scales.period,
+        span=scales.span,
+        speed=float(speed),
+        direct=direct,
+        names=tuple(axis.name for axis in layout.responses),
     )
 
 

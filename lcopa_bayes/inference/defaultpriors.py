@@ -51,9 +51,8 @@ import numpy as np
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.data.drive import first_change
 from lcopa_bayes.data.record import Record
-from lcopa_bayes.inference.observations import Observed, Samples, sampling_period
+from lcopa_bayes.inference.observations import Observed, QuietNoise, Samples, quiet_noise, sampling_period
 from lcopa_bayes.inference.priors import Prior
-from lcopa_bayes.inference.restnoise import QuietNoise, quiet_noise
 
 _TIMES = 20.0
 """Correlation times of the noise that fit into a record at least [-]."""
@@ -97,13 +96,13 @@ class Scales:
         samples = [Samples.of(record, period) for record in records]
         moved = np.max([np.abs(record.drive - record.drive[0]).max(axis=0) for record in records], axis=0)
         return cls(
-            float(max(spans)),
-            period,
-            np.where(amplitude > 0, amplitude, 1.0),
-            np.nanmean(response, axis=0),
-            np.where(moved > 0, moved, 1.0),
-            np.max([np.abs(record.drive[0]) for record in records], axis=0),
-            tuple(tuple(one.quiet(axis) for one in samples) for axis in range(response.shape[1])),
+            span=float(max(spans)),
+            period=period,
+            amplitude=np.where(amplitude > 0, amplitude, 1.0),
+            level=np.nanmean(response, axis=0),
+            excursion=np.where(moved > 0, moved, 1.0),
+            resting=np.max([np.abs(record.drive[0]) for record in records], axis=0),
+            at_rest=tuple(tuple(one.quiet(axis) for one in samples) for axis in range(response.shape[1])),
         )
 
     def gain(self, response: int, drive: int) -> Prior:

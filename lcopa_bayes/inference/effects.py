@@ -1,14 +1,14 @@
 """A posterior's model with effects: responses, signatures and Jacobians in the table's values.
 
-    made = effected(problem.posterior, values, [OddCurvature(), Vibration(frequency=0.1)])
-    made.responses(values, psi)    # list per record, (samples, axes); at made.vanishing the base model's
-    made.signature(values)         # list per record, (samples, axes, psi): derivative at psi = 0
-    made.jacobian(values, psi)     # list per record, (samples, axes, rows of the table)
-    made.coefficients              # name, unit, prior scale, sign, effect and record of every psi
+    model = effected(problem.posterior, values, [OddCurvature(), Vibration(frequency=0.1)])
+    model.responses(values, psi)    # list per record, (samples, axes); at model.vanishing the base model's
+    model.signature(values)         # list per record, (samples, axes, psi): derivative at psi = 0
+    model.jacobian(values, psi)     # list per record, (samples, axes, rows of the table)
+    model.coefficients              # name, unit, prior scale, sign, effect and record of every psi
 
-An effect instance holds its internal constants; ``CubicStiffness.grid(made.ranges)`` lists those worth
+An effect instance holds its internal constants; ``CubicStiffness.grid(model.ranges)`` lists those worth
 trying and `lcopa_bayes.model.effects.catalogue` the classes by name. For records held out,
-``made.over(model, samples, epochs)`` is the same with other records, and `carried` moves psi over.
+``model.over(model, samples, epochs)`` is the same with other records.
 Samples an axis misses are filled too: choose with ``samples[r].axes[a].index``.
 """
 
@@ -82,15 +82,15 @@ class Effected:
         """What every entry of psi is."""
         out = []
         for e, effect in enumerate(self.effects):
-            told = effect.coefficients(self.ranges)
+            own = effect.coefficients(self.ranges)
             if effect.card.per_record:
                 out += [
                     Placed(f"{effect.name}.{one.name}[{record}]", one, e, r)
                     for r, record in enumerate(self.records)
-                    for one in told
+                    for one in own
                 ]
             else:
-                out += [Placed(f"{effect.name}.{one.name}", one, e, None) for one in told]
+                out += [Placed(f"{effect.name}.{one.name}", one, e, None) for one in own]
         return tuple(out)
 
     def with_effects(self, effects: Sequence[Effect]) -> Effected:
@@ -130,14 +130,14 @@ class Effected:
         slopes = plant_slopes(self.simulator, self.plant(values), at)
         out = []
         for r, slope in enumerate(slopes):
-            made = np.zeros((*next(iter(slope.values())).shape, len(table.rows)))
+            jacobian = np.zeros((*next(iter(slope.values())).shape, len(table.rows)))
             for k, row in enumerate(table.rows):
                 first, second = row.place
                 if (row.kind, first, second) in slope:
-                    made[..., k] = slope[row.kind, first, second]
+                    jacobian[..., k] = slope[row.kind, first, second]
                 elif row.kind == "offset" and self.offsets is not None and second in (-1, self.offsets[r]):
-                    made[:, first, k] = 1.0
-            out.append(made)
+                    jacobian[:, first, k] = 1.0
+            out.append(jacobian)
         return out
 
 
@@ -166,12 +166,6 @@ def effected(
     ranges = ranges_of(posterior.model, plant_of(posterior.table, values, fit, n), times)
     simulator = Simulator(posterior.model, tuple(effects), ranges, at, times)
     return Effected(posterior.table, simulator, names, fit)
-
-
-def carried(psi: Vector, source: Effected, target: Effected) -> Vector:
-    """psi for the same effects over other records; coefficients of one record vanish."""
-    shared = {one.name: value for one, value in zip(source.coefficients, psi, strict=True)}
-    return np.array([shared.get(one.name, 0.0) if one.record is None else 0.0 for one in target.coefficients])
 
 
 def effect_slopes(

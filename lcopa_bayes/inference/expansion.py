@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -15,6 +15,7 @@ _PORTION = 64
 """Parameter sets expanded at once."""
 
 
+@final
 class Expansion(NamedTuple):
     """``log_likelihood + gradient x - x' information x / 2`` for small x, for a batch."""
 
@@ -103,6 +104,7 @@ def expanded(posterior: Posterior, values: Matrix, columns: Sequence[int]) -> Ex
     return Expansion(total, gradient, information)
 
 
+@final
 class _Series(NamedTuple):
     """A derivative of a response axis, or what a unit of a gain or an offset adds to it."""
 

@@ -184,10 +184,7 @@ class LeastSquares:
             elif row.kind == "time" and not row.log_scale:
                 jacobian[:, k] /= raw[k]
         rows, prior = self._prior_rows(raw)
-        return (
-            np.concatenate([*parts, prior]),
-            np.concatenate([jacobian, rows])[:, self.columns],
-        )
+        return (np.concatenate([*parts, prior]), np.concatenate([jacobian, rows])[:, self.columns])
 
     def _plain(self, values: Matrix) -> Iterator[tuple[int, Observed, Matrix, Vector]]:
         """Response axis, samples, slopes in the table's rows (times in their logarithms) and misfit (model
@@ -253,9 +250,9 @@ class LeastSquares:
         UnstableError where effects leave no bounded response at the start.
         """
         bounds = self.bounds_around(values)
-        found = self.search(np.clip(self.coordinates(values), *bounds), values, bounds)
-        solution = self.posterior.table.canonical(self.values(found.x, values)[None])[0]
-        return solution, np.asarray(found.jac)
+        optimum = self.search(np.clip(self.coordinates(values), *bounds), values, bounds)
+        solution = self.posterior.table.canonical(self.values(optimum.x, values)[None])[0]
+        return solution, np.asarray(optimum.jac)
 
     def search(
         self,

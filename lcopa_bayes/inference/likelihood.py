@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import final
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares, minimize
 
 from lcopa_bayes.core.arrays import Matrix, Vector
@@ -27,6 +28,8 @@ _STIFFNESS = 1e3
 """Weight of a residual row that keeps orders decreasing [-]: a force of 1 moves them by 1e-6."""
 _EVALUATIONS = 60
 _ROUNDS = 12
+_NUDGE, _LEVEL = 1e-4, 0.03
+"""Step of a difference and slope at which a maximum is reached, per standard deviation [-], [nat]."""
 _GAINED = 1e-3
 """Rounds between plant and noise end when the log likelihood gains less [nat]."""
 
@@ -52,6 +55,18 @@ class Landscape:
     """
 
     posterior: Posterior
+    precision: Matrix | None = None
+    """Of the free parameters in their coordinates, (free, free), with a surrogate, whose maxima are sought in
+    all parameters at once; None without."""
+
+    @classmethod
+    def about(cls, posterior: Posterior, values: Matrix) -> Landscape:
+        """With the precision of draws (draws, rows) where a surrogate stands for the posterior."""
+        plain = cls(posterior)
+        if posterior.surrogate is None:
+            return plain
+        columns = np.stack([plain.column(k, values) for k in plain.free])
+        return replace(plain, precision=np.asarray(np.linalg.inv(np.cov(columns)), dtype=float))
 
     @cached_property
     def free(self) -> tuple[int, ...]:
@@ -103,6 +118,8 @@ class Landscape:
 
         Plant and noise parameters are maximised in turn until nothing is gained.
         """
+        if self.precision is not None:
+            return self._jointly(start, held)
         noise_moves = any(k not in self.least.columns and k != held for k in self.free)
         values, best = start, -np.inf
         for _ in range(_ROUNDS if noise_moves else 1):
@@ -114,6 +131,49 @@ class Landscape:
             if gained < _GAINED:
                 break
         return Peak(values, best)
+
+    def exact(self, values: Matrix) -> Vector:
+        """`log_likelihood` of the posterior itself where a surrogate stands for it, (batch,) [nat]."""
+        plain = replace(self.posterior, surrogate=None)
+        return plain.joint_log_likelihood(self.posterior.table.canonical(values))
+
+    def _jointly(self, start: Vector, held: int | None) -> Peak:
+        """A maximum near `start` under a surrogate, which costs little: Newton's steps in coordinates in
+        which the likelihood falls alike in all directions."""
+        assert self.precision is not None
+        moving = [p for p, k in enumerate(self.free) if k != held]
+        rows, columns = (
+            [self.posterior.table.rows[self.free[p]] for p in moving],
+            [self.free[p] for p in moving],
+        )
+        root = np.linalg.cholesky(self.precision[np.ix_(moving, moving)])
+        begin = np.array([row.coordinate(start[k]) for row, k in zip(rows, columns, strict=True)])
+        low, high = np.array([self.search(k) for k in columns]).T
+        steps = np.concatenate([np.zeros((1, len(moving))), _NUDGE * np.eye(len(moving))])
+
+        def at(t: Matrix) -> Matrix:
+            x = np.clip(begin + solve_triangular(root.T, t.T).T, low, high)  # the search ends there
+            values = np.tile(start, (len(t), 1))
+            for k, row, column in zip(columns, rows, x.T, strict=True):
+                values[:, k] = row.value_at(column)
+            return self.posterior.table.canonical(values)
+
+        def cost(t: Vector) -> tuple[float, Vector]:
+            levels = -self.log_likelihood(at(t + steps))
+            return float(levels[0]), (levels[1:] - levels[0]) / _NUDGE
+
+        def curvature(t: Vector) -> Matrix:
+            return np.eye(t.size)
+
+        found = minimize(
+            cost,
+            np.zeros(len(moving)),
+            jac=True,
+            hess=curvature,
+            method="trust-exact",
+            options={"gtol": _LEVEL, "initial_trust_radius": 3.0, "maxiter": _ROUNDS},
+        )
+        return Peak(at(found.x[None])[0], -float(found.fun))
 
     def at_bound(self, values: Vector, *, but: int | None = None) -> tuple[str, ...]:
         """Names of the free parameters that stand at an end of their search."""
@@ -145,7 +205,7 @@ class Landscape:
             if not np.isfinite(both(start, slopes=False)[0]).all():
                 return values
             functions = (lambda x: both(x, slopes=False)[0]), start, lambda x: both(x)[1]
-        found = least_squares(
+        optimum = least_squares(
             *functions,
             bounds=(ends[0], ends[1]),
             x_scale="jac",
@@ -154,7 +214,7 @@ class Landscape:
             xtol=1e-7,
             gtol=1e-7,
         )
-        whole[moving] = found.x
+        whole[moving] = optimum.x
         raw = least.values(whole, values)
         # a held time or order stays that of its own term: merged terms must not change places
         own = held is not None and table.rows[held].kind in ("time", "order")
@@ -224,14 +284,14 @@ class Landscape:
                 at = out.copy()
                 for k, coordinate in zip(moving, x, strict=True):
                     at[k] = self.value(k, coordinate)
-                told = [posterior.noise.pointwise(part, at[None, rows], gaps) for part, gaps in left]
-                return -float(sum(density.sum() for density in told))
+                densities = [posterior.noise.pointwise(part, at[None, rows], gaps) for part, gaps in left]
+                return -float(sum(density.sum() for density in densities))
 
             ends = [self.search(k) for k in moving]
             start = [
                 float(np.clip(self.coordinate(k, out[k]), *e)) for k, e in zip(moving, ends, strict=True)
             ]
-            found = minimize(cost, start, method="L-BFGS-B", bounds=ends, options={"ftol": 1e-12})
-            for k, coordinate in zip(moving, found.x, strict=True):
+            optimum = minimize(cost, start, method="L-BFGS-B", bounds=ends, options={"ftol": 1e-12})
+            for k, coordinate in zip(moving, optimum.x, strict=True):
                 out[k] = self.value(k, float(coordinate))
         return out

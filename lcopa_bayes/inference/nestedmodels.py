@@ -94,8 +94,8 @@ class _Lift:
         own, theirs = getattr(self.large.layout, of), getattr(self.small.layout, of)
         paths = [(i, j) for i, line in enumerate(own) for j, used in enumerate(line) if used == slot]
         acting = [(i, j) for i, j in paths if self.small.rows[self.small.at("gain", i, j)].value != 0.0]
-        found = {theirs[i][j] for i, j in acting or paths}
-        return found.pop() if len(found) == 1 else None
+        elements = {theirs[i][j] for i, j in acting or paths}
+        return elements.pop() if len(elements) == 1 else None
 
     def _gains(self, values: Matrix, out: Matrix) -> bool:
         for k in self.large.of_kind("gain"):
@@ -145,14 +145,14 @@ class _Lift:
             own = {
                 row.kind: k for k, row in enumerate(self.small.rows) if row.noise and row.place.first == axis
             }
-            told = {name: values[:, k] for name, k in own.items()}
+            columns = {name: values[:, k] for name, k in own.items()}
             if self.small_noise == "ar1" and self.large_noise == "white+ar1":
-                told |= {"sigma_ar": told["sigma"], "sigma": _HARDLY * told["sigma"]}
+                columns |= {"sigma_ar": columns["sigma"], "sigma": _HARDLY * columns["sigma"]}
             elif self.small_noise != self.large_noise:
-                sd = told["sigma"]
+                sd = columns["sigma"]
                 white = [target.noise.nearly_white(float(one)) for one in sd]
-                told = {name: np.array([one[name] for one in white]) for name in target.noise.names}
-            for name, column in told.items():
+                columns = {name: np.array([one[name] for one in white]) for name in target.noise.names}
+            for name, column in columns.items():
                 out[:, self.large.at(name, axis)] = column
         return True
 

@@ -94,18 +94,18 @@ class NoiseFit:
         if not self.free or power == 0.0:
             return template
         sd = float(np.sqrt(power / sum(residual.size for residual in self.residuals)))
-        found = [
+        optima = [
             minimize(
                 self._cost,
-                self._start(told),
+                self._start(estimates),
                 args=(template,),
                 jac=True,
                 method="L-BFGS-B",
                 bounds=list(zip(*self.ends, strict=True)),
             )
-            for told in (self.noise.estimate(self.residuals), self.noise.nearly_white(sd))
+            for estimates in (self.noise.estimate(self.residuals), self.noise.nearly_white(sd))
         ]
-        x = min(found, key=lambda one: float(one.fun)).x
+        x = min(optima, key=lambda one: float(one.fun)).x
         return np.asarray(self.values(x[None], template)[0])
 
     def covariance(self, values: Vector) -> Matrix:
@@ -124,12 +124,12 @@ class NoiseFit:
         sizes = np.maximum(sizes, 12 / np.square(high - low).max(initial=0.0))
         return np.asarray(directions / sizes @ directions.T)
 
-    def _start(self, told: Mapping[str, float]) -> Vector:
+    def _start(self, estimates: Mapping[str, float]) -> Vector:
         """Coordinates of starting values, moved inside the ends of the search."""
         out = []
         for column, k in enumerate(self.free):
             row, ends = self.rows[k], [end[column] for end in self.ends]
-            value = np.array([told[self.noise.names[k]]])
+            value = np.array([estimates[self.noise.names[k]]])
             inside = row.domain[0] < value[0] < row.domain[1]
             at = row.coordinate(value)[0] if inside else ends[int(value[0] >= row.domain[1])]
             out.append(float(np.clip(at, *ends)))

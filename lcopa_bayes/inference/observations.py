@@ -1,4 +1,7 @@
-"""Observed samples of a set of records, arranged for the likelihood."""
+"""Observed samples of a set of records, arranged for the likelihood.
+
+What samples at rest say about white measurement noise and a correlated part.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +11,11 @@ from functools import cached_property
 from typing import final
 
 import numpy as np
+from scipy.special import expit
 
 from lcopa_bayes.core.arrays import Flags, Index, Matrix, Vector
 from lcopa_bayes.data.record import Record
+from lcopa_bayes.inference.noise import WhiteAR1
 
 _ROUNDED = 1e-4
 """Deviation from whole sampling periods that rounded time stamps explain [sampling periods]."""
@@ -120,3 +125,125 @@ def sampling_period(records: Sequence[Record]) -> float:
     """Median time between samples over the records [time unit]; the unit in which noise correlates."""
     steps = [np.diff(record.time[~np.isnan(record.response).all(axis=1)]) for record in records]
     return float(np.median(np.concatenate(steps)))
+
+
+FEWEST = 8
+"""Independent deviations from rest below which nothing is derived from them [-]: with 8 a standard deviation
+is known to a quarter."""
+_LEVELS = 5
+"""Different readings at rest below which their scatter is the resolution of the instrument [-]."""
+_SHARES = expit(np.linspace(-6.0, 6.0, 25))
+"""Shares of the correlated part in the variance that are tried [-]."""
+_CORRELATIONS = 12
+"""Correlations that are tried [-]."""
+_DRAWS = 4000
+_UPPER = 0.975
+"""Probability that the correlated part is below its limit, at rest [-]."""
+_CELLS = 2_000_000
+"""Samples times parameter sets that are whitened at once [-]."""
+
+
+@final
+@dataclass(frozen=True)
+class QuietNoise:
+    """Noise of one response axis as its samples at rest give it."""
+
+    samples: int
+    """Samples less one level for each record [-]."""
+    sigma: float
+    """Posterior median of the white part's standard deviation [response unit]."""
+    log_sd: float
+    """Posterior standard deviation of its logarithm [-]."""
+    correlated: float
+    """97.5 % limit of the correlated part's standard deviation [response unit]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class PlausibleNoise:
+    """Posterior of `WhiteAR1` given pieces of it, over a grid of shares and correlations.
+
+    Flat priors of the level of each piece and of the logarithm of the standard deviation, both integrated out
+    in closed form.
+    """
+
+    shapes: Matrix
+    """Parameters of unit variance, (grid, 3): standard deviation of the white and of the correlated part,
+    correlation."""
+    weights: Vector
+    """Probability of each, (grid,) [-]."""
+    squares: Vector
+    """Squares of the whitened pieces about their levels under each, (grid,) [response unit^2]."""
+    count: int
+    """Samples less one level for each piece [-]."""
+
+    @classmethod
+    def of(cls, pieces: Sequence[Observed], shapes: Matrix, log_prior: Vector) -> PlausibleNoise:
+        """From pieces of two samples or more; ValueError with none."""
+        count = sum(piece.values.size - 1 for piece in pieces)
+        if not count:
+            raise ValueError("a noise scale needs a piece of two samples or more")
+        level, squares = np.zeros(len(shapes)), np.zeros(len(shapes))
+        for piece in pieces:
+            portions = np.array_split(
+                np.arange(len(shapes)), max(1, len(shapes) * piece.values.size // _CELLS)
+            )
+            parts = [_about_own_level(piece, shapes[portion]) for portion in portions if portion.size]
+            level += np.concatenate([one[0] for one in parts])
+            squares += np.concatenate([one[1] for one in parts])
+        weight = level - 0.5 * count * np.log(squares) + log_prior
+        weight = np.exp(weight - weight.max())
+        return cls(shapes, weight / weight.sum(), squares, count)
+
+    @property
+    def estimate(self) -> Vector:
+        """The parameters of largest probability, (3,)."""
+        k = int(np.argmax(self.weights))
+        scale = np.sqrt(self.squares[k : k + 1] / self.count)
+        return np.asarray(self._scaled(self.shapes[k : k + 1], scale)[0])
+
+    def draw(self, size: int, rng: np.random.Generator) -> Matrix:
+        """Parameters, (size, 3)."""
+        chosen = rng.choice(len(self.weights), size, p=self.weights)
+        scale = np.sqrt(self.squares[chosen] / rng.chisquare(self.count, size))
+        return self._scaled(self.shapes[chosen], scale)
+
+    @staticmethod
+    def _scaled(shapes: Matrix, scale: Vector) -> Matrix:
+        return np.column_stack([scale * shapes[:, 0], scale * shapes[:, 1], shapes[:, 2]])
+
+
+def mixed_shapes(correlations: tuple[float, float]) -> tuple[Matrix, Vector]:
+    """Grid of shares of the correlated part and of its correlation between two `correlations`, (grid, 3), and
+    the logarithm of a prior that is uniform in both, (grid,)."""
+    tried = np.linspace(*correlations, _CORRELATIONS)
+    shares, rho = (grid.ravel() for grid in np.meshgrid(_SHARES, tried))
+    shapes = np.column_stack([np.sqrt(1 - shares), np.sqrt(shares), rho])
+    return shapes, np.log(shares * (1 - shares))
+
+
+def quiet_noise(pieces: Sequence[Observed], correlations: tuple[float, float]) -> QuietNoise | None:
+    """Posterior of `WhiteAR1` from samples at rest, the level of each piece unknown; None where too few.
+
+    The share of the correlated part in the variance and its correlation between two `correlations` have
+    uniform priors (`mixed_shapes`).
+    """
+    count = sum(piece.values.size - 1 for piece in pieces)
+    readings = {value for piece in pieces for value in piece.values}
+    if count < FEWEST or len(readings) < _LEVELS:
+        return None
+    drawn = PlausibleNoise.of(pieces, *mixed_shapes(correlations)).draw(_DRAWS, np.random.default_rng(0))
+    sigma, sigma_ar = drawn[:, 0], drawn[:, 1]
+    limit = float(np.quantile(sigma_ar, _UPPER))
+    return QuietNoise(count, float(np.median(sigma)), float(np.log(sigma).std()), limit)
+
+
+def _about_own_level(piece: Observed, parameters: Matrix) -> tuple[Vector, Vector]:
+    """Log density of a piece under noise of unit variance, its level integrated out, without the sum of
+    squares, and that sum, each (batch,)."""
+    columns = np.stack([np.ones_like(piece.values), piece.values - piece.values.mean()])[None]
+    white, scales = WhiteAR1().whiten(columns, parameters, piece.gaps)
+    ones, misfit = white[:, 0], white[:, 1]
+    strength = np.einsum("bn,bn->b", ones, ones)
+    squares = np.einsum("bn,bn->b", misfit, misfit) - np.einsum("bn,bn->b", ones, misfit) ** 2 / strength
+    return -scales - 0.5 * np.log(strength), squares

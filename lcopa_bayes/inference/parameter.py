@@ -20,6 +20,7 @@ _REJECTION = 0.1
 """Draws are rejected until inside the domain down to this mass [-], and found by inversion below it."""
 
 
+@final
 class Place(NamedTuple):
     """Where a parameter enters: (response, drive) for gains, (element, term) for times and orders,
     (slot, 0) for delays, (response, record or -1 for all) for offsets, (response, 0) for noise,

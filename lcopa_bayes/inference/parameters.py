@@ -11,7 +11,7 @@ from typing import NamedTuple, final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Flags, Index, Matrix, Vector
-from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.core.errors import InputError, nearest, refuse_if
 from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.kinds import COEFFICIENTS, KINDS
@@ -29,6 +29,7 @@ _LEAST_ORDERED = 1e-3
 """Below this mass the share is not measured to 7 % and draws are rejected for ever [-]."""
 
 
+@final
 class Terms(NamedTuple):
     """Positions of the parameters of an element, by term."""
 
@@ -344,6 +345,5 @@ def _with_priors(
         value = np.nan if setting.fixed is None else setting.fixed
         out.append(replace(row, prior=prior, value=value, default=False))
         problems += out[-1].problems
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     return out

@@ -33,6 +33,7 @@ from lcopa_bayes.model.effects.simulator import Simulator
 from lcopa_bayes.model.forward import ForwardModel, deflections
 
 
+@final
 class Simulated(NamedTuple):
     """One record under a batch of plants."""
 

@@ -12,9 +12,9 @@ import numpy as np
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.data.drive import AxisDrive, axis_drives
 from lcopa_bayes.data.record import Driven
+from lcopa_bayes.model.blockpulses import Circle
 from lcopa_bayes.model.grid import Mesh
 from lcopa_bayes.model.layout import Layout
-from lcopa_bayes.model.powerseries import Circle
 from lcopa_bayes.model.stepresponse import Slopes, StepResponse, step_response
 from lcopa_bayes.model.superposition import Phase, Superposition, blocks_of, phases
 

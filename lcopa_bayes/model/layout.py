@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, final
 
-from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.core.errors import nearest, refuse_if
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.data.settings import ModelSettings
 
 
+@final
 class ElementSlot(NamedTuple):
     """An element that one or several paths use."""
 
@@ -21,6 +22,7 @@ class ElementSlot(NamedTuple):
     """Number of viscous terms."""
 
 
+@final
 class Unit(NamedTuple):
     """Response of an element to one delayed drive, before any gain."""
 
@@ -29,6 +31,7 @@ class Unit(NamedTuple):
     drive: int
 
 
+@final
 class PathSlot(NamedTuple):
     """A path from a drive to a response."""
 
@@ -70,12 +73,12 @@ class Layout:
         terms = _terms(names, model)
         delay_names = _distinct(by_delay)
         return cls(
-            tuple(drives),
-            tuple(responses),
-            tuple(ElementSlot(name, count) for name, count in zip(names, terms, strict=True)),
-            tuple(tuple(names.index(name) for name in row) for row in by_share),
-            delay_names,
-            tuple(tuple(delay_names.index(name) for name in row) for row in by_delay),
+            drives=tuple(drives),
+            responses=tuple(responses),
+            elements=tuple(ElementSlot(name, count) for name, count in zip(names, terms, strict=True)),
+            element_of=tuple(tuple(names.index(name) for name in row) for row in by_share),
+            delays=delay_names,
+            delay_of=tuple(tuple(delay_names.index(name) for name in row) for row in by_delay),
         )
 
     @cached_property
@@ -161,6 +164,5 @@ def _terms(names: tuple[str, ...], model: ModelSettings) -> list[int]:
         for name in names
         if name not in model.terms
     ]
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     return [model.terms[name] for name in names]

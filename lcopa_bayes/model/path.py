@@ -8,12 +8,13 @@ from enum import Enum
 from math import inf, isfinite
 from typing import Self, final
 
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.errors import InputError, refuse_if
 
 _SAME = 1e-9
 """Orders closer than this are one term [-]."""
 
 
+@final
 class Normalisation(Enum):
     """Which coefficient fixes the common scale of gain, viscosities and stiffness."""
 
@@ -57,17 +58,10 @@ class TransferPath:
             problems.append(f"viscosities and stiffness must be finite, the stiffness not 0; got {self}")
         if not all(0 < order < inf for order in self.orders):
             problems.append(f"orders must be positive and finite; got {self.orders}")
-        if problems:
-            raise InputError(problems)
+        refuse_if(problems)
 
     @classmethod
-    def of_times(
-        cls,
-        gain: float,
-        delay: float,
-        times: Sequence[float],
-        orders: Sequence[float],
-    ) -> Self:
+    def of_times(cls, gain: float, delay: float, times: Sequence[float], orders: Sequence[float]) -> Self:
         """``gain exp(-delay s) / (1 + sum_i (T_i s)^order_i)``, the form in which a plant is fitted.
 
         Parameters: gain at rest [response unit per drive unit]; delay and times T_i [time unit]; orders [-].

@@ -12,8 +12,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.data.drive import AxisDrive
+from lcopa_bayes.model.blockpulses import Circle, Spectrum
 from lcopa_bayes.model.grid import Lattice
-from lcopa_bayes.model.powerseries import Circle, Spectrum
 from lcopa_bayes.model.stepresponse import Kind, StepResponse
 
 SPARE = 5
@@ -160,13 +160,7 @@ class Superposition:
         return out
 
     def _add_anywhere(
-        self,
-        out: Array,
-        response: StepResponse,
-        phase: Phase,
-        lattice: Lattice,
-        delays: Vector,
-        kind: Kind,
+        self, out: Array, response: StepResponse, phase: Phase, lattice: Lattice, delays: Vector, kind: Kind
     ) -> None:
         """Add the response to one phase at sample times of any spacing."""
         x = (lattice.times - phase.time - delays[:, None]) / lattice.step

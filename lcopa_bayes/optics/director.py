@@ -3,21 +3,75 @@
 The energy on an equal grid is ``sum K(th) (dth)^2 / h`` plus the electric term, for
 ``2 G = k1 cos^2 th + k3 sin^2 th``, in units of ``k1 / (2 thickness)``. The drive is
 ``V sqrt(deps / k1)`` [-], pi at threshold.
+
+Planar nematic cell with strong anchoring: its material and the field inside it.
+
+Convention: the tilt th is measured out of the plates, 0 for a director lying in them and pi/2 along the
+cell normal, as ``G`` and the electric term of Ta et al. 2026, Eq. 20 read it (Eq. 17 counts from the
+normal). The director stays in one plane and varies across the cell only, so the terms in ``ph_x`` of
+Eq. 20 vanish, and with them the twist constant. Position is a fraction of the cell: the thickness, which the
+paper does not give, drops out of the tilt.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 from math import isfinite, pi, sqrt
-from typing import NamedTuple, final
+from typing import Annotated, NamedTuple, final
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
 
-from lcopa_bayes.core.arrays import Matrix, Vector, frozen
-from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.optics.cell import Cell, Field
-from lcopa_bayes.optics.checks import finite
+from lcopa_bayes.core.arrays import Matrix, Vector, finite, frozen
+from lcopa_bayes.core.errors import InputError, refuse_if
+from lcopa_bayes.core.rules import POSITIVE, Rule, Ruled, is_number
+from lcopa_bayes.model.literature import PAPER, StatedOptics
+
+PRETILT = Rule(
+    "a tilt in radians, from 0 to below pi/2", lambda value: is_number(value) and 0 <= value < pi / 2
+)
+
+
+@final
+class Field(Enum):
+    """Field inside the cell."""
+
+    UNIFORM = "uniform"
+    """``dV/dz = V / d`` everywhere: the plain reading of Ta et al. 2026, Eq. 20."""
+    SELF_CONSISTENT = "self-consistent"
+    """Constant displacement ``D``, ``dV/dz = D / (eps + deps sin^2 th)``, which integrates to V."""
+
+
+@final
+@dataclass(frozen=True)
+class Cell(Ruled):
+    """Nematic of positive dielectric anisotropy between parallel plates; InputError for anything else."""
+
+    k1: Annotated[float, POSITIVE]
+    """Splay constant [N]."""
+    k3: Annotated[float, POSITIVE]
+    """Bend constant [N]."""
+    permittivity: Annotated[float, POSITIVE]
+    """eps, perpendicular to the director [F/m]."""
+    permittivity_anisotropy: Annotated[float, POSITIVE]
+    """deps [F/m]; positive, or the field would not tilt the director."""
+    pretilt: Annotated[float, PRETILT] = 0.0
+    """Tilt at both plates [rad]; the same sense on both."""
+
+    @property
+    def threshold(self) -> float:
+        """Freedericksz voltage ``pi sqrt(k1 / deps)`` [V], for no pretilt and either field."""
+        return pi * sqrt(self.k1 / self.permittivity_anisotropy)
+
+
+def paper_cell(optics: StatedOptics = PAPER.optics, *, pretilt: float = 0.0) -> Cell:
+    """Liquid crystal of Section 3.2 (Ta et al. 2026, below Eqs. 18 and 19).
+
+    `optics` holds the printed numbers; `pretilt` [rad], which the paper does not give, is free.
+    """
+    return Cell(optics.k1, optics.k3, optics.permittivity, optics.permittivity_anisotropy, pretilt)
+
 
 CELLS = 800
 """Default number of grid cells [-]; keeps the mean tilt of the paper's cell within 1.1e-5 rad up to 5 V."""
@@ -25,6 +79,7 @@ _PER_LAYER = 4
 """Least grid cells per wall layer ``sqrt(k1 / deps) / V`` [-]; coarser grids do not resolve the wall."""
 
 
+@final
 class NotConverged(RuntimeError):  # noqa: N818 - a state of the iteration, named as such
     """Newton's iteration stopped short; holds the voltage, the residual reached and the iterations."""
 
@@ -63,6 +118,7 @@ class Profile:
         return float(self.tilt.max())
 
 
+@final
 class Expansion(NamedTuple):
     """Energy over ``k1 / thickness`` and its derivatives with respect to the interior tilts."""
 
@@ -206,5 +262,4 @@ def _check(cell: Cell, voltage: float, cells: int) -> None:
     elif isfinite(voltage) and voltage * _PER_LAYER * pi > cells * cell.threshold:
         need = int(np.ceil(voltage * _PER_LAYER * pi / cell.threshold))
         problems.append(f"{cells} cells are too few at {voltage:.6g} V; use at least {need}.")
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)

@@ -9,12 +9,10 @@ from typing import final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
+from lcopa_bayes.core.arrays import Array, Matrix, Vector, finite, frozen
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.model.literature import PAPER, StatedOptics
-from lcopa_bayes.optics.cell import Cell, Field, paper_cell
-from lcopa_bayes.optics.checks import finite
-from lcopa_bayes.optics.director import CELLS, equilibrium
+from lcopa_bayes.optics.director import CELLS, Cell, Field, equilibrium, paper_cell
 
 
 @final
@@ -109,7 +107,7 @@ def best_law(curve: DirectorCurve, optics: StatedOptics = PAPER.optics) -> TiltL
     low = float(u[lower] @ mean[lower] / (u[lower] @ u[lower]))
     high, start = np.polyfit(u[upper] - optics.knee_voltage, mean[upper], 1)
     knee, limit = optics.knee_voltage, optics.largest_voltage
-    return TiltLaw(low, float(high), float(start), knee, knee, limit)
+    return TiltLaw(low=low, high=float(high), start=float(start), origin=knee, knee=knee, limit=limit)
 
 
 @final
@@ -153,12 +151,12 @@ def fit_quality(curve: DirectorCurve, law: TiltLaw, lower: float, upper: float) 
     np.divide(np.abs(error), solved, out=relative, where=solved > 0)
     relative[error == 0] = 0.0
     return FitQuality(
-        float(curve.voltage[inside][0]),
-        float(curve.voltage[inside][-1]),
-        int(inside.sum()),
-        1 - float(error @ error) / float(((solved - solved.mean()) ** 2).sum()),
-        float(relative.max()),
-        float(np.abs(error).max()),
+        lower=float(curve.voltage[inside][0]),
+        upper=float(curve.voltage[inside][-1]),
+        points=int(inside.sum()),
+        r_squared=1 - float(error @ error) / float(((solved - solved.mean()) ** 2).sum()),
+        largest_relative_error=float(relative.max()),
+        largest_error=float(np.abs(error).max()),
     )
 
 
@@ -210,23 +208,23 @@ def tilt_law_check(
     printed, continuous = printed_law(optics), continuous_law(optics)
     near = director_curve(cell, [knee - 1e-3, knee + 1e-3], field=field, cells=cells)
     return TiltLawCheck(
-        cell.threshold,
-        curve,
-        judged(printed),
-        judged(continuous),
-        judged(best_law(curve, optics)),
-        printed.jump,
-        float(np.diff(near.mean)[0]),
-        float(printed(limit)),
+        threshold=cell.threshold,
+        curve=curve,
+        printed=judged(printed),
+        continuous=judged(continuous),
+        best=judged(best_law(curve, optics)),
+        printed_jump=printed.jump,
+        solved_change=float(np.diff(near.mean)[0]),
+        largest_printed_tilt=float(printed(limit)),
     )
 
 
 def _law(optics: StatedOptics, origin: float) -> TiltLaw:
     return TiltLaw(
-        optics.tilt_slope_low,
-        optics.tilt_slope_high,
-        optics.tilt_intercept_high,
-        origin,
-        optics.knee_voltage,
-        optics.largest_voltage,
+        low=optics.tilt_slope_low,
+        high=optics.tilt_slope_high,
+        start=optics.tilt_intercept_high,
+        origin=origin,
+        knee=optics.knee_voltage,
+        limit=optics.largest_voltage,
     )

@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-from lcopa_bayes.model.literature import PAPER, Stated
-from lcopa_bayes.paper import (
-    auditclaims,
-    comparisonclaims,
-    modelclaims,
-    numericsclaims,
-    opticsclaims,
-)
+from lcopa_bayes.model.literature import PAPER
+from lcopa_bayes.paper import auditclaims, comparisonclaims, modelclaims, numericsclaims, opticsclaims
 from lcopa_bayes.paper.auditclaims import from_audit
 from lcopa_bayes.paper.comparisonclaims import from_comparison, jointly, uncompared
 from lcopa_bayes.paper.verdict import Claim, Evidence, Judged
@@ -90,10 +84,7 @@ CLAIMS: tuple[Claim, ...] = (
         ),
     ),
     Claim(
-        "M3",
-        "The identified model settles in 10 ms without overshoot.",
-        "Table 1",
-        modelclaims.settling_time,
+        "M3", "The identified model settles in 10 ms without overshoot.", "Table 1", modelclaims.settling_time
     ),
     Claim(
         "M4",
@@ -161,7 +152,7 @@ CLAIMS: tuple[Claim, ...] = (
 )
 
 
-def judge(stated: Stated = PAPER, evidence: Evidence | None = None) -> tuple[Judged, ...]:
-    """Every claim with its verdict, computed from `stated` and the evidence at hand."""
+def judge(evidence: Evidence | None = None) -> tuple[Judged, ...]:
+    """Every claim with its verdict, computed from the printed numbers and the evidence at hand."""
     at_hand = evidence or Evidence()
-    return tuple(Judged(claim, claim.test(stated, at_hand)) for claim in CLAIMS)
+    return tuple(Judged(claim, claim.test(PAPER, at_hand)) for claim in CLAIMS)

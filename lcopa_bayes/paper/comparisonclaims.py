@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lcopa_bayes.model.literature import Stated
-from lcopa_bayes.paper.printedmodel import integer_rival
+from lcopa_bayes.paper.modelclaims import integer_rival
 from lcopa_bayes.paper.verdict import Evidence, Kind, Test, Verdict, undecided, waiting
 from lcopa_bayes.results.stored import stored_values
 

@@ -1,24 +1,83 @@
-"""The verb `identify`: the paper's identification of every path, and what to hold it against."""
+"""The verb `identify`: the paper's identification of every path, and what to hold it against.
+
+Output-error fit of one path: many starts, exact Jacobian, continuous delay.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, final
+from typing import Any, Literal, final
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.core.estimate import plain
-from lcopa_bayes.core.parallel import workers
-from lcopa_bayes.core.progress import Progress
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.errors import InputError, refuse_if
+from lcopa_bayes.core.estimate import attributes, plain
+from lcopa_bayes.core.parallel import Progress, workers
+from lcopa_bayes.data.settings import ModelSettings, NoiseSettings
 from lcopa_bayes.data.study import Study
+from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.inference.leastsquares import LeastSquares
+from lcopa_bayes.inference.optimum import find_optima
+from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.path import Normalisation, TransferPath
-from lcopa_bayes.paper.equation import equation_rmse, least_squares, output_rmse
 from lcopa_bayes.paper.intervals import Interval, Scan
-from lcopa_bayes.paper.outputerror import output_error_fit
-from lcopa_bayes.paper.paths import PathData, path_data
+from lcopa_bayes.paper.paths import PathData, equation_rmse, least_squares, output_rmse, path_data
 from lcopa_bayes.paper.scan import Scanned, scan
+
+
+def output_error_fit(
+    study: Study,
+    data: PathData,
+    rng: np.random.Generator,
+    *,
+    terms: int,
+    orders: tuple[float, ...] | Literal["free"] = "free",
+    start: TransferPath | None = None,
+    starts: int = 12,
+) -> TransferPath:
+    """Least sum of squares of response minus model over etas, b, orders and delay together.
+
+    The data are those of the scan, resting levels subtracted. Starts are the best of many draws from
+    the default priors and, if it is physical, the model `start` (as many terms, decreasing orders). The
+    default normal prior of the gain, five times the record's, is the only penalty. k is 1 in the result.
+    """
+    posterior = _posterior(study, data, terms, orders)
+    solutions = [optimum.values for optimum in find_optima(posterior, rng, starts=starts)]
+    if start is not None and start.physical:
+        least = LeastSquares(posterior)
+        values = least.with_noise(_values(posterior, start))
+        solutions.append(least.solve(values)[0])
+    models = [posterior.table.paths(values)[0][0] for values in solutions]
+    return min(models, key=lambda model: output_rmse(data.records, model))
+
+
+def _posterior(
+    study: Study, data: PathData, terms: int, orders: tuple[float, ...] | Literal["free"]
+) -> Posterior:
+    single = Study(
+        f"{study.name}-{data.name}",
+        None,
+        study.time_unit,
+        study.seed,
+        tuple(each.record for each in data.records),
+        model=ModelSettings(terms=terms, orders=orders, offset="none", exposure_ms=study.model.exposure_ms),
+        noise=NoiseSettings("white"),
+    )
+    return problem_of(single).posterior
+
+
+def _values(posterior: Posterior, model: TransferPath) -> Vector:
+    """Table values of a physical model; the noise scale is a guess."""
+    table = posterior.table
+    out = np.zeros(len(table.rows))
+    out[table.at("gain", 0)] = model.steady
+    times, orders = table.terms[0]
+    out[times], out[orders] = model.times, model.orders
+    out[table.at("delay", 0)] = model.delay
+    out[table.at("sigma", 0)] = 1.0
+    return out
 
 
 @final
@@ -62,13 +121,7 @@ class Identification:
     @property
     def models(self) -> tuple[Identified, ...]:
         """All models, in the order of the fields."""
-        return (
-            self.scan,
-            self.scan_last_eta,
-            self.output_error,
-            self.integer,
-            self.integer_output_error,
-        )
+        return (self.scan, self.scan_last_eta, self.output_error, self.integer, self.integer_output_error)
 
 
 def identify(
@@ -110,8 +163,7 @@ def scannable(study: Study, plan: Scan | None = None) -> tuple[PathData, ...]:
             plan.first_round(data.terms, data.span, data.records[0].blocks.grid.step)
         except InputError as error:
             problems += [f"path {data.name}: {problem}" for problem in error.problems]
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     return paths
 
 
@@ -187,7 +239,7 @@ def _of_scan(method: str, data: PathData, scanned: Scanned) -> Identified:
 def results(study: Study, identified: tuple[Identification, ...], plan: Scan | None = None) -> dict[str, Any]:
     """Every number as plain JSON values; units beside them."""
     stiffness = (plan or Scan()).stiffness[0]
-    fields: dict[str, Any] = plain(
+    return plain(
         {
             "study": study.name,
             "time_unit": study.time_unit,
@@ -195,7 +247,6 @@ def results(study: Study, identified: tuple[Identification, ...], plan: Scan | N
             "paths": [_path(each, stiffness, study.time_unit) for each in identified],
         }
     )
-    return fields
 
 
 def _sentence(identified: Identification, time_unit: str) -> str:
@@ -239,9 +290,7 @@ def _model(identified: Identified, stiffness: float, time_unit: str) -> dict[str
         },
         "steady": model.steady,
         "physical": model.physical,
-        "equation_rmse": identified.equation_rmse,
-        "output_rmse": identified.output_rmse,
-        "candidates": identified.candidates,
+        **attributes(identified, "equation_rmse", "output_rmse", "candidates"),
         "physical_candidates": identified.physical,
         "unconstrained_output_rmse": identified.unconstrained_rmse,
     }

@@ -11,7 +11,7 @@ from typing import NamedTuple, final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.errors import InputError, refuse_if
 
 _ROUND = 9
 """Decimals to which orders are compared."""
@@ -21,6 +21,7 @@ MOST_TERMS = 3
 """The paper's element has three viscous terms; a lattice of more orders cannot be scanned."""
 
 
+@final
 class Interval(NamedTuple):
     """Ends of a scanned interval, both included."""
 
@@ -28,6 +29,7 @@ class Interval(NamedTuple):
     high: float
 
 
+@final
 class Candidates(NamedTuple):
     """Candidates of one round of the scan: every row of orders with every delay."""
 
@@ -83,8 +85,7 @@ class Scan:
             problems.append(f"`stiffness` needs positive values of k; got {self.stiffness!r}")
         if isinstance(self.rounds, bool) or not isinstance(self.rounds, int) or self.rounds < 0:
             problems.append(f"`rounds` must be a whole number, 0 or more; got {self.rounds!r}")
-        if problems:
-            raise InputError(problems)
+        refuse_if(problems)
 
     def order_intervals(self, terms: int) -> tuple[Interval, ...]:
         """The interval of each order of a path with so many terms; InputError when they do not fit."""
@@ -120,8 +121,7 @@ class Scan:
             problems.append(
                 f"no whole number of blocks of {block:g} lies in the delay interval {(low, high)}"
             )
-        if problems:
-            raise InputError(problems)
+        refuse_if(problems)
         return Candidates(orders, block * counts)
 
     def next_round(

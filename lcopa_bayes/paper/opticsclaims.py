@@ -8,10 +8,14 @@ from math import pi
 import numpy as np
 
 from lcopa_bayes.model.literature import PAPER, Stated, StatedOptics
-from lcopa_bayes.optics.array import LinearArray, paper_array
-from lcopa_bayes.optics.cell import Field
-from lcopa_bayes.optics.lobes import strongest_grating_lobe
-from lcopa_bayes.optics.steering import geometry_check, largest_linearisation_error
+from lcopa_bayes.optics.array import (
+    LinearArray,
+    geometry_check,
+    largest_linearisation_error,
+    paper_array,
+    strongest_grating_lobe,
+)
+from lcopa_bayes.optics.director import Field
 from lcopa_bayes.optics.tiltlaw import TiltLawCheck, tilt_law_check
 from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict
 

@@ -16,13 +16,11 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
-from lcopa_bayes.core.progress import Progress
-from lcopa_bayes.model.blockpulses import integration_weights, lower_toeplitz
+from lcopa_bayes.core.parallel import Progress
+from lcopa_bayes.model.blockpulses import Circle, Spectrum, integration_weights, lower_toeplitz
 from lcopa_bayes.model.path import Normalisation, TransferPath
-from lcopa_bayes.model.powerseries import Circle, Spectrum
-from lcopa_bayes.paper.equation import differenced_integrals, known_column, least_squares
 from lcopa_bayes.paper.intervals import Candidates, Scan
-from lcopa_bayes.paper.paths import Blocks
+from lcopa_bayes.paper.paths import Blocks, differenced_integrals, known_column, least_squares
 
 _CELLS = 1 << 16
 """Candidates times blocks evaluated at once: 256 candidates of a 250-sample record, 1 MB an array."""

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, TypeAlias, final
 
-from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.model.literature import Stated
 
 
+@final
 class Kind(Enum):
     """What became of a claim."""
 
@@ -86,15 +87,12 @@ class Judged:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        fields: dict[str, Any] = plain(
+        return plain(
             {
                 "id": self.claim.id,
                 "verdict": self.verdict.kind.value,
-                "number": self.verdict.number,
-                "unit": self.verdict.unit,
-                "how": self.verdict.how,
+                **attributes(self.verdict, "number", "unit", "how"),
                 "text": self.claim.text,
                 "source": self.claim.source,
             }
         )
-        return fields

@@ -1,4 +1,7 @@
-"""The page of a study that was not fitted, drawn from `check.json` and its table alone."""
+"""The page of a study that was not fitted, drawn from `check.json` and its table alone.
+
+The page of a first look, drawn from `look.json` and its tables alone.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +13,12 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from lcopa_bayes.core.errors import refuse_if
-from lcopa_bayes.report.decimation import draw_line
-from lcopa_bayes.report.formatting import figures
-from lcopa_bayes.report.page import Verdict, write_graded
-from lcopa_bayes.report.savedrun import read_table
-from lcopa_bayes.report.section import Drawing, Section, Table
+from lcopa_bayes.report.page import Drawings, Verdict, write_graded
+from lcopa_bayes.report.savedrun import TABLES, SavedRun, read_table
+from lcopa_bayes.report.sections import records
 from lcopa_bayes.report.sections.records import draw_drives
-from lcopa_bayes.report.theme import HELD_OUT, SEEN, blank, label, plain, svg_of
+from lcopa_bayes.report.theme import HELD_OUT, SEEN, Drawing, blank, draw_line, label, plain, svg_of
+from lcopa_bayes.results.firstlook import TABLES as SHOWN
 
 _COLUMNS = ("record", "role", "axis", "unit", "time", "value", "held_out")
 
@@ -31,22 +33,35 @@ def write_check(folder: Path) -> Path:
     table = read_table(path, _COLUMNS, problems, verb="check")
     refuse_if(problems)
 
-    def sections(values: Mapping[str, Any]) -> list[Section]:
+    def drawn(values: Mapping[str, Any]) -> Drawings:
         unit = str(values["time_unit"])
-        return [
-            Section("Plant", tuple(values["sentences"])),
-            *(_record(one, table[table["record"] == one["record"]], unit) for one in values["records"]),
-            _priors(values),
-        ]
+        return {
+            one["record"]: [_record(one, table[table["record"] == one["record"]], unit)]
+            for one in values["records"]
+        }
 
-    return write_graded(folder, "check", "what was understood", sections, box=_box)
-
-
-def _box(values: Mapping[str, Any]) -> Verdict:
-    return Verdict("", str(values["verdict"]), "")
+    return write_graded(
+        folder, "check", "what was understood", drawn, box=lambda values: Verdict("", values["verdict"], "")
+    )
 
 
-def _record(one: Mapping[str, Any], rows: pd.DataFrame, unit: str) -> Section:
+def write_look(folder: Path) -> Path:
+    """`look.html` with the records, their bands and residuals, and the parameters; returns its path.
+
+    InputError when a file of the look is missing or cannot be used.
+    """
+    problems: list[str] = []
+    tables = {
+        name: read_table(folder / "tables" / f"look_{name}.csv", TABLES[name], problems, verb="look")
+        for name in SHOWN
+    }
+    refuse_if(problems)
+    return write_graded(
+        folder, "look", "first look", lambda values: records.drawn(SavedRun(values, {}, tables, {}))
+    )
+
+
+def _record(one: Mapping[str, Any], rows: pd.DataFrame, unit: str) -> Drawing:
     held = bool(one["held_out"])
     responses = rows[rows["role"] == "response"]
     units = list(dict.fromkeys(responses["unit"]))
@@ -60,11 +75,7 @@ def _record(one: Mapping[str, Any], rows: pd.DataFrame, unit: str) -> Section:
         draw_drives(panel, drives[drives["unit"] == own], own, until=float(rows["time"].max()))
     panels[-1].set_xlabel(label("time", unit))
     figure.align_ylabels()
-    return Section(
-        f"Record {one['record']}{', held out' if held else ''}",
-        tuple(one["sentences"]),
-        (Drawing(f"check_{one['record']}", svg_of(figure), f"Record {one['record']}."),),
-    )
+    return Drawing(f"check_{one['record']}", svg_of(figure), f"Record {one['record']}.")
 
 
 def _responses(panel: Axes, rows: pd.DataFrame, unit: str, colour: str) -> None:
@@ -84,15 +95,3 @@ def _responses(panel: Axes, rows: pd.DataFrame, unit: str, colour: str) -> None:
     panel.set_ylabel(label(names[0] if len(names) == 1 else "response", unit))
     if len(names) > 1:
         panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
-
-
-def _priors(values: Mapping[str, Any]) -> Section:
-    table = Table.of(
-        values["parameters"],
-        ("name", "code", "name"),
-        ("before any data", "prose", "words"),
-        ("unit", "text", "unit"),
-        ("density", "prose", lambda row: row.get("prior") or f"fixed at {figures(row['value'], 6)}"),
-        ("from", "text", lambda row: row.get("from") or "study"),
-    )
-    return Section("Priors", tables=(table,))

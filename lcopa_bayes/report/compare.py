@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from math import hypot
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,22 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from lcopa_bayes.comparison.compare import folder_name
-from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.report.decimation import draw_band, draw_line
-from lcopa_bayes.report.formatting import NONE, figures, interval, percent, to_spread, with_error
-from lcopa_bayes.report.page import Verdict, write_graded
-from lcopa_bayes.report.section import Drawing, Section, Table
-from lcopa_bayes.report.theme import CYCLE, NOISE, blank, headed, label, legend_above, plain, svg_of
+from lcopa_bayes.core.errors import refuse_if
+from lcopa_bayes.report.formatting import figures
+from lcopa_bayes.report.page import Drawings, Verdict, write_graded
+from lcopa_bayes.report.theme import (
+    CYCLE,
+    NOISE,
+    Drawing,
+    blank,
+    draw_band,
+    draw_line,
+    headed,
+    label,
+    legend_above,
+    plain,
+    svg_of,
+)
 from lcopa_bayes.results.bands import POINTWISE
 
 _NEAR = 60.0
@@ -30,11 +39,10 @@ def write_comparison(folder: Path) -> Path:
     InputError when the folder holds no comparison or it cannot be used.
     """
 
-    def sections(values: Mapping[str, Any]) -> list[Section]:
-        texts = [part(values) for part in (_priors, _predicted, _orders, _warnings)]
-        return [_scores(values), _averaged(values), _figures(values, _curves(folder, values)), *texts]
+    def drawn(values: Mapping[str, Any]) -> Drawings:
+        return {"candidates": [*_evidence(values), *_records(values, _curves(folder, values))]}
 
-    return write_graded(folder, "compare", "comparison", sections, box=_verdict)
+    return write_graded(folder, "compare", "comparison", drawn, box=_verdict)
 
 
 def _verdict(results: Mapping[str, Any]) -> Verdict:
@@ -53,208 +61,8 @@ def _curves(folder: Path, results: Mapping[str, Any]) -> dict[str, pd.DataFrame]
             out[str(row["name"])] = pd.read_csv(path, dtype={"record": str, "axis": str, "unit": str})
         except (OSError, ValueError) as error:
             problems.append(f"{path}: cannot be read ({error}); run `compare` again with --resume")
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     return out
-
-
-def _scores(results: Mapping[str, Any]) -> Section:
-    models = results["models"]
-    scores = Table.of(
-        models,
-        ("model", "code", "name"),
-        ("what it is", "prose", "about"),
-        ("parameters", "number", "parameters"),
-        ("log evidence [nat]", "number", lambda row: _with_error(row, "log_evidence")),
-        ("log Bayes factor", "number", lambda row: _with_error(row, "log_bayes_factor")),
-        ("probability", "number", lambda row: _with_error(row, "probability", places=3)),
-        ("grade", "grade", "grade"),
-    )
-    caption = (
-        "± is a standard error: of the evidence by bridge sampling, of predictive densities by the spread "
-        "over parts of the records. The Bayes factor is against the best, the probability among these "
-        "models alone, with equal prior probabilities. elpd is the log density of one forecast of held-out "
-        "data, each sample predicted from those before it. AIC and BIC are from the maximum of the "
-        "likelihood and take account of neither priors nor several modes."
-    )
-    text = [str(results["agreement"]["sentence"])]
-    text += [f"{entry['name']} is not ranked: {entry['reason']}." for entry in results["unranked"]]
-    text += [
-        f"{item['name']}: {item['reason']}; its other scores remain valid."
-        for item in results["evidence_undefined"]
-    ]
-    text += [f"{row['name']} {note}." for row in results["models"] for note in row["notes"]]
-    text += [
-        f"{row['name']} contains {', '.join(names)} and is at least as likely as what it contains."
-        for row in results["models"]
-        if (names := [contained["model"] for contained in row["containment"]["contains"]])
-        and row["containment"]["met"]
-    ]
-    others = Table.of(
-        models,
-        ("model", "code", "name"),
-        ("elpd [nat]", "number", lambda row: _with_error(row, "elpd", places=1)),
-        ("less than best", "number", lambda row: _with_error(row, "elpd_difference", places=1)),
-        ("stacking weight", "number", lambda row: _with_error(row, "stacking", "")),
-        ("max log likelihood", "number", lambda row: _with_error(row, "max_log_likelihood", "", places=1)),
-        ("AIC", "number", lambda row: _with_error(row, "aic", "", places=1)),
-        ("BIC", "number", lambda row: _with_error(row, "bic", "", places=1)),
-        caption=caption,
-    )
-    return Section("Scores", tuple(text), tables=(scores, others))
-
-
-def _averaged(results: Mapping[str, Any]) -> Section:
-    """Numbers that every candidate has, and the part of their uncertainty that the choice of a model adds."""
-    rows = results["averaged"]
-    if not rows:
-        return Section("Numbers over all models", ("Fewer than two usable candidates have an evidence.",))
-    table = Table.of(
-        rows,
-        ("number", "code", "name"),
-        ("median", "number", lambda row: to_spread(row["value"], _both(row))),
-        ("unit", "text", "unit"),
-        ("90 % interval", "interval", lambda row: interval(row["lower"], row["upper"], _both(row))),
-        ("sd by noise", "number", lambda row: figures(row["sd_noise"], 2)),
-        ("sd by structure", "number", lambda row: figures(row["sd_structure"], 2)),
-        ("weights", "prose", _weights),
-        ("grade", "grade", "grade"),
-        caption="Equal-tailed credible intervals of the mixture of all models. Weights are posterior "
-        "probabilities; a richer model that is not rejected and moves a number by more than half of its "
-        "standard deviation (*) weighs as much as the most probable one, and its interval is held. Standard "
-        "deviations are of draws within the models and of means between them; open where a number is not "
-        "reached.",
-    )
-    return Section("Numbers over all models", (), tables=(table,))
-
-
-def _both(row: Mapping[str, Any]) -> float | None:
-    parts = row["sd_noise"], row["sd_structure"]
-    return None if None in parts else float(hypot(*parts))
-
-
-def _weights(row: Mapping[str, Any]) -> str:
-    return ", ".join(
-        f"{name}{'*' * (name in row['raised'])} {weight:.2f}" for name, weight in row["weights"].items()
-    )
-
-
-def _priors(results: Mapping[str, Any]) -> Section:
-    table = Table.of(
-        [
-            width | {"model": row["name"], "change": _less(width["log_evidence"], row["log_evidence"])}
-            for row in results["models"]
-            for width in row["prior_widths"]
-        ],
-        ("model", "code", "model"),
-        ("width of the priors", "number", lambda row: f"{row['factor']:g}"),
-        ("log evidence [nat]", "number", lambda row: _with_error(row, "log_evidence", "sd")),
-        ("change", "number", lambda row: NONE if row["change"] is None else f"{row['change']:+.2f}"),
-        ("method", "text", "method"),
-        ("ESS", "number", lambda row: f"{row['ess']:.0f}"),
-        ("Pareto k", "number", lambda row: figures(row["pareto_k"], 2)),
-        ("priors changed", "prose", lambda row: ", ".join(row["parameters"]) or "none"),
-    )
-    text = (
-        "The evidence depends on the width of the priors. Here gains, times and delays have priors half and "
-        "twice as wide; orders keep theirs, which are the ends of their domain. Importance weights use the "
-        "existing draws; a refit moves them to the new posterior and repeats the bridge sampling; undefined "
-        "marks narrower priors that exclude values the data support; no preference is stated where this "
-        "occurs."
-    )
-    return Section("Influence of the prior", (text,), tables=(table,) if table.rows else ())
-
-
-def _less(value: float | None, other: float) -> float | None:
-    return None if value is None else value - other
-
-
-def _predicted(results: Mapping[str, Any]) -> Section:
-    predictions = Table.of(
-        [part | {"model": row["name"]} for row in results["models"] for part in row["predictions"]],
-        ("model", "code", "model"),
-        ("predicted", "code", "part"),
-        ("how", "text", "kind"),
-        ("samples", "number", "samples"),
-        ("log density [nat]", "number", lambda row: _with_error(row, "elpd", "monte_carlo_sd", places=1)),
-        ("if fitted", "number", lambda row: _with_error(row, "in_sample", "", places=1)),
-        ("method", "text", "method"),
-        ("Pareto k", "number", lambda row: figures(row["pareto_k"], 2)),
-        ("ESS", "number", lambda row: f"{row['ess']:.0f}"),
-        ("grade", "grade", "grade"),
-        ("level from", "prose", lambda row: "; ".join(row["level_from"])),
-    )
-    errors = Table.of(
-        [
-            entry | {"model": row["name"], "use": use}
-            for row in results["models"]
-            for key, use in (("fit_scores", "fit"), ("held_out", "held out"))
-            for entry in row[key]
-        ],
-        ("model", "code", "model"),
-        ("record", "code", "record"),
-        ("axis", "code", "axis"),
-        ("use", "text", "use"),
-        ("RMSE", "number", "rmse"),
-        ("unit", "text", "unit"),
-        ("in pointwise 90 % band", "number", lambda row: percent(row["coverage_90"])),
-        ("in pointwise 50 % band", "number", lambda row: percent(row["coverage_50"])),
-    )
-    text = (
-        "Whole records are predicted from the others, and the future of a record from its past where it is "
-        "the only one; single samples are never held out, since their neighbours determine them. The log "
-        "density is that of one forecast: each sample given those before it. The noise, and the offset "
-        "where a model has one per record, are those of the predicted record; all other parameters come "
-        "from the other records. Samples at rest, at least the first, are given; all models predict the "
-        "same samples. ± is the Monte Carlo error. 'if fitted' is the density of the same samples under "
-        "draws of a fit that includes them, which is larger; where it is not, the grade is lowered. Bands "
-        "are pointwise: of every 100 samples 90 are expected inside, not whole curves."
-    )
-    return Section("Prediction", (text,), tables=(predictions, errors))
-
-
-def _orders(results: Mapping[str, Any]) -> Section:
-    table = Table.of(
-        [entry["estimate"] | entry for entry in results["order_is_integer"]],
-        ("model", "code", "model"),
-        ("order", "code", "parameter"),
-        ("median", "number", lambda row: to_spread(row["value"], row["sd"])),
-        ("90 % interval", "interval", lambda row: interval(row["lower"], row["upper"], row["sd"])),
-        ("nearest", "number", lambda row: str(row["nearest"])),
-        ("log Bayes factor", "number", lambda row: _with_error(row, "log_bayes_factor", "log_sd")),
-        ("density from", "prose", "method"),
-        ("answer", "text", "answer"),
-        ("grade", "grade", "grade"),
-    )
-    text = (
-        "The Savage-Dickey ratio: posterior over prior density at the nearest integer, as a logarithm "
-        "[nat] with its Monte Carlo error. Two errors above log 3 the integer is favoured, two below log "
-        "1/3 it is not. Where too few draws are at the integer its density is that of a normal tail. "
-        "Intervals are equal-tailed credible.",
-    )
-    return Section("Is this order an integer?", text, tables=(table,) if table.rows else ())
-
-
-def _warnings(results: Mapping[str, Any]) -> Section:
-    text = tuple(f"{flag['model']}: {flag['sentence']}." for flag in results["flags"])
-    return Section(
-        "Warnings", text or ("The residuals of every candidate are compatible with its noise model.",)
-    )
-
-
-def _with_error(row: Mapping[str, Any], key: str, error: str | None = None, *, places: int = 2) -> str:
-    """`value ± error` of a key and that of its error, by default the one with `_sd`."""
-    return with_error(row[key], row.get(f"{key}_sd" if error is None else error), places)
-
-
-def _figures(results: Mapping[str, Any], curves: Mapping[str, pd.DataFrame]) -> Section:
-    """Figures of a comparison; `curves` by candidate."""
-    drawings = [*_evidence(results), *_records(results, curves)]
-    text = (
-        "Each model in its own colour throughout; black dots are fitted samples, red dots samples "
-        "that no model was fitted to.",
-    )
-    return Section("Candidates side by side", text, tuple(drawings))
 
 
 def _evidence(results: Mapping[str, Any]) -> list[Drawing]:

@@ -1,42 +1,35 @@
-"""Sections become one HTML page that needs nothing else, and figures become files."""
+"""Pages: the template of each verb holds its words and tables, and figures are drawn for it.
+
+A template calls `section`, `p`, `table` with `cells`, and `figures` of a `Page`, and prints the values of a
+result through the functions of `formatting`. A page needs nothing else; its figures are files too.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
-from typing import Any, final
+from typing import Any, TypeAlias, final
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
+from jinja2 import ChoiceLoader, Environment, FileSystemLoader, PackageLoader, StrictUndefined, UndefinedError
+from markupsafe import Markup, escape
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.files import writable_folder, write_text
-from lcopa_bayes.core.parallel import workers
-from lcopa_bayes.report.formatting import stopped
-from lcopa_bayes.report.savedrun import SavedRun, load_run
-from lcopa_bayes.report.section import Drawing, Section
-from lcopa_bayes.report.sections import overview, pairs, parameters, records, responses, sampling
-from lcopa_bayes.report.theme import inlined, look
+from lcopa_bayes.report import formatting
+from lcopa_bayes.report.theme import Drawing, inlined, look
+from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
 from lcopa_bayes.results.stored import stored_values
 
-_SECTIONS = (
-    overview.overview,
-    parameters.estimates,
-    responses.steps,
-    responses.frequency,
-    records.data,
-    records.residuals,
-    pairs.pairs,
-    parameters.priors,
-    parameters.sensitivity,
-    parameters.traces,
-    sampling.evidence,
-    sampling.cross_check,
-    sampling.provenance,
-)
-"""What a report shows, in this order; a later stage adds its own section here."""
+Drawings: TypeAlias = Mapping[str, Any]
+"""Figures by the name under which a template places them, and what else it shows as it is."""
+_KINDS = ("text", "number", "grade", "code", "interval", "prose")
+"""Cells of `text` and `number` stay on one line; those of `interval` and `prose` may wrap."""
+_PRINTED = ("figures", "percent", "ends", "sentence", "stopped", "probability")
+"""Functions of `formatting` that are filters; a template calls the others."""
+_CALLED = ("interval", "to_spread", "with_error", "NONE", "OPEN")
 _ADVICE = {
     "reliable": "The sampling behind the numbers is reliable.",
     "tentative": "Read the numbers below with caution: a longer run or another model may change them.",
@@ -62,84 +55,174 @@ class Verdict:
     def of(cls, values: Mapping[str, Any]) -> Verdict:
         """Verdict of a result; the reason is not repeated."""
         sentence, reason = str(values["verdict"]), str(values["grade_reason"])
-        return cls(str(values["grade"]), stopped(sentence), "" if reason in sentence else reason)
+        return cls(str(values["grade"]), formatting.stopped(sentence), "" if reason in sentence else reason)
 
 
-def write_report(folder: Path, *, jobs: int = 1) -> Path:
-    """Draw the report of a run folder: `figures/*.svg` and `report.html`, whose path is returned.
+@final
+@dataclass
+class Page:
+    """What a template puts on a page, in the order it does so."""
 
-    Reads only the folder and calculates nothing; the same folder gives the same bytes, whatever `jobs`
-    [processes]. InputError when a
-    file of the folder is missing or cannot be used.
-    """
-    run = load_run(folder)
-    with workers(run, jobs=jobs) as crew:
-        sections = list(crew.each(_drawn, range(len(_SECTIONS))))
-    return write_page(folder, str(run.results["study"]), sections, Verdict.of(run.results))
+    titles: list[str] = field(default_factory=list)
+    drawings: list[Drawing] = field(default_factory=list)
+    _kinds: list[str] = field(default_factory=list)
+
+    def section(self, title: str, caller: Callable[[], str]) -> Markup:
+        """A titled part of the page."""
+        self.titles.append(title)
+        shown = '<section id="{}">\n<h2>{}</h2>\n{}</section>\n'
+        return Markup(shown).format(anchor(title), title, Markup(caller()))
+
+    def p(self, text: str = "", caller: Callable[[], str] | None = None) -> Markup:
+        """A paragraph."""
+        return Markup("<p>{}</p>\n").format(tied(text if caller is None else caller()))
+
+    def table(
+        self, rows: Iterable[Any], *heads: str, caption: str = "", caller: Callable[[Any], str]
+    ) -> Markup:
+        """A table with a row for each of `rows`, whose `cells` the template gives; nothing without rows.
+
+        `heads` are titles, each with the kind of its column behind a colon unless it is `text`.
+        """
+        split = [head.rpartition(":") for head in heads]
+        columns = [
+            (title, kind) if kind in _KINDS else (head, "text")
+            for head, (title, _, kind) in zip(heads, split, strict=True)
+        ]
+        self._kinds = [kind for _, kind in columns]
+        body = [Markup("<tr>{}</tr>\n").format(Markup(caller(row).strip())) for row in rows]
+        if not body:
+            return Markup("")
+        head = Markup("").join(
+            Markup('<th class="{}">{}</th>').format(kind, title) for title, kind in columns
+        )
+        shown = (
+            '<div class="wide">\n<table>\n<thead><tr>{}</tr></thead>\n<tbody>\n{}</tbody>\n</table>\n</div>\n'
+        )
+        note = Markup('<p class="note">{}</p>\n').format(tied(caption)) if caption else ""
+        return Markup(shown).format(head, Markup("").join(body)) + note
+
+    def cells(self, *values: object) -> Markup:
+        """Cells of a row; a number is printed to three digits, what is undefined as a dash.
+
+        ValueError unless there is one for each column.
+        """
+        if len(values) != len(self._kinds):
+            raise ValueError(f"each row needs {len(self._kinds)} cells; got {values}")
+        return Markup("").join(map(_cell, self._kinds, values))
+
+    def figures(self, drawings: Iterable[Drawing]) -> Markup:
+        """Figures with their captions."""
+        out = Markup("")
+        for one in drawings:
+            self.drawings.append(one)
+            mark = Markup('<span class="mark">{}</span>').format(one.mark) if one.mark else ""
+            shown = (
+                '<figure>\n<div class="wide" role="img" aria-label="{}">{}</div>\n'
+                "<figcaption>{}{}</figcaption>\n</figure>\n"
+            )
+            svg = Markup(inlined(one.svg, file_stem(one)))
+            out += Markup(shown).format(one.caption, svg, mark, tied(one.caption))
+        return out
 
 
-def _drawn(run: SavedRun, number: int) -> Section:
-    """A section of the report."""
-    with look():
-        return _SECTIONS[number](run)
+def _cell(kind: str, value: object) -> Markup:
+    number = kind == "number" and isinstance(value, float)
+    text = formatting.figures(value) if value is None or number else value  # type: ignore[arg-type]
+    return Markup('<td class="{}">{}</td>').format(f"{kind} {text}" if kind == "grade" else kind, text)
+
+
+def each(rows: Iterable[Mapping[str, Any]], *keys: str) -> list[tuple[Any, Any]]:
+    """Every row with every entry of its lists of these keys."""
+    return [(row, one) for row in rows for key in keys for one in row[key]]
+
+
+def zip_of(*lists: Sequence[Any]) -> list[tuple[Any, ...]]:
+    """Entries of lists of one length side by side."""
+    return list(zip(*lists, strict=True))
+
+
+def anchor(title: str) -> str:
+    """Name of a section inside its page."""
+    return "-".join("".join(c if c.isalnum() else " " for c in title.lower()).split())
+
+
+def tied(text: str) -> Markup:
+    """A paragraph without line breaks in numbers with a percent sign, nor in p-values."""
+    words = re.sub(r"[ \n]+", " ", escape(text)).strip()
+    return Markup(words.replace(" %", "\u00a0%").replace("p = ", "p\u00a0=\u00a0"))
 
 
 def write_graded(
     folder: Path,
     verb: str,
     title: str,
-    compose: Callable[[Mapping[str, Any]], Sequence[Section]],
+    draw: Callable[[Mapping[str, Any]], Drawings] = lambda values: {},
     *,
-    box: Callable[[Mapping[str, Any]], Verdict] = Verdict.of,
+    box: Callable[[Mapping[str, Any]], Verdict] | None = Verdict.of,
     file: str | None = None,
     name: str | None = None,
+    **more: Any,
 ) -> Path:
-    """Write the page of a verb's result: the sections that `compose` draws of its values, below its grade;
-    returns the path of the page.
+    """Write the page of a verb's result by the verb's template, with the figures that `draw` gives of its
+    values and `more` beside them; returns the path of the page.
 
     `file` and `name`, of values and page, are by default named after the verb. InputError when the values
     cannot be read or a key is absent.
     """
-    values = stored_values(folder, verb, ("study",), file=file)
+    values = stored_values(folder, verb, (), file=file)
     try:
+        shown = ": ".join(filter(None, (values.get("study"), title)))
         with look():
-            sections = compose(values)
-        verdict = box(values)
-    except KeyError as error:
+            drawn = draw(values)
+        return write_page(
+            folder, f"{verb}.html", shown, values, drawn, verdict=box and box(values), name=name, **more
+        )
+    except (KeyError, UndefinedError) as error:
         raise InputError(f"{folder / (file or f'{verb}.json')}: lacks {error}; run `{verb}` again") from error
-    return write_page(folder, f"{values['study']}: {title}", sections, verdict, name or f"{verb}.html")
 
 
 def write_page(
     folder: Path,
+    template: str | Path,
     title: str,
-    sections: Sequence[Section],
+    values: Mapping[str, Any],
+    drawn: Drawings,
+    *,
     verdict: Verdict | None = None,
-    name: str = "report.html",
+    name: str | None = None,
+    **more: Any,
 ) -> Path:
-    """Write the figures of some sections and the page `name` that shows them; returns its path."""
-    figures = writable_folder(folder / "figures")
-    for section in sections:
-        for drawing in section.drawings:
-            write_text(figures / f"{file_stem(drawing)}.svg", drawing.svg)
-    path = folder / name
-    write_text(path, page(title, sections, verdict))
-    return path
+    """Write a page and its figures; returns the path of the page, by default named as the template.
 
-
-def page(title: str, sections: Sequence[Section], verdict: Verdict | None = None) -> str:
-    """The page as HTML with its figures inside."""
+    The template, the package's by its name or a file, sees `values` as `v`, the figures as `drawn`, and
+    `more`.
+    """
+    page, template = Page(), Path(template)
     environment = Environment(
-        loader=PackageLoader("lcopa_bayes.report", "."),
+        loader=ChoiceLoader([FileSystemLoader(template.parent), PackageLoader("lcopa_bayes.report", ".")]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["tied"] = lambda text: text.replace(" %", "\u00a0%").replace("p = ", "p\u00a0=\u00a0")
-    environment.filters["svg"] = lambda drawing: Markup(inlined(drawing.svg, file_stem(drawing)))
-    shown = environment.get_template("report.html")
-    return shown.render(title=title, sections=sections, verdict=verdict) + "\n"
+    environment.filters |= {key: getattr(formatting, key) for key in _PRINTED} | {
+        "anchor": anchor,
+        "tied": tied,
+    }
+    environment.globals |= {key: getattr(formatting, key) for key in _CALLED}
+    environment.globals |= {key: getattr(page, key) for key in ("section", "p", "table", "cells", "figures")}
+    environment.globals |= {"each": each, "pairs": zip_of, "product": product}
+    environment.globals |= {"POINTWISE": POINTWISE, "SIMULTANEOUS": SIMULTANEOUS}
+    body = environment.get_template(template.name).render(v=values, drawn=drawn, **more)
+    whole = environment.get_template("page.html")
+    text = whole.render(title=title, titles=page.titles, body=Markup(body), verdict=verdict) + "\n"
+    figures = writable_folder(folder / "figures")
+    for drawing in page.drawings:
+        write_text(figures / f"{file_stem(drawing)}.svg", drawing.svg)
+    path = folder / (name or template.name)
+    write_text(path, text)
+    return path
 
 
 def file_stem(drawing: Drawing) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from lcopa_bayes.core.arrays import Matrix
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.results.bands import POINTWISE, QUANTILE_NAMES, SIMULTANEOUS
 from lcopa_bayes.results.datatree import posterior_draws
 from lcopa_bayes.results.runfolder import ORIGINS
@@ -45,7 +45,7 @@ TABLES: Mapping[str, tuple[str, ...]] = {
 }
 """Tables the report draws and the columns it needs of each."""
 _CHECK_TABLES: Mapping[str, tuple[str, ...]] = {
-    "cross_check_density": ("name", "log_scale", "left", "right", "ensembles", "nested"),
+    "cross_check_density": ("name", "log_scale", "left", "right", "ensembles", "nested")
 }
 """The same of a run that was checked by a second method."""
 _RESULTS = (
@@ -131,8 +131,7 @@ def load_run(folder: Path) -> SavedRun:
             "both must come from the same run, so run `fit` again"
             for name in absent
         ]
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     return SavedRun(results, origin, tables, draws)
 
 

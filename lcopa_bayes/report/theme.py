@@ -1,21 +1,30 @@
-"""How figures look, and how they become the same bytes every time."""
+"""How figures look, and how they become the same bytes every time.
+
+Fewer points for the same picture: long curves are drawn through the extremes of short stretches.
+"""
 
 from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from math import log10
-from typing import Any
+from typing import Any, TypeVar, final
 
 import matplotlib
+import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
+from lcopa_bayes.core.arrays import Index, Vector
+
+T = TypeVar("T")
 INK = "#1a1a1a"
 SEEN = "#1a1a1a"
 """Observations of records that were fitted."""
@@ -70,9 +79,9 @@ def look() -> Iterator[None]:
         yield
 
 
-def blank(height: float, width: float = WIDTH) -> Figure:
-    """An empty figure of a height and width [in]."""
-    return Figure(figsize=(width, height), layout="constrained")
+def blank(height: float) -> Figure:
+    """An empty figure of a height [in]."""
+    return Figure(figsize=(WIDTH, height), layout="constrained")
 
 
 def grid(count: int, *, columns: int, height: float) -> tuple[Figure, Sequence[Axes]]:
@@ -146,3 +155,81 @@ def inlined(svg: str, prefix: str) -> str:
     element = re.sub(r'\bid="', f'id="{prefix}-', element)
     element = element.replace('href="#', f'href="#{prefix}-').replace("url(#", f"url(#{prefix}-")
     return element.strip()
+
+
+MOST = 600
+"""Points of a curve that are drawn; a figure is about 500 points wide."""
+
+
+def extremes(*curves: Vector, most: int = MOST) -> Index:
+    """Positions to draw, increasing: all of them up to `most`, else the least and greatest per stretch.
+
+    The curves share their positions, as the two edges of a band do. Stretches hold equally many samples;
+    the first, the last and every overall extreme are among the positions. NaN counts as missing. At most
+    `most` + 2 positions are returned. ValueError when the curves differ in length or `most` is less than
+    two per curve.
+    """
+    size = curves[0].size
+    if any(curve.size != size for curve in curves) or most < 2 * len(curves):
+        raise ValueError(f"need curves of one length and room for 2 points of each; got {most} points")
+    if size <= most:
+        return np.arange(size)
+    stretches = most // (2 * len(curves))
+    edges = np.linspace(0, size, stretches + 1).astype(int)[:-1]
+    owner = np.repeat(np.arange(stretches), np.diff(np.append(edges, size)))
+    picked = [np.array([0, size - 1])]
+    for curve in curves:
+        for values in (curve, -curve):
+            filled = np.where(np.isnan(values), np.inf, values)
+            order = np.lexsort((filled, owner))
+            picked.append(order[edges])
+    return np.unique(np.concatenate(picked))
+
+
+def draw_line(panel: Axes, x: Vector, y: Vector, *args: Any, **style: Any) -> None:
+    """`panel.plot` through the extremes of a curve (n,)."""
+    at = extremes(y)
+    panel.plot(x[at], y[at], *args, **style)
+
+
+def draw_band(panel: Axes, x: Vector, low: Vector, high: Vector, **style: Any) -> None:
+    """`panel.fill_between` through the extremes of both ends (n,), without an edge."""
+    at = extremes(low, high)
+    panel.fill_between(x[at], low[at], high[at], lw=0, **style)
+
+
+def draw_bands(
+    panel: Axes, x: Vector, rows: pd.DataFrame, bands: Sequence[tuple[str, str, str, str, float, str]]
+) -> None:
+    """Bands between columns of a table, each given by what the names of its columns begin with, the names of
+    its ends, colour, opacity and label."""
+    for column, low, high, colour, alpha, name in bands:
+        lower, upper = (rows[f"{column}_{end}"].to_numpy() for end in (low, high))
+        draw_band(panel, x, lower, upper, color=colour, alpha=alpha, label=name)
+
+
+def extremes_note(size: int) -> str:
+    """A sentence for the caption when a record of `size` samples is longer than what is drawn."""
+    if size <= MOST:
+        return ""
+    return f"Drawn through the extremes of short stretches: the record has {size} samples."
+
+
+@final
+@dataclass(frozen=True)
+class Drawing:
+    """A figure as SVG, with the stem of its file name and its caption."""
+
+    stem: str
+    svg: str
+    caption: str
+    mark: str = ""
+    """A word set before the caption that must not be overlooked, such as "held out"."""
+
+
+def paged(
+    stem: str, names: Sequence[T], most: int, draw: Callable[[Sequence[T]], str], caption: str
+) -> tuple[Drawing, ...]:
+    """Figures `<stem>_01` and so on, each of up to `most` of the `names`, as `draw` gives them."""
+    parts = [names[k : k + most] for k in range(0, len(names), most)]
+    return tuple(Drawing(f"{stem}_{k:02d}", draw(part), caption) for k, part in enumerate(parts, start=1))

@@ -11,7 +11,7 @@ size from the same draws would cover too little when points are many and draws f
 from __future__ import annotations
 
 from math import ceil
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -30,6 +30,7 @@ QUANTILE_NAMES = ("05", "25", "50", "75", "95")
 """What columns of tables call them."""
 
 
+@final
 class Bands(NamedTuple):
     """Bands of one curve over its points."""
 

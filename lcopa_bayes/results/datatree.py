@@ -21,7 +21,7 @@ from lcopa_bayes.core.files import enduring
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.results.prediction import record_draws, responses
-from lcopa_bayes.results.provenance import settings_of
+from lcopa_bayes.results.runfolder import settings_of
 
 if TYPE_CHECKING:
     from lcopa_bayes.results.fit import Fit
@@ -243,7 +243,7 @@ def _predicted(
 
     Single precision, a few draws at a time: these are by far the largest arrays of a run.
     """
-    posterior, table = fit.problem.posterior, fit.draws.table
+    posterior, table = fit.near, fit.draws.table
     size = values.shape[0]
     density, drawn = (
         {name: np.empty((size, seen.size), np.float32) for name, seen in fitted.observed.items()}
@@ -252,13 +252,17 @@ def _predicted(
     for first in range(0, size, _PORTION):
         rows = slice(first, first + _PORTION)
         part = values[rows]
-        pointwise = posterior.pointwise(part) if likelihood else ()
-        plant = responses(table, posterior.model, part)
+        # draws have bounded responses; those of the prior that have none are NaN
+        known = posterior.responses(part) if likelihood else ()
+        plant = () if likelihood else responses(table, posterior.model, part)
         for name, (r, axis) in fitted.places.items():
-            seen = posterior.samples[r].axes[axis]
-            noise = posterior.noise.draw(posterior.noise_parameters(part, axis), seen.gaps, rng)
-            offset = table.offset(part, axis, r)[:, None]
-            drawn[name][rows] = plant[r][axis][:, seen.index] + offset + noise
+            seen, parameters = posterior.samples[r].axes[axis], posterior.noise_parameters(part, axis)
+            noise = posterior.noise.draw(parameters, seen.gaps, rng)
             if likelihood:
-                density[name][rows] = pointwise[r][axis]
+                misfit = posterior.residual(axis, r, seen, part, known[r])
+                density[name][rows] = posterior.noise.pointwise(misfit, parameters, seen.gaps)
+                drawn[name][rows] = seen.values - misfit + noise
+            else:
+                offset = table.offset(part, axis, r)[:, None]
+                drawn[name][rows] = plant[r][axis][:, seen.index] + offset + noise
     return density if likelihood else {}, drawn

@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.arrays import Flags, Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of
+from lcopa_bayes.core.estimate import attributes
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.leastsquares import LeastSquares
@@ -105,9 +106,7 @@ class Discretisation:
             "parameter": self.parameter,
             "shift_sd": self.shift,
             "shift_error_sd": self.error,
-            "refinement": self.refinement,
-            "blocks": self.blocks,
-            "negligible": self.negligible,
+            **attributes(self, "refinement", "blocks", "negligible"),
             "moved": list(self.moved),
         }
 
@@ -208,12 +207,12 @@ def discretisation(problem: Problem, draws: Draws, *, jobs: int = 1) -> Discreti
     worst = int(np.abs(shifts).argmax())
     names = [draws.table.names[k] for k in rows]
     return Discretisation(
-        names[worst],
-        float(shifts[worst]),
-        float(errors[worst]),
-        problem.refinement,
-        _cells(problem),
-        tuple(names[k] for k in np.flatnonzero(~_negligible(shifts, errors))),
+        parameter=names[worst],
+        shift=float(shifts[worst]),
+        error=float(errors[worst]),
+        refinement=problem.refinement,
+        blocks=_cells(problem),
+        moved=tuple(names[k] for k in np.flatnonzero(~_negligible(shifts, errors))),
     )
 
 

@@ -18,6 +18,7 @@ from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.optimum import Optimum
+from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.results.adequacy import limitations
 from lcopa_bayes.results.datatree import POSTERIOR, posterior_tree, save_tree
 from lcopa_bayes.results.discretisation import Discretisation, discretisation, optima_of, resolved_optima
@@ -25,9 +26,8 @@ from lcopa_bayes.results.firstlook import FirstLook
 from lcopa_bayes.results.frequency import FrequencyResponse, frequency_response
 from lcopa_bayes.results.prediction import Band, study_bands
 from lcopa_bayes.results.predictive import Predictive
-from lcopa_bayes.results.provenance import fingerprint, provenance
 from lcopa_bayes.results.residuals import Residual, residuals
-from lcopa_bayes.results.runfolder import add_origin, opened
+from lcopa_bayes.results.runfolder import add_origin, fingerprint, opened, provenance
 from lcopa_bayes.results.savedfit import NAME as SAVED
 from lcopa_bayes.results.savedfit import fit_to_json
 from lcopa_bayes.results.sensitivity import Sensitivity, sensitivity
@@ -79,6 +79,11 @@ class Fit(Predictive):
     """How a second, independent sampling method agrees; None without one."""
     rival: Rival | None = None
     """The same study with integer orders, and how it predicts; None when none was fitted."""
+
+    @property
+    def near(self) -> Posterior:
+        """The posterior, with effects by what the draws were made with: a response costs a hundredth."""
+        return replace(self.problem.posterior, surrogate=self.run.surrogate)
 
     @property
     def verdict(self) -> str:
@@ -183,23 +188,23 @@ def fit(
         limitations(problem, draws, shown, remaining, np.random.default_rng([plan.seed, 4]))
     )
     metrics = step_metrics(draws, curves, time_unit=study.time_unit)
-    moved = sensitivity(draws, problem.posterior)
+    moved = sensitivity(draws, replace(problem.posterior, surrogate=run.surrogate))
     response = frequency_response(
         draws, span=problem.scales.span, period=problem.scales.period, time_unit=study.time_unit
     )
     return Fit(
-        problem,
-        run,
-        draws,
-        tuple(shown),
-        tuple(remaining),
-        curves,
-        tuple(metrics),
-        moved,
-        weighed,
-        width,
-        response,
-        check,
+        problem=problem,
+        run=run,
+        draws=draws,
+        bands=tuple(shown),
+        residuals=tuple(remaining),
+        curves=curves,
+        metrics=tuple(metrics),
+        sensitivity=moved,
+        evidence=weighed,
+        discretisation=width,
+        frequency=response,
+        cross_check=check,
     )
 
 

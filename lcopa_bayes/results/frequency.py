@@ -15,7 +15,7 @@ from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import Estimate, plain
 from lcopa_bayes.inference.parameters import ParameterTable
-from lcopa_bayes.model.transfer import denominator
+from lcopa_bayes.model.stepresponse import denominator
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS, Bands, named
 from lcopa_bayes.results.result import notebook_table
 from lcopa_bayes.sampling.draws import Draws
@@ -56,9 +56,7 @@ class PathResponse:
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
         curves = {"gain": self.gain._asdict(), "phase_deg": self.phase._asdict()}
-        out: dict[str, Any] = plain(
-            {"path": self.path, "unit": self.unit, **curves, "bandwidth": self.bandwidth.as_json()}
-        )
+        out = plain({"path": self.path, "unit": self.unit, **curves, "bandwidth": self.bandwidth.as_json()})
         return out | ({"note": self.note} if self.note else {})
 
 
@@ -110,7 +108,7 @@ class FrequencyResponse:
 
     def to_json(self) -> dict[str, Any]:
         """Frequencies, bands and bandwidths as plain values."""
-        out: dict[str, Any] = plain(
+        return plain(
             {
                 "frequency": self.frequency,
                 "time_unit": self.time_unit,
@@ -120,7 +118,6 @@ class FrequencyResponse:
                 "draws": self.draws,
             }
         )
-        return out
 
     def _repr_html_(self) -> str:
         return notebook_table(self.summary())
@@ -147,12 +144,7 @@ def transfer_function(table: ParameterTable, values: Matrix, frequency: Vector) 
 
 
 def frequency_response(
-    draws: Draws,
-    frequencies: ArrayLike | None = None,
-    *,
-    span: float,
-    period: float,
-    time_unit: str,
+    draws: Draws, frequencies: ArrayLike | None = None, *, span: float, period: float, time_unit: str
 ) -> FrequencyResponse:
     """Gain and phase of every path with pointwise and simultaneous 50 and 90 % bands.
 
@@ -182,18 +174,14 @@ def frequency_response(
         wide = _bandwidth(searched, reached[i, j], np.abs(gains[:, i, j]))
         paths.append(
             PathResponse(
-                name,
-                unit,
-                Bands(np.exp(log_gain.pointwise), np.exp(log_gain.simultaneous)),
-                Bands.of(np.degrees(phase[i, j])),
-                Estimate.of(
-                    f"bandwidth[{name}]",
-                    f"1/{time_unit}",
-                    wide,
-                    ess=draws.ess,
-                    grade=draws.grade.level,
+                path=name,
+                unit=unit,
+                gain=Bands(np.exp(log_gain.pointwise), np.exp(log_gain.simultaneous)),
+                phase=Bands.of(np.degrees(phase[i, j])),
+                bandwidth=Estimate.of(
+                    f"bandwidth[{name}]", f"1/{time_unit}", wide, ess=draws.ess, grade=draws.grade.level
                 ),
-                f"the sign of the gain is open: {100 * negative:.0f} % of draws are negative, and the "
+                note=f"the sign of the gain is open: {100 * negative:.0f} % of draws are negative, and the "
                 "phase has two values 180 deg apart"
                 if either
                 else "",

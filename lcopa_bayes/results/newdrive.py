@@ -12,7 +12,7 @@ import pandas as pd
 
 from lcopa_bayes.core.arrays import Array, Vector
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.core.files import save_json, save_table, writable_folder
 from lcopa_bayes.data.drive import Drive, drive_of, first_change
 from lcopa_bayes.data.record import Record, load_columns, record_of
@@ -21,17 +21,9 @@ from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
 from lcopa_bayes.results.fittedrange import FittedRange, Outside
 from lcopa_bayes.results.frequency import transfer_function
-from lcopa_bayes.results.prediction import (
-    Band,
-    band_of,
-    bands,
-    disturbances,
-    named_rng,
-    plant_draws,
-)
-from lcopa_bayes.results.provenance import digest, provenance
+from lcopa_bayes.results.prediction import Band, band_of, bands, disturbances, named_rng, plant_draws
 from lcopa_bayes.results.result import Result
-from lcopa_bayes.results.runfolder import add_origin, opened
+from lcopa_bayes.results.runfolder import add_origin, digest, opened, provenance
 from lcopa_bayes.sampling.draws import Draws
 
 Level = Literal["fitted", "zero"]
@@ -147,15 +139,11 @@ class Prediction(Result):
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, without the bands, which `table` holds."""
-        out: dict[str, Any] = plain(
+        return plain(
             {
                 "study": self.study,
                 "drive": self.driven.name,
-                "verdict": self.verdict,
-                "grade": self.grade,
-                "grade_reason": self.grade_reason,
-                "time_unit": self.time_unit,
-                "seed": self.seed,
+                **attributes(self, "verdict", "grade", "grade_reason", "time_unit", "seed"),
                 "measured": isinstance(self.driven, Record),
                 "kinds": [POINTWISE, SIMULTANEOUS],
                 "levels": [0.5, 0.9],
@@ -165,7 +153,6 @@ class Prediction(Result):
                 "scores": self.scores,
             }
         )
-        return out
 
     def save(self, folder: Path | str) -> Path:
         """Write `predict.json` and the tables of bands and drives into a folder; returns the folder.
@@ -205,15 +192,15 @@ def predict(
     squared = _squared(draws, fitted.centres(driven, times))
     grade = draws.grade
     return Prediction(
-        study.name,
-        driven,
-        tuple(predicted),
-        fitted.outside(driven, times, squared),
-        grade.level,
-        grade.reason,
-        study.time_unit,
-        study.seed,
-        plain(provenance(study, "predict") | {"draws_sha256": draws.sha256}),
+        study=study.name,
+        driven=driven,
+        bands=tuple(predicted),
+        outside=fitted.outside(driven, times, squared),
+        grade=grade.level,
+        grade_reason=grade.reason,
+        time_unit=study.time_unit,
+        seed=study.seed,
+        origin=plain(provenance(study, "predict") | {"draws_sha256": draws.sha256}),
     )
 
 

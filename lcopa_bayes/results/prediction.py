@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.estimate import attributes
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.noise import GaussianNoise, Noise
@@ -64,14 +65,7 @@ class Band:
 
     def table(self) -> pd.DataFrame:
         """One row per time: what was observed, and the ends of the bands by kind [`unit`]."""
-        columns: dict[str, Any] = {
-            "record": self.record,
-            "axis": self.axis,
-            "unit": self.unit,
-            "held_out": self.held_out,
-            "time": self.time,
-            "observed": self.observed,
-        }
+        columns: dict[str, Any] = attributes(self, "record", "axis", "unit", "held_out", "time", "observed")
         columns |= named("plant", Bands(self.plant, self.plant_simultaneous))
         return pd.DataFrame(columns | named("noisy", Bands(self.noisy, self.noisy_simultaneous)))
 
@@ -93,17 +87,12 @@ class Band:
     def score(self) -> dict[str, Any]:
         """Error and coverage as plain values."""
         return {
-            "record": self.record,
-            "axis": self.axis,
-            "unit": self.unit,
-            "rmse": self.rmse,
+            **attributes(self, "record", "axis", "unit", "rmse"),
             "coverage_50": self.coverage(LEVELS[0]),
             "coverage_90": self.coverage(LEVELS[1]),
             "bands": POINTWISE,
             "samples": self.time.size,
-            "offset_from": self.offset_from,
-            "offset_samples": self.offset_samples,
-            "draws": self.draws,
+            **attributes(self, "offset_from", "offset_samples", "draws"),
         }
 
 
@@ -123,13 +112,7 @@ def responses(table: ParameterTable, model: ForwardModel, values: Matrix) -> lis
 
 
 def bands(
-    draws: Draws,
-    model: ForwardModel,
-    samples: Sequence[Samples],
-    noise: Noise,
-    *,
-    held_out: bool,
-    seed: int,
+    draws: Draws, model: ForwardModel, samples: Sequence[Samples], noise: Noise, *, held_out: bool, seed: int
 ) -> list[Band]:
     """50 and 90 % bands of every axis of every record, for the plant alone and with noise.
 
@@ -155,13 +138,7 @@ def study_bands(problem: Problem, draws: Draws) -> list[Band]:
 
 
 def record_draws(
-    draws: Draws,
-    model: ForwardModel,
-    samples: Sequence[Samples],
-    noise: Noise,
-    *,
-    held_out: bool,
-    seed: int,
+    draws: Draws, model: ForwardModel, samples: Sequence[Samples], noise: Noise, *, held_out: bool, seed: int
 ) -> Iterator[tuple[tuple[str, Axis, bool], Vector, Vector, Matrix, Matrix, tuple[Vector, str, int]]]:
     """The draws behind `bands`, axis by axis of every record: arguments of `band_of`."""
     for r, record in enumerate(samples):
@@ -232,20 +209,20 @@ def band_of(
     shares = np.mean((noisy >= low) & (noisy <= high), axis=1)
     share = np.mean((observed >= low) & (observed <= high))
     return Band(
-        name,
-        axis.name,
-        axis.unit,
-        held_out,
-        times,
-        observed,
-        plant.pointwise,
-        with_noise.pointwise,
-        plant.simultaneous,
-        with_noise.simultaneous,
-        source,
-        used,
-        response.shape[0],
-        float((1 + np.count_nonzero(shares <= share)) / (1 + shares.size)),
+        record=name,
+        axis=axis.name,
+        unit=axis.unit,
+        held_out=held_out,
+        time=times,
+        observed=observed,
+        plant=plant.pointwise,
+        noisy=with_noise.pointwise,
+        plant_simultaneous=plant.simultaneous,
+        noisy_simultaneous=with_noise.simultaneous,
+        offset_from=source,
+        offset_samples=used,
+        draws=response.shape[0],
+        p_inside=float((1 + np.count_nonzero(shares <= share)) / (1 + shares.size)),
     )
 
 

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from xarray import DataTree
 
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import attributes
 from lcopa_bayes.data.drive import Drive
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
@@ -44,11 +45,7 @@ class Predictive(Result):
             [
                 {
                     "parameter": one.name,
-                    "value": one.value,
-                    "lower": one.lower,
-                    "upper": one.upper,
-                    "unit": one.unit,
-                    "ess": one.ess,
+                    **attributes(one, "value", "lower", "upper", "unit", "ess"),
                     "rhat": qualities[one.name].rhat,
                     "grade": one.grade,
                 }

@@ -10,6 +10,7 @@ import numpy as np
 from scipy import signal, stats
 
 from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.estimate import attributes
 from lcopa_bayes.inference.noise import Noise
 from lcopa_bayes.results.prediction import Band
 from lcopa_bayes.sampling.draws import Draws
@@ -58,13 +59,7 @@ class Residual:
 
     def test(self) -> dict[str, Any]:
         """Size and test of whiteness as plain values."""
-        return {
-            "record": self.record,
-            "axis": self.axis,
-            "held_out": self.held_out,
-            "p_white": self.p_white,
-            "rms": self.rms,
-        }
+        return attributes(self, "record", "axis", "held_out", "p_white", "rms")
 
 
 def residuals(draws: Draws, bands: Sequence[Band], noise: Noise, period: float) -> list[Residual]:
@@ -88,17 +83,17 @@ def _residual(band: Band, draws: Draws, axis: int, noise: Noise, period: float) 
     rate = 1.0 / float(np.median(np.diff(band.time)))
     frequency, power = signal.periodogram(centred, fs=rate)
     return Residual(
-        band.record,
-        band.axis,
-        band.unit,
-        band.held_out,
-        band.time,
-        values,
-        innovations,
-        autocorrelation,
-        frequency[1:],
-        power[1:] / (2 * centred.var() / rate),
-        ljung_box(autocorrelation, n, fitted=noise.memory),
+        record=band.record,
+        axis=band.axis,
+        unit=band.unit,
+        held_out=band.held_out,
+        time=band.time,
+        values=values,
+        innovations=innovations,
+        autocorrelation=autocorrelation,
+        frequency=frequency[1:],
+        spectrum=power[1:] / (2 * centred.var() / rate),
+        p_white=ljung_box(autocorrelation, n, fitted=noise.memory),
     )
 
 

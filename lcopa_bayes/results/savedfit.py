@@ -20,14 +20,14 @@ import xarray as xr
 
 from lcopa_bayes.core.arrays import Array
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import writable_folder, write_whole
 from lcopa_bayes.data.studywriter import study_from_json, study_to_json
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.results.datatree import POSTERIOR, load_tree, posterior_draws
 from lcopa_bayes.results.predictive import Predictive
-from lcopa_bayes.results.provenance import provenance
-from lcopa_bayes.results.runfolder import add_origin, opened, origins
+from lcopa_bayes.results.runfolder import add_origin, opened, origins, provenance
 from lcopa_bayes.sampling.convergence import Limitation, Quality
 from lcopa_bayes.sampling.draws import Draws
 from lcopa_bayes.sampling.modes import Modes
@@ -88,16 +88,7 @@ def fit_to_json(problem: Problem, draws: Draws) -> dict[str, Any]:
         "target_ess": draws.target_ess,
         "qualities": [_texts(asdict(one)) for one in draws.qualities],
         "limitations": [one.as_json() for one in draws.limitations],
-        "modes": [
-            {
-                "parameter": one.parameter,
-                "unit": one.unit,
-                "boundaries": list(one.boundaries),
-                "shares": one.shares.tolist(),
-                "errors": one.errors.tolist(),
-            }
-            for one in draws.modes
-        ],
+        "modes": [plain(asdict(one)) for one in draws.modes],
         "study": study_to_json(problem.study),
     }
 

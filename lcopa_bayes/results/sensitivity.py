@@ -61,8 +61,7 @@ class Sensitivity:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; what is not trusted is None."""
-        values: dict[str, Any] = plain(asdict(self) | {"threshold": THRESHOLD})
-        return values
+        return plain(asdict(self) | {"threshold": THRESHOLD})
 
 
 def sensitivity(draws: Draws, posterior: Posterior) -> tuple[Sensitivity, ...]:

@@ -13,9 +13,8 @@ from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import save_json, writable_folder, write_text
 from lcopa_bayes.results.datatree import POSTERIOR
 from lcopa_bayes.results.predictive import Predictive
-from lcopa_bayes.results.provenance import provenance
 from lcopa_bayes.results.result import Result
-from lcopa_bayes.results.runfolder import add_origin, opened, origins
+from lcopa_bayes.results.runfolder import add_origin, opened, origins, provenance
 from lcopa_bayes.results.savedfit import NAME, load_fit
 
 R = TypeVar("R", bound="StoredResult")
@@ -96,8 +95,7 @@ class StoredResult(Result):
 
 def origin_of(fit: Predictive, verb: str) -> dict[str, Any]:
     """Provenance of a result that rests on a fit."""
-    values: dict[str, Any] = plain(provenance(fit.study, verb) | {"draws_sha256": fit.draws.sha256})
-    return values
+    return plain(provenance(fit.study, verb) | {"draws_sha256": fit.draws.sha256})
 
 
 def stored_values(

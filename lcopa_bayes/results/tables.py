@@ -173,7 +173,4 @@ def _cross_check(fit: Fit, check: CrossCheck) -> dict[str, pd.DataFrame]:
                 }
             )
         )
-    return {
-        "cross_check": pd.DataFrame(rows),
-        "cross_check_density": pd.concat(densities, ignore_index=True),
-    }
+    return {"cross_check": pd.DataFrame(rows), "cross_check_density": pd.concat(densities, ignore_index=True)}

@@ -28,6 +28,7 @@ _WIDER = 1.1
 _LOG_2PI = float(np.log(2 * np.pi))
 
 
+@final
 class Kept(NamedTuple):
     """One draw for each of a batch of points."""
 
@@ -41,6 +42,7 @@ class Kept(NamedTuple):
     """Effective share of the draws tried, (batch,) [-]."""
 
 
+@final
 class _Block(NamedTuple):
     """Gaussian of a few coordinates given those before them, those after them integrated out."""
 

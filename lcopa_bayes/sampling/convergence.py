@@ -12,6 +12,7 @@ from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 from scipy.stats import chi2, norm, rankdata, spearmanr
 
 from lcopa_bayes.core.arrays import Array, Vector
+from lcopa_bayes.core.estimate import attributes
 from lcopa_bayes.sampling.modes import Modes
 
 Level = Literal["reliable", "tentative", "unusable"]
@@ -162,12 +163,7 @@ class Limitation:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        return {
-            "level": self.level,
-            "reason": self.reason,
-            "remedy": self.remedy,
-            "parameters": list(self.parameters),
-        }
+        return {**attributes(self, "level", "reason", "remedy"), "parameters": list(self.parameters)}
 
 
 def limited(grade: Grade, limitations: Sequence[Limitation]) -> Grade:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.stats import kstwobign, norm
 
 from lcopa_bayes.core.arrays import Vector
-from lcopa_bayes.core.estimate import EQUAL_TAILED, LEVEL, plain
+from lcopa_bayes.core.estimate import EQUAL_TAILED, LEVEL, attributes, plain
 from lcopa_bayes.sampling.convergence import Grade, Level, Limitation
 from lcopa_bayes.sampling.draws import Draws
 from lcopa_bayes.sampling.nested import Nested
@@ -190,14 +190,12 @@ class CrossCheck:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        fields: dict[str, Any] = plain(
+        return plain(
             {
                 "agrees": self.agrees,
                 "sentence": self.sentence,
                 "alarm": ALARM,
-                "log_evidence": self.nested.log_evidence,
-                "log_evidence_sd": self.nested.log_evidence_sd,
-                "run_log_evidences": self.nested.run_log_evidences,
+                **attributes(self.nested, "log_evidence", "log_evidence_sd", "run_log_evidences"),
                 "run_log_evidence": self.log_evidence,
                 "run_log_evidence_sd": self.log_evidence_sd,
                 "evidence_p": self.evidence_p,
@@ -208,15 +206,12 @@ class CrossCheck:
                         "unit": parameter.unit,
                         "run": parameter.run.as_json(),
                         "nested": parameter.nested.as_json(),
-                        "distance": parameter.distance,
-                        "p": parameter.p,
-                        "resolution": parameter.resolution,
+                        **attributes(parameter, "distance", "p", "resolution"),
                     }
                     for parameter in self.parameters
                 ],
             }
         )
-        return fields
 
 
 def holm(p: Sequence[float]) -> list[float]:

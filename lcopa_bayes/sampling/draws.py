@@ -113,8 +113,7 @@ class Draws:
                 self.column(quality.name),
                 ess=quality.ess,
                 grade=self.level(
-                    quality.name,
-                    Grade.worst([quality.grade(self.target_ess), *shares.get(quality.name, [])]),
+                    quality.name, Grade.worst([quality.grade(self.target_ess), *shares.get(quality.name, [])])
                 ),
             )
             for quality in self.qualities

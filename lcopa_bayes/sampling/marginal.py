@@ -23,8 +23,7 @@ from scipy.spatial import cKDTree
 from scipy.special import logsumexp
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
-from lcopa_bayes.core.parallel import Workers
-from lcopa_bayes.core.progress import Progress
+from lcopa_bayes.core.parallel import Progress, Workers
 from lcopa_bayes.inference.conditional import Conditional
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.optimum import Optimum, again, find_optima
@@ -92,6 +91,7 @@ _TASK = 64
 """Points of a task."""
 
 
+@final
 class _Point(NamedTuple):
     """What is known at each of a batch of points."""
 

@@ -13,7 +13,7 @@ from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 from scipy.ndimage import gaussian_filter1d
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector, frozen
-from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.estimate import attributes, plain
 
 DEPTH = 0.5
 """The minimum between two modes is below this share of the lower of both [-] ..."""
@@ -89,12 +89,9 @@ class Modes:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; shares by ensemble and mode."""
-        fields: dict[str, Any] = plain(
+        return plain(
             {
-                "parameter": self.parameter,
-                "unit": self.unit,
-                "boundaries": self.boundaries,
-                "shares": self.shares,
+                **attributes(self, "parameter", "unit", "boundaries", "shares"),
                 "shares_mcse": self.errors,
                 "pooled": self.pooled,
                 "pooled_mcse": self.pooled_errors,
@@ -102,7 +99,6 @@ class Modes:
                 "sentence": self.sentence(),
             }
         )
-        return fields
 
     def sentence(self) -> str:
         """Number, position and shares of the modes, and the remedy when the ensembles weigh them

@@ -18,8 +18,7 @@ from dynesty.internal_samplers import InternalSampler, SamplerArgument, SamplerR
 from scipy.special import logsumexp
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
-from lcopa_bayes.core.parallel import workers
-from lcopa_bayes.core.progress import Progress
+from lcopa_bayes.core.parallel import Progress, workers
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.constrainedwalk import Walk
@@ -180,6 +179,7 @@ def _run(shared: tuple[Posterior, NestedPlan], seed: np.random.SeedSequence) -> 
     return strands, plan.live + int(np.sum(results.ncall))
 
 
+@final
 class _Together:
     """What dynesty takes for its pool of workers: a queue of points is moved as one batch."""
 

@@ -42,12 +42,7 @@ class RidgeMove(PopulationMove):
     """A move of ratios, orders and held times of one element; the other times follow."""
 
     def rebuilt(
-        self,
-        proposed: Matrix,
-        here: Matrix,
-        element: ElementColumns,
-        log_ratios: Matrix,
-        frequencies: Vector,
+        self, proposed: Matrix, here: Matrix, element: ElementColumns, log_ratios: Matrix, frequencies: Vector
     ) -> tuple[Matrix, Vector]:
         """`proposed` with the times that follow from its ratios; its gains keep the level D(s_0).
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import ceil, inf
@@ -13,11 +13,11 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix
-from lcopa_bayes.core.parallel import workers
-from lcopa_bayes.core.progress import Progress
+from lcopa_bayes.core.parallel import Progress, workers
 from lcopa_bayes.data.settings import Method
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.simulation import Simulated
 from lcopa_bayes.sampling.chainfile import Chain, load_chain, save_chain
 from lcopa_bayes.sampling.convergence import CERTAIN, Quality, drifts, qualities
 from lcopa_bayes.sampling.ensemble import Ensemble, advance
@@ -122,6 +122,8 @@ class Run:
     unconfirmed: tuple[str, ...] = ()
     """Parameters with modes that filled while the ensembles ran, whose shares importance draws could not
     confirm."""
+    surrogate: Callable[[Matrix], Sequence[Simulated]] | None = None
+    """What stands for the responses of a plant with effects where the draws are; None without."""
     stopped_after: float | None = None
     """Time that sampling had taken when its budget ended it [s]; None: it ended by itself."""
 

@@ -20,6 +20,7 @@ from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
 
 
+@final
 class Shape(NamedTuple):
     """An element at given frequencies, for a batch."""
 
@@ -78,11 +79,7 @@ class ElementColumns:
         return Shape(np.log(level[:, 1:] / level[:, :1]), np.log(level[:, 0]), volume)
 
     def log_times(
-        self,
-        log_ratios: Matrix,
-        orders: Matrix,
-        frequencies: Vector,
-        held_log_time: Vector | None = None,
+        self, log_ratios: Matrix, orders: Matrix, frequencies: Vector, held_log_time: Vector | None = None
     ) -> Matrix:
         """Log times that follow, (batch, ratios), at these ratios and orders; NaN where there are none.
 

@@ -42,11 +42,17 @@ _STREAM = 12
 """Marks the randomness of such a run."""
 _FEWEST = 100.0
 """Effective draws below which weights are not used [-]."""
+_EVEN = 0.9
+"""Effective draws per draw from which weights are so even that their largest ones do not matter, whatever the
+shape of their tail [-]."""
 _TRIED = 128
 """Draws at which a surrogate is compared with the posterior before more is spent on it [-]."""
 _SURPLUS = 2.5
 """Effective draws of a surrogate that are weighted by the posterior itself, over those wanted [-]: the error
 of a quantile is uncertain itself, and resampling costs the rest."""
+_LEAST = 1_500.0
+"""Such draws at least [-]: with fewer the means of their four parts scatter too much to show that they agree
+(`convergence.RELIABLE_SCATTER`)."""
 _WALKERS = 64
 """Walkers of an ensemble that moves weighted draws on, at least [-]."""
 _ROUNDS, _KEPT, _THIN = 24, 20, 5
@@ -86,7 +92,7 @@ def weighted_run(
             share = weighted.ess / weighted.count
     if not usable(weighted):
         return None
-    run = Run((), plan, weighted)
+    run = Run((), plan, weighted, surrogate=near.surrogate)
     draws = gather(near, run)
     if share < LEAST_EFFICIENCY:
         draws = draws.limited(
@@ -104,7 +110,8 @@ def weighted_run(
 
 def usable(weighted: Weighted) -> bool:
     """Whether averages converge and enough draws count."""
-    return weighted.pareto_k <= usable_k(weighted.count) and weighted.ess >= _FEWEST
+    converging = weighted.pareto_k <= usable_k(weighted.count) or weighted.ess >= _EVEN * weighted.count
+    return converging and weighted.ess >= _FEWEST
 
 
 def _by_surrogate(
@@ -124,7 +131,7 @@ def _by_surrogate(
     held = _efficiency(posterior, first.coordinates[tried], first.log_density[tried], mapped)
     if held < LEAST_EFFICIENCY:
         return posterior, None, 0.0
-    count, share = int(_SURPLUS * plan.wanted / held), first.ess / first.count
+    count, share = int(max(_SURPLUS * plan.wanted, _LEAST) / held), first.ess / first.count
     drawn = first.batches(max(1, int(min(count, first.ess)) // BATCHES), rng).ravel()
     z, about = first.coordinates[drawn], first.log_density[drawn]
     if share < LEAST_EFFICIENCY:

@@ -1,18 +1,215 @@
-"""`check`: what was understood of a study, in words and pictures, without fitting it."""
+"""`check`: what was understood of a study, in words and pictures, without fitting it.
+
+What a study holds, before anything is fitted: axes, drives, sampling, noise at rest, onsets and priors.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
+import numpy as np
 import pandas as pd
 
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.data.drive import axis_drives, first_change
 from lcopa_bayes.data.record import Record
-from lcopa_bayes.results.inventory import inventory
-from lcopa_bayes.results.provenance import provenance
+from lcopa_bayes.data.requirements import unmet
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.inference.observations import Samples
+from lcopa_bayes.inference.parameter import Parameter
+from lcopa_bayes.results.runfolder import provenance
 from lcopa_bayes.results.stored import StoredResult
 from lcopa_bayes.verbs.sources import StudyLike, study_of
+
+_EVEN = 0.01
+"""Spread of the gaps between samples over their median from which sampling is irregular [-]."""
+_STILL = 5
+"""Samples at rest without which no onset is looked for [-]."""
+_AWAY = 5.0
+"""Deviation from rest that is a response, over the scatter at rest [-] ..."""
+_IN_TURN = 3
+"""... in so many samples in turn."""
+_ENDS = (0.05, 0.95)
+
+
+def inventory(study: Study) -> dict[str, Any]:
+    """What was understood of a study, as plain values with sentences.
+
+    InputError where its settings do not fit its records.
+    """
+    problem, obstacles = problem_of(study), unmet(study)
+    rows = problem.posterior.table.rows
+    sentences = [*_of_plant(problem), *_of_model(problem)]
+    verdict = f"To mend before a fit: {'; '.join(obstacles)}." if obstacles else "The records can be fitted."
+    return plain(
+        {
+            "study": study.name,
+            "time_unit": study.time_unit,
+            "verdict": verdict,
+            "grade": "unusable" if obstacles else "reliable",
+            "grade_reason": verdict,
+            "problems": obstacles,
+            "sentences": sentences,
+            "records": [
+                *(_record(one, problem, held_out=False) for one in study.fit),
+                *(_record(one, problem, held_out=True) for one in study.held_out),
+            ],
+            "parameters": [_prior(row) for row in rows],
+        }
+    )
+
+
+def _of_plant(problem: Problem) -> list[str]:
+    study = problem.study
+    drives, responses = (
+        ", ".join(f"{axis.name} [{axis.unit}]" for axis in axes)
+        for axes in (study.drive_axes, study.response_axes)
+    )
+    number = len(study.drive_axes) * len(study.response_axes)
+    return [
+        f"{_counted(number, 'path')} from {drives} to {responses}; times in {study.time_unit}.",
+        f"{_counted(len(study.fit), 'record')} to fit, {len(study.held_out)} held out.",
+    ]
+
+
+def _of_model(problem: Problem) -> list[str]:
+    table = problem.posterior.table
+    terms = sorted({slot.terms for slot in table.layout.elements})
+    elements, delays = len(table.layout.elements), len(table.of_kind("delay"))
+    free = [row for row in table.rows if row.free]
+    several = " or ".join(map(str, terms))
+    return [
+        f"Every path is gain exp(-delay s) / (1 + sum of (time_i s)^order_i), with {several} "
+        f"term{'s' * (terms != [1])}; all paths together have {_counted(elements, 'element')} and "
+        f"{_counted(delays, 'delay')}.",
+        f"{_counted(len(free), 'free parameter')}, {len(table.rows) - len(free)} fixed; "
+        f"{problem.posterior.dimension} are sampled, the others are integrated out.",
+    ]
+
+
+def _record(record: Record, problem: Problem, *, held_out: bool) -> dict[str, Any]:
+    samples = Samples.of(record, problem.scales.period)
+    gaps = np.diff(samples.times if samples.times.size > 1 else record.time)
+    period = float(np.median(gaps))
+    even = bool(np.ptp(gaps) <= _EVEN * period)
+    began = first_change(record)
+    out: dict[str, Any] = {
+        "record": record.name,
+        "held_out": held_out,
+        "rows": record.time.size,
+        "start": float(record.time[0]),
+        "end": float(record.time[-1]),
+        "period": period,
+        "even": even,
+        "longest_gap": float(gaps.max()),
+        "drives": _driven(record),
+        "responses": [_response(record, samples, axis, began) for axis in range(record.response.shape[1])],
+    }
+    return out | {"sentences": _sentences(out, record.time_unit)}
+
+
+def _driven(record: Record) -> list[dict[str, Any]]:
+    out = []
+    for axis, drive, values in zip(record.drive_axes, axis_drives(record), record.drive.T, strict=True):
+        holds = np.diff([*drive.times, record.time[-1]])
+        out.append(
+            {
+                "axis": axis.name,
+                "unit": axis.unit,
+                "rest": float(values[0]),
+                "lowest": float(values.min()),
+                "highest": float(values.max()),
+                "changes": drive.times.size,
+                "first_change": float(drive.times[0]) if drive.moves else None,
+                "longest_hold": float(holds.max()) if drive.moves else None,
+            }
+        )
+    return out
+
+
+def _response(record: Record, samples: Samples, axis: int, began: float) -> dict[str, Any]:
+    observed, at_rest = samples.axes[axis], samples.quiet(axis)
+    times = samples.times[observed.index]
+    scatter = float(at_rest.values.std(ddof=1)) if at_rest.values.size > 1 else None
+    name = record.response_axes[axis]
+    return {
+        "axis": name.name,
+        "unit": name.unit,
+        "samples": observed.values.size,
+        "missing": record.time.size - observed.values.size,
+        "lowest": float(observed.values.min()) if observed.values.size else None,
+        "highest": float(observed.values.max()) if observed.values.size else None,
+        "at_rest": at_rest.values.size,
+        "scatter": scatter,
+        "onset": _onset(times, observed.values, at_rest.values, began),
+    }
+
+
+def _onset(times: Vector, values: Vector, at_rest: Vector, began: float) -> float | None:
+    """Time from the first change of a drive to the first clear deviation from rest; None without one."""
+    if at_rest.size < _STILL or at_rest.size + _IN_TURN > values.size:
+        return None
+    away = np.abs(values - at_rest.mean()) > _AWAY * at_rest.std(ddof=1)
+    away[: at_rest.size] = False
+    in_turn = np.convolve(away, np.ones(_IN_TURN, dtype=int), mode="valid") == _IN_TURN
+    return float(times[int(in_turn.argmax())] - began) if in_turn.any() else None
+
+
+def _sentences(one: dict[str, Any], unit: str) -> list[str]:
+    span = f"{one['rows']} rows from {one['start']:.6g} to {one['end']:.6g} {unit}"
+    spaced = f"sampled every {one['period']:.4g} {unit}"
+    gaps = f"gaps of {one['period']:.4g} {unit} in the median and up to {one['longest_gap']:.4g} {unit}"
+    uneven = f"sampled irregularly, with {gaps}"
+    out = [f"{span}, {spaced if one['even'] else uneven}."]
+    for drive in one["drives"]:
+        if drive["first_change"] is None:
+            out.append(f"{drive['axis']} stays at {drive['rest']:.4g} {drive['unit']}.")
+        else:
+            often = _counted(drive["changes"], "time")
+            out.append(
+                f"{drive['axis']} changes {often} from {drive['first_change']:.4g} {unit} on, between "
+                f"{drive['lowest']:.4g} and {drive['highest']:.4g} {drive['unit']}; longest hold "
+                f"{drive['longest_hold']:.4g} {unit}."
+            )
+    for axis in one["responses"]:
+        if not axis["samples"]:
+            out.append(f"{axis['axis']} was not sampled.")
+            continue
+        said = (
+            f"{axis['axis']} between {axis['lowest']:.4g} and {axis['highest']:.4g} {axis['unit']}, "
+            f"{axis['samples']} samples"
+        )
+        said += f", {axis['missing']} missing" if axis["missing"] else ""
+        if axis["scatter"] is not None:
+            said += f"; {axis['at_rest']} at rest, which scatter by {axis['scatter']:.2g} {axis['unit']}"
+        if axis["onset"] is not None:
+            said += f"; it moves clearly {axis['onset']:.4g} {unit} after the first change of a drive"
+        out.append(f"{said}.")
+    return out
+
+
+def _counted(number: int, noun: str) -> str:
+    return f"{number} {noun}{'s' * (number != 1)}"
+
+
+def _prior(row: Parameter) -> dict[str, Any]:
+    if row.prior is None:
+        return {"name": row.name, "unit": row.unit, "value": row.value, "words": f"fixed at {row.value:.6g}"}
+    ends: Sequence[float] = [float(row.prior.frozen.ppf(end)) for end in _ENDS]
+    return {
+        "name": row.name,
+        "unit": row.unit,
+        "lower": ends[0],
+        "upper": ends[1],
+        "prior": str(row.prior),
+        "from": "default" if row.default else "study",
+        "words": f"between {ends[0]:.4g} and {ends[1]:.4g} with 90 % probability",
+    }
 
 
 @final

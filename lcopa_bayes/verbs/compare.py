@@ -19,8 +19,7 @@ from lcopa_bayes.data.settings import CandidateSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_candidates
 from lcopa_bayes.inference.assembly import problem_of
-from lcopa_bayes.results.provenance import provenance
-from lcopa_bayes.results.runfolder import opened
+from lcopa_bayes.results.runfolder import opened, provenance
 from lcopa_bayes.results.stored import StoredResult
 from lcopa_bayes.verbs.sources import FitLike, study_of
 

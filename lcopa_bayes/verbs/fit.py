@@ -13,9 +13,8 @@ from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.fit import fit as sampled
 from lcopa_bayes.results.integerrival import integer_rival
 from lcopa_bayes.results.predictive import Predictive
-from lcopa_bayes.results.provenance import provenance
 from lcopa_bayes.results.result import write_page
-from lcopa_bayes.results.runfolder import opened
+from lcopa_bayes.results.runfolder import opened, provenance
 from lcopa_bayes.verbs.look import look_result
 from lcopa_bayes.verbs.sources import FitLike, StudyLike, finished, study_of
 
@@ -73,13 +72,7 @@ def _announced(page: Path) -> None:
 
 
 def basis(
-    source: FitLike,
-    *,
-    jobs: int,
-    folder: Path | str | None,
-    resume: bool,
-    quick: bool,
-    quiet: bool,
+    source: FitLike, *, jobs: int, folder: Path | str | None, resume: bool, quick: bool, quiet: bool
 ) -> Predictive:
     """The finished fit that is given or named, else the fit of the study that is; parameters as `fit`."""
     result = finished(source)

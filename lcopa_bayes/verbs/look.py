@@ -9,7 +9,7 @@ from typing import final
 import pandas as pd
 
 from lcopa_bayes.results.firstlook import FirstLook, first_look
-from lcopa_bayes.results.provenance import provenance
+from lcopa_bayes.results.runfolder import provenance
 from lcopa_bayes.results.stored import StoredResult
 from lcopa_bayes.verbs.sources import StudyLike, study_of
 

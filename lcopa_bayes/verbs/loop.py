@@ -16,8 +16,7 @@ from lcopa_bayes.data.studywriter import write_study
 from lcopa_bayes.effectsearch.loop import loop as searched
 from lcopa_bayes.effectsearch.summary import drawn, results, words
 from lcopa_bayes.inference.assembly import problem_of
-from lcopa_bayes.results.provenance import provenance
-from lcopa_bayes.results.runfolder import opened
+from lcopa_bayes.results.runfolder import opened, provenance
 from lcopa_bayes.results.stored import StoredResult
 from lcopa_bayes.verbs.sources import FitLike, study_of
 

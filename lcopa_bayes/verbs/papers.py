@@ -15,15 +15,13 @@ from lcopa_bayes.core.files import writable_folder
 from lcopa_bayes.paper.auditclaims import load_audit
 from lcopa_bayes.paper.claims import judge
 from lcopa_bayes.paper.comparisonclaims import load_comparison
-from lcopa_bayes.paper.figures import panels
 from lcopa_bayes.paper.identify import identify as identified
 from lcopa_bayes.paper.identify import results, scannable
 from lcopa_bayes.paper.intervals import Scan
-from lcopa_bayes.paper.opticsplan import OpticsPlan
-from lcopa_bayes.paper.staticoptics import static_optics
-from lcopa_bayes.paper.steptable import load_posterior, step_table
+from lcopa_bayes.paper.staticoptics import OpticsPlan, static_optics
+from lcopa_bayes.paper.steptable import load_posterior, panels, step_table
 from lcopa_bayes.paper.verdict import Evidence, Kind
-from lcopa_bayes.results.provenance import provenance
+from lcopa_bayes.results.runfolder import provenance
 from lcopa_bayes.results.stored import StoredResult
 from lcopa_bayes.verbs.sources import FitLike, study_of
 

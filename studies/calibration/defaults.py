@@ -25,12 +25,10 @@ from typing import Any
 
 import numpy as np
 
-from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import step
-from lcopa_bayes.bench.device import Device
+from lcopa_bayes.bench.device import Bench, Device, simulate
 from lcopa_bayes.calibration.calibrate import Calibration, calibrate
 from lcopa_bayes.calibration.ranks import LEVELS, Coverage
-from lcopa_bayes.calibration.summary import results
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import save_json, writable_folder, write_text
 from lcopa_bayes.data.record import Axis
@@ -38,6 +36,7 @@ from lcopa_bayes.data.settings import ModelSettings, NoiseSettings, SamplerSetti
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.model.path import TransferPath
 from lcopa_bayes.report.theme import BAND, HELD_OUT, NOISE, blank, look, svg_of
+from lcopa_bayes.verbs.calibrate import results
 
 CAMERA, DURATION, COMMAND = 0.2, 48.0, 2.0
 """Sampling period, length of the record, and time of the step [ms]."""
@@ -132,11 +131,11 @@ def cells() -> tuple[Cell, ...]:
     return tuple(out)
 
 
-def row_of(cell: Cell, made: Calibration) -> dict[str, Any]:
+def row_of(cell: Cell, calibration: Calibration) -> dict[str, Any]:
     """What a cell gave: hits by parameter and level, and what the replicas say of themselves."""
-    told = results(made)
-    names = [quantity.name for quantity in made.replication.quantities if quantity.kind == "parameter"]
-    inside = np.array([outcome.inside for outcome in made.outcomes])[:, : len(names)].sum(axis=0)
+    result = results(calibration)
+    names = [quantity.name for quantity in calibration.replication.quantities if quantity.kind == "parameter"]
+    inside = np.array([outcome.inside for outcome in calibration.outcomes])[:, : len(names)].sum(axis=0)
     return {
         "cell": cell.name,
         "noise": cell.noise,
@@ -145,13 +144,13 @@ def row_of(cell: Cell, made: Calibration) -> dict[str, Any]:
         "delay": cell.delay,
         "onset": cell.onset,
         "truth": cell.truth,
-        "replicas": len(made.outcomes),
+        "replicas": len(calibration.outcomes),
         "hits": {
             name: dict(zip(map(str, LEVELS), row.tolist(), strict=True))
             for name, row in zip(names, inside, strict=True)
         },
-        **{key: told[key] for key in ("grades", "engine", "discretisation", "model_gap", "seconds")},
-        "failures": told["failures"][:3],
+        **{key: result[key] for key in ("grades", "engine", "discretisation", "model_gap", "seconds")},
+        "failures": result["failures"][:3],
     }
 
 
@@ -223,17 +222,17 @@ def sentence(coverage: Sequence[dict[str, Any]], kind: str, what: str) -> str:
     )
 
 
-def table_of(told: dict[str, Any]) -> str:
+def table_of(result: dict[str, Any]) -> str:
     """Markdown: coverage of 90 % intervals per cell, and pooled."""
-    rows, by_cell = told["cells"], {}
-    for row in told["coverage"]:
+    rows, by_cell = result["cells"], {}
+    for row in result["coverage"]:
         if row["level"] == LEVELS[-1]:
             by_cell.setdefault(row["cell"], {})[row["parameter"]] = row
-    names = list(dict.fromkeys(row["parameter"] for row in told["coverage"]))
+    names = list(dict.fromkeys(row["parameter"] for row in result["coverage"]))
     lines = [
         "# Coverage of 90 % intervals at default settings",
         "",
-        *(f"{line}\n" for line in told["verdict"]),
+        *(f"{line}\n" for line in result["verdict"]),
     ]
     head = ["cell", "replicas", *names, "ensembles", "not reliable", "block shift", "s"]
     lines += [" | ".join(["", *head, ""]).strip(), "|" + "---|" * len(head)]
@@ -255,7 +254,7 @@ def table_of(told: dict[str, Any]) -> str:
             + " |"
         )
     lines += ["", "Pooled over one-term cells of the default noise:", ""]
-    pool = [row for row in told["pooled"] if row["level"] == LEVELS[-1]]
+    pool = [row for row in result["pooled"] if row["level"] == LEVELS[-1]]
     columns = list(dict.fromkeys(row["parameter"] for row in pool))
     lines += ["| cells | replicas | " + " | ".join(columns) + " |", "|" + "---|" * (len(columns) + 2)]
     for group in dict.fromkeys(row["cells"] for row in pool):
@@ -264,25 +263,25 @@ def table_of(told: dict[str, Any]) -> str:
         lines.append(f"| {group} | {own[columns[0]]['replicas']} | " + " | ".join(values) + " |")
     lines += [
         "",
-        f"Replicas in all: {told['replicas']}, of them {told['sampled']} by ensembles, "
-        f"{told['not_reliable']} not graded reliable, {told['failed']} failed. `block shift`: largest shift "
-        "of a posterior mean by the width of the blocks over the replicas [posterior sd]; `s`: median "
+        f"Replicas in all: {result['replicas']}, of them {result['sampled']} by ensembles, "
+        f"{result['not_reliable']} not graded reliable, {result['failed']} failed. `block shift`: largest "
+        "shift of a posterior mean by the width of the blocks over the replicas [posterior sd]; `s`: median "
         "processor time of a replica.",
         "",
     ]
     return "\n".join(lines)
 
 
-def figure_of(told: dict[str, Any]) -> str:
+def figure_of(result: dict[str, Any]) -> str:
     """Coverage of 90 % intervals with bands, one panel per parameter, one row per cell."""
-    names = [n for n in dict.fromkeys(row["parameter"] for row in told["coverage"]) if kind_of(n) in PLANT]
-    order = [row["cell"] for row in told["cells"]]
+    names = [n for n in dict.fromkeys(row["parameter"] for row in result["coverage"]) if kind_of(n) in PLANT]
+    order = [row["cell"] for row in result["cells"]]
     with look():
         figure = blank(1.2 + 0.17 * len(order))
         panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
         for panel, name in zip(panels, names, strict=True):
             panel.axvline(LEVELS[-1], color=NOISE, lw=0.9, ls=(0, (4, 3)))
-            for row in told["coverage"]:
+            for row in result["coverage"]:
                 if row["parameter"] == name and row["level"] == LEVELS[-1]:
                     at, seen = order.index(row["cell"]), row["observed"]
                     ends = np.abs(np.array([[row["lower"]], [row["upper"]]]) - seen)
@@ -347,7 +346,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if replicas == 0:
             continue
         writable_folder(options.store)
-        made = calibrate(
+        calibration = calibrate(
             cell.study(1000 * options.seed + number),
             replicas=replicas,
             truth=cell.truth,
@@ -355,16 +354,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
             folder=folder,
             resume=True,
         )
-        rows.append(row_of(cell, made))
+        rows.append(row_of(cell, calibration))
         shown = {
             name: hits[str(LEVELS[-1])] / rows[-1]["replicas"] for name, hits in rows[-1]["hits"].items()
         }
         print(cell.name, rows[-1]["replicas"], {n: round(v, 3) for n, v in shown.items()}, flush=True)
-        told = summary(rows, options.seed)
+        result = summary(rows, options.seed)
         out = writable_folder(options.out)
-        save_json(told, out / "results.json")
-        write_text(out / "table.md", table_of(told))
-        write_text(out / "coverage.svg", figure_of(told))
+        save_json(result, out / "results.json")
+        write_text(out / "table.md", table_of(result))
+        write_text(out / "coverage.svg", figure_of(result))
     return 0
 
 

@@ -22,12 +22,11 @@ from typing import Any
 import numpy as np
 from scipy.stats import beta
 
-from lcopa_bayes.bench.acquisition import Bench, truth
 from lcopa_bayes.bench.command import staircase
-from lcopa_bayes.bench.device import Device
-from lcopa_bayes.calibration.simulation import measured
+from lcopa_bayes.bench.device import Bench, Device, truth
+from lcopa_bayes.calibration.replica import measured
+from lcopa_bayes.comparison.averaging import by_evidence, simplest
 from lcopa_bayes.comparison.candidates import candidates_of
-from lcopa_bayes.comparison.gains import by_evidence, simplest
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.files import writable_folder, write_text
 from lcopa_bayes.core.parallel import workers
@@ -118,14 +117,14 @@ def drawn(problem: Problem, rng: np.random.Generator) -> tuple[Vector, int]:
 
 def replica(number: int, *, quick: bool) -> dict[str, Any]:
     """One truth, its record, and the evidence of every candidate. Depends on `number` and `quick` alone."""
-    made, kind = problems(), KINDS[number % len(KINDS)]
+    prepared, kind = problems(), KINDS[number % len(KINDS)]
     rng = np.random.default_rng([SEED, number])
-    values, tries = drawn(made[kind], rng)
-    posterior = made[kind].posterior
+    values, tries = drawn(prepared[kind], rng)
+    posterior = prepared[kind].posterior
     clean = [part[:, 0].T for part in responses(posterior.table, posterior.model, values[None])]
-    records = measured(made[kind], values, clean, rng)
+    records = measured(prepared[kind], values, clean, rng)
     rows = []
-    for name, one in made.items():
+    for name, one in prepared.items():
         if one.study.model.orders == "free" and one.study.model.terms > LARGEST[kind]:
             continue
         posterior = problem_of(replace(one.study, fit=records)).posterior
@@ -146,7 +145,7 @@ def replica(number: int, *, quick: bool) -> dict[str, Any]:
             }
         )
     chosen = simplest([row for row in rows if row["usable"]], by_evidence, "log_evidence")
-    names = made[kind].posterior.table.names
+    names = prepared[kind].posterior.table.names
     return {
         "replica": number,
         "quick": quick,
@@ -220,19 +219,19 @@ def main() -> None:
     done: dict[int, dict[str, Any]] = {}
     for number in range(options.replicas):
         path = folder / f"{number:05d}.json"
-        told = json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
-        if told is not None and told["quick"] == options.quick:
-            done[number] = told
+        result = json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+        if result is not None and result["quick"] == options.quick:
+            done[number] = result
     missing = [number for number in range(options.replicas) if number not in done]
     with workers(options.quick, jobs=options.jobs) as crew:
-        for told in crew.finished(_perform, missing):
-            done[told["replica"]] = told
-            write_text(folder / f"{told['replica']:05d}.json", json.dumps(told, allow_nan=False) + "\n")
+        for result in crew.finished(_perform, missing):
+            done[result["replica"]] = result
+            write_text(folder / f"{result['replica']:05d}.json", json.dumps(result, allow_nan=False) + "\n")
             right = sum(one["preferred"] == one["kind"] for one in done.values())
             print(f"{len(done)} of {options.replicas}: {right} right", flush=True)
-    told = summary([done[number] for number in sorted(done)])
-    write_text(options.out / "summary.json", json.dumps(told, indent=1, allow_nan=False) + "\n")
-    share = told["generating_model_preferred"]
+    result = summary([done[number] for number in sorted(done)])
+    write_text(options.out / "summary.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
+    share = result["generating_model_preferred"]
     print(
         f"generating model preferred in {share['count']} of {share['of']}, 90 % interval "
         f"{share['lower']:.3f} to {share['upper']:.3f}"

@@ -35,7 +35,7 @@ from lcopa_bayes.model.grid import Mesh
 from lcopa_bayes.model.layout import Layout
 from lcopa_bayes.model.literature import PAPER
 from lcopa_bayes.model.path import TransferPath
-from lcopa_bayes.model.wavelets import WaveletBasis, wavelet_response
+from lcopa_bayes.paper.numericsclaims import WaveletBasis, wavelet_response
 
 SPAN = 25.0
 """Length of the record [ms]."""

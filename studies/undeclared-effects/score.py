@@ -24,10 +24,7 @@ from lcopa_bayes.bench.undeclared import NAMED, OUTSIDE
 from lcopa_bayes.core.files import writable_folder, write_text
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.effectsearch import candidates, rounds, trace, verdict
-from lcopa_bayes.report.formatting import figures
 from lcopa_bayes.report.page import Verdict, write_page
-from lcopa_bayes.report.section import Column, Section, Table
-from lcopa_bayes.report.theme import look
 
 HERE = Path(__file__).parent
 FIRST_TEST_SEED = 1000
@@ -65,7 +62,7 @@ def tasks(options: argparse.Namespace) -> list[Task]:
 
 def frozen() -> dict[str, Any]:
     """Thresholds and targets; ends the run when the package's are others."""
-    told = tomllib.loads((HERE / "thresholds.toml").read_text(encoding="utf-8"))
+    frozen_values = tomllib.loads((HERE / "thresholds.toml").read_text(encoding="utf-8"))
     held = {
         "explained": verdict.EXPLAINED,
         "alone": verdict.ALONE,
@@ -79,15 +76,15 @@ def frozen() -> dict[str, Any]:
         "near": candidates.NEAR,
         "most_effects": rounds.MOST,
     }
-    wrong = [key for key in held if told["package"][key] != held[key]]
+    wrong = [key for key in held if frozen_values["package"][key] != held[key]]
     if wrong:
         sys.exit(f"thresholds.toml and the package differ in {', '.join(wrong)}: thresholds are frozen")
-    return told
+    return frozen_values
 
 
 def main() -> None:
     options = _options()
-    told = frozen()
+    frozen_values = frozen()
     if options.seed < FIRST_TEST_SEED and not options.trial:
         sys.exit(f"seeds below {FIRST_TEST_SEED} were used in development; give --trial to use one")
     listed = tasks(options)[:: options.every][: options.limit]
@@ -95,7 +92,7 @@ def main() -> None:
     with workers(folder, jobs=options.jobs) as crew:
         rows = list(tqdm(crew.finished(play, listed), total=len(listed), disable=options.quiet))
     rows.sort(key=lambda row: (row["kind"], row["effects"], row["seed"]))
-    lines = sheet(rows, told["targets"], told["package"]["seen"])
+    lines = sheet(rows, frozen_values["targets"], frozen_values["package"]["seen"])
     values = {
         "seed": options.seed,
         "campaigns": len(rows),
@@ -106,45 +103,22 @@ def main() -> None:
             [row[key] for key in ("kind", "effects", "seed", "crashed")] for row in rows if row["crashed"]
         ],
         "grades": [row["grade"] for row in rows if row.get("grade")],
-        "thresholds": told,
+        "thresholds": frozen_values,
         "command": " ".join(["python", "studies/undeclared-effects/score.py", *sys.argv[1:]]),
     }
     write_text(options.out / "results.json", json.dumps(values, indent=1) + "\n")
-    with look():
-        path = write_page(
-            options.out, "Undeclared effects: the score sheet", sections(values), _verdict(values)
+    title = "Undeclared effects: the score sheet"
+    print(
+        write_page(
+            options.out,
+            HERE / "scoresheet.html",
+            title,
+            values,
+            {},
+            verdict=_verdict(values),
+            name="report.html",
         )
-    print(path)
-
-
-def sections(values: dict[str, Any]) -> list[Section]:
-    """Score sheet and tracing matrix."""
-    columns = (
-        *(Column("measure", "prose"), Column("found", "number"), Column("target", "number")),
-        *(Column("95 % interval or quartiles", "interval"), Column("campaigns", "number"), Column("reached")),
     )
-    rows = []
-    for line in values["sheet"]:
-        ends = [line["lower"], line["upper"]] if "lower" in line else line.get("quartiles", [None, None])
-        sign = {"most": "at most", "least": "at least", "within": "within"}[line["side"]]
-        reached = "–" if line["value"] is None else "yes" if line["reached"] else "no"  # noqa: RUF001
-        spread = " to ".join(figures(end, 2) for end in ends)
-        target = f"{sign} {line['target']}"
-        rows.append((line["measure"], figures(line["value"]), target, spread, str(line["trials"]), reached))
-    counts = tuple(
-        (hidden, ", ".join(f"{name} {count}" for name, count in said.items()))
-        for hidden, said in values["matrix"].items()
-    )
-    text = (
-        f"{values['campaigns']} campaigns from seed {values['seed']}, median "
-        f"{values['cpu_seconds_each']:.0f} s of one "
-        f"core each. Made again by: {values['command']}"
-    )
-    found = Table((Column("hidden", "code"), Column("put down to", "prose")), counts, "Counts of campaigns.")
-    return [
-        Section("Score sheet", (text,), (), (Table(columns, tuple(rows)),)),
-        Section("What was put down to what", (), (), (found,)),
-    ]
 
 
 def _verdict(values: dict[str, Any]) -> Verdict:

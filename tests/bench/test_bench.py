@@ -20,10 +20,19 @@ from scipy.special import erfcx
 import lcopa_bayes.bench
 from lcopa_bayes.bench import device as bench_device
 from lcopa_bayes.bench import inversion
-from lcopa_bayes.bench.acquisition import PAPER_BENCH, Bench, simulate, truth
 from lcopa_bayes.bench.campaignfile import load_plan, write_campaign
 from lcopa_bayes.bench.command import Command, on_off, prbs, quiet, staircase, step, two_axis
-from lcopa_bayes.bench.device import PAPER_DEVICE, Device, TableError, superposed, tabulated
+from lcopa_bayes.bench.device import (
+    PAPER_BENCH,
+    PAPER_DEVICE,
+    Bench,
+    Device,
+    TableError,
+    simulate,
+    superposed,
+    tabulated,
+    truth,
+)
 from lcopa_bayes.bench.inversion import (
     InversionError,
     PoleSearchError,

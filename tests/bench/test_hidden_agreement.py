@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from small import study
 
-from lcopa_bayes.bench.acquisition import Bench, truth
+from lcopa_bayes.bench.device import Bench, truth
 from lcopa_bayes.bench.hiddeneffects import HiddenDevice
 from lcopa_bayes.bench.undeclared import NAMED, NOISE, drawn, rich_schedules, shot_of, steerer
 from lcopa_bayes.inference.assembly import problem_of

@@ -12,8 +12,7 @@ from numpy.testing import assert_array_equal
 from small import record, study, with_effect
 
 from lcopa_bayes.bench.command import staircase
-from lcopa_bayes.calibration.replica import Replication
-from lcopa_bayes.calibration.simulation import exact_responses
+from lcopa_bayes.calibration.replica import Replication, exact_responses
 from lcopa_bayes.calibration.truths import Truths, truths_stated
 from lcopa_bayes.cli import main
 from lcopa_bayes.data.study import Study

@@ -23,12 +23,21 @@ from small import ONE, TRUTH, TWO, check_page, problem, record, row_values, same
 
 from lcopa_bayes.bench.command import on_off
 from lcopa_bayes.bench.inversion import step_response
-from lcopa_bayes.calibration.calibrate import Calibration, calibrate
+from lcopa_bayes.calibration.calibrate import Calibration, Store, calibrate
 from lcopa_bayes.calibration.ranks import Coverage, bin_limits, corridor, p_uniform, rank_of
-from lcopa_bayes.calibration.replica import ENGINES, RANKED, Failure, Outcome, Replication, holds
-from lcopa_bayes.calibration.simulation import command_of, device_of, exact_responses, measured, model_gap
-from lcopa_bayes.calibration.store import Store
-from lcopa_bayes.calibration.summary import results
+from lcopa_bayes.calibration.replica import (
+    ENGINES,
+    RANKED,
+    Failure,
+    Outcome,
+    Replication,
+    command_of,
+    device_of,
+    exact_responses,
+    holds,
+    measured,
+    model_gap,
+)
 from lcopa_bayes.calibration.truths import Truths, truths_around, truths_stated
 from lcopa_bayes.cli import main
 from lcopa_bayes.core.errors import InputError
@@ -37,6 +46,7 @@ from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.results.discretisation import resolved
 from lcopa_bayes.results.fit import fit, plan_of
+from lcopa_bayes.verbs.calibrate import results
 
 
 @pytest.fixture(scope="module")

@@ -12,12 +12,12 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import norm
 from small import Toy, problem, record
 
+from lcopa_bayes.comparison.averaging import stretches, total_sd
+from lcopa_bayes.comparison.candidatefit import savage_dickey
+from lcopa_bayes.comparison.compare import judged, probabilities, stacking_weights
 from lcopa_bayes.comparison.decision import decided
-from lcopa_bayes.comparison.folds import CUTS, parts_of, predicted, without
-from lcopa_bayes.comparison.gains import stretches, total_sd
-from lcopa_bayes.comparison.integerorder import savage_dickey
-from lcopa_bayes.comparison.judgement import judged, probabilities, stacking_weights
 from lcopa_bayes.comparison.priorwidth import _scaled
+from lcopa_bayes.comparison.sequentialdensity import CUTS, parts_of, predicted, without
 from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.parameter import Parameter, Place

@@ -14,10 +14,15 @@ from small import TRUTH, problem, record, study
 from lcopa_bayes.comparison import predictivedensity, priorwidth
 from lcopa_bayes.comparison.candidates import candidates_of
 from lcopa_bayes.comparison.compare import compare
-from lcopa_bayes.comparison.folds import parts_of, without
 from lcopa_bayes.comparison.predictivedensity import left_out_weights, predictions
 from lcopa_bayes.comparison.priorwidth import widths
-from lcopa_bayes.comparison.sequentialdensity import known_before, linear_densities, log_densities
+from lcopa_bayes.comparison.sequentialdensity import (
+    known_before,
+    linear_densities,
+    log_densities,
+    parts_of,
+    without,
+)
 from lcopa_bayes.data.settings import CandidateSettings
 from lcopa_bayes.inference.noise import AR1, Student, White
 from lcopa_bayes.inference.observations import Observed, Samples

@@ -16,7 +16,7 @@ from lcopa_bayes.bench.device import Device
 from lcopa_bayes.cli import main
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.record import Record, save_record
-from lcopa_bayes.data.rest import not_at_rest, unrest
+from lcopa_bayes.data.requirements import not_at_rest, unrest
 from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.results.fit import fit

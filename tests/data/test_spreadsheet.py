@@ -17,9 +17,8 @@ from openpyxl import Workbook
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.conversion import Mapped, axis_of, convert, resolved
-from lcopa_bayes.data.notation import decimal_sign, numbers
 from lcopa_bayes.data.record import Axis, Record
-from lcopa_bayes.data.spreadsheet import read_spreadsheet
+from lcopa_bayes.data.spreadsheet import decimal_sign, numbers, read_spreadsheet
 
 N = 60
 TIME = 0.5 * np.arange(N)

@@ -16,6 +16,7 @@ from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.data.studywriter import write_study
 from lcopa_bayes.effectsearch.explained import coordinates_of, explained_study
 from lcopa_bayes.effectsearch.loop import Loop, loop
+from lcopa_bayes.identifiability.audit import audit
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.model.effects.commands import OverdrivePulse
@@ -82,6 +83,15 @@ def test_held_out_records_are_predicted_to_the_noise(again: Fit):
     (band,) = [one for one in again.bands if one.held_out]
     assert band.rmse < 1.2 * 5e-3
     assert 0.8 < band.coverage(0.9) <= 1.0
+
+
+def test_an_audit_of_the_explained_study_is_of_the_same_effect(again: Fit):
+    """Ends of the profile are those of the draws where the prior says little."""
+    found = {one.profile.parameter: one for one in audit(again).findings}["odd_curvature.c"]
+    (own,) = [one for one in again.draws.estimates() if one.name == "odd_curvature.c"]
+    assert "identified" in found.verdict
+    ends = found.profile.intervals[0.9]
+    np.testing.assert_allclose(ends, (own.lower, own.upper), atol=0.5 * own.sd)  # type: ignore[arg-type]
 
 
 def test_constants_are_held_where_the_loop_left_them(bent: Loop):

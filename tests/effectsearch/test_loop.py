@@ -1,15 +1,15 @@
 """The loop on small campaigns of one axis: a hidden effect is found, a clean one stays clean."""
 
 import json
+import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import on_off, staircase, step
-from lcopa_bayes.bench.device import Device
+from lcopa_bayes.bench.device import Bench, Device, simulate
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
@@ -21,6 +21,7 @@ from lcopa_bayes.effectsearch.heldouteffects import unseen_share
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.noise import axis_noise, repeat_pieces
 from lcopa_bayes.effectsearch.regression import Regression
+from lcopa_bayes.effectsearch.scores import risen
 from lcopa_bayes.effectsearch.summary import drawn, results, words
 from lcopa_bayes.effectsearch.verdict import Findings, decide
 from lcopa_bayes.effectsearch.whitening import Whitening
@@ -30,6 +31,7 @@ from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.effect import UnstableError
 from lcopa_bayes.model.path import TransferPath
 
+loops = sys.modules[loop.__module__]
 NOISE = 5e-3
 NAMES = ("odd_curvature", "even_curvature", "gain_drift", "unmodelled_smooth")
 LIBRARY = [catalogue()[name] for name in NAMES]
@@ -309,10 +311,43 @@ FOUND = Findings("", (), True, 50.0, 3.0, ("a",), (), 48.0, 20.0, "smooth", 1.0,
         ({"failed": "the base fit did not converge"}, "unexplained"),
         ({"unseen": 0.2}, "explained"),
         ({"unseen": 0.8}, "unexplained"),
+        ({"risen": 1.04}, "explained"),
+        ({"risen": 1.06}, "unexplained"),
     ],
 )
 def test_the_verdict_follows_from_what_was_found(change, kind):
     assert decide(replace(FOUND, **change)).kind == kind
+
+
+def test_the_error_that_has_risen_is_that_of_the_worst_axis(clean):
+    (one,) = {score.axis: score for score in clean.before.unseen}.values()
+    other = replace(one, axis="other")
+    miss = 1.2 * (one.predicted - one.observed)
+    worse = replace(other, predicted=one.observed + miss)
+    assert risen([one, other], [worse, one]) == pytest.approx(1.2)
+    assert risen([one, other], [one, replace(other, predicted=one.observed + miss / 1.44)]) == pytest.approx(
+        1.0
+    )
+
+
+def test_draws_that_predict_worse_than_the_optimum_are_not_used(clean, monkeypatch):
+    """As of another mode: the error after a loop is never above that before it."""
+    scores = loops.held_out_scores
+
+    def away(state, problem):
+        made = scores(replace(state, sampled=None), problem)
+        return [replace(one, predicted=one.predicted + 1.0) for one in made] if state.sampled else made
+
+    def around(model, _):
+        return np.random.default_rng(0).normal(size=(50, len(model.names)))
+
+    monkeypatch.setattr(loops, "explained_draws", lambda *_, **__: ("draws", None))
+    monkeypatch.setattr(loops, "coordinates_of", around)
+    monkeypatch.setattr(loops, "held_out_scores", away)
+    found = loop(study(1), library=LIBRARY, quick=True, as_stated=True)
+    assert found.draws is None
+    assert any("are not used" in caution for caution in found.cautions)
+    assert found.after.unseen[0].rmse == pytest.approx(clean.after.unseen[0].rmse)
 
 
 def test_whitening_of_records_is_that_of_their_parts(clean):

@@ -1,6 +1,7 @@
 """What chance gives the loop: noise known from samples of it, and decisions that err as seldom as told."""
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,22 +11,21 @@ from hypothesis import strategies as st
 from scipy.stats import binom, chi2, kstest, norm
 from scipy.stats import t as student
 
-from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import on_off, staircase, step
-from lcopa_bayes.bench.device import Device
+from lcopa_bayes.bench.device import Bench, Device, simulate
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.heldouteffects import Errors
 from lcopa_bayes.effectsearch.loop import loop
-from lcopa_bayes.effectsearch.noise import FEWEST, Law
+from lcopa_bayes.effectsearch.noise import FEWEST, Law, joint_noise
 from lcopa_bayes.effectsearch.refits import SIGNIFICANT, Refit
 from lcopa_bayes.effectsearch.signature import Scale
 from lcopa_bayes.effectsearch.trace import Trace, Traced, against_chance, threshold_of
 from lcopa_bayes.effectsearch.whitening import Whitening
+from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.noise import WhiteAR1
-from lcopa_bayes.inference.observations import Observed, Samples
-from lcopa_bayes.inference.restnoise import PlausibleNoise
+from lcopa_bayes.inference.observations import Observed, PlausibleNoise, Samples
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.path import TransferPath
 
@@ -184,6 +184,7 @@ def test_significance_beside_coloured_noise_is_what_it_says():
         )
         wide = SimpleNamespace(bounds=(np.full(4, -np.inf), np.full(4, np.inf)))
         seen = SimpleNamespace(model=wide, optimum=optimum, whitening=white, places=lambda _: [3])
+        seen._scatter = partial(Refit._scatter, seen)
         new.append(Refit.wald(seen, "curve"))
         old.append(chi2.sf(x[3] ** 2 / np.linalg.inv(information)[3, 3], 1))
     for level in (0.2, 0.05, 0.01):
@@ -191,6 +192,59 @@ def test_significance_beside_coloured_noise_is_what_it_says():
         assert binom.cdf(beyond, 150, level) > 1e-3
         assert binom.sf(beyond - 1, 150, level) > 1e-3
     assert np.mean(np.array(old) < SIGNIFICANT) > 4 * SIGNIFICANT
+
+
+def test_the_likelihood_ratio_of_a_single_coefficient_is_its_square_over_its_variance():
+    rng, n = np.random.default_rng(8), 300
+    white = Whitening(
+        samples_of([rng.normal(size=n)]),
+        (Law(1.0),),
+        (5.0,),
+        (known_by(rng.normal(size=400), (0.0, 1.0, 0.3)),),
+    )
+    t = np.linspace(0, 1, n)
+    tangents = white(np.stack([np.ones(n), t, t**2])).T
+    noise = white(rng.normal(size=n) + 3 * t**2)
+    fits = [np.linalg.lstsq(tangents[:, :k], noise, rcond=None)[0] for k in (2, 3)]
+    costs = [0.5 * ((noise - tangents[:, : x.size] @ x) ** 2).sum() for x in fits]
+    optimum = SimpleNamespace(
+        x=fits[1],
+        stuck=np.zeros(3, bool),
+        jacobian=tangents,
+        information=tangents.T @ tangents,
+        cost=costs[1],
+    )
+    wide = SimpleNamespace(bounds=(np.full(3, -np.inf), np.full(3, np.inf)))
+    before = SimpleNamespace(cost=costs[0])
+    seen = SimpleNamespace(model=wide, optimum=optimum, before=before, whitening=white, places=lambda _: [2])
+    seen._scatter = partial(Refit._scatter, seen)
+    assert 1e-12 < Refit.wald(seen, "curve") < 0.3
+    assert Refit.ratio(seen, "curve") == pytest.approx(Refit.wald(seen, "curve"), rel=1e-6)
+
+
+@pytest.mark.parametrize("width", [2.0, 4.0])
+def test_a_smooth_misfit_scatters_as_its_own_autocorrelations_say(width):
+    """From sample to sample it looks like a random walk, which would scatter five times as much and more."""
+    rng, n = np.random.default_rng(9), 600
+    kernel = np.exp(-0.5 * (np.arange(-40, 41) / width) ** 2)
+    kernel /= np.sqrt((kernel**2).sum())
+
+    def drawn(count):
+        return np.array([np.convolve(rng.normal(size=n + 80), kernel, "valid") for _ in range(count)])
+
+    (piece,), slow = drawn(1), np.cos(np.linspace(0, np.pi, n))
+    single = samples_of([piece])
+    fitted = joint_noise([single[0].axes[0]], "x", 0, Scales.of([single[0].record]))
+
+    def scatter(dependence):
+        """Variance of the product with a slow column that is stated, over that of many draws."""
+        white = Whitening(single, (fitted.law,), (dependence,), (fitted.posterior,))
+        column = white(slow[None])[0]
+        stated = float(np.mean(white.covariances(column[:, None], 100)))
+        return stated / (np.var(white(drawn(500)) @ column) * piece.var())
+
+    assert 0.8 < scatter(fitted.dependence) < 2.2
+    assert scatter(1e6) > 5.0
 
 
 def test_a_threshold_tells_its_own_error():

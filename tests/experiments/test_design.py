@@ -13,19 +13,17 @@ from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 from small import TRUTH, TWO, draws_of, problem, record, row_values
 
-from lcopa_bayes.bench.acquisition import Bench as VirtualBench
-from lcopa_bayes.bench.acquisition import truth
 from lcopa_bayes.bench.command import quiet, step
+from lcopa_bayes.bench.device import Bench as VirtualBench
+from lcopa_bayes.bench.device import truth
 from lcopa_bayes.cli import main
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.record import load_record, save_record
 from lcopa_bayes.experiments.candidates import PLAIN, Candidate, candidates, template
 from lcopa_bayes.experiments.confirmation import confirm, confirmed
-from lcopa_bayes.experiments.design import checked, design
-from lcopa_bayes.experiments.information import Bench
+from lcopa_bayes.experiments.design import checked, cramer_rao, design, promises, reached, within
+from lcopa_bayes.experiments.information import Bench, device_of, refit
 from lcopa_bayes.experiments.limits import Limits, bench_times, limits_of
-from lcopa_bayes.experiments.precision import cramer_rao, promises, reached, within
-from lcopa_bayes.experiments.refit import device_of, refit
 from lcopa_bayes.experiments.summary import as_json, next_measurement
 from lcopa_bayes.identifiability.curvature import sensitivities
 from lcopa_bayes.inference.assembly import Problem

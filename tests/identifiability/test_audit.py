@@ -13,13 +13,11 @@ from small import TRUTH, TWO, draws_of, problem, record
 
 from lcopa_bayes.bench.command import step
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.identifiability.audit import _flat
+from lcopa_bayes.identifiability.audit import _flat, radial
 from lcopa_bayes.identifiability.contraction import Tolerance, beliefs, prior_draws, prior_spread
 from lcopa_bayes.identifiability.curvature import curvature, sensitivities
-from lcopa_bayes.identifiability.printedform import printed_form, printed_structure
 from lcopa_bayes.identifiability.profile import Freedom, Profile, _Path, profile
-from lcopa_bayes.identifiability.radial import radial
-from lcopa_bayes.identifiability.symmetries import Structure, structure
+from lcopa_bayes.identifiability.symmetries import Structure, printed_form, printed_structure, structure
 from lcopa_bayes.identifiability.verdict import Finding, judged
 from lcopa_bayes.inference.likelihood import Landscape, Peak
 from lcopa_bayes.inference.optimum import find_optima

@@ -13,10 +13,10 @@ from small import TWO, problem, record
 from lcopa_bayes.bench.command import on_off, step
 from lcopa_bayes.cli import main
 from lcopa_bayes.data.record import save_record
-from lcopa_bayes.identifiability.delays import delays
+from lcopa_bayes.identifiability.curvature import delays
 from lcopa_bayes.paper.claims import judge
 from lcopa_bayes.paper.verdict import Evidence
-from lcopa_bayes.report.audit import _next
+from lcopa_bayes.report.page import write_page
 from lcopa_bayes.sampling.convergence import Limitation
 
 STUDY = """[records]
@@ -214,18 +214,22 @@ def test_paths_driven_one_after_the_other_are_told_apart_and_an_idle_drive_is_no
 # -- what is said when every parameter is identified ----------------------------------------------
 
 
-def advice(limitations: list[dict]) -> str:
-    section = _next({"next_measurement": None, "limitations": limitations})
-    return " ".join(section.text)
+def advice(run: Path, tmp_path: Path, limitations: list[dict]) -> str:
+    values = json.loads((run / "audit.json").read_text())
+    values |= {"next_measurement": None, "limitations": limitations}
+    drawn = {"profiles": (), "spectrum": (), "pairs": ()}
+    page = write_page(tmp_path, "audit.html", "audit", values, drawn).read_text(encoding="utf-8")
+    section = page[page.index('<section id="what-to-measure-next">') :]
+    return " ".join(re.findall(r"<p>(.*?)</p>", section[: section.index("</section>")]))
 
 
-def test_a_model_that_passes_its_checks_needs_no_further_record():
-    assert advice([]).startswith("Given this model every parameter is identified")
+def test_a_model_that_passes_its_checks_needs_no_further_record(run, tmp_path):
+    assert advice(run, tmp_path, []).startswith("Given this model every parameter is identified")
 
 
-def test_a_model_that_fails_its_checks_is_corrected_first():
+def test_a_model_that_fails_its_checks_is_corrected_first(run, tmp_path):
     limit = Limitation("tentative", "intervals hold only if A", "add terms").as_json()
-    said = advice([limit])
+    said = advice(run, tmp_path, [limit])
     assert "nothing more" not in said
     assert "checks of the model fail" in said
     assert "Intervals hold only if A. Remedy: add terms." in said

@@ -12,8 +12,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy import integrate, stats
 from small import ONE, TRUTH, TWO, problem, record, row_values
 
-from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import step
+from lcopa_bayes.bench.device import Bench, simulate
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.inference.posterior import Posterior
 

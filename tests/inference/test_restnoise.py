@@ -13,12 +13,11 @@ from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.noise import NOISES, WhiteAR1
 from lcopa_bayes.inference.noisefit import NoiseFit
-from lcopa_bayes.inference.observations import Observed
+from lcopa_bayes.inference.observations import FEWEST, Observed, _about_own_level, quiet_noise
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.priors import Prior
-from lcopa_bayes.inference.restnoise import FEWEST, _about_own_level, quiet_noise
 
 CORRELATIONS = (np.exp(-1.0), 0.95)
 LATE = step(1.0, at=4.0)

@@ -18,7 +18,7 @@ from lcopa_bayes.bench.device import Device
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Axis
-from lcopa_bayes.inference.effects import Effected, carried, effected
+from lcopa_bayes.inference.effects import Effected, effected
 from lcopa_bayes.model.effects import balance, sensor
 from lcopa_bayes.model.effects.catalogue import bundled, catalogue
 from lcopa_bayes.model.effects.commands import Hysteresis, RefreshHold
@@ -366,7 +366,6 @@ def test_coefficients_of_records_and_of_all():
     psi[0], psi[5] = 0.02, 1e-3
     assert apart(made.responses(VALUES, psi)[:1], made.responses(VALUES, np.r_[0.02, np.zeros(8)])[:1]) == 0.0
     alone = made.over(made.simulator.model, [], np.zeros(2))
-    assert_allclose(carried(psi, made, made), np.r_[0.02, np.zeros(8)])
     assert alone.offsets is None
 
 

@@ -16,8 +16,8 @@ from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.literature import PAPER
 from lcopa_bayes.model.path import Normalisation, TransferPath
-from lcopa_bayes.model.transfer import denominator
-from lcopa_bayes.paper.equation import response_to
+from lcopa_bayes.model.stepresponse import denominator
+from lcopa_bayes.paper.paths import response_to
 
 PATHS = {name: getattr(PAPER.plant, name) for name in ("xx", "xy", "yx", "yy")}
 TERM = st.tuples(st.floats(0.05, 2.0), st.floats(-3.0, 3.0))

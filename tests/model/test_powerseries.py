@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.linalg import solve_triangular
 
-from lcopa_bayes.model.blockpulses import integration_matrix, lower_toeplitz
-from lcopa_bayes.model.powerseries import Circle
-from lcopa_bayes.model.transfer import transfer, transfer_slopes
+from lcopa_bayes.model.blockpulses import Circle, integration_matrix, lower_toeplitz
+from lcopa_bayes.model.stepresponse import transfer, transfer_slopes
 
 
 def fast(times: np.ndarray, orders: np.ndarray, drive: np.ndarray, step: float) -> np.ndarray:

@@ -12,11 +12,11 @@ from lcopa_bayes.bench.inversion import unit_ramp, unit_step
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.data.settings import ModelSettings
+from lcopa_bayes.model.blockpulses import Circle
 from lcopa_bayes.model.forward import Dynamics, Experiment, ForwardModel
 from lcopa_bayes.model.grid import Mesh
 from lcopa_bayes.model.layout import Layout
 from lcopa_bayes.model.path import TransferPath
-from lcopa_bayes.model.powerseries import Circle
 from lcopa_bayes.model.stepresponse import Slopes, StepResponse, step_response, taps
 from lcopa_bayes.model.superposition import phases
 

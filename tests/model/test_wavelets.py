@@ -13,12 +13,11 @@ from numpy.testing import assert_allclose
 from scipy.integrate import quad
 
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.model.blockpulses import integration_matrix
+from lcopa_bayes.model.blockpulses import Circle, integration_matrix
 from lcopa_bayes.model.literature import PAPER
 from lcopa_bayes.model.path import TransferPath
-from lcopa_bayes.model.powerseries import Circle
-from lcopa_bayes.model.transfer import transfer
-from lcopa_bayes.model.wavelets import (
+from lcopa_bayes.model.stepresponse import transfer
+from lcopa_bayes.paper.numericsclaims import (
     WaveletBasis,
     block_pulse_response,
     form_cost,

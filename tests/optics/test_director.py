@@ -12,8 +12,16 @@ from scipy.special import ellipk
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.model.literature import PAPER
-from lcopa_bayes.optics.cell import Cell, Field, paper_cell
-from lcopa_bayes.optics.director import NotConverged, equilibrium, expand, grid_threshold, newton_step
+from lcopa_bayes.optics.director import (
+    Cell,
+    Field,
+    NotConverged,
+    equilibrium,
+    expand,
+    grid_threshold,
+    newton_step,
+    paper_cell,
+)
 from lcopa_bayes.optics.tiltlaw import (
     RANGES,
     TiltLaw,

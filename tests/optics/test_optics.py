@@ -12,29 +12,25 @@ from hypothesis import strategies as st
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.model.literature import PAPER
-from lcopa_bayes.optics.array import LinearArray, paper_array
-from lcopa_bayes.optics.farfield import (
+from lcopa_bayes.optics.array import (
+    LinearArray,
     array_factor,
     element_factor,
-    intensity,
-    planar_pattern,
-    planar_patterns,
-    steered_patterns,
-)
-from lcopa_bayes.optics.lobes import (
-    lobes,
-    main_lobe,
-    side_lobe_level,
-    strongest_grating_lobe,
-)
-from lcopa_bayes.optics.steering import (
     geometry_check,
+    intensity,
     largest_linearisation_error,
     linearisation_error,
     linearised_angle,
+    lobes,
+    main_lobe,
+    paper_array,
+    planar_pattern,
+    planar_patterns,
+    side_lobe_level,
+    steered_patterns,
+    strongest_grating_lobe,
 )
-from lcopa_bayes.paper.opticsplan import OpticsPlan
-from lcopa_bayes.paper.staticoptics import lobe_rows
+from lcopa_bayes.paper.staticoptics import OpticsPlan, lobe_rows
 
 ARRAY = paper_array()
 SLIT = paper_array(fill_factor=1.0)

@@ -13,10 +13,9 @@ from lcopa_bayes.bench.inversion import step_response
 from lcopa_bayes.model.literature import PAPER, Stated
 from lcopa_bayes.model.path import TransferPath
 from lcopa_bayes.paper.claims import CLAIMS, judge
-from lcopa_bayes.paper.modelclaims import crosstalk_rules
+from lcopa_bayes.paper.modelclaims import RECORD_LENGTH, PrintedModel, crosstalk_rules, integer_rival
 from lcopa_bayes.paper.numericsclaims import delay_costs, wavelet_cost
 from lcopa_bayes.paper.opticsclaims import tilt_checks
-from lcopa_bayes.paper.printedmodel import RECORD_LENGTH, PrintedModel, integer_rival
 from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict
 
 BY_ID = {claim.id: claim for claim in CLAIMS}

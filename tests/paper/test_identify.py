@@ -17,26 +17,26 @@ from scipy.integrate import quad
 from scipy.linalg import solve_triangular
 from small import ONE, TWO, path, record, study
 
-from lcopa_bayes.bench.acquisition import Bench, truth
 from lcopa_bayes.bench.command import Command, prbs, step
-from lcopa_bayes.bench.device import Device
+from lcopa_bayes.bench.device import Bench, Device, truth
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.model.blockpulses import integration_matrix
 from lcopa_bayes.model.path import Normalisation, TransferPath
-from lcopa_bayes.paper.equation import (
+from lcopa_bayes.paper.identify import identify, integer_orders, output_error_fit, results
+from lcopa_bayes.paper.intervals import Candidates, Interval, Scan, decreasing
+from lcopa_bayes.paper.paths import (
+    MOST_BLOCKS,
+    PathData,
     columns,
     equation_rmse,
     least_squares,
     output_rmse,
+    path_data,
     responses,
 )
-from lcopa_bayes.paper.identify import identify, integer_orders, results
-from lcopa_bayes.paper.intervals import Candidates, Interval, Scan, decreasing
-from lcopa_bayes.paper.outputerror import output_error_fit
-from lcopa_bayes.paper.paths import MOST_BLOCKS, PathData, path_data
 from lcopa_bayes.paper.scan import evaluate, scan
 
 PAPER_STEP = Path(__file__).parents[2] / "studies" / "paper-step"

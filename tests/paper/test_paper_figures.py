@@ -9,18 +9,24 @@ from math import exp, inf, log, pi, sqrt
 import numpy as np
 import pytest
 
-from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import on_off, step
-from lcopa_bayes.bench.device import PAPER_DEVICE
+from lcopa_bayes.bench.device import PAPER_DEVICE, Bench, simulate
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.model.literature import PAPER
 from lcopa_bayes.model.path import TransferPath
-from lcopa_bayes.paper.figures import KINDS, panels, paper_figure
 from lcopa_bayes.paper.identify import identify
 from lcopa_bayes.paper.intervals import Interval, Scan
-from lcopa_bayes.paper.steptable import METRICS, load_posterior, step_of, step_table
+from lcopa_bayes.paper.steptable import (
+    KINDS,
+    METRICS,
+    load_posterior,
+    panels,
+    paper_figure,
+    step_of,
+    step_table,
+)
 
 NOISE = 1e-4
 FEW = Scan(

@@ -3,7 +3,6 @@
 import inspect
 import json
 import re
-from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
@@ -20,12 +19,10 @@ from hypothesis.extra.numpy import arrays
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.inference import defaultpriors
 from lcopa_bayes.report import write_page, write_report
-from lcopa_bayes.report.decimation import extremes
 from lcopa_bayes.report.formatting import NOT_REACHED, figures, interval, sentence, stopped, to_spread
 from lcopa_bayes.report.savedrun import load_run
-from lcopa_bayes.report.section import Column, Drawing, Section, Table
-from lcopa_bayes.report.sections import pairs, parameters, records, responses, sampling
-from lcopa_bayes.report.theme import inlined
+from lcopa_bayes.report.sections import pairs, records
+from lcopa_bayes.report.theme import Drawing, extremes, inlined
 from lcopa_bayes.sampling.modes import Modes
 
 PARAMETERS = {
@@ -352,9 +349,8 @@ def test_records_too_short_for_residuals_leave_a_sentence(tmp_path):
     folder = run_folder(tmp_path / "run")
     for name in ("residuals", "autocorrelation", "spectrum"):
         (folder / "tables" / f"{name}.csv").write_text("\n", encoding="utf-8")
-    section = records.residuals(load_run(folder))
-    assert section.drawings == ()
-    assert "too short" in section.text[0]
+    assert records.drawn(load_run(folder))["residuals"] == []
+    assert "too short" in section_of(write_report(folder).read_text(encoding="utf-8"), "residuals")
 
 
 def test_names_that_look_like_numbers_or_nothing_stay_names(tmp_path):
@@ -367,8 +363,8 @@ def test_names_that_look_like_numbers_or_nothing_stay_names(tmp_path):
 
 
 def test_long_records_make_small_figures_and_say_so(tmp_path):
-    run = load_run(run_folder(tmp_path / "run", size=40_000))
-    drawings = (*records.data(run).drawings, *records.residuals(run).drawings)
+    drawn = records.drawn(load_run(run_folder(tmp_path / "run", size=40_000)))
+    drawings = (*drawn["data"], *drawn["residuals"])
     assert max(len(drawing.svg) for drawing in drawings) < 300_000
     assert all("the record has 40000 samples" in drawing.caption for drawing in drawings)
 
@@ -442,24 +438,48 @@ def test_interesting_parameters_come_first_and_the_rest_is_named(tmp_path):
     ]
 
 
-def test_a_page_of_any_sections_can_be_written(tmp_path):
+def test_a_page_of_any_template_can_be_written(tmp_path):
     svg = '<svg xmlns="http://www.w3.org/2000/svg"><g id="a"/><use href="#a"/></svg>'
-    table = Table((Column("claim"), Column("how", "prose")), (("1", "by test"),))
-    section = Section("Far field", ("Text.",), (Drawing("far field", svg, "Caption."),), (table,))
-    path = write_page(tmp_path, "optics", [section], name="optics.html")
+    template = tmp_path / "fields.html"
+    template.write_text(
+        """{% call section("Far field") %}{{ p("Text.") }}{{ figures(drawn.field) }}
+        {% call(row) table(v.claims, "claim", "how:prose") %}{{ cells(*row) }}{% endcall %}{% endcall %}""",
+        encoding="utf-8",
+    )
+    drawn = {"field": [Drawing("far field", svg, "Caption.")]}
+    values = {"claims": [("<1>", "by test")]}
+    path = write_page(tmp_path, template, "optics", values, drawn, name="optics.html")
     text = path.read_text(encoding="utf-8")
     assert (tmp_path / "figures" / "far_field.svg").read_text(encoding="utf-8") == svg
     assert inlined(svg, "far_field") == '<svg><g id="far_field-a"/><use href="#far_field-a"/></svg>'
     assert '<use href="#far_field-a"/>' in text
+    assert '<a href="#far-field">Far field</a>' in text
+    assert rows_of(text) == [["claim", "how"], ["<1>", "by test"]]
+    assert "<1>" not in text
     assert "verdict" not in text[text.index("<body>") :]
     with pytest.raises(ValueError, match="2 cells"):
-        Table(table.columns, (("1",),))
+        write_page(tmp_path, template, "optics", {"claims": [("1",)]}, drawn)
+    without = write_page(tmp_path, template, "optics", {"claims": []}, drawn)
+    assert "<table>" not in without.read_text(encoding="utf-8")
 
 
-def test_step_table_is_left_out_when_there_are_no_metrics(folder, tmp_path):
-    run = load_run(folder)
-    bare = type(run)({**run.results, "step_metrics": []}, run.provenance, run.tables, run.draws)
-    assert responses.steps(bare).tables == ()
+def section_of(html: str, name: str) -> str:
+    """A section of a page as text, without its figures."""
+    start = html.index(f'<section id="{name}">')
+    whole = html[start : html.index("</section>", start)]
+    return unescape(re.sub(r"<svg.*?</svg>", "", whole, flags=re.DOTALL))
+
+
+def page_with(tmp_path: Path, **more: object) -> str:
+    """The page of a run with other results."""
+    folder = run_folder(tmp_path / "other")
+    (folder / "results.json").write_text(json.dumps(results_of() | more), encoding="utf-8")
+    return write_report(folder).read_text(encoding="utf-8")
+
+
+def test_step_table_is_left_out_when_there_are_no_metrics(html, tmp_path):
+    assert "<table>" in section_of(html, "step-responses")
+    assert "<table>" not in section_of(page_with(tmp_path, step_metrics=[]), "step-responses")
 
 
 def test_a_clause_becomes_a_sentence_once():
@@ -467,55 +487,53 @@ def test_a_clause_becomes_a_sentence_once():
     assert stopped("on/off, 14 ms is best") == "on/off, 14 ms is best."
 
 
-def with_results(folder: Path, **more: object):
-    run = load_run(folder)
-    return type(run)({**run.results, **more}, run.provenance, run.tables, run.draws)
-
-
-def test_several_modes_are_shown_with_their_shares(folder):
-    assert len(parameters.estimates(load_run(folder)).tables) == 2
-    found = Modes("time_1", "ms", (1.1,), np.array([[0.3, 0.7], [0.5, 0.5]]), np.full((2, 2), 0.02))
-    row = found.as_json() | {"grade": "tentative"}
-    table = parameters.estimates(with_results(folder, modes=[row])).tables[1]
-    assert table.rows[0][:6] == (
+def test_several_modes_are_shown_with_their_shares(html, tmp_path):
+    assert "several modes" not in section_of(html, "parameters")
+    modes = Modes("time_1", "ms", (1.1,), np.array([[0.3, 0.7], [0.5, 0.5]]), np.full((2, 2), 0.02))
+    row = modes.as_json() | {"grade": "tentative"}
+    rows = rows_of(section_of(page_with(tmp_path, modes=[row]), "parameters"))
+    (shown,) = [cells for cells in rows if cells[:2] == ["time_1", "1.10"]]
+    assert shown[:6] == [
         *("time_1", "1.10", "ms", "0.40 ± 0.10, 0.60 ± 0.10", "0.30 to 0.50, 0.50 to 0.70", "tentative"),
-    )
-    assert "run longer" in table.rows[0][6]
+    ]
+    assert "run longer" in shown[6]
 
 
-def test_the_most_prior_sensitive_parameters_are_shown_and_the_rest_counted(folder):
-    shown = parameters.sensitivity(load_run(folder))
-    assert shown.tables[0].rows[0] == (
+def test_the_most_prior_sensitive_parameters_are_shown_and_the_rest_counted(html, tmp_path):
+    shown = section_of(html, "prior-sensitivity")
+    rows = rows_of(shown)
+    assert rows[1] == [
         *("time_1", "0.210 ± 0.012", "0.210 ± 0.012", "prior-data conflict", "0.31", "tentative", ""),
-    )
-    assert shown.tables[0].rows[1][1:4] == ("–", "–", "not trusted")  # noqa: RUF001
-    assert any("matters for 1 of 2 parameters: time_1" in text for text in shown.text)
-    assert any("Not trusted for 1 parameter(s), gain" in text for text in shown.text)
-    many = parameters.sensitivity(
-        with_results(folder, sensitivity=[moved(f"p{k}", 0.01, "-") for k in range(30)])
-    )
-    assert len(many.tables[0].rows) == 20
-    assert any("20 most affected of 30" in text for text in many.text)
-    assert any("No parameter depends noticeably" in text for text in many.text)
-    assert parameters.sensitivity(with_results(folder, sensitivity=[])).tables == ()
+    ]
+    assert rows[2][1:4] == ["–", "–", "not trusted"]  # noqa: RUF001
+    assert "matters for 1 of 2 parameters: time_1" in shown
+    assert "Not trusted for 1 parameter(s), gain" in shown
+    moved_by = [moved(f"p{k}", 0.01, "-") for k in range(30)]
+    many = section_of(page_with(tmp_path / "many", sensitivity=moved_by), "prior-sensitivity")
+    assert len(rows_of(many)) == 1 + 20
+    assert "20 most affected of 30" in many
+    assert "No parameter depends noticeably" in many
+    none = section_of(page_with(tmp_path / "none", sensitivity=[]), "prior-sensitivity")
+    assert "<table>" not in none
 
 
-def test_a_page_of_importance_draws_speaks_of_no_ensembles(folder):
+def test_a_page_of_importance_draws_speaks_of_no_ensembles(html, tmp_path):
     """Batches of weighted draws are no ensembles of walkers, and their evidence is no bridge."""
-    of_ensembles, settings = with_results(folder), {"method": "importance draws", "batches": 2, "seed": 1}
-    assert "by bridge sampling" in str(sampling.evidence(of_ensembles))
-    assert "Each colour is an independent ensemble" in str(parameters.traces(of_ensembles))
-    weighted = with_results(folder, sampler=settings)
-    shown = [sampling.evidence(weighted), parameters.traces(weighted), sampling.provenance(weighted)]
-    assert "the mean weight of the importance draws" in shown[0].text[0]
-    assert "ensemble" not in "".join(str(one.text) for one in shown)
+    assert "by bridge sampling" in section_of(html, "evidence")
+    assert "Each colour is an independent ensemble" in section_of(html, "traces")
+    settings = {"method": "importance draws", "batches": 2, "seed": 1}
+    weighted = page_with(tmp_path, sampler=settings)
+    shown = [section_of(weighted, name) for name in ("evidence", "traces", "sampler-and-provenance")]
+    assert "the mean weight of the importance draws" in shown[0]
+    assert "ensemble" not in "".join(shown)
 
 
-def test_a_fixed_parameter_is_not_called_sampled(folder):
-    run = with_results(folder)
+def test_a_fixed_parameter_is_not_called_sampled(tmp_path):
+    folder = run_folder(tmp_path / "run")
     row = {"unit": "-", "prior": "x", "from": "study", "integrated_out": False}
     rows = pd.DataFrame([{"name": name, **row} for name in ("a", "b")])
-    results = {**run.results, "fixed": [{"name": "a", "value": 1.0, "unit": "-"}]}
-    run = replace(run, results=results, tables={**run.tables, "priors": rows})
-    (table,) = parameters.priors(run).tables
-    assert [cells[-1] for cells in table.rows] == ["fixed", "sampled"]
+    rows.to_csv(folder / "tables" / "priors.csv", index=False)
+    results = results_of() | {"fixed": [{"name": "a", "value": 1.0, "unit": "-"}]}
+    (folder / "results.json").write_text(json.dumps(results), encoding="utf-8")
+    shown = section_of(write_report(folder).read_text(encoding="utf-8"), "priors-and-posteriors")
+    assert [cells[-1] for cells in rows_of(shown)] == ["treated", "fixed", "sampled"]

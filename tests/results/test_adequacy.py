@@ -13,11 +13,10 @@ from lcopa_bayes.data.record import Record
 from lcopa_bayes.identifiability.audit import audit
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.optimum import find_optima
-from lcopa_bayes.results.adequacy import _coverage, limitations
+from lcopa_bayes.results.adequacy import RESONANCE_PEAK, _coverage, limitations, peaks, unresolved
 from lcopa_bayes.results.fit import fit
 from lcopa_bayes.results.prediction import bands
 from lcopa_bayes.results.residuals import residuals
-from lcopa_bayes.results.resonance import PEAK, peaks, unresolved
 from lcopa_bayes.results.summary import results
 from lcopa_bayes.sampling.convergence import Limitation
 from lcopa_bayes.sampling.draws import Draws
@@ -228,7 +227,7 @@ def test_the_peak_of_one_term_in_closed_form():
     exact = 1 / (2 * np.abs(np.cos(np.pi * orders[:3] / 4)))
     assert found[:3] == pytest.approx(exact, rel=0.01)
     assert at[:3] == pytest.approx(1 / 0.3, rel=0.02)
-    assert found[2] == pytest.approx(PEAK, rel=0.02)
+    assert found[2] == pytest.approx(RESONANCE_PEAK, rel=0.02)
     assert found[3] < 2
     assert found[4] > 50
 
@@ -236,7 +235,7 @@ def test_the_peak_of_one_term_in_closed_form():
 def test_a_second_term_damps_the_resonance():
     times, orders = np.array([[0.3, 0.3]]), np.array([[2.0, 1.0]])
     assert peaks(times, orders)[0] < 1.5
-    assert peaks(np.array([[0.3, 1e-4]]), orders)[0] > PEAK
+    assert peaks(np.array([[0.3, 1e-4]]), orders)[0] > RESONANCE_PEAK
 
 
 @pytest.mark.parametrize(

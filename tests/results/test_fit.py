@@ -14,7 +14,7 @@ from lcopa_bayes.bench.command import on_off
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.results.fit import Fit, fit, plan_of
-from lcopa_bayes.results.provenance import commanded, fingerprint, provenance
+from lcopa_bayes.results.runfolder import commanded, fingerprint, provenance
 from lcopa_bayes.results.summary import residual_rms, results, verdict
 
 TINY = {"ensembles": 2, "walkers": 32, "steps": 600, "thin": 3, "target_ess": 200}

@@ -201,7 +201,7 @@ def test_figures_that_cannot_be_kept_are_told(tmp_path):
 
     (tmp_path / "figures").write_text("a file in the way")
     with pytest.raises(InputError, match="figures"):
-        write_page(tmp_path, "it", [])
+        write_page(tmp_path, "claims.html", "it", {"verdict": "", "claims": []}, {"claims": []})
 
 
 def test_numbers_survive_the_enduring_file(tmp_path):

@@ -11,8 +11,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from small import ONE, TRUTH, TWO, draws_of, problem, record, row_values, study
 
-from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import Command, on_off, step
+from lcopa_bayes.bench.device import Bench, simulate
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.drive import Drive
 from lcopa_bayes.data.record import Axis, save_record

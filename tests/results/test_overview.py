@@ -12,7 +12,7 @@ from small import TWO, problem, record, study
 from lcopa_bayes.bench.command import on_off
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.results.fit import fit
-from lcopa_bayes.results.overview import overview, plant
+from lcopa_bayes.results.summary import overview, plant
 
 NUMBER = r"(-?[\d.]+(?:e-?\d+)?)"
 

@@ -14,7 +14,7 @@ from small import draws_of, problem
 from lcopa_bayes.data.settings import EffectsSettings, PriorSettings
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.optimum import find_optima
-from lcopa_bayes.results.priorconflict import conflicts
+from lcopa_bayes.results.adequacy import conflicts
 from lcopa_bayes.sampling.convergence import Limitation
 from lcopa_bayes.sampling.draws import Draws
 

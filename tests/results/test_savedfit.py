@@ -18,7 +18,7 @@ from lcopa_bayes.data.drive import Drive
 from lcopa_bayes.data.settings import CandidateSettings, CompareSettings, PriorSettings
 from lcopa_bayes.data.studywriter import study_from_json, study_to_json
 from lcopa_bayes.results.fit import Fit, fit
-from lcopa_bayes.results.provenance import fingerprint, settings_of
+from lcopa_bayes.results.runfolder import fingerprint, settings_of
 from lcopa_bayes.results.savedfit import fit_to_json, load_fit
 
 TINY = {"ensembles": 2, "walkers": 16, "steps": 60, "thin": 1, "target_ess": 100}

@@ -11,8 +11,8 @@ from scipy.integrate import dblquad
 from scipy.special import logsumexp
 from small import TRUTH, Toy, problem, record
 
-from lcopa_bayes.comparison.folds import Part
 from lcopa_bayes.comparison.predictivedensity import Predicted
+from lcopa_bayes.comparison.sequentialdensity import Part
 from lcopa_bayes.core.arrays import Array, Matrix
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.draws import gather

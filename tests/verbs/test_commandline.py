@@ -12,7 +12,7 @@ import pytest
 
 import lcopa_bayes as lb
 from lcopa_bayes.cli import VERBS, _parser, main
-from lcopa_bayes.verbs.choices import EXAMPLES
+from lcopa_bayes.verbs.commandline import EXAMPLES
 
 TERMS = tomllib.loads(files("lcopa_bayes.verbs").joinpath("glossary.toml").read_text(encoding="utf-8"))
 

@@ -11,20 +11,24 @@ from numpy.testing import assert_allclose
 from small import record, study, with_effect
 
 from lcopa_bayes.bench.command import Command, staircase
-from lcopa_bayes.calibration.simulation import exact_responses, model_gap
+from lcopa_bayes.calibration.replica import exact_responses, model_gap
 from lcopa_bayes.calibration.truths import Truths
 from lcopa_bayes.cli import main
 from lcopa_bayes.comparison.candidates import candidates_of, derived, known_settings
 from lcopa_bayes.data.settings import EffectsSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studywriter import write_study
-from lcopa_bayes.experiments.information import Bench
-from lcopa_bayes.experiments.refit import EffectedDevice, device_of, refit
+from lcopa_bayes.experiments.information import Bench, EffectedDevice, device_of, refit
+from lcopa_bayes.identifiability import audit
 from lcopa_bayes.identifiability.curvature import sensitivities
+from lcopa_bayes.identifiability.profile import profile
 from lcopa_bayes.identifiability.symmetries import DIFFERENCED, structure
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.likelihood import Landscape
 from lcopa_bayes.inference.nestedmodels import lifted
+from lcopa_bayes.inference.simulation import Simulation
+from lcopa_bayes.results.fit import plan_of
+from lcopa_bayes.sampling.weightedrun import weighted_run
 
 TRUTH = {
     "gain": 2.0, "time": 1.5, "order": 0.8, "delay": 0.73, "offset": 0.3, "sigma": 0.02, "coefficient": 0.4,
@@ -59,6 +63,30 @@ def test_a_climb_with_the_effect_held_is_a_profile(stiff: tuple[Problem, np.ndar
         apart.append(best.log_likelihood - held.log_likelihood)
     assert min(apart) > 0.2
     assert apart[0] == pytest.approx(apart[1], rel=0.5)
+
+
+def test_profiles_by_a_surrogate_are_those_of_the_posterior(
+    stiff: tuple[Problem, np.ndarray], monkeypatch: pytest.MonkeyPatch
+):
+    """Its maxima are found by the surrogate, its heights are the posterior's: one response per point."""
+    problem, _ = stiff
+    found = weighted_run(problem.posterior, plan_of(problem, quick=True), quick=True)
+    assert found is not None
+    draws, exact = found[1], Landscape(problem.posterior)
+    near = audit._near(exact, draws, np.random.default_rng(2), 1)
+    assert near is not None
+    simulated, called = [], Simulation.__call__
+    monkeypatch.setattr(Simulation, "__call__", lambda self, v: simulated.append(len(v)) or called(self, v))
+    best = draws.flat[np.argmax(draws.log_density)]
+    k, profiles = problem.posterior.table.names.index("cubic_stiffness.c"), []
+    step = 0.1 * float(draws.column("cubic_stiffness.c").std())
+    for landscape in (exact, near):
+        simulated.clear()
+        profiles.append(profile(landscape, k, landscape.maximise(best), draws.thinned(50), step))
+    assert sum(simulated) <= len(profiles[1].values)
+    (low, high), ends = profiles[0].intervals[0.9], profiles[1].intervals[0.9]
+    assert_allclose(ends, (low, high), atol=0.05 * (high - low))  # type: ignore[operator]
+    assert profiles[1].best == pytest.approx(profiles[0].best, abs=0.05)
 
 
 def test_a_symmetry_is_seen_through_differences(stiff: tuple[Problem, np.ndarray]):

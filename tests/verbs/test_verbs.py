@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from small import check_page
 
-from lcopa_bayes.bench.acquisition import Bench, simulate
 from lcopa_bayes.bench.command import step
-from lcopa_bayes.bench.device import Device
+from lcopa_bayes.bench.device import Bench, Device, simulate
 from lcopa_bayes.bench.inversion import step_response
 from lcopa_bayes.cli import main
 from lcopa_bayes.core.errors import InputError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import TypeAlias, final
 
 import numpy as np
 from scipy import fft
@@ -38,6 +38,7 @@ _SHARES = (0.5, 0.2, 0.05)
 """Steps of an iteration that would overshoot, over the distance to its target [-]."""
 
 
+@final
 class RunawayError(ArithmeticError):
     """No bounded solution; carries the `block` where it was lost."""
 
@@ -124,6 +125,7 @@ def balanced(kernel: Matrix, force: Force, scale: Matrix, guess: Matrix) -> Matr
     return y
 
 
+@final
 @dataclass(frozen=True, eq=False)
 class _Balance:
     """What is solved, and what of it is."""

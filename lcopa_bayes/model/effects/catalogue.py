@@ -13,16 +13,8 @@ from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
 
-from lcopa_bayes.core.errors import InputError, nearest
-from lcopa_bayes.model.effects import (
-    commands,
-    dynamics,
-    generic,
-    parallel,
-    records,
-    response,
-    sensor,
-)
+from lcopa_bayes.core.errors import InputError, nearest, refuse_if
+from lcopa_bayes.model.effects import commands, dynamics, generic, parallel, records, response, sensor
 from lcopa_bayes.model.effects.effect import Card, Effect
 
 GROUP = "lcopa_bayes.effects"
@@ -64,8 +56,7 @@ def catalogue(add: Sequence[str] = (), folder: Path | None = None) -> dict[str, 
             problems.append(f"{where}: an effect named {kind.card.name!r} exists; choose another name")
         else:
             known[kind.card.name] = kind
-    if problems:
-        raise InputError(problems)
+    refuse_if(problems)
     return known
 
 

@@ -10,14 +10,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.data.drive import AxisDrive
-from lcopa_bayes.model.effects.effect import (
-    Card,
-    Constant,
-    DriveEffect,
-    Ranges,
-    Scene,
-    single,
-)
+from lcopa_bayes.model.effects.effect import Card, Constant, DriveEffect, Ranges, Scene, single
 
 
 @final

@@ -92,7 +92,7 @@ class Overflow(ForceEffect):
     """Where the further loss begins, over the largest deflection [-]."""
 
     batched = True
-    estimated = (*single("s", 0.3, one_signed=True), *single("k", 1.0, one_signed=True))
+    estimated = (*single("s", 0.3, one_signed=True), *single("k", 3.0, one_signed=True))
     card: ClassVar[Card] = Card(
         name="overflow",
         place="plant",

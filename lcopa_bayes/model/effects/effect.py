@@ -24,6 +24,7 @@ from lcopa_bayes.model.grid import Grid
 from lcopa_bayes.model.layout import Layout
 
 
+@final
 class UnstableError(ArithmeticError):
     """The plant with its effects has no bounded response; carries the `effects`, `record` and `why`."""
 

@@ -11,6 +11,7 @@ import numpy as np
 from scipy import fft
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
+from lcopa_bayes.model.blockpulses import Spectrum
 from lcopa_bayes.model.effects.balance import RunawayError, balanced, earlier, iterated, resting
 from lcopa_bayes.model.effects.effect import (
     Effect,
@@ -22,8 +23,7 @@ from lcopa_bayes.model.effects.effect import (
 )
 from lcopa_bayes.model.forward import Dynamics, Experiment, ForwardModel, StepResponses, deflections
 from lcopa_bayes.model.layout import Layout
-from lcopa_bayes.model.powerseries import Spectrum
-from lcopa_bayes.model.transfer import transfer
+from lcopa_bayes.model.stepresponse import transfer
 
 Acting: TypeAlias = Sequence[tuple[Effect, Vector]]
 """Effects with their coefficients."""
@@ -59,6 +59,7 @@ class Plant:
         return b"".join(part.tobytes() for part in (*self.dynamics.times, *self.dynamics.orders))
 
 
+@final
 class Moved(NamedTuple):
     """A record up to its reading."""
 

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from lcopa_bayes.core.arrays import Index, Vector
+from lcopa_bayes.model.blockpulses import Circle
 from lcopa_bayes.model.effects.effect import Ranges
 from lcopa_bayes.model.effects.passage import Plant
 from lcopa_bayes.model.forward import Experiment, ForwardModel, deflections
 from lcopa_bayes.model.layout import Layout
-from lcopa_bayes.model.powerseries import Circle
-from lcopa_bayes.model.transfer import transfer
+from lcopa_bayes.model.stepresponse import transfer
 
 _BLOCKS = 2048
 

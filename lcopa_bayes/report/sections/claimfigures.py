@@ -8,25 +8,43 @@ import numpy as np
 
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.literature import PAPER, Stated
-from lcopa_bayes.optics.array import LinearArray, paper_array
-from lcopa_bayes.optics.lobes import strongest_grating_lobe
-from lcopa_bayes.optics.steering import geometry_check, linearisation_error
+from lcopa_bayes.optics.array import (
+    LinearArray,
+    geometry_check,
+    linearisation_error,
+    paper_array,
+    strongest_grating_lobe,
+)
 from lcopa_bayes.optics.tiltlaw import continuous_law, printed_law
-from lcopa_bayes.paper.equation import response_to
-from lcopa_bayes.paper.modelclaims import crosstalk_rules
+from lcopa_bayes.paper.modelclaims import (
+    RECORD_LENGTH,
+    SETTLING_BANDS,
+    PrintedModel,
+    crosstalk_rules,
+    integer_rival,
+)
 from lcopa_bayes.paper.numericsclaims import delay_costs
 from lcopa_bayes.paper.opticsclaims import FAR_WEAKER, tilt_checks
-from lcopa_bayes.paper.printedmodel import RECORD_LENGTH, SETTLING_BANDS, PrintedModel, integer_rival
+from lcopa_bayes.paper.paths import response_to
 from lcopa_bayes.report.formatting import figures
-from lcopa_bayes.report.section import Drawing, Section
-from lcopa_bayes.report.theme import BAND, CYCLE, HELD_OUT, NOISE, STEADY, blank, legend_above, svg_of
+from lcopa_bayes.report.theme import (
+    BAND,
+    CYCLE,
+    HELD_OUT,
+    NOISE,
+    STEADY,
+    Drawing,
+    blank,
+    legend_above,
+    svg_of,
+)
 
 _SHOWN = 100.0
 """Time of the long panel [ms]."""
 
 
-def sections(stated: Stated = PAPER) -> list[Section]:
-    """One section for each family of claims."""
+def drawn(stated: Stated = PAPER) -> list[tuple[str, Drawing]]:
+    """A title and a figure for each family of claims."""
     rival, costs = integer_rival(stated), delay_costs(stated)
     shown = (
         (
@@ -68,10 +86,7 @@ def sections(stated: Stated = PAPER) -> list[Section]:
             "Section 2 and for the pitch that the measured step implies.",
         ),
     )
-    return [
-        Section(title, drawings=(Drawing(f"claim_{stem}", draw(stated), caption),))
-        for title, stem, draw, caption in shown
-    ]
+    return [(title, Drawing(f"claim_{stem}", draw(stated), caption)) for title, stem, draw, caption in shown]
 
 
 def _steady(stated: Stated) -> str:

@@ -7,55 +7,46 @@ import numpy as np
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.optics.tiltlaw import continuous_law, printed_law
 from lcopa_bayes.paper.staticoptics import StaticOptics
-from lcopa_bayes.report.decimation import extremes
-from lcopa_bayes.report.formatting import NONE, figures
-from lcopa_bayes.report.section import Drawing, Section, Table
-from lcopa_bayes.report.theme import CYCLE, HELD_OUT, STEADY, blank, grid, svg_of
+from lcopa_bayes.report.page import Drawings
+from lcopa_bayes.report.theme import CYCLE, HELD_OUT, STEADY, Drawing, blank, extremes, grid, svg_of
 
 _FLOOR = -50.0
 """Lowest intensity shown [dB]."""
 _MOST = 1600
 """Points of a pattern that are drawn: its nulls are narrow."""
-_LAWS = {"printed": "as printed", "continuous": "continuous", "best": "best of this form"}
 
 
-def sections(calculated: StaticOptics) -> list[Section]:
+def drawn(calculated: StaticOptics) -> Drawings:
     """Far fields, director, tilt law and steering chain."""
-    return [*_far_fields(calculated), *_cell(calculated)]
-
-
-def _far_fields(calculated: StaticOptics) -> list[Section]:
-    """The far field along one axis and over both."""
-    optics = calculated.plan.optics
-    array = (
-        f"{optics.elements} elements, {figures(1e6 * optics.pitch_in_wavelengths * optics.wavelength)} µm "
-        f"= {figures(optics.pitch_in_wavelengths)} wavelengths apart, wavelength "
-        f"{figures(1e9 * optics.wavelength, 4)} nm."
-    )
-    along_axis = Section(
-        "Far field along one axis",
-        (array, "Intensities are relative to the main lobe; elements in the figure are isotropic."),
-        (
+    return {
+        "far_field": [
             Drawing(
                 "farfield_1d",
                 _steered(calculated),
                 "Far field steered to each target (Ta et al. 2026, Eq. 4, Fig. 3). Dashed: the target.",
-            ),
-        ),
-        (_steering(calculated), _lobes(calculated)),
-    )
-    both = Section(
-        "Far field over both axes",
-        drawings=(
+            )
+        ],
+        "planar": [
             Drawing(
                 "farfield_2d",
                 _planar(calculated),
                 "Far field of the square array in direction cosines (Eq. 12, Fig. 5): along the normal and "
                 "steered. Circle: the target; every other bright spot is a grating lobe.",
+            )
+        ],
+        "director": [
+            Drawing("director", _profiles(calculated), "Tilt across the cell at several voltages (Fig. 10)."),
+            Drawing(
+                "tilt_voltage",
+                _curve(calculated),
+                "Spatial mean of the solved tilt against voltage, beside Eq. 24 as printed and with its "
+                "upper branch counted from the knee (Fig. 11). No tilt exceeds pi/2.",
             ),
-        ),
-    )
-    return [along_axis, both]
+        ],
+        "chain": [
+            Drawing("steering_chain", _chain(calculated), "Tilt, phase step, angle and error of Eq. 26.")
+        ],
+    }
 
 
 def _decibel(values: Matrix) -> Matrix:
@@ -107,72 +98,6 @@ def _planar(calculated: StaticOptics) -> str:
         )
     figure.colorbar(shown, ax=panels, label="intensity [dB]", shrink=0.75)
     return svg_of(figure)
-
-
-def _steering(calculated: StaticOptics) -> Table:
-    return Table.of(
-        calculated.values["steering"],
-        ("target [deg]", "number", "target_deg"),
-        ("phase step [rad]", "number", lambda row: figures(row["phase_step_rad"], 4)),
-        ("main lobe [deg]", "number", lambda row: figures(row["main_lobe_deg"], 5)),
-        (
-            "highest side lobe [dB]",
-            "number",
-            lambda row: NONE if row["side_lobe"] is None else figures(float(10 * np.log10(row["side_lobe"]))),
-        ),
-        caption="Steering by sin(angle) = wavelength x phase step / (2 pi pitch), Eq. 5.",
-    )
-
-
-def _lobes(calculated: StaticOptics) -> Table:
-    fill = figures(calculated.plan.fill_factor)
-    return Table.of(
-        calculated.values["grating_lobes"],
-        ("target [deg]", "number", "target_deg"),
-        ("order", "number", "order"),
-        ("angle [deg]", "number", "angle_deg"),
-        ("isotropic", "number", "isotropic"),
-        (
-            f"fill factor {fill}",
-            "number",
-            lambda row: figures(row["with_element"] if row["with_element"] > 1e-12 else 0.0),
-        ),
-        caption="All lobes; order 0 is the main lobe. Intensity relative to it, for point elements as in "
-        f"Eqs. 2 to 4 and for slits that fill {fill} of the pitch.",
-    )
-
-
-def _cell(calculated: StaticOptics) -> list[Section]:
-    """Director, tilt law and steering chain."""
-    plan = calculated.plan
-    text = (
-        "Tilt counts from the plates; the director lies in one plane and varies across the cell only "
-        f"(Eq. 20). Field: {plan.field}; pretilt {figures(plan.pretilt)} rad. Threshold "
-        f"pi sqrt(k1 / deps) = {figures(calculated.check.threshold, 4)} V."
-    )
-    director = Section(
-        "Director",
-        (text,),
-        (
-            Drawing("director", _profiles(calculated), "Tilt across the cell at several voltages (Fig. 10)."),
-            Drawing(
-                "tilt_voltage",
-                _curve(calculated),
-                "Spatial mean of the solved tilt against voltage, beside Eq. 24 as printed and with its "
-                "upper branch counted from the knee (Fig. 11). No tilt exceeds pi/2.",
-            ),
-        ),
-        (_tilts(calculated), _fits(calculated)),
-    )
-    chain = Section(
-        "From volts to angle",
-        (
-            "The printed lower branch: mean tilt by Eq. 24, phase step by Eq. 23, angle by Eq. 5 and, "
-            "linearised, by Eq. 26; as far as the beam propagates.",
-        ),
-        (Drawing("steering_chain", _chain(calculated), "Tilt, phase step, angle and error of Eq. 26."),),
-    )
-    return [director, chain]
 
 
 def _profiles(calculated: StaticOptics) -> str:
@@ -231,43 +156,3 @@ def _chain(calculated: StaticOptics) -> str:
     for panel in (angle, error):
         panel.set_xlabel("voltage [V]")
     return svg_of(figure)
-
-
-def _tilts(calculated: StaticOptics) -> Table:
-    titles = {
-        "voltage_V": "voltage [V]",
-        "tilt_rad": "mean tilt [rad]",
-        "largest_tilt_rad": "largest tilt [rad]",
-        "printed_law_rad": "Eq. 24 as printed [rad]",
-        "continuous_law_rad": "Eq. 24, continuous [rad]",
-    }
-    rows = [{key: figures(row[key], 4) for key in titles} for row in calculated.values["mean_tilt"]]
-    return Table.of(rows, *((title, "number", key) for key, title in titles.items()))
-
-
-def _fits(calculated: StaticOptics) -> Table:
-    optics = calculated.plan.optics
-    return Table.of(
-        [
-            entry | entry[law] | {"law": said}
-            for entry in calculated.values["tilt_law"]
-            for law, said in _LAWS.items()
-        ],
-        ("range", "text", "range"),
-        ("from [V]", "number", "from_V"),
-        ("to [V]", "number", "to_V"),
-        ("law", "text", "law"),
-        ("R²", "number", lambda row: figures(row["r_squared"], 4)),
-        ("largest error [rad]", "number", "largest_error_rad"),
-        (
-            "largest relative error",
-            "number",
-            lambda row: (
-                NONE
-                if row["largest_relative_error"] is None
-                else f"{100 * row['largest_relative_error']:.3g} %"
-            ),
-        ),
-        caption="A dash: below the threshold the solved tilt is zero and the law is not. Stated: R² above "
-        f"{figures(optics.tilt_fit_r_squared)}, error below {100 * optics.tilt_fit_error:.2g} %.",
-    )

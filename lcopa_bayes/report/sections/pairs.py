@@ -6,9 +6,9 @@ import corner
 import numpy as np
 from matplotlib.figure import Figure
 
+from lcopa_bayes.report.page import Drawings
 from lcopa_bayes.report.savedrun import SavedRun
-from lcopa_bayes.report.section import Drawing, Section
-from lcopa_bayes.report.theme import BAND, plain, svg_of
+from lcopa_bayes.report.theme import BAND, Drawing, plain, svg_of
 
 _IN_CORNER = 10
 """Parameters on one corner plot."""
@@ -33,18 +33,18 @@ def ranked(names: list[str]) -> list[str]:
     return sorted(names, key=rank)
 
 
-def pairs(run: SavedRun) -> Section:
-    """Corner plot of the most interesting free parameters."""
-    moving = [name for name in run.units if np.ptp(run.draws[name]) > 0]
-    shown, left_out = ranked(moving)[:_IN_CORNER], ranked(moving)[_IN_CORNER:]
+def drawn(run: SavedRun) -> Drawings:
+    """Corner plot of the most interesting free parameters that vary."""
+    moving = ranked([name for name in run.units if np.ptp(run.draws[name]) > 0])
+    shown, left_out = moving[:_IN_CORNER], moving[_IN_CORNER:]
     if not shown:
-        return Section("Pairs of parameters", ("No free parameter has draws that vary.",))
+        return {"pairs": ()}
     caption = (
         "Contours, smoothed, hold about 50 and 90 % of the draws of a pair; dashed "
         f"lines mark the 5, 50 and 95 % quantiles; each axis spans {100 * _MIDDLE:g} % of the draws."
     )
     rest = f" Not shown for lack of space: {', '.join(left_out)}." if left_out else ""
-    return Section("Pairs of parameters", drawings=(Drawing("corner", _corner(run, shown), caption + rest),))
+    return {"pairs": [Drawing("corner", _corner(run, shown), caption + rest)]}
 
 
 def _corner(run: SavedRun, names: list[str]) -> str:

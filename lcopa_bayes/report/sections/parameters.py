@@ -1,130 +1,45 @@
-"""Parameters: table, traces, priors and what decides each of them."""
+"""Parameters: table, corner plot, traces, priors and what decides each of them.
+
+The answers that stand first on the page of a fit.
+"""
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from itertools import cycle
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 
-from lcopa_bayes.inference import defaultpriors
-from lcopa_bayes.report.formatting import NONE, figures, interval, percent, to_spread, with_error
+from lcopa_bayes.report.page import Drawings
 from lcopa_bayes.report.savedrun import SavedRun
-from lcopa_bayes.report.section import Section, Table, paged
-from lcopa_bayes.report.theme import (
-    BAND,
-    CYCLE,
-    HELD_OUT,
-    grid,
-    label,
-    legend_above,
-    svg_of,
-)
+from lcopa_bayes.report.theme import BAND, CYCLE, HELD_OUT, grid, label, legend_above, paged, svg_of
 
 _PER_FIGURE = 12
 """Parameters on one figure of traces or of priors."""
 _BINS = 30
-_MOST_SENSITIVE = 20
-"""Sensitivities shown; the others are in the table of the run folder."""
-_SENSITIVITY = (
-    "Sensitivity is how fast the posterior moves when the prior of all parameters, or the likelihood, is "
-    "raised to a power near 1 (Kallioinen et al. 2024). It is notable from {threshold} on. Where both are "
-    "notable there is a prior-data conflict, or a prior meant to be informative; where only that of the "
-    "prior is, the record has little information about this parameter. Densities are on the scale of "
-    "sampling: a uniform prior, and a log-uniform prior of a time constant, has no power to scale, so the "
-    "influence of its bounds is not visible here."
-)
 
 
-def estimates(run: SavedRun) -> Section:
-    """Free parameters with intervals and grades, parameters with several modes, and fixed parameters."""
-    free = run.results["parameters"]
-    kind = ", ".join(dict.fromkeys(f"{percent(row['level'])} {row['interval']}" for row in free))
-    tables = [
-        Table.of(
-            free,
-            ("name", "code", "name"),
-            ("median", "number", lambda row: to_spread(row["value"], row["sd"])),
-            ("unit", "text", "unit"),
-            (
-                "90 % interval" if all(row["level"] == 0.9 for row in free) else "interval",
-                "number",
-                lambda row: interval(row["lower"], row["upper"], row["sd"]),
-            ),
-            ("mean", "number", lambda row: to_spread(row["mean"], row["sd"])),
-            ("sd", "number", lambda row: figures(row["sd"], 2)),
-            ("ESS", "number", _ess),
-            ("R-hat", "number", lambda row: NONE if row.get("rhat") is None else f"{row['rhat']:.3f}"),
-            ("grade", "grade", "grade"),
-            caption=f"Intervals are {kind}. Digits end at the second significant digit of the standard "
-            "deviation. ESS is the smaller of the effective sample sizes of bulk and tails; R-hat compares "
-            "independent sets of draws.",
-        )
-    ]
-    if run.results["modes"]:
-        tables.append(_modes(run.results["modes"]))
-    if run.results["fixed"]:
-        tables.append(fixed(run.results["fixed"]))
-    text = () if run.results["fixed"] else ("No parameter was fixed.",)
-    return Section("Parameters", text, tables=tuple(tables))
-
-
-def fixed(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Values of fixed parameters."""
-    return Table.of(
-        rows,
-        ("fixed parameter", "code", "name"),
-        ("value", "number", lambda row: figures(row["value"], 6)),
-        ("unit", "text", "unit"),
-    )
-
-
-def _modes(rows: list[Mapping[str, Any]]) -> Table:
-    """Shares of the modes of parameters whose marginal has several."""
-    return Table.of(
-        rows,
-        ("several modes in", "code", "parameter"),
-        ("split at", "number", lambda row: ", ".join(figures(end) for end in row["boundaries"])),
-        ("unit", "text", "unit"),
-        ("shares of all draws", "interval", _shares),
-        (
-            "range over sets of draws",
-            "interval",
-            lambda row: ", ".join(f"{min(s):.2f} to {max(s):.2f}" for s in zip(*row["shares"], strict=True)),
-        ),
-        ("grade", "grade", "grade"),
-        ("statement", "prose", "sentence"),
-        caption="The draws of these parameters lie in separate modes; medians and intervals mix them. "
-        "± is the Monte Carlo standard error.",
-    )
-
-
-def _shares(row: Mapping[str, Any]) -> str:
-    return ", ".join(map(with_error, row["pooled"], row["pooled_mcse"]))
-
-
-def _ess(row: Mapping[str, Any]) -> str:
-    return figures(row["ess"]) if (row["ess"] or 0) < 100 else f"{row['ess']:.0f}"
-
-
-def traces(run: SavedRun) -> Section:
-    """Draws in their order, with ensembles, or batches, in colours and R-hat in the titles."""
-    names = list(run.units)
+def drawn(run: SavedRun) -> Drawings:
+    """Traces of the draws, and prior densities over their histograms."""
+    names, density = list(run.units), run.tables["prior_density"]
     sets, draws = run.draws[names[0]].shape
-    caption = (
+    trace = (
         f"{draws} draws of each of {sets} batches, in random order."
         if run.weighted
         else f"{draws} draws of each of {sets} ensembles, thinned evenly from the kept part of the run, "
         "walkers side by side within a step."
     )
-    kind = "batch of importance draws" if run.weighted else "ensemble"
-    text = f"Each colour is an independent {kind}. Draws whose colours separate or drift have not converged."
-    return Section(
-        "Traces", (text,), paged("trace", names, _PER_FIGURE, lambda part: _traces(run, part), caption)
+    prior = (
+        "Histogram: draws. Line: prior density, which may reach far beyond the axis. Where the axis is "
+        "logarithmic, both are densities per natural logarithm of the parameter."
     )
+    own = [name for name in dict.fromkeys(density["name"]) if name in run.draws]
+    return {
+        "traces": paged("trace", names, _PER_FIGURE, lambda part: _traces(run, part), trace),
+        "priors": paged("priors", own, _PER_FIGURE, lambda part: marginals(run, part, _prior), prior),
+        "prior_table": run.tables["priors"].to_dict("records"),
+    }
 
 
 def _traces(run: SavedRun, names: Sequence[str]) -> str:
@@ -142,43 +57,6 @@ def _traces(run: SavedRun, names: Sequence[str]) -> str:
     for panel in panels[-2:]:
         panel.set_xlabel("draw [-]")
     return svg_of(figure)
-
-
-def priors(run: SavedRun) -> Section:
-    """Prior densities over histograms of the draws, the table of priors and how defaults are derived."""
-    density = run.tables["prior_density"]
-    names = [name for name in dict.fromkeys(density["name"]) if name in run.draws]
-    caption = (
-        "Histogram: draws. Line: prior density, which may reach far beyond the axis. Where the axis is "
-        "logarithmic, both are densities per natural logarithm of the parameter."
-    )
-    held = {row["name"] for row in run.results["fixed"]}
-    table = Table.of(
-        run.tables["priors"].to_dict("records"),  # type: ignore[arg-type]
-        ("name", "code", "name"),
-        ("unit", "text", "unit"),
-        ("prior", "code", "prior"),
-        ("from", "text", "from"),
-        ("treated", "text", lambda row: _treated(row, held)),
-        caption="Where a prior is a default, the rule below derived it from the fit records.",
-    )
-    return Section(
-        "Priors and posteriors",
-        (
-            "Where the histogram follows the line the data have not changed the prior.",
-            f"Times, those in priors included, are in {run.time_unit}: the `time_unit` of the study, by "
-            "default the unit of the first fit record.",
-        ),
-        paged("priors", names, _PER_FIGURE, lambda part: marginals(run, part, _prior), caption),
-        (table,),
-        inspect.cleandoc(defaultpriors.__doc__ or ""),
-    )
-
-
-def _treated(row: Mapping[str, Any], held: set[str]) -> str:
-    if row["name"] in held:
-        return "fixed"
-    return "integrated out exactly" if row["integrated_out"] else "sampled"
 
 
 def marginals(run: SavedRun, names: Sequence[str], draw: Callable[[Axes, SavedRun, str], None]) -> str:
@@ -213,47 +91,3 @@ def _prior(panel: Axes, run: SavedRun, name: str) -> None:
     panel.stairs(counts, np.exp(edges) if log else edges, fill=True, color=BAND, alpha=0.5, label="draws")
     panel.plot(x, height, color=HELD_OUT, label="prior")
     density_axis(panel, log=log)
-
-
-def sensitivity(run: SavedRun) -> Section:
-    """How far prior and data decide each parameter, with Monte Carlo errors, the most affected first."""
-    rows = run.results["sensitivity"]
-    struck = [str(row["parameter"]) for row in rows if row["diagnosis"] not in ("-", "not trusted")]
-    doubtful = [str(row["parameter"]) for row in rows if row["diagnosis"] == "not trusted"]
-    text = [_SENSITIVITY.format(threshold=figures(rows[0]["threshold"], 1))] if rows else []
-    if struck:
-        text.append(f"The prior matters for {len(struck)} of {len(rows)} parameters: {', '.join(struck)}.")
-    elif rows and not doubtful:
-        text.append("No parameter depends noticeably on its prior density.")
-    if doubtful:
-        text.append(
-            f"Not trusted for {len(doubtful)} parameter(s), {', '.join(doubtful)}: the draws are too few or "
-            "their importance weights too uneven; sample more steps."
-        )
-    if len(rows) > _MOST_SENSITIVE:
-        text.append(
-            f"The {_MOST_SENSITIVE} most affected of {len(rows)} are shown; tables/sensitivity.csv has them "
-            "all."
-        )
-    table = Table.of(
-        rows[:_MOST_SENSITIVE],
-        ("name", "code", "parameter"),
-        ("prior", "number", lambda row: with_error(row["prior"], row["prior_mcse"], 3, bare=False)),
-        (
-            "likelihood",
-            "number",
-            lambda row: with_error(row["likelihood"], row["likelihood_mcse"], 3, bare=False),
-        ),
-        ("diagnosis", "prose", "diagnosis"),
-        ("Pareto k", "number", _pareto_k),
-        ("grade", "grade", "grade"),
-        ("note", "prose", "note"),
-        caption="± is the Monte Carlo standard error; Pareto k is the larger of those of the weights that "
-        "scale the prior and the likelihood; the grade is that of the parameter's draws.",
-    )
-    return Section("Prior sensitivity", tuple(text), tables=(table,) if rows else ())
-
-
-def _pareto_k(row: Mapping[str, Any]) -> str:
-    ks = [row[key] for key in ("prior_k", "likelihood_k") if row[key] is not None]
-    return figures(max(ks), 2) if ks else NONE

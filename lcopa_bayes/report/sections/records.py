@@ -12,16 +12,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lcopa_bayes.core.arrays import Index, Vector
-from lcopa_bayes.report.decimation import draw_bands, draw_line, extremes, said
 from lcopa_bayes.report.formatting import figures, percent, probability
+from lcopa_bayes.report.page import Drawings
 from lcopa_bayes.report.savedrun import SavedRun
-from lcopa_bayes.report.section import Drawing, Section, Table, score_columns
 from lcopa_bayes.report.theme import (
     BAND,
     CYCLE,
     INK,
     NOISE,
+    Drawing,
     blank,
+    draw_bands,
+    draw_line,
+    extremes,
+    extremes_note,
     headed,
     label,
     legend_above,
@@ -41,36 +45,29 @@ _ORDINATE_BAND = (-log(0.975), -log(0.025))
 """2.5 and 97.5 % quantiles of the unit exponential law of a periodogram ordinate over its mean [-]."""
 
 
-def data(run: SavedRun) -> Section:
-    """Observed and predicted responses with their drives, fitted records first, and the scores."""
+def drawn(run: SavedRun) -> Drawings:
+    """Observed and predicted responses with their drives, fitted records first, and of each the residual with
+    its autocorrelation and spectrum."""
     scores = {
         (row["record"], row["axis"], held): row
         for key, held in (("fit_scores", False), ("held_out", True))
         for row in run.results[key]
     }
-    drawings = []
+    data, residuals = [], []
     for number, (record, axis) in enumerate(run.records("bands"), start=1):
         rows = run.part("bands", record, axis)
         held = bool(rows["held_out"].iloc[0])
         score = scores.get((record, axis, held), {})
-        drawings.append(
-            Drawing(
-                f"data_{number:02d}_{record}_{axis}",
-                _data(run, rows, record, axis, held=held),
-                _described(score, record, axis, len(rows), held=held) + _before(run, rows, record),
-                mark="held out" if held else "",
-            )
-        )
-    return Section(
-        "Data and bands",
-        (
-            "The plant bands hold the response without noise, the grey band the samples themselves. "
-            f"Bands are {POINTWISE}: each holds at every time by itself; a whole curve leaves it more often. "
-            "A correct model has about 50 and 90 % of the samples in its bands with noise.",
-        ),
-        tuple(drawings),
-        (_scores(run),),
-    )
+        caption = _described(score, record, axis, len(rows), held=held) + _before(run, rows, record)
+        svg = _data(run, rows, record, axis, held=held)
+        data.append(Drawing(f"data_{number:02d}_{record}_{axis}", svg, caption, "held out" * held))
+    for number, (record, axis) in enumerate(run.records("residuals"), start=1):
+        rows = run.part("residuals", record, axis)
+        held = bool(rows["held_out"].iloc[0])
+        caption = _tested(run, record, axis, len(rows), held=held)
+        svg = _residual(run, rows, record, axis, held=held)
+        residuals.append(Drawing(f"residuals_{number:02d}_{record}_{axis}", svg, caption, "held out" * held))
+    return {"data": data, "residuals": residuals}
 
 
 def _data(run: SavedRun, rows: pd.DataFrame, record: str, axis: str, *, held: bool) -> str:
@@ -147,7 +144,7 @@ def _described(score: Mapping[str, Any], record: str, axis: str, size: int, *, h
             f"{score['samples']} samples lie in the {POINTWISE} 90 % band with noise, "
             f"{percent(score['coverage_50'])} in the 50 % band. Offset: {score['offset_from']}."
         )
-    return " ".join([*parts, *filter(None, [said(size)])])
+    return " ".join([*parts, *filter(None, [extremes_note(size)])])
 
 
 def _before(run: SavedRun, rows: pd.DataFrame, record: str) -> str:
@@ -157,47 +154,6 @@ def _before(run: SavedRun, rows: pd.DataFrame, record: str) -> str:
     first, last = rows["time"].min(), rows["time"].max()
     early = begin < first - 0.02 * (last - first)
     return f" The drive from {figures(begin)} {run.time_unit} on is included but not shown." if early else ""
-
-
-def _scores(run: SavedRun) -> Table:
-    rows = [
-        row | {"use": use}
-        for key, use in (("fit_scores", "fit"), ("held_out", "held out"))
-        for row in run.results[key]
-    ]
-    return Table.of(
-        rows,
-        ("record", "text", "record"),
-        ("axis", "text", "axis"),
-        ("use", "text", "use"),
-        *score_columns(),
-        caption=f"RMSE is against the median of the plant; coverage is by the {POINTWISE} bands with noise. "
-        "Where an offset comes from all samples of a held-out record, a constant error is not visible in its "
-        "scores.",
-    )
-
-
-def residuals(run: SavedRun) -> Section:
-    """Residual, autocorrelation and spectrum of every axis of every record."""
-    drawings = []
-    for number, (record, axis) in enumerate(run.records("residuals"), start=1):
-        rows = run.part("residuals", record, axis)
-        held = bool(rows["held_out"].iloc[0])
-        drawings.append(
-            Drawing(
-                f"residuals_{number:02d}_{record}_{axis}",
-                _residual(run, rows, record, axis, held=held),
-                _tested(run, record, axis, len(rows), held=held),
-                mark="held out" if held else "",
-            )
-        )
-    text = (
-        "The residual is observed minus the median of the plant; the two lower panels show it after the "
-        "fitted noise model has whitened it. Grey bands hold 95 % of the points if it is white."
-        if drawings
-        else "Every record is too short for residuals to be tested."
-    )
-    return Section("Residuals", (text,), tuple(drawings))
 
 
 def _residual(run: SavedRun, rows: pd.DataFrame, record: str, axis: str, *, held: bool) -> str:
@@ -233,10 +189,7 @@ def _spectrum(panel: Axes, rows: pd.DataFrame, time_unit: str) -> None:
     at = _shown(power)
     panel.plot(frequency[at], power[at], color=BAND, lw=0.8)
     panel.set(
-        xscale="log",
-        yscale="log",
-        xlabel=label("frequency", f"1/{time_unit}"),
-        ylabel="power over white [-]",
+        xscale="log", yscale="log", xlabel=label("frequency", f"1/{time_unit}"), ylabel="power over white [-]"
     )
 
 
@@ -258,4 +211,4 @@ def _tested(run: SavedRun, record: str, axis: str, size: int, *, held: bool) -> 
             if p is not None:
                 judged = "not white" if p < WHITE_P else "no sign that it is not white"
                 parts.append(f"Ljung-Box test of the whitened residual: {probability(p)}, {judged}.")
-    return " ".join([*parts, *filter(None, [said(size)])])
+    return " ".join([*parts, *filter(None, [extremes_note(size)])])

@@ -9,11 +9,21 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from lcopa_bayes.report.decimation import draw_bands, draw_line
-from lcopa_bayes.report.formatting import NOT_REACHED, OPEN, figures, interval, to_spread
+from lcopa_bayes.report.formatting import NOT_REACHED, OPEN, interval, to_spread
+from lcopa_bayes.report.page import Drawings
 from lcopa_bayes.report.savedrun import SavedRun
-from lcopa_bayes.report.section import Section, Table, paged
-from lcopa_bayes.report.theme import BAND, STEADY, grid, label, legend_above, plain, svg_of
+from lcopa_bayes.report.theme import (
+    BAND,
+    STEADY,
+    draw_bands,
+    draw_line,
+    grid,
+    label,
+    legend_above,
+    paged,
+    plain,
+    svg_of,
+)
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
 
 _STEPS_PER_FIGURE, _BODE_PER_FIGURE = 6, 4
@@ -29,17 +39,39 @@ _WORDS = {
 _TIMES = ("rise", "settling")
 
 
-def steps(run: SavedRun) -> Section:
-    """Bands of the response to a unit step, and the table of step metrics."""
-    curves = run.tables["step_response"]
-    paths = list(dict.fromkeys(curves["path"]))
-    caption = (
+def drawn(run: SavedRun) -> Drawings:
+    """Bands of the response to a unit step and the step metrics as they are printed; Bode plots."""
+    step, bode = run.tables["step_response"], run.tables["frequency_response"]
+    paths, answered = list(dict.fromkeys(step["path"])), list(dict.fromkeys(bode["path"]))
+    steps = (
         "Response of the plant to a unit step at time 0, over the longest record: median, "
         f"{POINTWISE} 50 and 90 % bands. Dashed: median and 90 % interval of the steady state it tends to."
     )
-    drawings = paged("step", paths, _STEPS_PER_FIGURE, lambda part: _steps(run, curves, part), caption)
-    tables = (_metrics(run.results["step_metrics"]),) if run.results["step_metrics"] else ()
-    return Section("Step responses", drawings=drawings, tables=tables)
+    frequency = (
+        f"Gain and phase of each path: median, {POINTWISE} 50 and 90 % bands, and the {SIMULTANEOUS} "
+        "90 % band (dashed), which holds the whole curve. From one cycle in the longest fit record to one in "
+        "two sampling periods."
+    )
+    return {
+        "steps": paged("step", paths, _STEPS_PER_FIGURE, lambda part: _steps(run, step, part), steps),
+        "frequency": paged(
+            "frequency", answered, _BODE_PER_FIGURE, lambda part: _bode(run, bode, part), frequency
+        ),
+        "metrics": [_metric(row) for row in run.results["step_metrics"]],
+    }
+
+
+def _metric(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row of the table of step metrics."""
+    kind, path = _kind(row)
+    return {
+        **{key: row[key] for key in ("unit", "sd", "grade")},
+        "path": path,
+        "metric": _WORDS.get(kind, kind.replace("_", " ")),
+        "median": _median(row),
+        "ends": _interval(row),
+        "note": row.get("note", ""),
+    }
 
 
 def _steps(run: SavedRun, curves: pd.DataFrame, paths: Sequence[str]) -> str:
@@ -67,23 +99,6 @@ def _path(panel: Axes, rows: pd.DataFrame) -> None:
     panel.axhline(0.0, color="#b0b0b0", lw=0.6, zorder=0)
 
 
-def _metrics(metrics: Sequence[Mapping[str, Any]]) -> Table:
-    return Table.of(
-        metrics,
-        ("path", "text", lambda row: _kind(row)[1]),
-        ("metric", "text", lambda row: _WORDS.get(_kind(row)[0], _kind(row)[0].replace("_", " "))),
-        ("median", "interval", _median),
-        ("unit", "text", "unit"),
-        ("90 % interval", "interval", _interval),
-        ("sd", "number", lambda row: figures(row["sd"], 2)),
-        ("grade", "grade", "grade"),
-        ("note", "prose", lambda row: str(row.get("note", ""))),
-        caption="Times count from the step. Intervals are 90 % equal-tailed credible; where they are open, "
-        "the response of that share of the draws does not reach them within the record, or does not remain "
-        "there after it.",
-    )
-
-
 def _kind(metric: Mapping[str, Any]) -> tuple[str, str]:
     """Kind and path of a metric."""
     kind, _, where = str(metric["name"]).partition("[")
@@ -103,19 +118,6 @@ def _interval(metric: Mapping[str, Any]) -> str:
     lower, upper, never = metric["lower"], metric["upper"], _open(metric)
     ends = interval(lower, upper, metric["sd"], nothing=never)
     return ends if (lower is None) == (upper is None) else ends.replace(OPEN, never)
-
-
-def frequency(run: SavedRun) -> Section:
-    """Bode plots: gain and phase with their bands."""
-    table = run.tables["frequency_response"]
-    paths = list(dict.fromkeys(table["path"]))
-    caption = (
-        f"Gain and phase of each path: median, {POINTWISE} 50 and 90 % bands, and the {SIMULTANEOUS} "
-        "90 % band (dashed), which holds the whole curve. From one cycle in the longest fit record to one in "
-        "two sampling periods."
-    )
-    drawings = paged("frequency", paths, _BODE_PER_FIGURE, lambda part: _bode(run, table, part), caption)
-    return Section("Frequency response", drawings=drawings)
 
 
 def _bode(run: SavedRun, table: pd.DataFrame, paths: Sequence[str]) -> str:
