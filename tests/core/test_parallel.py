@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
+from lcopa_bayes.core import parallel
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.parallel import meanwhile, workers
 
 
 def threads(size, seed):
@@ -79,6 +80,29 @@ def test_a_task_that_ends_in_an_error_has_the_result_it_is_given(jobs):
         assert sorted(map(str, done)) == ["(0, <class 'ZeroDivisionError'>)"] * 2 + ["2.0", "3.0", "6.0"]
     with pytest.raises(InputError, match="a worker process ended"), workers(0, jobs=2) as crew:
         list(crew.finished(lost, range(3), lambda one, error: one))
+
+
+def half(one):
+    return one / 2 if one else 1 / one
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_what_is_done_meanwhile_gives_its_result_and_its_error(jobs):
+    given = []
+    with meanwhile(half, 8, given.append, jobs=jobs):
+        pass
+    assert given == [4.0]
+    reached = []
+    with pytest.raises(ZeroDivisionError), meanwhile(half, 0, given.append, jobs=jobs):
+        reached.append(jobs)
+    assert given == [4.0]
+    assert reached == [2][: jobs - 1]  # alone the task comes first
+
+
+def test_workers_are_processes_of_their_own_where_forks_are_not_safe(monkeypatch):
+    monkeypatch.setattr(parallel, "_CONTEXT", parallel._SpawnContext())
+    with workers(6, jobs=2) as crew:
+        assert list(crew.each(over, [1, 2, 3])) == [6.0, 3.0, 2.0]
 
 
 SCRIPT = """
