@@ -13,7 +13,8 @@ combinations of modes, and a mode of one group is met only where all others happ
 A point that proposals were fitted to has too small a weight as a draw of these: where it is heavy they
 follow it. Once the points cover the posterior, draws that count come in two halves, each from proposals
 fitted to the other half and to what was before. None of these draws is taken away, however many are needed:
-to stop where draws look good would take a mode that was not met for none.
+to stop where draws look good would take a mode that was not met for none. Where a few weigh more than all
+others, they count anew from there.
 """
 
 from __future__ import annotations
@@ -65,6 +66,8 @@ _SETTLED, _HELPFUL = 300.0, 0.1
 """Effective draws of all points, and per draw of the next proposal, from which draws count."""
 _LEARNED = 0.15
 """Share of the last of these in proposals whose draws count: wider than they are [-]."""
+_LOST = 0.03
+"""Effective draws per draw below which a few are of a region that proposals did not cover [-]."""
 _MOST, _MOST_DRAWN = 4, 40.0
 """Most draws of a round over the least, and of all that count over the effective draws wanted [-]."""
 _VISITED = 6_000
@@ -209,6 +212,8 @@ class Search:
                 if not self._misses(proposals[0], weighted, self._walked(), halves[0]):
                     return weighted
                 since, worth = len(halves[0].counts), 0.0
+            elif weighted.ess < _LOST * weighted.count:
+                since, worth = len(halves[0].counts), 0.0  # a region met for the first time is learned
             if self._late():
                 return None
         return None
