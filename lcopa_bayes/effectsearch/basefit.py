@@ -19,7 +19,7 @@ from lcopa_bayes.inference.observations import Observed
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.posterior import Posterior
 
-_STARTS = 2
+_STARTS = 4
 """Starts of the search for the optimum [-]."""
 _DELAYS = (0.7, 0.85, 1.15, 1.3)
 """Factors on the fitted delays from which the descent is started again: delays can jump [-]."""

@@ -139,6 +139,9 @@ def _apart(posterior: Posterior, one: Vector, other: Vector) -> float:
 
 
 def _size(row: Parameter) -> float:
+    """A large difference: without end for gains and levels, which the dynamics determine at any optimum."""
+    if row.kind in ("gain", "offset"):
+        return np.inf
     if row.prior is None or row.log_scale or row.logit_scale:
         return 1.0
     sd = float(row.prior.frozen.std())
