@@ -68,7 +68,7 @@ STAGES = {
         "Fit.save": "saving",
     },
     "lcopa_bayes.results.discretisation": {"find_optima": "least squares"},
-    "lcopa_bayes.sampling.marginal": {"Search._first": "search", "Search._walked": "walkers"},
+    "lcopa_bayes.sampling.marginal": {"Search._improved": "search", "Search._walked": "walkers"},
     "lcopa_bayes.report.pages": {"write_page_of": "page"},
 }
 """Stage of each function, by the module that calls it."""

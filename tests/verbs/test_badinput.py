@@ -137,8 +137,14 @@ def test_a_budget_of_time_ends_sampling_and_says_what_more_would_give(tmp_path, 
 def test_a_search_that_its_budget_ends_gives_the_draws_it_has(monkeypatch):
     """Time is up once the first draws are there, a tenth of those wanted."""
     task = study(record(camera=0.6), sampler={"target_ess": 3000, "seconds": 1.0})
-    clock = iter([0.0, 0.5])
-    monkeypatch.setattr(sampler, "monotonic", lambda: next(clock, 2.0))
+    clock, draw = [0.0], marginal.Search._last
+
+    def last(*given):
+        clock.append(2.0)
+        return draw(*given)
+
+    monkeypatch.setattr(sampler, "monotonic", lambda: clock[-1])
+    monkeypatch.setattr(marginal.Search, "_last", last)
     monkeypatch.setattr(marginal, "_SPARE", 0.1)
     fitted = fit(task)
     assert fitted.run.weighted is not None
