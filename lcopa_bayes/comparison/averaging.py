@@ -118,10 +118,12 @@ def _values(row: Row, name: str) -> Vector:
 
 
 def _moved(values: Vector, others: Vector) -> bool:
-    """Whether a median lies more than half a standard deviation from the other's."""
-    apart = abs(np.median(values) - np.median(others))
+    """Whether a median lies more than half a standard deviation from the other's; not where both are open."""
+    here, there = np.median(values), np.median(others)
+    if here == there:
+        return False
     sd = float(np.std(others)) if np.isfinite(others).all() else 0.0
-    return bool(not np.isfinite(apart) or apart > _MOVED * sd)
+    return bool(abs(here - there) > _MOVED * sd)
 
 
 def mixture_quantiles(values: Matrix, weights: Vector, probabilities: Vector) -> Vector:

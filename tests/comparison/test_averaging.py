@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from scipy.optimize import brentq
 from scipy.stats import norm
 
-from lcopa_bayes.comparison.averaging import averaged, mixture_quantiles, parts_of_sd
+from lcopa_bayes.comparison.averaging import _moved, averaged, mixture_quantiles, parts_of_sd
 
 AT = (np.arange(200) + 0.5) / 200
 
@@ -130,3 +130,11 @@ def test_an_extrapolation_is_covered_although_the_evidence_is_against_the_term_t
         covered[1] += low <= truth <= high
     assert covered[0] / 400 > 0.85
     assert covered[1] / 400 < 0.7
+
+
+def test_a_number_that_both_candidates_leave_open_has_not_moved():
+    """A settling time that neither reaches; one that only one reaches has moved."""
+    settled, never = gaussian(0, 1), np.full(200, np.inf)
+    assert not _moved(never, never)
+    assert _moved(never, settled)
+    assert _moved(settled, never)
