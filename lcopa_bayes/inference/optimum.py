@@ -12,7 +12,6 @@ from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.leastsquares import LeastSquares
-from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.inference.poles import regressed
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.effects.effect import UnstableError
@@ -134,18 +133,8 @@ def _kept(posterior: Posterior, optima: list[Optimum]) -> tuple[Optimum, ...]:
 def _apart(posterior: Posterior, one: Vector, other: Vector) -> float:
     """Largest difference between table values in a sampled coordinate [natural log, or sd of the prior]."""
     first, second = posterior.coordinates(np.stack((one, other)))
-    sizes = [_size(posterior.table.rows[k]) for k in posterior.sampled]
+    sizes = [posterior.table.rows[k].breadth for k in posterior.sampled]
     return float((np.abs(first - second) / np.array(sizes)).max(initial=0.0))
-
-
-def _size(row: Parameter) -> float:
-    """A large difference: without end for gains and levels, which the dynamics determine at any optimum."""
-    if row.kind in ("gain", "offset"):
-        return np.inf
-    if row.prior is None or row.log_scale or row.logit_scale:
-        return 1.0
-    sd = float(row.prior.frozen.std())
-    return sd if 0.0 < sd < np.inf else 1.0
 
 
 def _spread(posterior: Posterior) -> list[float]:

@@ -79,6 +79,17 @@ class Parameter:
         """Whether it is sampled by its logit."""
         return self.declared.scale == "logit"
 
+    @cached_property
+    def breadth(self) -> float:
+        """A large difference on the sampled scale [natural log, or prior sd]; infinite for gains and for
+        offsets, which the dynamics determine at any optimum."""
+        if self.kind in ("gain", "offset"):
+            return inf
+        if self.prior is None or self.log_scale or self.logit_scale:
+            return 1.0
+        sd = float(self.prior.frozen.std())
+        return sd if 0.0 < sd < inf else 1.0
+
     def coordinate(self, values: Array | float) -> Array:
         """Values on the scale the parameter is sampled on, same shape."""
         return np.asarray(np.log(values) if self.log_scale else logit(values) if self.logit_scale else values)
