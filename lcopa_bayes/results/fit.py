@@ -42,6 +42,7 @@ from lcopa_bayes.sampling.sampler import Run, SamplePlan, sample
 from lcopa_bayes.sampling.weightedrun import QUICK_STARTS, STARTS, weighted_run
 
 if TYPE_CHECKING:
+    from lcopa_bayes.comparison.structure import Structure
     from lcopa_bayes.results.integerrival import Rival
 
 _QUICK = 4
@@ -79,6 +80,8 @@ class Fit(Predictive):
     """How a second, independent sampling method agrees; None without one."""
     rival: Rival | None = None
     """The same study with integer orders, and how it predicts; None when none was fitted."""
+    structure: Structure | None = None
+    """What other structures the records allow; None where the study states its terms."""
 
     @property
     def near(self) -> Posterior:
@@ -142,6 +145,8 @@ def fit(
     its records, these do not meet the requirements of a fit (`requirements`), or the folder cannot be written
     to; then nothing is written.
     """
+    if study.model.terms == "auto":
+        raise ValueError("the number of terms is not settled yet")
     if look is None:
         refuse_if(unmet(study))
     problem = look.problem if look else problem_of(study)

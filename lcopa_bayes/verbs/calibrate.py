@@ -19,6 +19,7 @@ from lcopa_bayes.calibration.calibrate import calibrate as calibrated
 from lcopa_bayes.calibration.ranks import LEVELS, SIMULTANEOUS, Coverage, bin_limits, corridor, p_uniform
 from lcopa_bayes.calibration.replica import ENGINES, RANKED, Engine, Outcome, Quantity
 from lcopa_bayes.calibration.truths import Stated, Truths
+from lcopa_bayes.comparison.structure import settled
 from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.results.discretisation import LARGEST
 from lcopa_bayes.results.predictive import Predictive
@@ -289,7 +290,7 @@ def calibrate(
     InputError for input that cannot be used, when a worker is lost, when not one replica could be done, and
     for a folder as `fit`.
     """
-    wanted = study_of(study)
+    wanted = settled(study_of(study))
     origin = plain(provenance(wanted, "calibrate"))
     with opened(folder, origin) as place:
         calibration = calibrated(

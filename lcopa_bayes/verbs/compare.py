@@ -14,6 +14,7 @@ import pandas as pd
 from lcopa_bayes.comparison.candidatefit import CARD
 from lcopa_bayes.comparison.candidates import candidates_of, of_studies
 from lcopa_bayes.comparison.compare import compare as compared
+from lcopa_bayes.comparison.structure import settled
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.data.settings import CandidateSettings
 from lcopa_bayes.data.study import Study
@@ -85,7 +86,7 @@ def compare(
     else:
         named = isinstance(described, Path | str)
         chosen, more = load_candidates(Path(described)) if named else (None, described)  # type: ignore[arg-type]
-        single = study_of(study)  # type: ignore[arg-type]
+        single = settled(study_of(study))  # type: ignore[arg-type]
         if single.effects.use:  # its candidates have them or not, but never without their priors
             problem_of(single)
         models = candidates_of(single, more, candidates or chosen)  # type: ignore[arg-type]

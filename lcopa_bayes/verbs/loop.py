@@ -9,6 +9,7 @@ from typing import final
 
 import pandas as pd
 
+from lcopa_bayes.comparison.structure import settled
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_study
@@ -90,7 +91,7 @@ def loop(
     `jobs`, processes to use; `folder`, a run folder to write into; `quick`, fewer chance residuals and
     shorter ensembles. InputError as `fit`.
     """
-    wanted = study_of(study)
+    wanted = settled(study_of(study))
     problem_of(wanted)  # what is wrong with the study is said before anything is written
     origin = plain(provenance(wanted, "loop"))
     with opened(folder, origin):

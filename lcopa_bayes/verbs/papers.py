@@ -11,6 +11,7 @@ from typing import final
 
 import pandas as pd
 
+from lcopa_bayes.comparison.structure import settled
 from lcopa_bayes.core.files import writable_folder
 from lcopa_bayes.paper.auditclaims import load_audit
 from lcopa_bayes.paper.claims import judge
@@ -105,7 +106,7 @@ def identify(
     whose intervals are shown too; `folder`, a run folder to write into; `jobs`, processes to use; `quiet`, no
     progress bar. InputError when records, intervals or folders cannot be used.
     """
-    wanted, plan = study_of(study), scan or Scan()
+    wanted, plan = settled(study_of(study)), scan or Scan()
     beside = None if posterior is None else load_posterior(Path(posterior), wanted)
     scannable(wanted, plan)
     if folder is not None:
