@@ -89,7 +89,7 @@ class RecordsSettings(Ruled):
 class ModelSettings(Ruled):
     """Table ``[model]``."""
 
-    terms: Annotated[int | Literal["auto"] | Mapping[str, int], _TERMS] = 1
+    terms: Annotated[int | Literal["auto"] | Mapping[str, int], _TERMS] = "auto"
     """Viscous terms [-] of every element, 1 to 6, or of each element by name; "auto": the records choose, and
     what paths share too; in a study file that states `orders` the default is their number."""
     orders: Annotated[Literal["free"] | tuple[float, ...], _ORDERS] = "free"

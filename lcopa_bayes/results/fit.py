@@ -42,8 +42,8 @@ from lcopa_bayes.sampling.sampler import Run, SamplePlan, sample
 from lcopa_bayes.sampling.weightedrun import QUICK_STARTS, STARTS, weighted_run
 
 if TYPE_CHECKING:
-    from lcopa_bayes.comparison.structure import Structure
     from lcopa_bayes.results.integerrival import Rival
+    from lcopa_bayes.results.structure import Structure
 
 _QUICK = 4
 """How many times fewer steps a quick fit takes."""

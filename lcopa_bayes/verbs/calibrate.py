@@ -19,12 +19,12 @@ from lcopa_bayes.calibration.calibrate import calibrate as calibrated
 from lcopa_bayes.calibration.ranks import LEVELS, SIMULTANEOUS, Coverage, bin_limits, corridor, p_uniform
 from lcopa_bayes.calibration.replica import ENGINES, RANKED, Engine, Outcome, Quantity
 from lcopa_bayes.calibration.truths import Stated, Truths
-from lcopa_bayes.comparison.structure import settled
 from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.results.discretisation import LARGEST
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.runfolder import opened, provenance
 from lcopa_bayes.results.stored import StoredResult
+from lcopa_bayes.results.structure import settled
 from lcopa_bayes.sampling.importanceweights import LARGEST_K
 from lcopa_bayes.verbs.sources import StudyLike, study_of
 

@@ -14,7 +14,6 @@ import pandas as pd
 from lcopa_bayes.comparison.candidatefit import CARD
 from lcopa_bayes.comparison.candidates import candidates_of, of_studies
 from lcopa_bayes.comparison.compare import compare as compared
-from lcopa_bayes.comparison.structure import settled
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.data.settings import CandidateSettings
 from lcopa_bayes.data.study import Study
@@ -22,6 +21,7 @@ from lcopa_bayes.data.studyfile import load_candidates
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.results.runfolder import opened, provenance
 from lcopa_bayes.results.stored import StoredResult
+from lcopa_bayes.results.structure import settled
 from lcopa_bayes.verbs.sources import FitLike, study_of
 
 

@@ -7,7 +7,6 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
-from lcopa_bayes.comparison.structure import structure_of
 from lcopa_bayes.core.parallel import meanwhile
 from lcopa_bayes.results.firstlook import FirstLook, first_look
 from lcopa_bayes.results.fit import Fit
@@ -16,6 +15,7 @@ from lcopa_bayes.results.integerrival import integer_rival
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.result import write_page
 from lcopa_bayes.results.runfolder import opened, provenance
+from lcopa_bayes.results.structure import structure_of
 from lcopa_bayes.verbs.look import look_result
 from lcopa_bayes.verbs.sources import FitLike, StudyLike, finished, study_of
 
@@ -44,7 +44,7 @@ def fit(
     """
     wanted = study_of(study)
     structure = structure_of(wanted)
-    wanted = structure.study if structure else wanted
+    wanted = structure.chosen.study if structure else wanted
     with opened(folder, provenance(wanted, "fit")) as place:
         seen: FirstLook | None = None
         drawn: AbstractContextManager[None] = nullcontext()

@@ -8,10 +8,10 @@ from typing import final
 
 import pandas as pd
 
-from lcopa_bayes.comparison.structure import structure_of
 from lcopa_bayes.results.firstlook import FirstLook, first_look
 from lcopa_bayes.results.runfolder import provenance
 from lcopa_bayes.results.stored import StoredResult
+from lcopa_bayes.results.structure import structure_of
 from lcopa_bayes.verbs.sources import StudyLike, study_of
 
 

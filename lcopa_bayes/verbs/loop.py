@@ -9,7 +9,6 @@ from typing import final
 
 import pandas as pd
 
-from lcopa_bayes.comparison.structure import settled
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_study
@@ -19,6 +18,7 @@ from lcopa_bayes.effectsearch.summary import drawn, results, words
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.results.runfolder import opened, provenance
 from lcopa_bayes.results.stored import StoredResult
+from lcopa_bayes.results.structure import settled
 from lcopa_bayes.verbs.sources import FitLike, study_of
 
 CURVES = "loop_curves.json"

@@ -11,7 +11,6 @@ from typing import final
 
 import pandas as pd
 
-from lcopa_bayes.comparison.structure import settled
 from lcopa_bayes.core.files import writable_folder
 from lcopa_bayes.paper.auditclaims import load_audit
 from lcopa_bayes.paper.claims import judge
@@ -24,6 +23,7 @@ from lcopa_bayes.paper.steptable import load_posterior, panels, step_table
 from lcopa_bayes.paper.verdict import Evidence, Kind
 from lcopa_bayes.results.runfolder import provenance
 from lcopa_bayes.results.stored import StoredResult
+from lcopa_bayes.results.structure import settled
 from lcopa_bayes.verbs.sources import FitLike, study_of
 
 

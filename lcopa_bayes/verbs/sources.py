@@ -13,6 +13,7 @@ from lcopa_bayes.data.studyfile import BrokenStudyError, load_study
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.savedfit import NAME, load_fit
+from lcopa_bayes.results.structure import with_least_terms
 
 StudyLike: TypeAlias = Study | Path | str | Sequence[Path | str]
 """A study, its folder or file, or record files to make one of."""
@@ -35,7 +36,7 @@ def study_of(source: FitLike, *, held_out: Sequence[Path] = ()) -> Study:
     except BrokenStudyError as broken:
         problems = [*broken.problems, *unmet_apart_from_rest(broken.study)]
         try:
-            problem_of(broken.study)
+            problem_of(with_least_terms(broken.study))
         except InputError as error:
             problems += error.problems
         raise InputError(problems) from None
