@@ -10,6 +10,7 @@ from types import MappingProxyType
 from typing import Any, final
 
 import numpy as np
+import pandas as pd
 
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.rules import rebuilt
@@ -157,6 +158,26 @@ class Study:
     def with_seed(self, seed: int) -> Study:
         """The same study with another seed."""
         return replace(self, seed=seed)
+
+    def summary(self) -> pd.DataFrame:
+        """One row per record: samples, first and last time [`time_unit`], axes [units], and whether it is
+        held out."""
+        return pd.DataFrame(
+            [
+                {
+                    "record": one.name,
+                    "samples": one.time.size,
+                    "begin": one.time[0],
+                    "end": one.time[-1],
+                    "time_unit": one.time_unit,
+                    "drives": ", ".join(f"{axis.name} [{axis.unit}]" for axis in one.drive_axes),
+                    "responses": ", ".join(f"{axis.name} [{axis.unit}]" for axis in one.response_axes),
+                    "held_out": held_out,
+                }
+                for held_out, records in ((False, self.fit), (True, self.held_out))
+                for one in records
+            ]
+        )
 
     def __repr__(self) -> str:
         """Its records, without their numbers and the settings."""
