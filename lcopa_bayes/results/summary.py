@@ -21,8 +21,6 @@ from lcopa_bayes.sampling.convergence import Grade, shares_grade
 if TYPE_CHECKING:
     from lcopa_bayes.results.firstlook import FirstLook
     from lcopa_bayes.results.fit import Fit
-if TYPE_CHECKING:
-    from lcopa_bayes.results.fit import Fit
 
 _NAMED = 8
 """Most parameters named in a sentence."""

@@ -111,7 +111,4 @@ def design(
     if values["winner"] is not None:
         texts[TEMPLATE] = template(fit.study, planned.limits, planned.winner.candidate.command, planned.time)
         values["template"] = TEMPLATE
-    result = DesignResult(values, origin_of(fit, "design"), texts, fit)
-    if folder is not None:
-        result.save(folder)
-    return result
+    return DesignResult(values, origin_of(fit, "design"), texts, fit).kept(folder)

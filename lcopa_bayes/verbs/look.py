@@ -35,10 +35,7 @@ def look(study: StudyLike, *, folder: Path | str | None = None) -> LookResult:
     of a few searches, intervals and bands are of draws about it, which know of no other mode. InputError as
     `fit`, and where no search leads to a plant inside the priors.
     """
-    result = look_result(first_look(study_of(study)))
-    if folder is not None:
-        result.save(folder)
-    return result
+    return look_result(first_look(study_of(study))).kept(folder)
 
 
 def look_result(seen: FirstLook) -> LookResult:

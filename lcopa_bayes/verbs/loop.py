@@ -97,7 +97,4 @@ def loop(
         outcome = searched(wanted, jobs=jobs, quick=quick, as_stated=as_stated)
         curves = json.dumps(plain(drawn(outcome)), indent=1, allow_nan=False) + "\n"
         values = results(outcome) | {"explained": EXPLAINED}
-        result = LoopResult(values, origin, {CURVES: curves}, study=outcome.study)
-        if folder is not None:
-            result.save(folder)
-    return result
+        return LoopResult(values, origin, {CURVES: curves}, study=outcome.study).kept(folder)

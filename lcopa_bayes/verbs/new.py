@@ -121,9 +121,9 @@ def new(
         problems.append("no table: name one or more files")
     refuse_if(problems)
     stated = Mapped(time, tuple(drives), tuple(responses), time_unit, decimal, time_format)
-    converted = convert(tables, stated)
-    own, apart = converted.records[: len(fitted)], converted.records[len(fitted) :]
+    records, notes = convert(tables, stated)
+    own, apart = records[: len(fitted)], records[len(fitted) :]
     study = Study(folder.resolve().name, fit=own, held_out=apart)
-    result = NewStudy(study, tuple(converted.notes), tuple(unmet(study)))
+    result = NewStudy(study, tuple(notes), tuple(unmet(study)))
     result.save(folder, overwrite=overwrite)
     return result
