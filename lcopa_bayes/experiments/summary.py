@@ -59,7 +59,7 @@ def _row(result: Design, promise: Promise) -> dict[str, Any]:
         "words": promise.candidate.words if promise.excites else "excites nothing that could be seen",
         "changes": promise.candidate.command.times.size,
         "time": promise.time,
-        "worst": result.worst_of(promise).as_json() if among.any() else None,
+        "worst": result.over_draws("worst", promise.worst(among)).as_json() if among.any() else None,
         "factor_over_step": quantile(result.factors(promise), 0.5) if among.any() else None,
         "typical": promise.typical(among) if among.any() else None,
         "relative_sd": [

@@ -205,7 +205,9 @@ def crosstalk_gains(stated: Stated, evidence: Evidence) -> Verdict:
     """
     wanted = stated.records.crosstalk_gains
     rules = crosstalk_rules(stated)
-    gaps = {name: _gap(pair, wanted) for name, pair in rules.items()}
+    gaps = {
+        name: max(abs(a / b - 1) for a, b in zip(pair, wanted, strict=True)) for name, pair in rules.items()
+    }
     name = min(gaps, key=gaps.__getitem__)
     hit = [rule for rule, pair in rules.items() if _matches(pair, wanted)]
     yx, xy = rules[hit[0] if hit else name]
@@ -288,10 +290,6 @@ def two_axis_steady(stated: Stated, evidence: Evidence) -> Verdict:
         f"{100 * SETTLED_PART:.0f} % of the record."
     )
     return Verdict(Kind.of(min(gaps) <= limit), min(gaps), "rad", how)
-
-
-def _gap(pair: tuple[float, float], wanted: tuple[float, float]) -> float:
-    return max(abs(a / b - 1) for a, b in zip(pair, wanted, strict=True))
 
 
 def _matches(pair: tuple[float, float], wanted: tuple[float, float]) -> bool:

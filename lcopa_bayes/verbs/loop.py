@@ -23,7 +23,7 @@ from lcopa_bayes.verbs.sources import FitLike, study_of
 CURVES = "loop_curves.json"
 """File of the residuals and views that the page draws."""
 EXPLAINED = "explained.toml"
-"""File of the study with what a loop found."""
+"""File of the study with the effects that a loop identified."""
 
 
 @final
@@ -32,7 +32,7 @@ class LoopResult(StoredResult):
     """What the model of a study lacks."""
 
     study: Study | None = None
-    """The study with the effects that were found declared, named as the study and ``-explained``: what `fit`,
+    """The study with the identified effects declared, named as the study and ``-explained``: what `fit`,
     `audit` and `compare` take."""
 
     verb, file, beside = "loop", "loop.json", (CURVES,)
@@ -57,12 +57,14 @@ class LoopResult(StoredResult):
         return pd.DataFrame(rows, columns=pd.Index([*columns, "confounded_with"]))
 
     def save(self, folder: Path | str) -> Path:
-        """Write the result into a run folder, with `explained.toml`, the study of what was found, and its
-        records; returns the folder. InputError as `StoredResult.save`."""
+        """Write the result into a run folder, with `explained.toml`, the study with the identified effects,
+        and its records; returns the folder. InputError as `StoredResult.save`."""
         with opened(folder, self.origin) as path:
             if self.study is not None:
                 write_study(
-                    self.study, path / EXPLAINED, note=f"{self.values['study']} with what `loop` found."
+                    self.study,
+                    path / EXPLAINED,
+                    note=f"{self.values['study']} with the effects that `loop` identified.",
                 )
             return super().save(path)
 
