@@ -88,7 +88,8 @@ def _outcome(options: argparse.Namespace, command: Sequence[str]) -> Outcome:
 def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     """All verbs with their options."""
     raw = argparse.RawDescriptionHelpFormatter
-    parser = CommandParser(prog=PROGRAM, description=lcopa_bayes.__doc__, epilog=_CODES, formatter_class=raw)
+    about = str(lcopa_bayes.__doc__).partition("\n")[0]
+    parser = CommandParser(prog=PROGRAM, description=about, epilog=_CODES, formatter_class=raw)
     parser.given = given
     if given[:1] == ["--print-completion"]:
         import shtab

@@ -78,7 +78,7 @@ def test_a_longer_plan_begins_like_a_shorter_one(uninterrupted):
         assert_array_equal(one.chain, other.chain[: 2 * ROUND])
 
 
-@pytest.mark.parametrize("saves", [1, 2, 4])
+@pytest.mark.parametrize("saves", [2, *(pytest.param(saves, marks=pytest.mark.slow) for saves in (1, 4))])
 def test_a_killed_run_resumes_to_the_same_draws(tmp_path, monkeypatch, uninterrupted, saves):
     path, saved = tmp_path / "chain.h5", []
 
