@@ -116,7 +116,7 @@ def integer_rival(stated: Stated = PAPER) -> Rival:
     study = Study("integer rival", None, "ms", 0, (record,), model=settings)
     data = path_data(study)[0]
     plan = Scan(orders=tuple(Interval(order, order) for order in orders), whole_blocks=False)
-    start = scan([each.blocks for each in data.records], len(orders), data.span, plan).model
+    start = scan(data.blocks, len(orders), data.span, plan).model
     model = output_error_fit(
         study, data, np.random.default_rng(0), terms=len(orders), orders=orders, start=start, starts=4
     )
