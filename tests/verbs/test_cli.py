@@ -40,7 +40,7 @@ def study(record: Path, more: str = "") -> Path:
     path = record.parent / "study.toml"
     path.write_text(
         '[records]\nfit = ["pulse.csv"]\n[noise]\nkind = "white"\n'
-        "[sampler]\nensembles = 2\nwalkers = 32\nsteps = 400\n" + more
+        "[sampler]\nensembles = 2\nwalkers = 16\nsteps = 200\n" + more
     )
     return path
 
