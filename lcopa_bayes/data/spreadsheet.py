@@ -1,6 +1,6 @@
 """Tables as people save them: spreadsheets and text of any separator, encoding and decimal sign.
 
-Everything is read as text first, with the line or row it stands in, so that a message can quote it. Above the
+Everything is read as text first, with its line or row, so that a message can quote it. Above the
 header there may be lines of remarks, below it a line of units.
 
 Numbers and time stamps in the notations of spreadsheets.
@@ -145,7 +145,7 @@ def _tabled(path: Path, rows: Sequence[tuple[int, list[str]]], width: int) -> Ce
     units = _units(above[-1]) if len(above) > 1 and _filled(above[-2]) > 1 else None
     header = above[-2] if units else above[-1]
     if _filled(header) < 2:
-        raise InputError(f"{path}, line {rows[first][0]}: no line of column names stands above the numbers")
+        raise InputError(f"{path}, line {rows[first][0]}: there is no line of column names above the numbers")
     names = [
         f"{name} [{unit}]" if units and unit else name
         for name, unit in zip_longest(header, (units or [])[: len(header)], fillvalue="")

@@ -12,7 +12,7 @@ from typing import Any, final
 import numpy as np
 import pandas as pd
 
-from lcopa_bayes.core.errors import InputError, refuse_if
+from lcopa_bayes.core.errors import gathered, refuse_if
 from lcopa_bayes.core.rules import rebuilt
 from lcopa_bayes.core.units import in_time_unit
 from lcopa_bayes.data.record import Axis, Record, RecordLike, records_of, several
@@ -201,11 +201,9 @@ def _records(
     """Records to fit and held out; those read here come in one time unit. What is wrong joins `problems`."""
     out: list[tuple[Record, ...]] = []
     for given, called in ((several(fit), "record"), (several(held_out), "held-out")):
-        try:
+        read: tuple[Record, ...] = ()
+        with gathered(problems):
             read = records_of(given, called=called)
-        except InputError as error:
-            problems += error.problems
-            read = ()
         unit = time_unit or next((record.time_unit for role in (*out, read) for record in role), None)
         as_given = read and all(isinstance(one, Record) for one in given)
         out.append(read if as_given else records_of(read, unit))

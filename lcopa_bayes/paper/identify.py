@@ -12,7 +12,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.arrays import Vector
-from lcopa_bayes.core.errors import InputError, refuse_if
+from lcopa_bayes.core.errors import InputError, gathered, refuse_if
 from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.core.parallel import Progress, workers
 from lcopa_bayes.data.settings import ModelSettings, NoiseSettings
@@ -155,10 +155,8 @@ def scannable(study: Study, plan: Scan | None = None) -> tuple[PathData, ...]:
     paths = path_data(study)
     problems: list[str] = []
     for data in paths:
-        try:
+        with gathered(problems, f"path {data.name}: "):
             plan.first_round(data.terms, data.span, data.records[0].blocks.grid.step)
-        except InputError as error:
-            problems += [f"path {data.name}: {problem}" for problem in error.problems]
     refuse_if(problems)
     return paths
 

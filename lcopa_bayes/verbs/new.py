@@ -9,7 +9,7 @@ from typing import Any, final
 
 import pandas as pd
 
-from lcopa_bayes.core.errors import InputError, refuse_if
+from lcopa_bayes.core.errors import gathered, refuse_if
 from lcopa_bayes.data.cells import CellTable
 from lcopa_bayes.data.conversion import Mapped, convert
 from lcopa_bayes.data.requirements import unmet
@@ -107,10 +107,8 @@ def new(
     problems: list[str] = []
     tables: list[CellTable] = []
     for path in paths:
-        try:
+        with gathered(problems):
             tables.append(read_spreadsheet(path, sheet=sheet))
-        except InputError as error:
-            problems += error.problems
     stems = [path.stem for path in paths]
     problems += [
         f"{path}: another table is called {path.stem!r} too; rename one"
