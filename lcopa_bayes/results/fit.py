@@ -237,7 +237,4 @@ def plan_of(problem: Problem, *, quick: bool) -> SamplePlan:
         seconds=wanted.seconds,
         method=wanted.method or ("auto" if wanted.steps is None and wanted.thin is None else "ensembles"),
     )
-    if not quick:
-        return plan
-    steps = max(plan.thin, plan.steps // _QUICK)
-    return replace(plan, steps=steps)
+    return replace(plan, steps=max(plan.thin, plan.steps // _QUICK)) if quick else plan

@@ -309,7 +309,4 @@ def calibrate(
         texts = {
             f"tables/{name}.csv": table.to_csv(index=False) for name, table in tables(calibration).items()
         }
-        result = CalibrationResult(results(calibration), origin, texts)
-        if place is not None:
-            result.save(place)
-    return result
+        return CalibrationResult(results(calibration), origin, texts).kept(place)

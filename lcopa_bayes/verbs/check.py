@@ -256,10 +256,7 @@ def check(study: StudyLike, *, folder: Path | str | None = None) -> CheckResult:
         ignore_index=True,
     )
     texts = {"tables/check_records.csv": records.to_csv(index=False)}
-    result = CheckResult(inventory(wanted), provenance(wanted, "check"), texts)
-    if folder is not None:
-        result.save(folder)
-    return result
+    return CheckResult(inventory(wanted), provenance(wanted, "check"), texts).kept(folder)
 
 
 def _table(record: Record, *, held_out: bool) -> pd.DataFrame:

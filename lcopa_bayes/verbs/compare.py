@@ -98,7 +98,4 @@ def compare(
         values = compared(models, jobs=jobs, folder=path, resume=resume, quick=quick, quiet=quiet)
         outcome = sorted(one for pattern in Comparison.beside for one in path.glob(pattern))
         texts = {str(one.relative_to(path)): one.read_text(encoding="utf-8") for one in outcome}
-        result = Comparison(values, origin, texts)
-        if folder is not None:
-            result.save(folder)
-    return result
+        return Comparison(values, origin, texts).kept(folder)

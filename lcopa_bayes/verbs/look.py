@@ -38,10 +38,7 @@ def look(study: StudyLike, *, folder: Path | str | None = None) -> LookResult:
     """
     wanted = study_of(study)
     structure = structure_of(wanted)
-    result = look_result(structure.look if structure else first_look(wanted))
-    if folder is not None:
-        result.save(folder)
-    return result
+    return look_result(structure.look if structure else first_look(wanted)).kept(folder)
 
 
 def look_result(seen: FirstLook) -> LookResult:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeAlias
 
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.errors import InputError, gathered
 from lcopa_bayes.data.requirements import unmet_apart_from_rest
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import BrokenStudyError, load_study
@@ -35,10 +35,8 @@ def study_of(source: FitLike, *, held_out: Sequence[Path] = ()) -> Study:
         return load_study(source, held_out=held_out)  # type: ignore[arg-type]
     except BrokenStudyError as broken:
         problems = [*broken.problems, *unmet_apart_from_rest(broken.study)]
-        try:
+        with gathered(problems):
             problem_of(with_least_terms(broken.study))
-        except InputError as error:
-            problems += error.problems
         raise InputError(problems) from None
 
 
