@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import TypeAlias, final
+from typing import TypeAlias
 
 import numpy as np
-from scipy import fft
-from scipy.linalg import toeplitz
-from scipy.linalg.lapack import dtrtrs
 
 from lcopa_bayes.core.arrays import Array, Flags, Index, Matrix
 
-Force: TypeAlias = Callable[[slice | Index, Matrix, Matrix, Matrix], Matrix]
+Force: TypeAlias = Callable[[slice, Matrix, Matrix, Matrix], Matrix]
 """(blocks, deviation of y, its values one and two blocks before) -> deviation of the force, each of
-(axes, blocks); blocks by their positions may come several times."""
+(rows, blocks)."""
 
 TOLERANCE = 1e-12
 """Change of y in the last iteration over the largest y [-]."""
@@ -25,26 +21,8 @@ _DEPTH = 4
 """Earlier iterates that the acceleration combines (Anderson 1965, J. ACM 12)."""
 _LEVELS = 400
 """Most steps towards the level at rest [-]."""
-_DENSE = 128
-"""Longest stretch for a dense matrix [blocks]."""
-_NEWTON = 12
-_NUDGE = 1e-6
-_SINGULAR = 1e-3
-"""Below this a block's own feed-through leaves Newton's step undetermined [-]."""
-_LEAST = 2
-"""Stretches this short are iterated to the end."""
-_LONG_SWEEPS = 400
-_SHARES = (0.5, 0.2, 0.05)
-"""Steps of an iteration that would overshoot, over the distance to its target [-]."""
-
-
-@final
-class RunawayError(ArithmeticError):
-    """No bounded solution; carries the `block` where it was lost."""
-
-    def __init__(self, block: int) -> None:
-        self.block = block
-        super().__init__(f"the response runs away at block {block}")
+_WIDENED, _HALVED = 60, 60
+"""Most steps towards a bracket of a root, and within it [-]."""
 
 
 def resting(force: Callable[[Matrix], Matrix], start: Matrix, scale: Matrix) -> tuple[Matrix, Flags]:
@@ -109,153 +87,67 @@ def _mixed(steps: Sequence[Matrix], points: Sequence[Matrix]) -> Matrix:
     return np.asarray(points[-1] - (weights.swapaxes(1, 2) @ apart)[:, 0])
 
 
-def balanced(kernel: Matrix, force: Force, scale: Matrix, guess: Matrix) -> Matrix:
-    """``y = kernel * force(y)``, causal convolution, (axes, n), where `iterated` fails on the whole.
+def marched(kernel: Matrix, force: Force, scale: Matrix, plants: int) -> tuple[Array, Flags]:
+    """``y = kernel * force(y)``, causal convolution, block by block where `iterated` fails on the whole:
+    (plants, axes, n), and which plants have no bounded solution, (plants,).
 
-    Parameters: kernel (axes, n), the impulse response in block means; scale (axes, 1), typical size of y;
-    guess (axes, n), y as far as an iteration got. The record is halved, the first half solved and its
-    convolution added to the second; stretches of up to 128 blocks are solved by Newton's method, or halved
-    further, down to two blocks, where the direct feed-through is small.
-    Raises RunawayError. Accuracy: 1e-12 of the scale per iteration.
+    Parameters: kernel (rows, n), the impulse response in block means, of every axis of every plant; scale
+    (rows, 1), typical size of y. Each block is one equation per row, solved by regula falsi with weights of
+    Anderson and Bjoerck (1973, BIT 13) to 1e-12 of the scale; a force that jumps is met at the jump.
     """
-    y, v = np.zeros(kernel.shape), np.zeros(kernel.shape)
-    reach = min(kernel.shape[1], _DENSE)
-    operators = [np.asfortranarray(toeplitz(row[:reach], np.zeros(reach))) for row in kernel]
-    _Balance(kernel, operators, force, scale, guess, y, v).solve(0, kernel.shape[1], _DENSE)
-    return y
+    rows, n = kernel.shape
+    y, v = np.zeros((rows, n + 2)), np.zeros((rows, n))
+    lost: Flags = np.zeros((rows, 1), dtype=bool)
+    for k in range(n):
+        history = np.einsum("rk,rk->r", kernel[:, k:0:-1], v[:, :k])[:, None]
+        one, two, own = y[:, k + 1, None], y[:, k, None], slice(k, k + 1)
 
-
-@final
-@dataclass(frozen=True, eq=False)
-class _Balance:
-    """What is solved, and what of it is."""
-
-    kernel: Matrix
-    operators: list[Matrix]
-    """Convolution with each row of the kernel, over the longest dense stretch; its leading part over less."""
-    force: Force
-    scale: Matrix
-    """(axes, 1)."""
-    guess: Matrix
-    y: Matrix
-    v: Matrix
-
-    def solve(self, a: int, b: int, limit: int) -> int:
-        """Solve blocks a to b in place; `y` holds there what earlier forces leave, on return the response.
-
-        A stretch longer than `limit` is halved untried. Returns the limit that experience suggests.
-        """
-        n = b - a
-        if n <= max(limit, _LEAST):
-            history = self.y[:, a:b].copy()
-            before = np.concatenate((np.zeros((len(history), 2)), self.y[:, max(a - 2, 0) : a]), axis=1)[
-                :, -2:
-            ]
-            problem = history, before, slice(a, b)
-            if n > _LEAST:
-                solution = self._newton(*problem, self.guess[:, a:b])
-                solution = self._newton(*problem, history) if solution is None else solution
-            else:
-                solution = self._iterated(*problem)
-            if solution is not None:
-                self.y[:, a:b], self.v[:, a:b] = solution
-                return min(_DENSE, max(limit, 2 * n))
-            if n <= _LEAST:
-                raise RunawayError(a)
-            limit = n // 2
-        middle = (a + b) // 2
-        limit = self.solve(a, middle, limit)
-        self.y[:, middle:b] += convolved(self.kernel[:, :n], self.v[:, a:middle])[:, middle - a :]
-        return self.solve(middle, b, limit)
-
-    def _newton(
-        self, history: Matrix, before: Matrix, blocks: slice, start: Matrix
-    ) -> tuple[Matrix, Matrix] | None:
-        """Fixed point ``y = history + kernel * force(y)`` with its force, by Newton's method from `start`.
-
-        Slopes of the force, in y and in its two earlier values, are differences over 1e-6 of the scale; that
-        of one axis in another is for the iteration.
-        """
-        axes, n = history.shape
-        scale, operators = self.scale, self.operators
-        nudge = _NUDGE * scale[..., None] * np.eye(4)[1:].T  # (axes, 4 variants, 3 arguments)
-        every = np.tile(np.arange(blocks.start, blocks.stop), 4)
-        diagonal = np.arange(n)
-        y = start
-        for _ in range(_NEWTON):
+        def excess(
+            at: Matrix, own: slice = own, one: Matrix = one, two: Matrix = two, history: Matrix = history
+        ) -> Matrix:
             with np.errstate(over="ignore", invalid="ignore"):
-                one, two = earlier(before, y)
-                varied = [
-                    (value[:, None, :] + nudge[:, :, k, None]).reshape(axes, -1)
-                    for k, value in enumerate((y, one, two))
-                ]
-                forces = self.force(every, *varied).reshape(axes, 4, n)
-                v = forces[:, 0]
-                slopes = (forces[:, 1:] - forces[:, :1]) / (_NUDGE * scale[..., None])
-                residual = history - y
-                for i, operator in enumerate(operators):
-                    residual[i] += operator[:n, :n] @ v[i]
-            size = float(np.abs(residual / scale).max())
-            if not (size < RUNAWAY and np.isfinite(slopes.sum())):  # NaN too
-                return None
-            if size < TOLERANCE:
-                return y + residual, v
-            step = np.empty_like(y)
-            for i, operator in enumerate(operators):
-                matrix = operator[:n, :n] * -slopes[i, 0]
-                for back in (1, 2):
-                    if slopes[i, back].any():
-                        matrix[:, : n - back] -= operator[:n, back:n] * slopes[i, back, back:]
-                matrix[diagonal, diagonal] += 1.0
-                if not np.all(np.abs(matrix[diagonal, diagonal]) > _SINGULAR):
-                    return None
-                step[i] = dtrtrs(matrix, residual[i], lower=1)[0]
-            y = y + step
-        return None
+                return np.asarray(at - history - kernel[:, :1] * force(own, at, one, two))
 
-    def _iterated(self, history: Matrix, before: Matrix, blocks: slice) -> tuple[Matrix, Matrix] | None:
-        """The same for a few blocks by iteration, where the force turns too steeply for that by shorter
-        steps."""
-        kernel = self.kernel[:, : history.shape[1]]
+        y[:, k + 2, None] = now = _root(excess, 2 * one - two, scale)
+        lost |= ~(np.abs(now) < RUNAWAY * scale)
+        y[lost[:, 0], : k + 3] = 0.0
+        v[:, own] = force(own, y[:, k + 2, None], one, two)
+    away: Flags = np.asarray(lost.reshape(plants, -1).any(axis=1))
+    return y[:, 2:].reshape(plants, -1, n), away
 
-        def force(y: Matrix) -> Matrix:
-            return self.force(blocks, y, *earlier(before, y))
 
-        def swept(plants: Index, y: Array) -> Array:
-            return (history + convolved(kernel, force(y[0])))[None]
-
-        found, solved = iterated(swept, history[None], self.scale[None], _LONG_SWEEPS)
-        if solved[0]:
-            return found[0], force(found[0])
-        for share in _SHARES:
-            y = history
-            for _ in range(_LONG_SWEEPS):
-                with np.errstate(over="ignore", invalid="ignore"):
-                    v = force(y)
-                    target = history + convolved(kernel, v)
-                    size = float(np.abs((target - y) / self.scale).max())
-                if not size < RUNAWAY:  # NaN too
-                    break
-                if size < TOLERANCE:
-                    return target, v
-                y = y + share * (target - y)
-        return None
+def _root(excess: Callable[[Matrix], Matrix], start: Matrix, scale: Matrix) -> Matrix:
+    """Where an excess that rises in the end is 0, (rows, 1); NaN where it is so nowhere near."""
+    a, low = start, excess(start)
+    step = -low
+    b, high = a + step, excess(a + step)
+    for _ in range(_WIDENED):
+        outside = np.sign(high) == np.sign(low)
+        if not outside.any():
+            break
+        step = np.where(outside, 2.0 * step, step)
+        a, low = np.where(outside, b, a), np.where(outside, high, low)
+        b = np.where(outside, b + step, b)
+        high = np.where(outside, excess(b), high)
+    found = np.where(np.sign(high) == np.sign(low), np.nan, b)
+    found = np.where(low == 0.0, a, found)
+    tolerance = TOLERANCE * scale
+    for _ in range(_HALVED):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            c = (a * high - b * low) / (high - low)
+            c = np.where(np.isfinite(c), c, 0.5 * (a + b))
+            value = excess(c)
+            within = np.sign(value) == np.sign(high)
+            share = 1.0 - value / np.where(within, high, 1.0)
+        low = np.where(within, np.where(share > 0, share, 0.5) * low, high)
+        a = np.where(within, a, b)
+        b, high = c, value
+        if ((np.abs(high) <= tolerance) | (np.abs(b - a) <= tolerance) | np.isnan(found)).all():
+            break
+    return np.where(np.isnan(found), np.nan, b)
 
 
 def earlier(before: Matrix, y: Matrix) -> tuple[Matrix, Matrix]:
     """Values one and two blocks before those of `y`, from the two blocks before its first."""
     joined = np.concatenate((before, y), axis=1)
     return joined[:, 1:-1], joined[:, :-2]
-
-
-def convolved(kernel: Matrix, v: Matrix) -> Matrix:
-    """Causal convolution along the last axis, as long as the kernel."""
-    n, m = kernel.shape[1], v.shape[1]
-    if n <= 32:
-        out = np.zeros(kernel.shape)
-        for k in range(m):
-            out[:, k:] += v[:, k : k + 1] * kernel[:, : n - k]
-        return out
-    length = fft.next_fast_len(n + m - 1, real=True)
-    product = fft.rfft(kernel, length) * fft.rfft(v, length)
-    return np.asarray(fft.irfft(product, length)[:, :n])

@@ -23,7 +23,7 @@ from lcopa_bayes.model.effects.effect import (
     SensorEffect,
     UnstableError,
 )
-from lcopa_bayes.model.effects.passage import Moved, Plant, forced, linear, passed
+from lcopa_bayes.model.effects.passage import Forces, Moved, Plant, forced, linear, passed
 from lcopa_bayes.model.forward import ForwardModel, StepResponses, joined
 
 UPSTREAM = (DriveEffect, ElementEffect, ForceEffect, SensorEffect)
@@ -142,24 +142,26 @@ class Simulator:
             return passed(model, scenes, plant, [self._acting(acting, psi, r) for r in range(len(scenes))])
         return linear(model, scenes, plant, self.step_responses.get_or(plant.elements, dict))
 
-    def moved_together(self, plants: Sequence[Plant], psi: Vector) -> list[list[Moved]]:
-        """`moved` of many plants: at once where all that acts before the reading are forces that take many.
+    def moved_together(self, cases: Sequence[tuple[Plant, Vector]]) -> list[list[Moved]]:
+        """`moved` of many plants and coefficients: at once where all that acts before the reading are forces
+        that take many.
 
         Raises UnstableError.
         """
+        psis = np.array([psi for _, psi in cases])
         acting = [
-            (effect, psi[part])
+            (effect, psis[:, part])
             for effect, part in zip(self.effects, self._slices, strict=True)
-            if isinstance(effect, UPSTREAM) and psi[part].any()
+            if isinstance(effect, UPSTREAM) and psis[:, part].any()
         ]
-        forces = [
-            (effect, own)
-            for effect, own in acting
-            if isinstance(effect, ForceEffect) and effect.batched and not effect.card.per_record
-        ]
-        if not acting or len(forces) < len(acting):
-            return [self.moved(plant, psi) for plant in plants]
-        scenes = [self.scenes(plant, psi) for plant in plants]
+        if not acting or not all(
+            isinstance(effect, ForceEffect) and effect.batched and not effect.card.per_record
+            for effect, _ in acting
+        ):
+            return [self.moved(plant, psi) for plant, psi in cases]
+        plants, axes = [plant for plant, _ in cases], self.ranges.axes
+        forces: Forces = [(one, np.repeat(own.T, axes, axis=1)[..., None]) for one, own in acting]  # type: ignore[misc]
+        scenes = [self.scenes(plant, psi) for plant, psi in cases]
         gains, dynamics = np.array([plant.gains for plant in plants]), joined([p.dynamics for p in plants])
         out: list[list[Moved]] = [[] for _ in plants]
         for r, (deflection, failures) in enumerate(forced(self.model, scenes[0], gains, dynamics, forces)):
