@@ -22,7 +22,7 @@ from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.effects import Effected, effected
 from lcopa_bayes.model.effects import balance, sensor
 from lcopa_bayes.model.effects.catalogue import bundled, catalogue
-from lcopa_bayes.model.effects.commands import Hysteresis, RefreshHold
+from lcopa_bayes.model.effects.commands import Hysteresis, RefreshHold, SampledDrive
 from lcopa_bayes.model.effects.dynamics import (
     CubicStiffness,
     LevelDependentSpeed,
@@ -484,3 +484,38 @@ def test_a_force_that_turns_within_a_block_is_met_there():
     errors = [apart(one, made[-1]) for one in made[:-1]]
     assert errors[1] < 0.15 * errors[0]
     assert errors[2] < 0.06 * errors[0]
+
+
+def test_a_force_that_jumps_is_met_block_by_block():
+    """Newton's method fails where a force all but jumps with the direction; the balance still holds."""
+    n = 200
+    kernel = np.repeat(np.exp(-np.arange(n) / 3.0)[None] / 4.0, 2, axis=0)
+    f = np.array([2.0, -1.5])[:, None] * np.sin(np.arange(n) / 9.0)
+
+    def force(blocks, y, one, two):
+        return f[:, blocks] - y - 0.4 * np.tanh(1e5 * (y - one))
+
+    found, lost = balance.marched(kernel, force, np.ones((2, 1)), 2)
+    y = found[:, 0]
+    before = np.concatenate((np.zeros((2, 2)), y), axis=1)
+    v = force(slice(None), y, before[:, 1:-1], before[:, :-2])
+    again = np.array([np.convolve(k, own)[:n] for k, own in zip(kernel, v, strict=True)])
+    assert not lost.any()
+    assert_allclose(again, y, atol=1e-5)
+
+
+def test_a_sampled_drive_is_a_delay_that_coefficients_move():
+    """A drive that only lags, with a force: as commands, plant by plant, and as delays, all at once."""
+    whole, values = fractional_plant(staircase([1.0, -1.0, 0.6], hold=4.0, start=0.35))
+    kinds = [SampledDrive(), CubicStiffness()]
+    made = effected(whole.posterior, values, kinds)
+    psi = np.array([0.7, 0.4])
+    plants = [
+        made.plant(values * np.where(np.array(whole.posterior.table.names) == "gain", s, 1)) for s in (1, 1.2)
+    ]
+    together = made.simulator.moved_together([(plant, psi) for plant in plants])
+    for plant, moved in zip(plants, together, strict=True):
+        alone = made.simulator.moved(plant, psi)
+        assert_allclose(
+            moved[0].deflection, alone[0].deflection, atol=2e-5 * np.abs(alone[0].deflection).max()
+        )

@@ -6,12 +6,13 @@ from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
 import numpy as np
+from scipy import fft
 
 from lcopa_bayes.core.arrays import Array, Flags, Index, Matrix
 
-Force: TypeAlias = Callable[[slice, Matrix, Matrix, Matrix], Matrix]
+Force: TypeAlias = Callable[[slice | Index, Matrix, Matrix, Matrix], Matrix]
 """(blocks, deviation of y, its values one and two blocks before) -> deviation of the force, each of
-(rows, blocks)."""
+(rows, blocks); blocks by their positions may come several times."""
 
 TOLERANCE = 1e-12
 """Change of y in the last iteration over the largest y [-]."""
@@ -21,7 +22,13 @@ _DEPTH = 4
 """Earlier iterates that the acceleration combines (Anderson 1965, J. ACM 12)."""
 _LEVELS = 400
 """Most steps towards the level at rest [-]."""
-_WIDENED, _HALVED = 60, 60
+_STRETCH = 64
+"""Blocks that Newton's method solves at once [-]."""
+_NEWTON = 12
+_NUDGE = 1e-6
+_JUMP = 1e-9
+"""Width of a bracket over the scale in which a force is taken to jump [-]."""
+_WIDENED, _HALVED = 60, 120
 """Most steps towards a bracket of a root, and within it [-]."""
 
 
@@ -88,63 +95,123 @@ def _mixed(steps: Sequence[Matrix], points: Sequence[Matrix]) -> Matrix:
 
 
 def marched(kernel: Matrix, force: Force, scale: Matrix, plants: int) -> tuple[Array, Flags]:
-    """``y = kernel * force(y)``, causal convolution, block by block where `iterated` fails on the whole:
+    """``y = kernel * force(y)``, causal convolution, stretch by stretch where `iterated` fails on the whole:
     (plants, axes, n), and which plants have no bounded solution, (plants,).
 
     Parameters: kernel (rows, n), the impulse response in block means, of every axis of every plant; scale
-    (rows, 1), typical size of y. Each block is one equation per row, solved by regula falsi with weights of
-    Anderson and Bjoerck (1973, BIT 13) to 1e-12 of the scale; a force that jumps is met at the jump.
+    (rows, 1), typical size of y. A stretch is solved by Newton's method, for rows where that fails block by
+    block, each one equation. Accuracy: 1e-12 of the scale.
     """
     rows, n = kernel.shape
-    y, v = np.zeros((rows, n + 2)), np.zeros((rows, n))
-    lost: Flags = np.zeros((rows, 1), dtype=bool)
-    for k in range(n):
-        history = np.einsum("rk,rk->r", kernel[:, k:0:-1], v[:, :k])[:, None]
-        one, two, own = y[:, k + 1, None], y[:, k, None], slice(k, k + 1)
-
-        def excess(
-            at: Matrix, own: slice = own, one: Matrix = one, two: Matrix = two, history: Matrix = history
-        ) -> Matrix:
-            with np.errstate(over="ignore", invalid="ignore"):
-                return np.asarray(at - history - kernel[:, :1] * force(own, at, one, two))
-
-        y[:, k + 2, None] = now = _root(excess, 2 * one - two, scale)
-        lost |= ~(np.abs(now) < RUNAWAY * scale)
-        y[lost[:, 0], : k + 3] = 0.0
-        v[:, own] = force(own, y[:, k + 2, None], one, two)
+    length, window = fft.next_fast_len(2 * n, real=True), min(n, _STRETCH)
+    spectrum = fft.rfft(kernel, length)
+    lags = np.subtract.outer(np.arange(window), np.arange(window))
+    operator = np.where(lags >= 0, kernel[:, np.maximum(lags, 0)], 0.0)
+    y, history, lost = np.zeros((rows, n + 2)), np.zeros((rows, n)), np.zeros(rows, dtype=bool)
+    for first in range(0, n, window):
+        own = slice(first, min(first + window, n))
+        size = own.stop - first
+        before, past = y[:, first : first + 2], history[:, own]
+        now, v, solved = _newton(operator[:, :size, :size], past, before, force, own, scale)
+        if not (solved | lost).all():
+            known = solved | lost
+            slow, pushed = _blockwise(operator[:, :size, :size], past, before, force, own, scale, known)
+            now, v = (np.where(solved[:, None], *pair) for pair in ((now, slow), (v, pushed)))
+        with np.errstate(invalid="ignore"):
+            lost |= ~(np.abs(now) < RUNAWAY * scale).all(axis=1)
+        y[:, first + 2 : own.stop + 2] = np.where(lost[:, None], 0.0, now)
+        product = spectrum * fft.rfft(np.where(lost[:, None], 0.0, v), length)
+        history[:, own.stop :] += fft.irfft(product, length)[:, size : n - first]
     away: Flags = np.asarray(lost.reshape(plants, -1).any(axis=1))
     return y[:, 2:].reshape(plants, -1, n), away
 
 
-def _root(excess: Callable[[Matrix], Matrix], start: Matrix, scale: Matrix) -> Matrix:
-    """Where an excess that rises in the end is 0, (rows, 1); NaN where it is so nowhere near."""
+def _newton(
+    operator: Array, past: Matrix, before: Matrix, force: Force, own: slice, scale: Matrix
+) -> tuple[Matrix, Matrix, Flags]:
+    """``y = past + operator @ force(y)`` on a stretch, the force, both (rows, blocks), and what is solved,
+    (rows,). Slopes of the force, in y and in its two earlier values, are differences over 1e-6 of the scale.
+    """
+    rows, n = past.shape
+    nudge = _NUDGE * scale[..., None] * np.eye(4)[1:].T  # (rows, 4 variants, 3 arguments)
+    every = np.tile(np.arange(own.start, own.stop), 4)
+    y, solved = past, np.zeros(rows, dtype=bool)
+    out, pushed = past.copy(), np.zeros(past.shape)
+    for _ in range(_NEWTON):
+        with np.errstate(over="ignore", invalid="ignore"):
+            values = (y, *earlier(before, y))
+            varied = [(v[:, None] + nudge[:, :, k, None]).reshape(rows, -1) for k, v in enumerate(values)]
+            forces = force(every, *varied).reshape(rows, 4, n)
+            slopes = (forces[:, 1:] - forces[:, :1]) / (_NUDGE * scale[..., None])
+            residual = past - y + (operator @ forces[:, 0, :, None])[..., 0]
+            done = np.abs(residual / scale).max(axis=1) < TOLERANCE
+        new = done & ~solved
+        out[new], pushed[new] = (y + residual)[new], forces[new, 0]
+        solved |= done
+        usable = np.isfinite(slopes).all(axis=(1, 2)) & np.isfinite(residual).all(axis=1)
+        if solved.all() or not (usable & ~solved).any():
+            break
+        matrix = np.eye(n) - operator * slopes[:, :1]
+        for back in (1, 2):
+            matrix[:, :, :-back] -= operator[:, :, back:] * slopes[:, back, None, back:]
+        matrix[~usable], residual[~usable] = np.eye(n), 0.0
+        try:
+            y = y + np.linalg.solve(matrix, residual[..., None])[..., 0]
+        except np.linalg.LinAlgError:
+            break
+    return out, pushed, solved
+
+
+def _blockwise(
+    operator: Array, past: Matrix, before: Matrix, force: Force, own: slice, scale: Matrix, known: Flags
+) -> tuple[Matrix, Matrix]:
+    """The same block by block, by regula falsi (Dowell and Jarratt 1971, BIT 11) with bisections between: a
+    force that all but jumps is met at the jump."""
+    y, v = np.concatenate((before, past), axis=1), np.zeros(past.shape)
+    for k in range(past.shape[1]):
+        before_it = past[:, k, None] + np.vecdot(operator[:, k, :k], v[:, :k])[:, None]
+        one, two, place = y[:, k + 1, None], y[:, k, None], slice(own.start + k, own.start + k + 1)
+
+        def excess(
+            at: Matrix, place: slice = place, one: Matrix = one, two: Matrix = two, past: Matrix = before_it
+        ) -> Matrix:
+            with np.errstate(over="ignore", invalid="ignore"):
+                return np.asarray(at - past - operator[:, :1, 0] * force(place, at, one, two))
+
+        now = _root(excess, 2 * one - two, scale, known[:, None])
+        y[:, k + 2, None] = np.where(np.isfinite(now), now, RUNAWAY * scale)
+        v[:, k, None] = force(place, y[:, k + 2, None], one, two)
+    return y[:, 2:], v
+
+
+def _root(excess: Callable[[Matrix], Matrix], start: Matrix, scale: Matrix, known: Flags) -> Matrix:
+    """Where an excess that rises in the end is 0, (rows, 1); NaN where it is so nowhere near, or not asked
+    for because it is known, (rows, 1)."""
     a, low = start, excess(start)
     step = -low
     b, high = a + step, excess(a + step)
     for _ in range(_WIDENED):
-        outside = np.sign(high) == np.sign(low)
+        outside = (np.sign(high) == np.sign(low)) & (np.abs(b) < RUNAWAY * scale) & ~known
         if not outside.any():
             break
         step = np.where(outside, 2.0 * step, step)
         a, low = np.where(outside, b, a), np.where(outside, high, low)
         b = np.where(outside, b + step, b)
         high = np.where(outside, excess(b), high)
-    found = np.where(np.sign(high) == np.sign(low), np.nan, b)
-    found = np.where(low == 0.0, a, found)
-    tolerance = TOLERANCE * scale
-    for _ in range(_HALVED):
+    found, done = np.where(low == 0.0, a, np.nan), ~(np.sign(high) * np.sign(low) < 0) | known
+    for count in range(_HALVED):
+        if done.all():
+            break
         with np.errstate(divide="ignore", invalid="ignore"):
             c = (a * high - b * low) / (high - low)
-            c = np.where(np.isfinite(c), c, 0.5 * (a + b))
-            value = excess(c)
-            within = np.sign(value) == np.sign(high)
-            share = 1.0 - value / np.where(within, high, 1.0)
-        low = np.where(within, np.where(share > 0, share, 0.5) * low, high)
-        a = np.where(within, a, b)
-        b, high = c, value
-        if ((np.abs(high) <= tolerance) | (np.abs(b - a) <= tolerance) | np.isnan(found)).all():
-            break
-    return np.where(np.isnan(found), np.nan, b)
+        c = np.where(np.isfinite(c) & (count % 3 < 2), c, 0.5 * (a + b))
+        value = excess(c)
+        found = np.where(done, found, c)
+        beyond = np.sign(value) == np.sign(high)
+        a, b = np.where(beyond, a, c), np.where(beyond, c, b)
+        low, high = np.where(beyond, 0.5 * low, value), np.where(beyond, value, 0.5 * high)
+        done |= np.isnan(value) | (np.abs(value) <= TOLERANCE * scale) | (np.abs(b - a) <= _JUMP * scale)
+    return found
 
 
 def earlier(before: Matrix, y: Matrix) -> tuple[Matrix, Matrix]:

@@ -18,7 +18,7 @@ from dataclasses import MISSING, dataclass, fields
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal, NamedTuple, Self, final
 
-from lcopa_bayes.core.arrays import Index, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.grid import Grid
 from lcopa_bayes.model.layout import Layout
@@ -221,6 +221,13 @@ class Effect(ABC):
 
 class DriveEffect(Effect):
     """Changes the commands of one drive axis."""
+
+    lags: ClassVar[bool] = False
+    """Whether all it does is to make every change act later by the same time, `lag`."""
+
+    def lag(self, ranges: Ranges, psi: Array) -> Array:
+        """That time [time unit], of coefficients (coefficients, ...)."""
+        raise NotImplementedError(f"{self.name} does more than delay its commands")
 
     @abstractmethod
     def commands(

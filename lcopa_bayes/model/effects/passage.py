@@ -34,7 +34,7 @@ Forces: TypeAlias = Sequence[tuple[ForceEffect, Array]]
 constants that differ likewise."""
 Kernels: TypeAlias = dict[tuple[int, float, float], Matrix]
 """Responses to an impulse by element, width of the blocks, and the factor on time constants."""
-_SWEEPS = 100
+_SWEEPS = 50
 """Most sweeps of the iteration [-]: what they do not bring to rest is solved block by block."""
 RUNS_AWAY = "the response runs away"
 

@@ -23,7 +23,7 @@ from lcopa_bayes.model.effects.effect import (
     SensorEffect,
     UnstableError,
 )
-from lcopa_bayes.model.effects.passage import Forces, Moved, Plant, forced, linear, passed
+from lcopa_bayes.model.effects.passage import Moved, Plant, forced, linear, passed
 from lcopa_bayes.model.forward import ForwardModel, StepResponses, joined
 
 UPSTREAM = (DriveEffect, ElementEffect, ForceEffect, SensorEffect)
@@ -154,22 +154,27 @@ class Simulator:
             for effect, part in zip(self.effects, self._slices, strict=True)
             if isinstance(effect, UPSTREAM) and psis[:, part].any()
         ]
-        if not acting or not all(
-            isinstance(effect, ForceEffect) and effect.batched and not effect.card.per_record
-            for effect, _ in acting
-        ):
+        forces = [
+            (effect, np.repeat(own.T, self.ranges.axes, axis=1)[..., None])
+            for effect, own in acting
+            if isinstance(effect, ForceEffect) and effect.batched and not effect.card.per_record
+        ]
+        lags = [(one, own) for one, own in acting if isinstance(one, DriveEffect) and one.lags]
+        if not forces or len(forces) + len(lags) < len(acting):
             return [self.moved(plant, psi) for plant, psi in cases]
-        plants, axes = [plant for plant, _ in cases], self.ranges.axes
-        forces: Forces = [(one, np.repeat(own.T, axes, axis=1)[..., None]) for one, own in acting]  # type: ignore[misc]
-        scenes = [self.scenes(plant, psi) for plant, psi in cases]
+        plants, records = [plant for plant, _ in cases], range(len(self.model.experiments))
         gains, dynamics = np.array([plant.gains for plant in plants]), joined([p.dynamics for p in plants])
+        for effect, own in lags:
+            dynamics = dynamics.later(effect.lag(self.ranges, own.T))
+        commanded = [self.scene(r, plants[0]) for r in records]
+        scenes = [self.scenes(plant, psi) for plant, psi in cases]
         out: list[list[Moved]] = [[] for _ in plants]
-        for r, (deflection, failures) in enumerate(forced(self.model, scenes[0], gains, dynamics, forces)):
+        for r, (deflection, failures) in enumerate(forced(self.model, commanded, gains, dynamics, forces)):
             if failures:
                 names = tuple(effect.name for effect, _ in forces)
                 raise UnstableError(names, self.model.experiments[r].name, next(iter(failures.values())))
-            for b, own in enumerate(out):
-                own.append(Moved(scenes[b][r], deflection[:, b].T))
+            for b, each in enumerate(out):
+                each.append(Moved(scenes[b][r], deflection[:, b].T))
         return out
 
     def _bending(self, psi: Vector) -> list[bool]:
