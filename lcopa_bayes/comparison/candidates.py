@@ -13,6 +13,7 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import table_of
 from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.model.layout import Layout
+from lcopa_bayes.results.predictive import Predictive
 
 STUDY = "study"
 """Name of the candidate that is the study unchanged."""
@@ -42,6 +43,8 @@ class Candidate:
     notes: tuple[str, ...] = ()
     improper: tuple[str, ...] = ()
     """Parameters whose prior is improper."""
+    fit: Predictive | None = None
+    """Its finished fit; None: it is fitted."""
 
     @property
     def integer(self) -> bool:
@@ -153,15 +156,16 @@ def candidates_of(
     return tuple(distinct)
 
 
-def of_studies(studies: Sequence[Study]) -> tuple[Candidate, ...]:
-    """Studies of the same records as candidates, called by their names, with a number where these repeat."""
+def of_studies(studies: Sequence[Study], fits: Sequence[Predictive | None]) -> tuple[Candidate, ...]:
+    """Studies of the same records as candidates, called by their names, with a number where these repeat, and
+    those of their fits that are finished."""
     names = [study.name for study in studies]
     called = [
         name if names.count(name) == 1 else f"{name}-{number}" for number, name in enumerate(names, start=1)
     ]
     return tuple(
-        Candidate(name, study, _about(study, study.model, True), (), ())
-        for name, study in zip(called, studies, strict=True)
+        Candidate(name, study, _about(study, study.model, True), fit=fit)
+        for name, study, fit in zip(called, studies, fits, strict=True)
     )
 
 
@@ -245,13 +249,15 @@ def _about(study: Study, model: ModelSettings, cross: bool) -> str:
     )
     shared = {"paper": "direct and cross elements", "all": "one element", "none": "an element per path"}
     delays = {"shared": "one delay", "element": "a delay per element", "path": "a delay per path"}
+    effects = [f"with {', '.join(study.effects.use)}"] if study.effects.use else []
     if len(study.drive_axes) == len(study.response_axes) == 1:
-        return f"{terms}, {orders}"
+        return ", ".join([terms, orders, *effects])
     parts = [
         terms,
         orders,
         shared[str(model.share)],
         delays[str(model.delay)],
         *([] if cross else ["no cross paths"]),
+        *effects,
     ]
     return ", ".join(parts)

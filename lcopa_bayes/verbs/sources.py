@@ -40,6 +40,18 @@ def study_of(source: FitLike, *, held_out: Sequence[Path] = ()) -> Study:
         raise InputError(problems) from None
 
 
+def several(source: FitLike | Sequence[FitLike]) -> tuple[FitLike, ...]:
+    """The studies or fits of a sequence of two or more; none where it is one study, as of record files."""
+    if isinstance(source, str) or not isinstance(source, Sequence) or len(source) < 2:
+        return ()
+    whole = (
+        isinstance(one, Study | Predictive)
+        or (isinstance(one, Path | str) and (Path(one).is_dir() or Path(one).suffix == ".toml"))
+        for one in source
+    )
+    return tuple(source) if all(whole) else ()
+
+
 def finished(source: FitLike) -> Predictive | None:
     """The finished fit that is given or kept in the run folder that is named; None for a study."""
     if isinstance(source, Predictive):
