@@ -8,7 +8,6 @@ be compared between machines, and between hours of one machine.
 
 from __future__ import annotations
 
-import argparse
 import ctypes
 import json
 import os
@@ -29,7 +28,7 @@ import pandas as pd
 from comparison import Spread, ratio
 from probe import SAMPLING
 
-from lcopa_bayes.cli import VERBS
+from lcopa_bayes.verbs.commandline import USAGES
 
 HERE = Path(__file__).parent
 STUDIES = HERE.parent
@@ -233,10 +232,8 @@ class Workshop:
 
 @cache
 def options_of(verb: str) -> str:
-    """Help on the options of a verb."""
-    parser = argparse.ArgumentParser()
-    VERBS[verb].options(parser)
-    return parser.format_help()
+    """Names of the options of a verb."""
+    return " ".join(name for name, _ in USAGES[verb].options)
 
 
 _SUBREAPER = 36
