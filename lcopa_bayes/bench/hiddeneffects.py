@@ -14,7 +14,6 @@ from lcopa_bayes.bench.command import Command
 from lcopa_bayes.bench.device import Device
 from lcopa_bayes.bench.inversion import unit_step
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.data.record import Axis
 from lcopa_bayes.model.path import Normalisation, TransferPath
 
 Balance: TypeAlias = Callable[[Vector, Vector, Vector, int], Vector]
@@ -135,21 +134,6 @@ class HiddenDevice:
     effects: tuple[Hidden, ...]
     shot: Shot
     steps: int = STEPS
-
-    @property
-    def drive_axes(self) -> tuple[Axis, ...]:
-        """Axes of the drive."""
-        return self.device.drive_axes
-
-    @property
-    def response_axes(self) -> tuple[Axis, ...]:
-        """Axes of the response."""
-        return self.device.response_axes
-
-    @property
-    def time_unit(self) -> str:
-        """Unit of every time."""
-        return self.device.time_unit
 
     def response(self, command: Command, time: ArrayLike, *, exposure: float = 0.0) -> Matrix:
         """Responses at `time` [ms], (n, n_responses); the first axis pairs with the first drive, and so on.

@@ -13,10 +13,10 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from lcopa_bayes.core.errors import refuse_if
+from lcopa_bayes.report import records
 from lcopa_bayes.report.page import Drawings, Verdict, write_graded
+from lcopa_bayes.report.records import draw_drives
 from lcopa_bayes.report.savedrun import TABLES, SavedRun, read_table
-from lcopa_bayes.report.sections import records
-from lcopa_bayes.report.sections.records import draw_drives
 from lcopa_bayes.report.theme import HELD_OUT, SEEN, Drawing, blank, draw_line, label, plain, svg_of
 from lcopa_bayes.results.firstlook import TABLES as SHOWN
 
@@ -30,7 +30,7 @@ def write_check(folder: Path) -> Path:
     """
     problems: list[str] = []
     path = folder / "tables" / "check_records.csv"
-    table = read_table(path, _COLUMNS, problems, verb="check")
+    table = read_table(path, problems, _COLUMNS, verb="check")
     refuse_if(problems)
 
     def drawn(values: Mapping[str, Any]) -> Drawings:
@@ -52,7 +52,7 @@ def write_look(folder: Path) -> Path:
     """
     problems: list[str] = []
     tables = {
-        name: read_table(folder / "tables" / f"look_{name}.csv", TABLES[name], problems, verb="look")
+        name: read_table(folder / "tables" / f"look_{name}.csv", problems, TABLES[name], verb="look")
         for name in SHOWN
     }
     refuse_if(problems)

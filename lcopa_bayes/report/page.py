@@ -129,6 +129,8 @@ class Page:
 def _cell(kind: str, value: object) -> Markup:
     number = kind == "number" and isinstance(value, float)
     text = formatting.figures(value) if value is None or number else value  # type: ignore[arg-type]
+    if kind in ("number", "interval", "prose"):
+        text = formatting.signed(str(text))
     return Markup('<td class="{}">{}</td>').format(f"{kind} {text}" if kind == "grade" else kind, text)
 
 
@@ -148,8 +150,8 @@ def anchor(title: str) -> str:
 
 
 def tied(text: str) -> Markup:
-    """A paragraph without line breaks in numbers with a percent sign, nor in p-values."""
-    words = re.sub(r"[ \n]+", " ", escape(text)).strip()
+    """A paragraph with true minus signs, without line breaks in percentages and p-values."""
+    words = formatting.signed(re.sub(r"[ \n]+", " ", escape(text)).strip())
     return Markup(words.replace(" %", "\u00a0%").replace("p = ", "p\u00a0=\u00a0"))
 
 

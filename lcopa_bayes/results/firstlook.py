@@ -18,6 +18,7 @@ from scipy.special import logsumexp
 from lcopa_bayes.core.covariance import root_of
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.estimate import Estimate, plain
+from lcopa_bayes.data.agreement import disagreements
 from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
@@ -87,7 +88,8 @@ class FirstLook:
     @property
     def verdict(self) -> str:
         """How well the best optimum follows the records, and what the numbers rest on."""
-        parts = []
+        study = self.problem.study
+        parts = [f"Records disagree: {one}." for one in disagreements((*study.fit, *study.held_out))]
         for held, name in ((False, "Fitted"), (True, "Held out")):
             shown = [band for band in self.bands if band.held_out == held]
             if shown:

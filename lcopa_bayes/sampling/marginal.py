@@ -206,7 +206,7 @@ class Search:
                 return None
             drawn += count
             weighted = self._weighted(halves, len(seen.counts), since)
-            worth = weighted.smallest_ess(self._rng) if weighted.ess > 2.0 else 0.0
+            worth = weighted.smallest_ess if weighted.ess > 2.0 else 0.0
             enough = worth >= wanted or (self._late() and worth >= _FEW)
             if enough and weighted.pareto_k <= usable_k(weighted.count):
                 if not self._misses(proposals[0], weighted, self._walked(), halves[0]):

@@ -15,6 +15,7 @@ import pandas as pd
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.data.agreement import disagreements
 from lcopa_bayes.data.drive import axis_drives, first_change
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.requirements import unmet
@@ -43,17 +44,20 @@ def inventory(study: Study) -> dict[str, Any]:
     InputError where its settings do not fit its records.
     """
     problem, obstacles = problem_of(study), unmet(study)
+    disagree = [str(one) for one in disagreements((*study.fit, *study.held_out))]
     rows = problem.posterior.table.rows
     sentences = [*_of_plant(problem), *_of_model(problem)]
     verdict = f"To mend before a fit: {'; '.join(obstacles)}." if obstacles else "The records can be fitted."
+    verdict = " ".join([verdict, *(f"Records disagree: {one}." for one in disagree)])
     return plain(
         {
             "study": study.name,
             "time_unit": study.time_unit,
             "verdict": verdict,
-            "grade": "unusable" if obstacles else "reliable",
+            "grade": "unusable" if obstacles else "tentative" if disagree else "reliable",
             "grade_reason": verdict,
             "problems": obstacles,
+            "disagreements": disagree,
             "sentences": sentences,
             "records": [
                 *(_record(one, problem, held_out=False) for one in study.fit),

@@ -13,7 +13,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from small import record
 
@@ -202,13 +201,3 @@ def test_figures_that_cannot_be_kept_are_told(tmp_path):
     (tmp_path / "figures").write_text("a file in the way")
     with pytest.raises(InputError, match="figures"):
         write_page(tmp_path, "claims.html", "it", {"verdict": "", "claims": []}, {"claims": []})
-
-
-def test_numbers_survive_the_enduring_file(tmp_path):
-    import h5py
-
-    values = np.random.default_rng(1).normal(size=(300, 7))
-    with files.enduring(tmp_path / "a.h5") as raw, h5py.File(raw, "w") as file:
-        file["x"] = values
-    with h5py.File(tmp_path / "a.h5") as file:
-        np.testing.assert_array_equal(file["x"][()], values)
