@@ -109,9 +109,14 @@ def _reported(result: Result, folder: Path, jobs: int = 1) -> Outcome:
 
 
 def _source(options: argparse.Namespace) -> FitLike:
-    """The study asked for, with the seed of the command line if one is given, or a finished fit."""
-    from lcopa_bayes.verbs.sources import finished, study_of
+    """The study asked for, with the seed of the command line if one is given, or a finished fit; several of
+    these for `compare`."""
+    from lcopa_bayes.verbs.sources import finished, several, study_of
 
+    if options.verb == "compare" and several(options.source):
+        if options.held_out or options.seed is not None:
+            raise InputError("--held-out and --seed change one study; state them in each of several")
+        return several(options.source)  # type: ignore[return-value]
     fitted = finished(options.source)
     if fitted is None:
         study = study_of(options.source, held_out=options.held_out)
@@ -127,11 +132,14 @@ def _source(options: argparse.Namespace) -> FitLike:
 def _folder(options: argparse.Namespace, source: FitLike, *inside: str) -> Path:
     """The run folder: as asked for, that of the finished fit, else by the name of the study."""
     from lcopa_bayes.results.savedfit import SavedFit
-    from lcopa_bayes.verbs.sources import study_of
+    from lcopa_bayes.verbs.sources import several, study_of
 
     if options.out is not None:
         return Path(options.out)
-    return source.folder if isinstance(source, SavedFit) else RUNS.joinpath(*inside, study_of(source).name)
+    if isinstance(source, SavedFit):
+        return source.folder
+    first = (several(source) or (source,))[0]
+    return RUNS.joinpath(*inside, study_of(first).name)
 
 
 def _jobs(options: argparse.Namespace) -> int:

@@ -123,19 +123,29 @@ def _curve(result: Design) -> list[dict[str, Any]]:
 
 _DRAWS = 8
 """Draws averaged over: enough to rank drives."""
+_EFFECT_SPANS, _EFFECT_DRAWS = 4, 2
+"""Length of the record with effects, whose simulation takes long [spans of the records], and draws."""
 
 
 def next_measurement(fit: Predictive, parameters: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     """The drive to play next and, per parameter that is not identified, the best drive for it.
 
-    `parameters`: rows of an audit with `name` and `verdict`. None when every one is identified. Bounds are
-    those of one new record of 40 spans alone, at 8 draws; the verb `design` tries more and confirms.
+    `parameters`: rows of an audit with `name` and `verdict`. None when every one is identified, no drive when
+    only parameters of the noise are not. Bounds are those of one new record of 40 spans alone, at 8 draws,
+    with effects of 4 spans, at 2; the verb `design` tries more and confirms.
     """
     left = [row["name"] for row in parameters if row["verdict"] != "identified"]
     if not left:
         return None
+    table = fit.draws.table
+    if all(table.rows[table.names.index(name)].noise for name in left):
+        reason = "no parameter of the plant is left open, and no drive tells more of the noise"
+        return {"drive": None, "reason": reason, "parameters": []}
+    long, draws = None, _DRAWS
+    if fit.problem.ranges is not None:
+        long, draws = _EFFECT_SPANS * fit.problem.scales.span, _EFFECT_DRAWS
     try:
-        result = design(fit, draws=_DRAWS, ladder=False)
+        result = design(fit, time=long, draws=draws, ladder=False)
     except InputError as error:
         return {"drive": None, "reason": "; ".join(error.problems), "parameters": []}
     rows = []

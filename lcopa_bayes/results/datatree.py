@@ -30,7 +30,7 @@ POSTERIOR = "posterior.nc"
 """File of a run folder that holds the tree."""
 _PORTION = 64
 """Draws predicted at a time."""
-_PRIOR_DRAWS = 200
+_PRIOR_DRAWS, _FEWER = 200, 32
 """Draws of the prior."""
 
 
@@ -87,7 +87,8 @@ def posterior_tree(fit: Fit) -> DataTree:
     free = [k for k, row in enumerate(table.rows) if row.free]
     variables = dict(zip(free, variable_names([table.names[k] for k in free]), strict=True))
     rng = np.random.default_rng([study.seed, 3])
-    prior = table.draw(_PRIOR_DRAWS, np.random.default_rng([study.seed, 9]))
+    count = _PRIOR_DRAWS if table.effects is None else _FEWER
+    prior = table.draw(count, np.random.default_rng([study.seed, 9]))
     fitted = _Series.of(posterior.samples)
     likelihood, predictive = _predicted(fit, fitted, draws.flat, rng, likelihood=True)
     _, before = _predicted(fit, fitted, prior, np.random.default_rng([study.seed, 10]), likelihood=False)
@@ -243,7 +244,7 @@ def _predicted(
         part = values[rows]
         # draws have bounded responses; those of the prior that have none are NaN
         known = posterior.responses(part) if likelihood else ()
-        plant = () if likelihood else responses(table, posterior.model, part)
+        plant = () if likelihood else responses(table, fit.problem.thrifty.posterior.model, part)
         for name, (r, axis) in fitted.places.items():
             seen, parameters = posterior.samples[r].axes[axis], posterior.noise_parameters(part, axis)
             noise = posterior.noise.draw(parameters, seen.gaps, rng)

@@ -9,7 +9,7 @@ narrow blocks would have had.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -99,6 +99,13 @@ class Discretisation:
                 self.moved,
             ),
         )
+
+    @classmethod
+    def of_json(cls, values: Mapping[str, Any]) -> Discretisation:
+        """From what `as_json` gave."""
+        own = {key: values[key] for key in ("parameter", "refinement", "blocks")}
+        moved = tuple(values["moved"])
+        return cls(shift=values["shift_sd"], error=values["shift_error_sd"], moved=moved, **own)
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""

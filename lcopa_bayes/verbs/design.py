@@ -18,6 +18,7 @@ from lcopa_bayes.experiments.design import design as designed
 from lcopa_bayes.experiments.summary import as_json
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.results.stored import StoredResult, origin_of
+from lcopa_bayes.results.structure import with_least_terms
 from lcopa_bayes.verbs.fit import basis
 from lcopa_bayes.verbs.sources import FitLike, study_of
 
@@ -96,7 +97,7 @@ def design(
     """
     wanted: dict[str, Any] = {"time": bench_time, "repeats": repeats}
     wanted |= {"amplitude": amplitude, "refresh": refresh}
-    checked(problem_of(study_of(source)), **wanted)  # before a long fit
+    checked(problem_of(with_least_terms(study_of(source))), **wanted)  # before a long fit
     fit = basis(source, jobs=jobs, folder=folder, resume=resume, quick=quick, quiet=quiet)
     draws = DRAWS // _QUICK if quick else DRAWS
     planned = designed(fit, **wanted, with_prior=with_prior, draws=draws)

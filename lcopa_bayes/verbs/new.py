@@ -19,7 +19,7 @@ from lcopa_bayes.data.studywriter import write_folder
 
 _SETTINGS = """\
 [model]
-# terms = 1  # viscous terms of every element; `loop` and `compare` say whether more are needed
+# terms = 1  # viscous terms of every element; without it the records choose
 # share = "none"  # every path has an element of its own; "all": one for all
 # delay = "path"  # every path has a delay of its own; "shared": one for all
 # offset = "record"  # "shared" where all records rest at the same level

@@ -24,6 +24,7 @@ from lcopa_bayes.paper.steptable import load_posterior, panels, step_table
 from lcopa_bayes.paper.verdict import Evidence, Kind
 from lcopa_bayes.results.runfolder import provenance
 from lcopa_bayes.results.stored import StoredResult
+from lcopa_bayes.results.structure import settled
 from lcopa_bayes.verbs.sources import FitLike, study_of
 
 
@@ -106,7 +107,7 @@ def identify(
     whose intervals are shown too; `folder`, a run folder to write into; `jobs`, processes to use; `quiet`, no
     progress bar. InputError when records, intervals or folders cannot be used.
     """
-    wanted, plan = study_of(study), scan or Scan()
+    wanted, plan = settled(study_of(study)), scan or Scan()
     beside = None if posterior is None else load_posterior(Path(posterior), wanted)
     scannable(wanted, plan)
     if folder is not None:

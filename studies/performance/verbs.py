@@ -19,7 +19,6 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -180,7 +179,7 @@ class Workshop:
             out += ["--pick", *CANDIDATES]
         if verb == "calibrate":
             out += ["--replicas", REPLICAS[self.quick]]
-        known = options_of(verb)
+        known = [option for option, _ in USAGES[verb].options]
         if "--jobs" in known:
             out += ["--jobs", str(self.jobs)]
         if self.quick and "--quick" in known:
@@ -228,12 +227,6 @@ class Workshop:
         results = fit_results(said) if cell.verb == "fit" and outcome == "done" else {}
         message = "" if outcome == "done" else (problem or said).strip().rpartition("\n")[2][:200]
         return Measurement(*spent, around, outcome, message, counts, results)
-
-
-@cache
-def options_of(verb: str) -> str:
-    """Names of the options of a verb."""
-    return " ".join(name for name, _ in USAGES[verb].options)
 
 
 _SUBREAPER = 36

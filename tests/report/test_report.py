@@ -140,6 +140,7 @@ def results_of() -> dict:
         ],
         "modes": [],
         "rival": None,
+        "structure": None,
         "log_evidence": -12.345,
         "log_evidence_sd": 0.0123,
         "log_evidence_grade": "tentative",
