@@ -150,7 +150,9 @@ def reached(problem: Problem, candidate: Candidate, card: Card) -> tuple[Peak, M
     if not len(inside[0]):
         return None
     landscape = Landscape(target)
-    peak = highest(landscape, inside[0])
+    peak = highest(Landscape(problem.thrifty.posterior), inside[0])
+    if problem.thrifty is not problem:
+        peak = Peak(peak.values, float(landscape.log_likelihood(peak.values[None])[0]))
     if not _inside(target, peak.values[None]).all():  # a climb knows the ends of priors, not all they exclude
         heights = landscape.log_likelihood(inside[0])
         peak = Peak(inside[0][int(heights.argmax())], float(heights.max()))

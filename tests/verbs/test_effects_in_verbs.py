@@ -18,8 +18,7 @@ from lcopa_bayes.comparison.candidates import candidates_of, derived, known_sett
 from lcopa_bayes.data.settings import EffectsSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studywriter import write_study
-from lcopa_bayes.experiments.information import Bench, EffectedDevice, device_of, refit
-from lcopa_bayes.identifiability import audit
+from lcopa_bayes.experiments.information import Bench, refit, with_effects
 from lcopa_bayes.identifiability.curvature import sensitivities
 from lcopa_bayes.identifiability.profile import profile
 from lcopa_bayes.identifiability.symmetries import DIFFERENCED, structure
@@ -28,6 +27,7 @@ from lcopa_bayes.inference.likelihood import Landscape
 from lcopa_bayes.inference.nestedmodels import lifted
 from lcopa_bayes.inference.simulation import Simulation
 from lcopa_bayes.results.fit import plan_of
+from lcopa_bayes.results.nearby import surrogate_about
 from lcopa_bayes.sampling.weightedrun import weighted_run
 
 TRUTH = {
@@ -73,8 +73,9 @@ def test_profiles_by_a_surrogate_are_those_of_the_posterior(
     found = weighted_run(problem.posterior, plan_of(problem, quick=True), quick=True)
     assert found is not None
     draws, exact = found[1], Landscape(problem.posterior)
-    near = audit._near(exact, draws, np.random.default_rng(2), 1)
-    assert near is not None
+    surrogate = surrogate_about(problem.posterior, draws, np.random.default_rng(2))
+    assert surrogate is not None
+    near = Landscape.about(replace(problem.posterior, surrogate=surrogate), draws.flat)
     simulated, called = [], Simulation.__call__
     monkeypatch.setattr(Simulation, "__call__", lambda self, v: simulated.append(len(v)) or called(self, v))
     best = draws.flat[np.argmax(draws.log_density)]
@@ -124,9 +125,7 @@ def test_information_of_a_new_drive_holds_the_effect(stiff: tuple[Problem, np.nd
     k = bench.columns[-1]
     up[k] += 1e-3
     down[k] -= 1e-3
-    devices = [device_of(problem, values) for values in (up, down)]
-    assert all(isinstance(one, EffectedDevice) for one in devices)
-    sides = [one.response(command, bench.sample_times)[:, 0] for one in devices]
+    sides = [with_effects(problem, values, command, bench.sample_times)[:, 0] for values in (up, down)]
     change = (sides[0] - sides[1]) / 2e-3 / TRUTH["sigma"]
     level = np.full(change.size, 1 / np.sqrt(change.size))
     assert_allclose(slopes[-1], change - (change @ level) * level, atol=2e-3 * np.abs(change).max())

@@ -8,7 +8,7 @@ from typing import ClassVar, Self, final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.arrays import Array, Vector
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.effects.effect import Card, Constant, DriveEffect, Ranges, Scene, single
 
@@ -31,6 +31,8 @@ class OverdrivePulse(DriveEffect):
         source="Thalhammer et al. 2013, Opt. Express 21:1779 (about 1 ms with overdrive)",
         reveals="on/off, staircase",
         mistaken_for="a faster element, overshoot of an order above 1",
+        linear=True,
+        fields=("optical",),
     )
 
     @classmethod
@@ -123,6 +125,7 @@ class GreyQuantisation(DriveEffect):
         source="8 bit per 2 pi: 24.5 mrad per grey level",
         reveals="many different levels, small steps",
         mistaken_for="gain, noise of the gain",
+        fields=("optical",),
     )
 
     @classmethod
@@ -237,10 +240,17 @@ class SampledDrive(DriveEffect):
         source="midpoint rule for a band-limited drive; Ljung 1999, System Identification, ch. 13",
         reveals="a drive that changes with every sample, a delay near 0",
         mistaken_for="a shorter delay, exactly so where the delay can shrink",
+        linear=True,
     )
+
+    lags = True
+
+    def lag(self, ranges: Ranges, psi: Array) -> Array:
+        """Half a period earlier where w is 1."""
+        return np.asarray(-0.5 * psi[0] * ranges.period)
 
     def commands(
         self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
     ) -> tuple[AxisDrive, float]:
         """All changes by the same time."""
-        return _shifted(drive, float(-0.5 * psi[0] * scene.ranges.period)), rest
+        return _shifted(drive, float(self.lag(scene.ranges, psi))), rest
