@@ -14,18 +14,15 @@ from typing import final
 import emcee
 import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]
-from scipy.optimize import brentq
-from scipy.special import logsumexp
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.mixturemoves import learned
 from lcopa_bayes.sampling.ridgemoves import emcee_sampler
 from lcopa_bayes.sampling.sampler import SamplePlan
+from lcopa_bayes.sampling.tempering import largest_rise, survivors
 from lcopa_bayes.sampling.weightedrun import weighted_run
 
-_EFFECTIVE = 0.5
-"""Share of a population that stays effective in one rise."""
 _MOVES = 15
 """Moves of every walker at each rise."""
 _BURN = 40
@@ -75,9 +72,9 @@ def transferred(
         while heat < 1.0:
             before, after = source.log_density(position), target.log_density(position)
             gain = after - before
-            rise = 1.0 - heat if jump else _rise(gain, 1.0 - heat)
+            rise = 1.0 - heat if jump else largest_rise(gain, 1.0 - heat)
             heat = 1.0 if heat + rise > 1.0 - 1e-9 else heat + rise
-            position = position[_resampled(rise * gain, rng)]
+            position = position[survivors(rise * gain, rng)]
             moves = _BURN if heat == 1.0 else _MOVES
             sampler = emcee_sampler(target, _Between(source, target, heat), len(position), mixture, random)
             state = sampler.run_mcmc(
@@ -114,26 +111,6 @@ class _Between:
 def _parted(position: Matrix, rng: np.random.Generator) -> Matrix:
     """Walkers in another sequence: the runs of copies that resampling makes are spread."""
     return position[rng.permutation(len(position))]
-
-
-def _rise(gain: Vector, room: float) -> float:
-    """Largest rise that keeps the wanted share effective, at most `room`."""
-
-    def excess(log_rise: float) -> float:
-        weights = np.exp(log_rise) * gain
-        return float(np.exp(2 * logsumexp(weights) - logsumexp(2 * weights))) / gain.size - _EFFECTIVE
-
-    if excess(np.log(room)) >= 0.0:
-        return room
-    low = np.log(1e-3 / max(1.0, float(np.ptp(gain))))
-    return float(np.exp(brentq(excess, low, np.log(room), xtol=1e-3)))
-
-
-def _resampled(log_weights: Vector, rng: np.random.Generator) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    """Systematic resampling: members in proportion to their weights, with one random number."""
-    weights = np.exp(log_weights - logsumexp(log_weights))
-    places = (np.arange(weights.size) + rng.random()) / weights.size
-    return np.minimum(np.searchsorted(np.cumsum(weights), places), weights.size - 1)
 
 
 def _judged(coordinates: Array) -> Transferred:

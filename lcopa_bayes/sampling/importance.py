@@ -123,7 +123,7 @@ def importance(
             own, k = tail_smoothed(seen.last_weights())
             worth = effective(own) / len(y)
             core, proposal = fitted(core, np.concatenate(seen.points), log_weights)
-            if k <= _LIGHT and worth > LEAST_EFFICIENCY:
+            if (k <= _LIGHT and worth > LEAST_EFFICIENCY) or late():
                 break
         last = worth < plan.promising or late()
         y = proposal.draw(effort.learning if last else effort.draws, rng)

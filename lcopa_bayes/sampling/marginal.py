@@ -20,8 +20,8 @@ others, they count anew from there.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from math import ceil
+from math import ceil, inf
+from time import monotonic
 from typing import NamedTuple, final
 
 import numpy as np
@@ -31,9 +31,8 @@ from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.parallel import Progress, Workers
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.sampling.coordinates import Chart
+from lcopa_bayes.sampling.aroundoptima import around_optima
 from lcopa_bayes.sampling.firstproposal import NEIGHBOURS, best_near, first_proposal, nearest
-from lcopa_bayes.sampling.importance import Effort, ImportancePlan, importance
 from lcopa_bayes.sampling.importanceweights import effective, usable_k
 from lcopa_bayes.sampling.mixture import spread_evenly
 from lcopa_bayes.sampling.mixturemoves import learned
@@ -58,6 +57,8 @@ _EFFECTIVE_TRIES = 5.0
 """Effective draws among them that are aimed at."""
 _PATIENCE, _ROUNDS = 12, 18
 """Rounds that improve the proposal after which few effective draws show that there is no hope, and most."""
+_FEWEST = 2.0
+"""Effective draws with which a search ends that has no time left [-]."""
 _FEW, _SINGLE = 20.0, (0.2, 0.6)
 """Effective draws of all points below which these say little of the shape of a posterior, and share of a
 single normal mode where they are more and fewer [-]."""
@@ -87,17 +88,11 @@ _LOOKED_AT, _HEAVIER = 1_000, 1.5
 """Points of theirs that are weighted, and factor on the expected mean weight that shows a missed region."""
 _POPULATION = 50.0
 """Effective draws of all points at which ensembles may start from them."""
-_SPARE = 1.15
-"""Factor on the estimated number of draws needed [-]."""
+_SPARE, _LEAST_RATE = 1.15, 0.2
+"""Factor on the estimated number of draws needed, and least of them that are taken to count for the parameter
+that is known least, over the effective share of all [-]."""
 _TASK = 64
 """Points of a task."""
-_DIRECT = ImportancePlan(
-    (Effort(3_000, 1_000, 6), Effort(4_000, 2_000, 6), Effort(8_000, 3_000, 4)), promising=0.05
-)
-"""Work of an attempt to draw around optima alone."""
-_ATTEMPTS, _STRAY, _SPARSE, _NEGLIGIBLE = 2, 3, 30.0, 0.01
-"""Such attempts, points that a second one begins at, at most, posterior density over that of a proposal from
-which it does not cover a point, and posterior mass of such points that may be missed [-]."""
 
 
 @final
@@ -125,7 +120,8 @@ class Search:
     """Points, proposals and weights of a search; deterministic given its arguments and what it is asked.
 
     `bar` counts points and names what is being done; `optima` are least-squares optima to begin with, by
-    default those of a few searches. Once it is `late` a search ends with the draws it has.
+    default those of a few searches. Once no time is `left` [s], or less than half of what the next round
+    takes, a search ends with the draws it has.
     """
 
     def __init__(
@@ -135,10 +131,12 @@ class Search:
         crew: Workers[Posterior],
         bar: Progress,
         optima: Sequence[Optimum] = (),
-        late: Callable[[], bool] = lambda: False,
+        left: Callable[[], float] = lambda: inf,
     ) -> None:
         self.posterior = posterior
-        self._late = late
+        self._left, self._pace = left, 0.0
+        self.unfinished = False
+        """Whether time ended it."""
         self._optima = tuple(optima)
         self._bar = bar
         self.outer = Outer(posterior)
@@ -184,8 +182,8 @@ class Search:
         seen, count, walked = Seen(), _LEARNING * self._difficulty, None
         level, reached = -np.inf, 0.0
         for number in range(_ROUNDS):
-            if self._late():
-                return None
+            if self._late(count):
+                return self._unfinished(seen)
             self._bar.set_description(f"searching for modes, round {number + 1}")
             rounds = self._round([seen], [proposal], count, starts if number == 0 else None)
             if not rounds:
@@ -212,47 +210,22 @@ class Search:
         return None
 
     def _direct(self, optima: Sequence[Optimum], seen: Seen, wanted: float) -> Weighted | None:
-        """Draws of a proposal around optima, a tenth of the cost of points; None where it does not come close
-        to the posterior, or does not cover what points of the whole prior show. A few of these may be far out
-        in a tail, one draw heavy by chance: a second attempt begins there too, and would find a mode."""
-        posterior, chart = self.posterior, Chart.of(self.posterior)
-        log_weights = seen.log_weights()
-        drawn = np.isfinite(log_weights)
-        z, density, log_weights = (
-            each[drawn] for each in (self._points[0].coordinates, self._points[0].log_density, log_weights)
+        """Draws around optima alone, or where time ends them, those there are."""
+        (point,) = self._points
+        raw = seen.log_weights() - np.log(sum(seen.counts))
+        hunted = point.coordinates, point.log_density, raw
+        enough, weighted = around_optima(
+            self.posterior, self._crew, optima, hunted, self._rng, wanted, self._late
         )
-        y, log_volume = chart.charted(z)
-        explored = np.zeros(len(y), dtype=bool)
-        for _ in range(_ATTEMPTS):
-            tried = importance(
-                posterior,
-                optima,
-                self._rng,
-                replace(_DIRECT, wanted=wanted),
-                lambda _, portions: self._crew.each(_density, portions),
-                self._late,
-            )
-            weighted = tried.weighted
-            if not tried.good(wanted):
-                return None
-            log_ratio = density + posterior.table.log_permutations - log_volume - weighted.log_evidence
-            missed = (log_ratio - tried.proposal.log_density(y) > np.log(_SPARSE)) & ~explored
-            mass = np.exp(log_weights[missed] - weighted.log_evidence).sum() / sum(seen.counts)
-            if mass < _NEGLIGIBLE:
-                return weighted
-            if missed.sum() > _STRAY:
-                return None
-            explored |= missed
-            places = zip(posterior.values(z[missed]), density[missed], strict=True)
-            optima = [*optima, *(Optimum(at, optima[0].covariance, float(level)) for at, level in places)]
-        return None
+        self.unfinished = not enough and self._late()
+        return weighted if enough or (self.unfinished and weighted.ess >= _FEWEST) else None
 
     def _last(
         self, first: Product, learned: Proposal, seen: Seen, wanted: float, expected: float
     ) -> Weighted | None:
         """Draws in two halves, each of proposals that know nothing of it, as many as are needed; None where
         these are too many."""
-        halves, since, worth = [seen, seen], len(seen.counts), 0.0
+        halves, since, worth, rate = [seen, seen], len(seen.counts), 0.0, expected
         self._bar.set_description("drawing from the posterior")
         drawn = 0
         while drawn < _MOST_DRAWN * wanted:
@@ -260,23 +233,37 @@ class Search:
                 Blend(self._by_groups(other, first, settled=True), learned, _LEARNED)
                 for other in halves[::-1]
             ]
-            count = int(np.clip(_SPARE * (wanted - worth) / expected, _LEARNING, _MOST * _LEARNING))
+            count = int(np.clip(_SPARE * (wanted - worth) / rate, _LEARNING, _MOST * _LEARNING))
             halves = self._round(halves, proposals, count // 2, None)
             if not halves:
                 return None
             drawn += count
             weighted = self._weighted(halves, len(seen.counts), since)
             worth = weighted.smallest_ess if weighted.ess > 2.0 else 0.0
-            enough = worth >= wanted or (self._late() and worth >= _FEW)
-            if enough and weighted.pareto_k <= usable_k(weighted.count):
+            rate = max(worth / weighted.count, _LEAST_RATE * expected)
+            if worth >= wanted and weighted.pareto_k <= usable_k(weighted.count):
                 if not self._misses(proposals[0], weighted, self._walked(), halves[0]):
                     return weighted
                 since, worth = len(halves[0].counts), 0.0
             elif weighted.ess < _LOST * weighted.count:
                 since, worth = len(halves[0].counts), 0.0  # a region met for the first time is learned
-            if self._late():
-                return None
+            if self._late(_LEARNING):
+                self.unfinished = True
+                return weighted if weighted.ess >= _FEW else self._unfinished(seen)
         return None
+
+    def _late(self, points: int = 0) -> bool:
+        """Whether a round of so many points would end later than the time that is left by more than it would
+        end before it."""
+        return self._left() < 0.5 * self._pace * points
+
+    def _unfinished(self, seen: Seen) -> Weighted | None:
+        """All draws of a search that time ended, weighted as draws of the mixture of their proposals; None
+        where one has all the weight."""
+        self.unfinished, weights = True, self._log_weights
+        if not np.isfinite(weights).any() or effective(weights - logsumexp(weights)) < _FEWEST:
+            return None
+        return self._weighted([seen], 0, 0)
 
     @property
     def _difficulty(self) -> int:
@@ -318,7 +305,7 @@ class Search:
         self, seen: Sequence[Seen], proposals: Sequence[Proposal], count: int, starts: Matrix | None
     ) -> list[Seen]:
         """With `count` draws of each proposal; nothing where hardly any lies inside the prior."""
-        drawn = []
+        drawn, begin = [], monotonic()
         for proposal in proposals:
             y = proposal.draw(count, self._rng)
             values = self.outer.values(y)
@@ -332,12 +319,15 @@ class Search:
         parts = zip(*(np.split(each, ends) for each in self._evaluated(y, values, starts)), strict=True)
         points = [_Point(*part) for part in parts]
         self._points += points
+        self._pace = (monotonic() - begin) / (count * len(proposals))
         each = zip(seen, proposals, points, strict=True)
         return [one.joined(proposal, count, own.y, own.log_marginal) for one, proposal, own in each]
 
     def _weighted(self, halves: Sequence[Seen], before: int, since: int) -> Weighted:
-        """Draws of two halves from round `since` on, in random order; the rounds `before` are undivided."""
-        points = [point for part in (0, 1) for point in self._points[before + part :: 2][since - before :]]
+        """Draws of halves, or of all, from round `since` on, in random order; rounds `before` are whole."""
+        parts, end = len(halves), len(halves[0].counts)
+        own = (self._points[before + part :: parts][since - before : end - before] for part in range(parts))
+        points = [point for each in own for point in each]
         raw = np.concatenate([half.log_weights(since) for half in halves])
         order = self._rng.permutation(np.flatnonzero(np.isfinite(raw)))
         z = np.concatenate([point.coordinates for point in points])[order]
@@ -393,7 +383,3 @@ class Search:
             parts.append(part)
             self._bar.update(len(part[0]))
         return [np.concatenate(each) for each in zip(*parts, strict=True)]
-
-
-def _density(posterior: Posterior, z: Matrix) -> Vector:
-    return posterior.log_density(z)

@@ -181,9 +181,13 @@ def sample(
     """
     begin = monotonic()
 
-    def spent() -> float | None:
-        """Time taken, where it exceeds the budget."""
-        return monotonic() - begin if _left(plan, begin) < 0.0 else None
+    def left() -> float:
+        """What is left of the budget [s]."""
+        return inf if plan.seconds is None else begin + plan.seconds - monotonic()
+
+    def spent(more: float = 0.0) -> float | None:
+        """Time taken, where the budget ends within half of what `more` takes [s]."""
+        return monotonic() - begin if left() < 0.5 * more else None
 
     known = None if starts is None else around(posterior, starts, plan.seed)
     stored = load_chain(chain_file, fingerprint) if resume and chain_file else Chain()
@@ -198,25 +202,26 @@ def sample(
         seeds = np.random.SeedSequence(plan.seed).spawn(plan.ensembles)
         if not ensembles and searched and known is None:
             with _points(quiet) as bar:
-                search = Search(posterior, plan.seed, crew, bar, optima, lambda: spent() is not None)
+                search = Search(posterior, plan.seed, crew, bar, optima, left)
                 weighted = search.run(wanted)
             if weighted is not None:
-                stopped = spent()
+                stopped = monotonic() - begin if search.unfinished else None
                 if stopped is None:
                     _store(chain_file, Chain((), weighted), fingerprint)
                 return Run((), plan, weighted, stopped_after=stopped)
             ensembles = _begun(search, plan, seeds)
         with Progress(total=rounds, initial=done, unit="round", quiet=quiet, desc="from the prior") as bar:
-            ensembles = ensembles or tuple(crew.each(_Birth(plan.walkers, _left(plan, begin)), seeds))
+            ensembles = ensembles or tuple(crew.each(_Birth(plan.walkers, left()), seeds))
             if not done:
                 _store(chain_file, Chain(ensembles), fingerprint)
             bar.set_description("sampling")
             mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
             hardest = max(ensemble.tempering_moves for ensemble in ensembles)
             least = max(_LEAST, round(_AS_LONG * hardest / (_ROUND * plan.thin)))
+            lasted = 0.0
             while True:
                 run = Run(ensembles, plan)
-                stopped = spent() if done >= _FEWEST else None
+                stopped = spent(lasted) if done >= _FEWEST else None
                 if stopped is not None:
                     return replace(run, stopped_after=stopped)
                 last = done >= rounds or (done >= least and finished(posterior, run, bar))
@@ -232,15 +237,11 @@ def sample(
                     return replace(run, unconfirmed=filling)
                 if due(done):
                     mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
+                at = monotonic()
                 ensembles = tuple(crew.each(_Round(plan.thin, mixture), ensembles))
-                done += 1
+                done, lasted = done + 1, monotonic() - at
                 _store(chain_file, Chain(ensembles), fingerprint)
                 bar.update()
-
-
-def _left(plan: SamplePlan, begin: float) -> float:
-    """What is left of the budget of a plan that was begun then [s]."""
-    return inf if plan.seconds is None else begin + plan.seconds - monotonic()
 
 
 def _points(quiet: bool) -> Progress:

@@ -81,9 +81,9 @@ def temper(
         likelihood[dead] = posterior.log_density(position[dead]) - prior[dead]
     heat, rises, moves, trail = 0.0, 0, 0, []
     while heat < 1.0:
-        rise = _rise(likelihood, 1.0 - heat)
+        rise = largest_rise(likelihood, 1.0 - heat)
         heat, rises = (1.0 if heat + rise > 1.0 - 1e-9 else heat + rise), rises + 1
-        kept = _resampled(rise * likelihood, rng)
+        kept = survivors(rise * likelihood, rng)
         position, prior, likelihood = position[kept], prior[kept], likelihood[kept]
         mixture = learned(posterior, [position], rises)
         sampler = emcee_sampler(posterior, _Tempered(posterior, heat), crowd, mixture, random)
@@ -123,7 +123,7 @@ class _Tempered:
         return self.posterior.log_density(coordinates, heat=self.heat)
 
 
-def _rise(likelihood: Vector, room: float) -> float:
+def largest_rise(likelihood: Vector, room: float) -> float:
     """Largest rise of the temperature that keeps the wanted share effective, at most `room`."""
 
     def excess(log_rise: float) -> float:
@@ -137,7 +137,7 @@ def _rise(likelihood: Vector, room: float) -> float:
     return float(np.exp(brentq(excess, low, np.log(room), xtol=1e-3)))
 
 
-def _resampled(log_weights: Vector, rng: np.random.Generator) -> np.ndarray[Any, np.dtype[np.intp]]:
+def survivors(log_weights: Vector, rng: np.random.Generator) -> np.ndarray[Any, np.dtype[np.intp]]:
     """Systematic resampling: members in proportion to their weights, with one random number."""
     weights = np.exp(log_weights - logsumexp(log_weights))
     places = (np.arange(weights.size) + rng.random()) / weights.size

@@ -121,8 +121,9 @@ def search_of(log_density, seed: int, groups=BOTH) -> Search:
     toy = Toy(log_density, dict.fromkeys("abcd"[: sum(map(len, groups))], WIDE))
     search = Search.__new__(Search)
     search.posterior, search._rng = toy, np.random.default_rng(seed)
-    search._points, search._bar = [], Progress(quiet=True)
-    search._seeds, search._late = np.random.SeedSequence(seed), lambda: False
+    search._points, search._bar, search._pace = [], Progress(quiet=True), 0.0
+    search._log_weights = np.empty(0)
+    search._seeds, search._left = np.random.SeedSequence(seed), lambda: np.inf
     search._crew = SimpleNamespace(each=lambda task, inputs: [task(toy, one) for one in inputs])
     every = lambda y: np.ones(len(y), dtype=bool)  # noqa: E731
     search.outer = SimpleNamespace(
@@ -201,6 +202,22 @@ def test_an_easy_posterior_is_drawn_from_directly_and_a_mode_elsewhere_is_not_mi
     assert share > 0.0 or len(search._points) == 1
     assert abs(weighted.log_evidence) < 4 * weighted.log_evidence_sd
     assert abs(np.exp(weighted.log_weights) @ (weighted.coordinates[:, 0] > 3) - share) < 0.3 * share + 1e-6
+
+
+def test_a_search_ends_with_what_it_has_when_its_time_is_over():
+    """A narrow valley: after two rounds few draws count, and they are weighted as what they are."""
+    first = whole(Mixture(np.ones(1), np.array([[0.0, 1.0]]), 4.0 * np.eye(2)[None]))
+    search = search_of(valley, 5)
+    search._left = lambda: np.inf if len(search._points) < 2 else -1.0
+    weighted = search._improved(first, np.empty((0, 2)), 1e6)
+    assert weighted is not None
+    assert search.unfinished
+    assert len(search._points) == 2
+    assert weighted.count == 2 * 768
+    assert abs(weighted.log_evidence) < 4.5 * weighted.log_evidence_sd < 1.0
+    search = search_of(valley, 5)
+    search._left = lambda: -1.0
+    assert search._improved(first, np.empty((0, 2)), 1e6) is None
 
 
 def test_a_search_gives_up_where_no_proposal_comes_near(monkeypatch):

@@ -145,6 +145,7 @@ def test_a_search_that_its_budget_ends_gives_the_draws_it_has(monkeypatch):
 
     monkeypatch.setattr(sampler, "monotonic", lambda: clock[-1])
     monkeypatch.setattr(marginal.Search, "_last", last)
+    monkeypatch.setattr(marginal.Search, "_direct", lambda *given: None)
     monkeypatch.setattr(marginal, "_SPARE", 0.1)
     fitted = fit(task)
     assert fitted.run.weighted is not None

@@ -1,0 +1,80 @@
+"""Draws of an easy posterior: a proposal around its optima, checked by points of the whole prior.
+
+A draw there costs one response where a point of a search (`marginal`) costs the descent of everything beside
+orders and noise. What such draws cannot show, mass that the proposal does not cover, the first points of the
+search do: each has a weight, and the mean of the weights of points that are not covered estimates that mass
+without bias.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.parallel import Workers
+from lcopa_bayes.inference.optimum import Optimum
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.sampling.coordinates import Chart
+from lcopa_bayes.sampling.importance import Effort, ImportancePlan, importance
+from lcopa_bayes.sampling.weighted import Weighted
+
+_PLAN = ImportancePlan(
+    (Effort(3_000, 1_000, 6), Effort(4_000, 2_000, 6), Effort(8_000, 3_000, 4)), promising=0.05
+)
+_ATTEMPTS, _STRAY = 2, 3
+"""Attempts, and points that the second one begins at, at most [-]."""
+_SPARSE, _NEGLIGIBLE = 30.0, 0.01
+"""Posterior density over that of a proposal from which it does not cover a point, and posterior mass of such
+points that may be missed [-]."""
+
+
+def around_optima(
+    posterior: Posterior,
+    crew: Workers[Posterior],
+    optima: Sequence[Optimum],
+    hunted: tuple[Matrix, Vector, Vector],
+    rng: np.random.Generator,
+    wanted: float,
+    late: Callable[[], bool],
+) -> tuple[bool, Weighted]:
+    """Draws of a proposal around optima, and whether they will do: not where the proposal does not come
+    close to the posterior, nor where it does not cover what points of the whole prior show.
+
+    `hunted` are coordinates of such points, (points, dimension), log densities there and log weights, whose
+    sum estimates the evidence [nat]. A few may be far out in a tail, heavy by chance: a second attempt
+    begins there too, and would find a mode.
+    """
+    chart, (z, density, log_weights) = Chart.of(posterior), hunted
+    drawn = np.isfinite(log_weights)
+    z, density, log_weights = z[drawn], density[drawn], log_weights[drawn]
+    y, log_volume = chart.charted(z)
+    explored = np.zeros(len(y), dtype=bool)
+    for _ in range(_ATTEMPTS):
+        tried = importance(
+            posterior,
+            optima,
+            rng,
+            replace(_PLAN, wanted=wanted),
+            lambda _, portions: crew.each(_density, portions),
+            late,
+        )
+        weighted = tried.weighted
+        if not tried.good(wanted):
+            break
+        log_ratio = density + posterior.table.log_permutations - log_volume - weighted.log_evidence
+        missed = (log_ratio - tried.proposal.log_density(y) > np.log(_SPARSE)) & ~explored
+        if np.exp(log_weights[missed] - weighted.log_evidence).sum() < _NEGLIGIBLE:
+            return True, weighted
+        if missed.sum() > _STRAY:
+            break
+        explored |= missed
+        places = zip(posterior.values(z[missed]), density[missed], strict=True)
+        optima = [*optima, *(Optimum(at, optima[0].covariance, float(level)) for at, level in places)]
+    return False, weighted
+
+
+def _density(posterior: Posterior, z: Matrix) -> Vector:
+    return posterior.log_density(z)
