@@ -53,22 +53,20 @@ def started(study: Study, fit: BaseFit) -> Mended | None:
 
     first = np.mean([one.drive[0] for one in study.fit], axis=0)
     ends = list(zip(low - reach, high + reach, strict=True))
-    found = minimize(
-        left, first, method="Powell", bounds=ends, options={"maxfev": _EVALUATIONS, "xtol": 1e-2}
-    )
-    if not np.isfinite(found.fun):
+    best = minimize(left, first, method="Powell", bounds=ends, options={"maxfev": _EVALUATIONS, "xtol": 1e-2})
+    if not np.isfinite(best.fun):
         return None
     count = fit.optimum.effective
     power = float(fit.optimum.residual @ fit.optimum.residual)
-    gain = 0.5 * count * np.log(power / found.fun) - 0.5 * first.size * np.log(count)
+    gain = 0.5 * count * np.log(power / best.fun) - 0.5 * first.size * np.log(count)
     if not gain > _GAIN:
         return None
     levels = " and ".join(
         f"{value:.4g} {axis.unit} of {axis.name}"
-        for value, axis in zip(found.x, study.drive_axes, strict=True)
+        for value, axis in zip(best.x, study.drive_axes, strict=True)
     )
     return Mended(
-        _begun(study, found.x),
+        _begun(study, best.x),
         "No record shows the plant at rest, and it did not rest under the first row's drive: a drive before "
         f"the first row, the same for all records, was fitted ({levels}, worth {gain:.0f} nat); an early row "
         "with a drive and no response would state it.",
