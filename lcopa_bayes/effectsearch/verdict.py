@@ -134,7 +134,7 @@ def _refused(given: Findings) -> str:
     if not given.effects:
         return (
             f"Something is missing (log Bayes factor {given.largest:.0f} nat against {given.threshold:.1f} "
-            f"by chance), and the residual is {given.excess:.2f} times the noise; but no effect of the library "
+            f"by chance), and the residual is {given.excess:.2f} times the noise; but no effect of the "
             "library survives a full refit: no name is forced."
         )
     nearest = f"The nearest effect ({', '.join(given.effects)})"
