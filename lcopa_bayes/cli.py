@@ -7,10 +7,10 @@ import gc
 import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, final
+from typing import TYPE_CHECKING, Any
 
 import lcopa_bayes
 
@@ -20,6 +20,7 @@ from lcopa_bayes.verbs.commandline import PROGRAM, RUNS, USAGES, CommandParser, 
 
 if TYPE_CHECKING:
     from lcopa_bayes.paper.intervals import Scan
+    from lcopa_bayes.results.result import Result
     from lcopa_bayes.verbs.sources import FitLike
 
 _CODES = "exit codes: 0 done, 2 the input cannot be used (nothing is written), 130 interrupted"
@@ -34,26 +35,12 @@ BUNDLED = ("paper-step-x", "paper-step")
 """Studies of records like the paper's, whose run folders hold evidence on its claims."""
 
 
-class Reported(Protocol):
-    """A result with values and a page."""
-
-    def to_json(self) -> dict[str, Any]: ...  # noqa: D102
-    def report(self, folder: Path | str, *, jobs: int = 1) -> Path: ...  # noqa: D102
-
-
 Derived = Callable[[argparse.Namespace, Any], object]
 """An argument of a public function from the options and the study or fit."""
 
 
-@final
-@dataclass(frozen=True)
-class Outcome:
-    """What a verb prints."""
-
-    values: Mapping[str, Any]
-    """With ``--json``."""
-    text: str
-    """For a reader."""
+Outcome = tuple[Mapping[str, Any], str]
+"""What a verb prints: values with ``--json``, a text for a reader."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -62,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser(given).parse_args(given)
     gc.set_threshold(*_COLLECTED)
     try:
-        outcome = _outcome(options, [PROGRAM, *given])
+        values, text = _outcome(options, [PROGRAM, *given])
     except InputError as error:
         return refused(error.problems, as_json=options.json)
     except FloatingPointError as error:  # a prior that reaches where the model cannot be computed
@@ -72,9 +59,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"interrupted{resume}", file=sys.stderr)
         return INTERRUPTED
     if options.json:
-        print(json.dumps(outcome.values, allow_nan=False))
+        print(json.dumps(values, allow_nan=False))
     elif not options.quiet:
-        print(outcome.text)
+        print(text)
     return 0
 
 
@@ -88,7 +75,8 @@ def _outcome(options: argparse.Namespace, command: Sequence[str]) -> Outcome:
 def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     """All verbs with their options."""
     raw = argparse.RawDescriptionHelpFormatter
-    parser = CommandParser(prog=PROGRAM, description=lcopa_bayes.__doc__, epilog=_CODES, formatter_class=raw)
+    about = str(lcopa_bayes.__doc__).partition("\n")[0]
+    parser = CommandParser(prog=PROGRAM, description=about, epilog=_CODES, formatter_class=raw)
     parser.given = given
     if given[:1] == ["--print-completion"]:
         import shtab
@@ -114,16 +102,21 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     return parser
 
 
-def _reported(result: Reported, folder: Path, jobs: int = 1) -> Outcome:
+def _reported(result: Result, folder: Path, jobs: int = 1) -> Outcome:
     """What a verb prints of a result, with the page it wrote in `jobs` processes."""
     page = result.report(folder, jobs=jobs)
-    return Outcome(result.to_json() | {"report": str(page)}, f"{result}\n\nreport: {page}")
+    return result.to_json() | {"report": str(page)}, f"{result}\n\nreport: {page}"
 
 
 def _source(options: argparse.Namespace) -> FitLike:
-    """The study asked for, with the seed of the command line if one is given, or a finished fit."""
-    from lcopa_bayes.verbs.sources import finished, study_of
+    """The study asked for, with the seed of the command line if one is given, or a finished fit; several of
+    these for `compare`."""
+    from lcopa_bayes.verbs.sources import finished, several, study_of
 
+    if options.verb == "compare" and several(options.source):
+        if options.held_out or options.seed is not None:
+            raise InputError("--held-out and --seed change one study; state them in each of several")
+        return several(options.source)  # type: ignore[return-value]
     fitted = finished(options.source)
     if fitted is None:
         study = study_of(options.source, held_out=options.held_out)
@@ -139,11 +132,14 @@ def _source(options: argparse.Namespace) -> FitLike:
 def _folder(options: argparse.Namespace, source: FitLike, *inside: str) -> Path:
     """The run folder: as asked for, that of the finished fit, else by the name of the study."""
     from lcopa_bayes.results.savedfit import SavedFit
-    from lcopa_bayes.verbs.sources import study_of
+    from lcopa_bayes.verbs.sources import several, study_of
 
     if options.out is not None:
         return Path(options.out)
-    return source.folder if isinstance(source, SavedFit) else RUNS.joinpath(*inside, study_of(source).name)
+    if isinstance(source, SavedFit):
+        return source.folder
+    first = (several(source) or (source,))[0]
+    return RUNS.joinpath(*inside, study_of(first).name)
 
 
 def _jobs(options: argparse.Namespace) -> int:
@@ -203,13 +199,13 @@ def _new(options: argparse.Namespace) -> Outcome:
         options.folder, options.files, overwrite=options.overwrite, **_given(options, *keys)
     )
     after = f"lcopa-bayes check {options.folder}"
-    return Outcome(result.to_json() | {"folder": str(options.folder)}, f"{result}\n\nnext: {after}")
+    return result.to_json() | {"folder": str(options.folder)}, f"{result}\n\nnext: {after}"
 
 
 def _explain(options: argparse.Namespace) -> Outcome:
     term = " ".join(options.term)
     text = lcopa_bayes.explain(term, runs=RUNS)
-    return Outcome({"term": term, "text": text}, text)
+    return {"term": term, "text": text}, text
 
 
 def _predict(options: argparse.Namespace) -> Outcome:
@@ -249,7 +245,7 @@ def _report(options: argparse.Namespace) -> Outcome:
     verbs = list(origins(options.folder))
     results = [load_result(options.folder, verb) for verb in verbs] or [load_result(options.folder)]
     pages = [str(result.report(options.folder)) for result in results]
-    return Outcome({"pages": pages, "report": pages[0]}, "\n".join(f"report: {page}" for page in pages))
+    return {"pages": pages, "report": pages[0]}, "\n".join(f"report: {page}" for page in pages)
 
 
 def _simulate(options: argparse.Namespace) -> Outcome:
@@ -258,7 +254,7 @@ def _simulate(options: argparse.Namespace) -> Outcome:
     simulation = simulate(options.campaign, seed=options.seed)
     paths = simulation.save(options.out, overwrite=options.overwrite)
     verdict = f"{len(simulation.records)} records in {options.out}"
-    return Outcome({"verdict": verdict, "files": [str(path) for path in paths]}, verdict)
+    return {"verdict": verdict, "files": [str(path) for path in paths]}, verdict
 
 
 def _scan(options: argparse.Namespace, study: Any) -> Scan:

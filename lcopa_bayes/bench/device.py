@@ -171,17 +171,8 @@ class Device:
         command's resting drive, then one step response per change. With an `exposure` > 0 [ms] each
         value is the mean over the exposure that ends at its time, taken exactly by the integral of the
         step response. Accuracy: `ACCURACY`, plus rounding 1e-13 time/exposure when there is an exposure.
-        Raises InputError for a command with another number of axes or a negative exposure.
         """
         time = frozen(time, name="time")
-        problems = []
-        if command.rest.size != len(self.drive_axes):
-            problems.append(
-                f"the device has {len(self.drive_axes)} drive axes; the command {command.rest.size}"
-            )
-        if not 0 <= exposure < inf:
-            problems.append(f"an exposure must be at least 0 and finite; got {exposure}")
-        refuse_if(problems)
         out = np.tile(np.array(self.offsets), (time.size, 1))
         jumps = command.jumps
         for i, row in enumerate(self.paths):

@@ -31,7 +31,7 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.likelihood import Landscape, Peak
 from lcopa_bayes.results.bands import POINTWISE
-from lcopa_bayes.results.fit import Fit, fit, plan_of
+from lcopa_bayes.results.fit import Fit, fit, plan_of, whole
 from lcopa_bayes.results.runfolder import digest, fingerprint, settings_of
 from lcopa_bayes.results.summary import residual_rms, scores
 from lcopa_bayes.sampling.convergence import Grade
@@ -194,9 +194,11 @@ def criteria(fit: Fit, also: Sequence[Peak] = ()) -> Criteria:
 
 
 def highest(landscape: Landscape, values: Matrix) -> Peak:
-    """The highest maximum of the likelihood reached from the best of some table values (n, rows)."""
+    """The highest maximum of the likelihood reached from the best few of some table values (n, rows), or from
+    the best where effects are simulated."""
     heights = landscape.log_likelihood(values)
-    best = np.argsort(-heights)[:_CLIMBED]
+    cheap = landscape.posterior.simulation is None or landscape.posterior.surrogate is not None
+    best = np.argsort(-heights)[: _CLIMBED if cheap else 1]
     peaks = [landscape.maximise(values[k]) for k in best]
     return max([Peak(values[best[0]], float(heights[best[0]])), *peaks], key=lambda one: one.log_likelihood)
 
@@ -233,6 +235,7 @@ class Contender:
             fingerprint(study, plan_of(problem_of(study), quick=self.quick)),
             self.candidate.improper,
             _VERSION,
+            "" if self.candidate.fit is None else self.candidate.fit.draws.sha256,
             [digest(record) for record in study.held_out],
         )
         return hashlib.sha256(json.dumps(entries).encode()).hexdigest()
@@ -259,13 +262,21 @@ class Contender:
             return result
         with threadpool_limits(1):
             began = time.perf_counter()
-            fitted = self._fitted(self.candidate.study, self.folder)
-            if fitted.draws.grade.level == "unusable" and self.patient != self.candidate.study.sampler:
-                longer = replace(self.candidate.study, sampler=self.patient)
-                fitted = self._fitted(longer, None if self.folder is None else self.folder / "longer")
+            fitted = self._first()
             entries = self.scored(fitted) | {"seconds": time.perf_counter() - began}
         self.store(entries)
         return entries
+
+    def _first(self) -> Fit:
+        """The finished fit; else one by the short plan, or by the study's own where that leaves nothing
+        usable."""
+        if self.candidate.fit is not None:
+            return whole(self.candidate.fit)
+        fitted = self._fitted(self.candidate.study, self.folder)
+        if fitted.draws.grade.level == "unusable" and self.patient != self.candidate.study.sampler:
+            longer = replace(self.candidate.study, sampler=self.patient)
+            fitted = self._fitted(longer, None if self.folder is None else self.folder / "longer")
+        return fitted
 
     def fitted_from(self, starts: Matrix) -> Fit:
         """The candidate fitted as its study asks, with modes known from elsewhere, table values

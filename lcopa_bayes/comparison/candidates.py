@@ -13,6 +13,7 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import table_of
 from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.model.layout import Layout
+from lcopa_bayes.results.predictive import Predictive
 
 STUDY = "study"
 """Name of the candidate that is the study unchanged."""
@@ -42,6 +43,8 @@ class Candidate:
     notes: tuple[str, ...] = ()
     improper: tuple[str, ...] = ()
     """Parameters whose prior is improper."""
+    fit: Predictive | None = None
+    """Its finished fit; None: it is fitted."""
 
     @property
     def integer(self) -> bool:
@@ -52,8 +55,7 @@ class Candidate:
     @property
     def terms(self) -> int:
         """Viscous terms of the richest element [-]."""
-        terms = self.study.model.terms
-        return max(terms.values()) if isinstance(terms, Mapping) else terms
+        return self.study.model.most_terms
 
 
 def known_settings(name: str, study: Study) -> CandidateSettings:
@@ -62,7 +64,7 @@ def known_settings(name: str, study: Study) -> CandidateSettings:
     while (result := re.fullmatch(rf"(.+)-({'|'.join(VARIANTS)})", base)) is not None:
         base = result[1]
         variants.append(result[2])
-    most = _most_terms(study.model)
+    most = study.model.most_terms
     settings: dict[str, object] = {}
     fractional = re.fullmatch(r"fractional-([1-6])", base)
     if fractional:
@@ -154,21 +156,22 @@ def candidates_of(
     return tuple(distinct)
 
 
-def of_studies(studies: Sequence[Study]) -> tuple[Candidate, ...]:
-    """Studies of the same records as candidates, called by their names, with a number where these repeat."""
+def of_studies(studies: Sequence[Study], fits: Sequence[Predictive | None]) -> tuple[Candidate, ...]:
+    """Studies of the same records as candidates, called by their names, with a number where these repeat, and
+    those of their fits that are finished."""
     names = [study.name for study in studies]
     called = [
         name if names.count(name) == 1 else f"{name}-{number}" for number, name in enumerate(names, start=1)
     ]
     return tuple(
-        Candidate(name, study, _about(study, study.model, True), (), ())
-        for name, study in zip(called, studies, strict=True)
+        Candidate(name, study, _about(study, study.model, True), fit=fit)
+        for name, study, fit in zip(called, studies, fits, strict=True)
     )
 
 
 def _short_list(study: Study) -> list[str]:
     """A few candidates that ask how many terms, and whether fractional ones."""
-    model, most = study.model, _most_terms(study.model)
+    model, most = study.model, study.model.most_terms
     if study.effects.use:
         return [STUDY, f"{STUDY}-no-effects"]
     plain = model.orders == "free" and not isinstance(model.terms, Mapping) and most <= _MOST
@@ -178,10 +181,6 @@ def _short_list(study: Study) -> list[str]:
     if len(study.drive_axes) != len(study.response_axes):  # do its paths have anything in common?
         fractional.insert(1, "fractional-1-shared")
     return [*own, *fractional, *(["first-order"] if most <= 2 and not own else []), "second-order"]
-
-
-def _most_terms(model: ModelSettings) -> int:
-    return max(model.terms.values()) if isinstance(model.terms, Mapping) else model.terms
 
 
 def _same(one: Candidate, other: Candidate) -> bool:
@@ -234,15 +233,15 @@ def _uncrossed(
 
 def _direct_terms(model: ModelSettings) -> int:
     if isinstance(model.terms, Mapping):
-        return model.terms.get("direct", max(model.terms.values()))
-    return model.terms
+        return model.terms.get("direct", model.most_terms)
+    return model.most_terms
 
 
 def _about(study: Study, model: ModelSettings, cross: bool) -> str:
     if isinstance(model.terms, Mapping):
         terms = ", ".join(f"{name} {count}" for name, count in model.terms.items()) + " terms"
     else:
-        terms = f"{model.terms} term{'s' if model.terms > 1 else ''}"
+        terms = f"{model.most_terms} term{'s' if model.most_terms > 1 else ''}"
     orders = (
         "free orders"
         if model.orders == "free"
@@ -250,13 +249,15 @@ def _about(study: Study, model: ModelSettings, cross: bool) -> str:
     )
     shared = {"paper": "direct and cross elements", "all": "one element", "none": "an element per path"}
     delays = {"shared": "one delay", "element": "a delay per element", "path": "a delay per path"}
+    effects = [f"with {', '.join(study.effects.use)}"] if study.effects.use else []
     if len(study.drive_axes) == len(study.response_axes) == 1:
-        return f"{terms}, {orders}"
+        return ", ".join([terms, orders, *effects])
     parts = [
         terms,
         orders,
         shared[str(model.share)],
         delays[str(model.delay)],
         *([] if cross else ["no cross paths"]),
+        *effects,
     ]
     return ", ".join(parts)

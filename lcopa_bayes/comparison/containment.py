@@ -27,8 +27,7 @@ from lcopa_bayes.inference.nestedmodels import lifted
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.sampling.convergence import Limitation
-from lcopa_bayes.sampling.coordinates import Chart
-from lcopa_bayes.sampling.evidence import charted_density
+from lcopa_bayes.sampling.coordinates import Chart, charted_density
 from lcopa_bayes.sampling.knownmodes import around
 
 TOLERANCE = 0.5
@@ -151,7 +150,9 @@ def reached(problem: Problem, candidate: Candidate, card: Card) -> tuple[Peak, M
     if not len(inside[0]):
         return None
     landscape = Landscape(target)
-    peak = highest(landscape, inside[0])
+    peak = highest(Landscape(problem.thrifty.posterior), inside[0])
+    if problem.thrifty is not problem:
+        peak = Peak(peak.values, float(landscape.log_likelihood(peak.values[None])[0]))
     if not _inside(target, peak.values[None]).all():  # a climb knows the ends of priors, not all they exclude
         heights = landscape.log_likelihood(inside[0])
         peak = Peak(inside[0][int(heights.argmax())], float(heights.max()))

@@ -90,6 +90,17 @@ def writable_folder(path: Path) -> Path:
     return path
 
 
+def read_json(path: Path, remedy: str) -> dict[str, Any]:
+    """The JSON object in a file; InputError with the `remedy` when it cannot be read."""
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(values, dict):
+            raise ValueError("no JSON object")
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); {remedy}") from None
+    return values
+
+
 def read_tables(path: Path, known: Collection[str]) -> tuple[dict[str, Any], list[str]]:
     """Tables of a TOML file, and what is wrong with their names; InputError when it cannot be read."""
     if not path.exists():

@@ -19,7 +19,7 @@ from lcopa_bayes.experiments.candidates import PLAIN, Candidate, candidates
 from lcopa_bayes.experiments.information import Bench
 from lcopa_bayes.experiments.limits import Limits, bench_times, limits_of
 from lcopa_bayes.identifiability.contraction import prior_draws, prior_spread
-from lcopa_bayes.identifiability.symmetries import Structure, structure
+from lcopa_bayes.identifiability.symmetries import DIFFERENCED, Structure, structure
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.likelihood import Landscape
 from lcopa_bayes.results.predictive import Predictive
@@ -144,8 +144,8 @@ def within(drive: Candidate, limits: Limits) -> bool:
     return bool(inside.all() and np.allclose(ticks, np.round(ticks), atol=1e-6))
 
 
-DRAWS = 24
-"""Draws of the posterior that are averaged over."""
+DRAWS, EFFECT_DRAWS = 24, 4
+"""Draws of the posterior that are averaged over, and most of them with effects."""
 WANTED = 0.1
 """Relative standard deviation that bench times are sought for [-]."""
 LINEAR = 0.5
@@ -221,23 +221,20 @@ class Design:
     @property
     def factor(self) -> Estimate:
         """`factors` of the winner: median and interval over the draws."""
-        return self._over_draws("factor over the plain step", self.factors(self.winner))
+        return self.over_draws("factor over the plain step", self.factors(self.winner))
 
     @property
     def linear(self) -> float:
         """Share of the draws at which the winner's worst bound is small enough to be believed [-]."""
         return float(np.mean(self.winner.worst(self.determined) <= LINEAR))
 
-    def _over_draws(self, name: str, column: Vector) -> Estimate:
+    def over_draws(self, name: str, column: Vector) -> Estimate:
+        """What the draws of the posterior say of a number [-]."""
         return Estimate.of(name, "-", column, ess=float(column.size), grade=self.fit.draws.grade.level)
 
     def estimate(self, promise: Promise, name: str) -> Estimate:
         """Expected relative standard deviation of a parameter, with its spread over the draws."""
-        return self._over_draws(name, promise.relative[:, self.names.index(name)])
-
-    def worst_of(self, promise: Promise) -> Estimate:
-        """Worst relative standard deviation over the parameters, with its spread over the draws."""
-        return self._over_draws("worst", promise.worst(self.determined))
+        return self.over_draws(name, promise.relative[:, self.names.index(name)])
 
     def best(self, name: str, row: tuple[Promise, ...]) -> Promise:
         """Best drive for one parameter at one bench time."""
@@ -317,11 +314,14 @@ def design(
     """Compare candidate drives for a fitted study at many bench times.
 
     `time` [time unit of the study] is what the winner is chosen for, by default 40 spans of the records;
-    without `ladder` no other time is tried. The measurement counts alone unless `with_prior`. InputError as
-    `limits_of` and `bench_times`, for fewer than one repeat, and when no plant parameter is free.
+    without `ladder` no other time is tried, nor with effects a longer one. The measurement counts alone
+    unless `with_prior`. InputError as `limits_of` and `bench_times`, for fewer than one repeat, and when no
+    plant parameter is free.
     """
-    problem, study = fit.problem, fit.study
+    problem, study = fit.problem.thrifty, fit.study
     limits, times, chosen = checked(problem, time=time, repeats=repeats, amplitude=amplitude, refresh=refresh)
+    if problem.ranges is not None:  # every drive takes simulations
+        times, draws = tuple(one for one in times if one <= chosen), min(draws, EFFECT_DRAWS)
     first = Bench(problem, times[0], limits.period)
     averaged = fit.draws.thinned(draws)
     landscape = Landscape(problem.posterior)
@@ -336,7 +336,8 @@ def design(
             raise InputError(f"no candidate drive lies inside the amplitude limit at {each:g}")
         bench = Bench(problem, each, limits.period)
         tried.append(tuple(promises(bench, possible, averaged, repeats=repeats, prior=known)))
-    result = _symmetries(first, limits, np.concatenate([averaged, believed[:_PRIOR_POINTS]]))
+    points = averaged if problem.ranges is not None else np.concatenate([averaged, believed[:_PRIOR_POINTS]])
+    result = _symmetries(first, limits, points)
     return Design(fit, limits, repeats, chosen, averaged, first.names, tuple(tried), result)
 
 
@@ -354,4 +355,5 @@ def _symmetries(bench: Bench, limits: Limits, points: Matrix) -> Structure:
         values.append(point[list(bench.columns)])
     if not slopes:
         return Structure((), 0, 0, True, np.empty(0))
-    return structure(bench.names, slopes, values, tolerances=_TOLERANCES)
+    tolerances = _TOLERANCES if bench.problem.ranges is None else DIFFERENCED
+    return structure(bench.names, slopes, values, tolerances=tolerances)

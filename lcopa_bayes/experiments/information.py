@@ -193,10 +193,10 @@ class Bench:
         if not any(row.free and row.place.first == axis for row in offsets):
             return np.asarray(white[:-1])
         level = white[-1] / np.linalg.norm(white[-1])
-        left = white[:-1] - np.outer(white[:-1] @ level, level)
-        before, after = (np.linalg.norm(part, axis=1) for part in (white[:-1], left))
-        left[after <= _NOTHING * before] = 0.0  # what is left of a constant is rounding
-        return np.asarray(left)
+        varying = white[:-1] - np.outer(white[:-1] @ level, level)
+        before, after = (np.linalg.norm(part, axis=1) for part in (white[:-1], varying))
+        varying[after <= _NOTHING * before] = 0.0  # what remains of a constant is rounding
+        return np.asarray(varying)
 
 
 def effected_model(

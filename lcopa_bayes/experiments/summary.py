@@ -59,7 +59,7 @@ def _row(result: Design, promise: Promise) -> dict[str, Any]:
         "words": promise.candidate.words if promise.excites else "excites nothing that could be seen",
         "changes": promise.candidate.command.times.size,
         "time": promise.time,
-        "worst": result.worst_of(promise).as_json() if among.any() else None,
+        "worst": result.over_draws("worst", promise.worst(among)).as_json() if among.any() else None,
         "factor_over_step": quantile(result.factors(promise), 0.5) if among.any() else None,
         "typical": promise.typical(among) if among.any() else None,
         "relative_sd": [
@@ -75,6 +75,16 @@ def _parameter(result: Design, name: str, unit: str) -> dict[str, Any]:
     best = result.best(name, result.here)
     sizes = np.abs(result.draws[:, result.fit.draws.table.names.index(name)])
     spread: Vector = best.relative[:, at] * sizes
+    estimates = (
+        {}
+        if reason
+        else {
+            "relative_sd": result.estimate(best, name),
+            "sd": Estimate.of(name, unit, spread, ess=float(spread.size), grade=result.fit.draws.grade.level),
+            "relative_sd_step": result.estimate(result.step, name),
+            "relative_sd_winner": result.estimate(result.winner, name),
+        }
+    )
     needed_words = "not by any drive tried"
     if needed is not None:
         needed_words = f"{'at most ' * needed[1]}{needed[0]:.3g} {result.fit.study.time_unit}"
@@ -83,14 +93,8 @@ def _parameter(result: Design, name: str, unit: str) -> dict[str, Any]:
         "unit": unit,
         "reason": reason,
         "best_drive": None if reason else best.candidate.name,
-        "relative_sd": None if reason else result.estimate(best, name).as_json(),
-        "sd": None
-        if reason
-        else Estimate.of(
-            name, unit, spread, ess=float(spread.size), grade=result.fit.draws.grade.level
-        ).as_json(),
-        "relative_sd_step": None if reason else result.estimate(result.step, name).as_json(),
-        "relative_sd_winner": None if reason else result.estimate(result.winner, name).as_json(),
+        **dict.fromkeys(("relative_sd", "sd", "relative_sd_step", "relative_sd_winner")),
+        **{key: one.as_json() for key, one in estimates.items()},
         "time_for_10_percent": None if needed is None else needed[0],
         "time_is_upper_bound": needed is not None and needed[1],
         "time_words": needed_words,
@@ -119,19 +123,29 @@ def _curve(result: Design) -> list[dict[str, Any]]:
 
 _DRAWS = 8
 """Draws averaged over: enough to rank drives."""
+_EFFECT_SPANS, _EFFECT_DRAWS = 4, 2
+"""Length of the record with effects, whose simulation takes long [spans of the records], and draws."""
 
 
 def next_measurement(fit: Predictive, parameters: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     """The drive to play next and, per parameter that is not identified, the best drive for it.
 
-    `parameters`: rows of an audit with `name` and `verdict`. None when every one is identified. Bounds are
-    those of one new record of 40 spans alone, at 8 draws; the verb `design` tries more and confirms.
+    `parameters`: rows of an audit with `name` and `verdict`. None when every one is identified, no drive when
+    only parameters of the noise are not. Bounds are those of one new record of 40 spans alone, at 8 draws,
+    with effects of 4 spans, at 2; the verb `design` tries more and confirms.
     """
     left = [row["name"] for row in parameters if row["verdict"] != "identified"]
     if not left:
         return None
+    table = fit.draws.table
+    if all(table.rows[table.names.index(name)].noise for name in left):
+        reason = "no parameter of the plant is left open, and no drive tells more of the noise"
+        return {"drive": None, "reason": reason, "parameters": []}
+    long, draws = None, _DRAWS
+    if fit.problem.ranges is not None:
+        long, draws = _EFFECT_SPANS * fit.problem.scales.span, _EFFECT_DRAWS
     try:
-        result = design(fit, draws=_DRAWS, ladder=False)
+        result = design(fit, time=long, draws=draws, ladder=False)
     except InputError as error:
         return {"drive": None, "reason": "; ".join(error.problems), "parameters": []}
     rows = []

@@ -43,22 +43,17 @@ from lcopa_bayes.identifiability.symmetries import (
 )
 from lcopa_bayes.identifiability.verdict import Finding, judged
 from lcopa_bayes.inference.likelihood import Landscape, Peak
-from lcopa_bayes.inference.optimum import Optimum, find_optima
+from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.parameter import Parameter
-from lcopa_bayes.inference.surrogate import Surrogate
 from lcopa_bayes.model.effects.effect import UnstableError
 from lcopa_bayes.results.adequacy import unresolved
+from lcopa_bayes.results.nearby import surrogate_about
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.sensitivity import sensitivity
-from lcopa_bayes.sampling.draws import Draws
 
 _POINTS, _FEWER = 24, 6
 """Prior draws at which symmetries are sought, besides likely ones, and with effects, whose slopes cost a
 second each."""
-_TRIED = 128
-"""Draws at which a surrogate is compared with the posterior [-]."""
-_ASTRAY = 1.0
-"""Standard deviation of the difference of their log likelihoods from which it is not used [nat]."""
 _WITNESSES = 400
 """Draws that profiles are started from."""
 _CLIMBED = 8
@@ -146,19 +141,22 @@ def audit(fit: Predictive, *, jobs: int = 1) -> Audit:
         prior = prior_draws(landscape, rng)
         spread = prior_spread(landscape, prior)
         thinned = fit.draws.thinned(_WITNESSES)
-        near = None if posterior.simulation is None else _near(landscape, fit.draws, rng, jobs)
-        ground = near or landscape
+        surrogate = None
+        if posterior.simulation is not None:  # a profile asks for the likelihood 100 000 times
+            surrogate = surrogate_about(posterior, fit.draws, rng, jobs=jobs)
+        ground = Landscape.about(replace(posterior, surrogate=surrogate), fit.draws.flat)
         ranked = thinned[np.argsort(-ground.log_likelihood(thinned))]
         likely = ranked[:_CLIMBED]
         optima = np.empty((0, prior.shape[1]))
-        if near is None:
+        if surrogate is None:
             optima = np.array([o.values for o in find_optima(posterior, rng)]).reshape(-1, prior.shape[1])
         starts = np.concatenate([optima, likely])
         peak = max((ground.maximise(v) for v in starts), key=lambda peak: peak.log_likelihood)
         known = known_best(fit.draws, prior, fit.problem.scales.span, time_unit=fit.study.time_unit)
+    rough = Landscape(fit.problem.thrifty.posterior)
     profiles, peak = _profiles(ground, peak, np.concatenate([thinned, optima]), jobs)
     count = _POINTS if posterior.simulation is None else _FEWER
-    points = _points(landscape, (*prior[:count], *likely[:count])) if landscape.least.columns else []
+    points = _points(rough, (*prior[:count], *likely[:count])) if landscape.least.columns else []
     symmetric, curved, moved, printed = Structure((), 0, 0, True, np.empty(0)), None, None, None
     if points:
         tolerances = TOLERANCES if posterior.simulation is None else DIFFERENCED
@@ -168,7 +166,7 @@ def audit(fit: Predictive, *, jobs: int = 1) -> Audit:
         symmetric = replace(symmetric, symmetries=(*symmetric.symmetries, *exchanges(posterior.table)))
         printed = printed_structure(points, rng)
         curved = curvature(landscape, peak.values, spread)
-        moved = radial(landscape, peak, spread, curved.directions[-1], _RADIUS)
+        moved = radial(rough, peak, spread, curved.directions[-1], _RADIUS)
     believed = beliefs(landscape, fit.draws, spread, sensitivity(fit.draws, ground.posterior))
     rows = [posterior.table.rows[k] for k in landscape.free]
     scales = fit.problem.scales
@@ -192,26 +190,6 @@ def audit(fit: Predictive, *, jobs: int = 1) -> Audit:
         delays=apart,
         peak=peak,
     )
-
-
-def _near(landscape: Landscape, draws: Draws, rng: np.random.Generator, jobs: int) -> Landscape | None:
-    """The likelihood of a plant with effects by a surrogate about its draws; None where it does not hold.
-
-    A profile asks for the likelihood 100 000 times; its points are evaluated by the posterior itself.
-    """
-    posterior, flat = landscape.posterior, draws.flat
-    z = posterior.coordinates(flat)
-    best = flat[np.argmax(draws.log_density.ravel())]
-    about = Optimum(best, np.cov(z.T), float(draws.log_density.max()))
-    tried = draws.thinned(_TRIED)
-    with workers(None, jobs=jobs) as crew:
-        surrogate = Surrogate.of(posterior, about, rng, crew.map)
-        parts = np.array_split(tried, max(1, _TRIED // 16))
-        exact = np.concatenate(list(crew.map(posterior.joint_log_likelihood, parts)))
-    if surrogate is None:
-        return None
-    near = Landscape.about(replace(posterior, surrogate=surrogate), flat)
-    return near if float(np.std(exact - near.log_likelihood(tried))) < _ASTRAY else None
 
 
 def _points(landscape: Landscape, values: Iterable[Vector]) -> list[Sensitivities]:

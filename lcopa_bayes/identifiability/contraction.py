@@ -184,9 +184,12 @@ def beliefs(
 def known_best(draws: Draws, prior: Matrix, span: float, *, time_unit: str) -> tuple[Known, ...]:
     """Step metrics and steepest slopes of every path, the most precise first.
 
-    `prior`, (draws, rows): draws of the prior; `span`: length of the record [time unit].
+    `prior`, (draws, rows): draws of the prior, of which with effects the plant alone counts; `span`: length
+    of the record [time unit].
     """
-    before = replace(draws, values=prior[None], log_density=np.zeros((1, prior.shape[0])))
+    alone = draws.table.without_effects
+    prior = prior[:, [draws.table.names.index(name) for name in alone.names]]
+    before = replace(draws, table=alone, values=prior[None], log_density=np.zeros((1, prior.shape[0])))
     functions = [_functions(each, span, time_unit) for each in (draws, before)]
     known = [
         Known(after, _width(after), _width(first))

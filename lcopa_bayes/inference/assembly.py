@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import final
 
 import numpy as np
@@ -77,6 +78,14 @@ class Problem:
         problem = replace(self, refinement=self.refinement * factor)
         _, model = problem.simulated(self.study.fit)
         return replace(problem, posterior=replace(self.posterior, model=model))
+
+    @cached_property
+    def thrifty(self) -> Problem:
+        """With effects, whose simulation takes as many times longer, the problem on blocks as wide as the
+        study's settings make them: for questions that narrower ones do not answer otherwise."""
+        if self.ranges is None or self.refinement == 1:
+            return self
+        return replace(self, refinement=1).refined(1)
 
 
 def problem_of(study: Study) -> Problem:

@@ -14,7 +14,7 @@ from lcopa_bayes.core.arrays import Array, Flags, Index, Matrix, Vector
 from lcopa_bayes.core.errors import InputError, nearest, refuse_if
 from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.inference.defaultpriors import Scales
-from lcopa_bayes.inference.kinds import COEFFICIENTS, KINDS
+from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS, KINDS
 from lcopa_bayes.inference.noise import NOISES
 from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.priors import Prior
@@ -58,6 +58,12 @@ class ParameterTable:
     def names(self) -> tuple[str, ...]:
         """Names, in table order."""
         return tuple(row.name for row in self.rows)
+
+    @property
+    def without_effects(self) -> ParameterTable:
+        """The plant's and the noise's parameters alone."""
+        rows = tuple(row for row in self.rows if row.kind not in (*COEFFICIENTS, *CONSTANTS))
+        return replace(self, rows=rows, effects=None)
 
     def of_kind(self, kind: str) -> list[int]:
         """Positions of the parameters of a kind."""

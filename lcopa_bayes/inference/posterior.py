@@ -11,7 +11,6 @@ import numpy as np
 from scipy.special import expit, log_expit, logit
 
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
-from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.noise import LOG_2PI, GaussianNoise, Noise
 from lcopa_bayes.inference.observations import Observed, Samples
 from lcopa_bayes.inference.parameter import Parameter
@@ -290,9 +289,7 @@ class Posterior:
     @cached_property
     def without_effects(self) -> Posterior:
         """The same of the plant alone; the noise stays."""
-        rows = tuple(row for row in self.table.rows if row.kind not in (*COEFFICIENTS, *CONSTANTS))
-        table = replace(self.table, rows=rows, effects=None)
-        return replace(self, table=table, model=self.model.plain, surrogate=None)
+        return replace(self, table=self.table.without_effects, model=self.model.plain, surrogate=None)
 
 
 @final

@@ -30,7 +30,7 @@ from lcopa_bayes.model.effects.effect import (
 )
 from lcopa_bayes.model.effects.passage import Moved, Plant, forced
 from lcopa_bayes.model.effects.simulator import Simulator
-from lcopa_bayes.model.forward import ForwardModel, deflections
+from lcopa_bayes.model.forward import Dynamics, ForwardModel, deflections
 
 
 @final
@@ -120,6 +120,14 @@ class Simulation:
         declared = self.declared
         return Simulator(self.model.plain, effects, declared.ranges, declared.epochs, declared.times)
 
+    def dynamics(self, values: Matrix) -> Dynamics:
+        """What shapes the responses at canonical table values, (batch, rows), lags of the drive included."""
+        dynamics = self.table.dynamics(values)
+        for effect, rows in zip(self.effects(values[0]), self.coefficients, strict=True):
+            if isinstance(effect, DriveEffect) and effect.lags:
+                dynamics = dynamics.later(effect.lag(self.declared.ranges, values[:, rows].T))
+        return dynamics
+
     def plant(self, values: Vector) -> Plant:
         """The plant of canonical table values, (rows,), without offsets."""
         batch = values[None]
@@ -131,7 +139,7 @@ class Simulation:
         declared, batch, layout = self.declared, len(values), self.table.layout
         shared = None
         if not (declared.bending or declared.commanding):
-            shared = self.model.plain.unit_responses(self.table.dynamics(values))
+            shared = self.model.plain.unit_responses(self.dynamics(values))
         sizes = [times.size for times in declared.times]
         bounded = np.ones(batch, dtype=bool)
         out = [
@@ -201,7 +209,7 @@ class Simulation:
     def _forced(self, values: Matrix, out: list[Simulated], bounded: Flags) -> None:
         """Write the responses of plants under forces, all at once."""
         declared, axes = self.declared, len(self.table.layout.responses)
-        gains, dynamics = self.table.gains(values), self.table.dynamics(values)
+        gains, dynamics = self.table.gains(values), self.dynamics(values)
         forces = []
         for kind, rows, constants in zip(declared.kinds, self.coefficients, self.constants, strict=True):
             if issubclass(kind, ForceEffect):
@@ -214,7 +222,7 @@ class Simulation:
         for record, (deflection, failures) in zip(out, records, strict=True):
             bounded[list(failures)] = False
             record.base[...] = deflection
-        if len(forces) < len(declared.kinds):
+        if not all(issubclass(kind, (DriveEffect, ForceEffect)) for kind in declared.kinds):
             for b in np.flatnonzero(bounded).tolist():
                 simulator = self.simulator(self.effects(values[b]))
                 self._finished(simulator, values[b], b, out)

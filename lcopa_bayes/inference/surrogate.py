@@ -12,7 +12,7 @@ from typing import Any, final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.core.covariance import root_of
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
@@ -96,13 +96,15 @@ class Surrogate:
     def __call__(self, values: Matrix) -> list[Simulated]:
         """Every record at canonical table values, (batch, rows)."""
         z = self.posterior.coordinates(values)[:, self.columns]
+        z, where = np.unique(z, axis=0, return_inverse=True)  # differences move other parameters too
         apart = z - self.centre
         features = _features(apart @ self.inverse.T, apart / self.sd, self.delays)
-        bounded: Flags = np.ones(len(values), dtype=bool)
+        where, bounded = where.ravel(), np.ones(len(values), dtype=bool)
         out = []
         for base, scaled in zip(self.bases, self.scaled, strict=True):
-            moved = np.stack([features @ base[:, axis] for axis in range(base.shape[1])])
-            out.append(Simulated(moved, {k: features @ each for k, each in scaled.items()}, bounded))
+            moved = np.stack([(features @ base[:, axis])[where] for axis in range(base.shape[1])])
+            columns = {k: (features @ each)[where] for k, each in scaled.items()}
+            out.append(Simulated(moved, columns, bounded))
         return out
 
 

@@ -46,6 +46,10 @@ class Dynamics:
         """Number of plants."""
         return int(self.delays.shape[0])
 
+    def later(self, by: Array) -> Dynamics:
+        """With all delays longer by a time, (batch,) [time unit]."""
+        return Dynamics(self.times, self.orders, self.delays + by[:, None])
+
     def __getitem__(self, plants: slice) -> Dynamics:
         """Some of the plants."""
         times, orders = (tuple(each[plants] for each in part) for part in (self.times, self.orders))

@@ -202,7 +202,7 @@ def _rounded(step: float) -> float:
     return float(f"{step:.11g}")
 
 
-_CUBIC = np.linalg.inv(np.vander(np.arange(4.0), increasing=True))
+CUBIC = np.linalg.inv(np.vander(np.arange(4.0), increasing=True))
 """Coefficients, in rising powers, of the Lagrange polynomials on 0, 1, 2, 3, one per column."""
 
 
@@ -237,6 +237,6 @@ def _through_integral(grid: Grid, at: Vector, *, derivative: bool) -> tuple[Inde
     powers = np.vander(at - first, 4, increasing=True)
     if derivative:
         powers = np.arange(4) * np.concatenate((np.zeros((at.size, 1)), powers[:, :-1]), axis=1)
-    nodes = powers @ _CUBIC
+    nodes = powers @ CUBIC
     # sum_j nodes_j A_j, A_j = sum of the means before edge j: a mean counts at all edges after it
     return first, np.cumsum(nodes[:, :0:-1], axis=1)[:, ::-1]

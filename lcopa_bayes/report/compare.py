@@ -11,10 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from lcopa_bayes.comparison.compare import folder_name
-from lcopa_bayes.core.errors import refuse_if
 from lcopa_bayes.report.formatting import figures
 from lcopa_bayes.report.page import Drawings, Verdict, write_graded
-from lcopa_bayes.report.savedrun import read_table
+from lcopa_bayes.report.savedrun import read_tables
 from lcopa_bayes.report.theme import (
     CYCLE,
     NOISE,
@@ -55,15 +54,9 @@ def _verdict(results: Mapping[str, Any]) -> Verdict:
 
 def _curves(folder: Path, results: Mapping[str, Any]) -> dict[str, pd.DataFrame]:
     """Curves of every candidate that has any; InputError when a table cannot be read."""
-    problems: list[str] = []
-    names = [str(row["name"]) for row in results["models"]]
-    tables = folder / "candidates"
-    out = {
-        name: read_table(tables / folder_name(name) / "tables" / "curves.csv", problems, verb="compare")
-        for name in names
-    }
-    refuse_if(problems)
-    return out
+    tables, names = folder / "candidates", [str(row["name"]) for row in results["models"]]
+    paths = {name: tables / folder_name(name) / "tables" / "curves.csv" for name in names}
+    return read_tables(paths, "compare")
 
 
 def _evidence(results: Mapping[str, Any]) -> list[Drawing]:

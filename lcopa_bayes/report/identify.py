@@ -9,12 +9,11 @@ from typing import Any, TypeAlias
 
 import pandas as pd
 
-from lcopa_bayes.core.errors import refuse_if
 from lcopa_bayes.model.path import Normalisation
 from lcopa_bayes.paper.steptable import KINDS, PRINTED
 from lcopa_bayes.report.formatting import figures, interval
 from lcopa_bayes.report.page import Drawings, write_graded
-from lcopa_bayes.report.savedrun import read_table
+from lcopa_bayes.report.savedrun import read_tables
 from lcopa_bayes.report.theme import (
     CYCLE,
     HELD_OUT,
@@ -42,15 +41,12 @@ def write_identification(folder: Path) -> Path:
     InputError when `identify.json` or a table of samples cannot be used.
     """
     values = stored_values(folder, "identify", ("study", "time_unit", "paths", "step_metrics", "records"))
-    problems: list[str] = []
-    samples = [
-        read_table(folder / entry["samples"], problems, verb="identify") for entry in values["records"]
-    ]
-    refuse_if(problems)
+    paths = {entry["samples"]: folder / entry["samples"] for entry in values["records"]}
+    samples = read_tables(paths, "identify")
 
     def drawn(values: Values) -> Drawings:
-        both = zip(values["records"], samples, strict=True)
-        return {"records": [_drawing(*one, values["time_unit"]) for one in both]}
+        unit = values["time_unit"]
+        return {"records": [_drawing(one, samples[one["samples"]], unit) for one in values["records"]]}
 
     def credible(one: Values) -> str:
         lower, upper = one["lower"], one["upper"]

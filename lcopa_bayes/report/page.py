@@ -7,7 +7,7 @@ result through the functions of `formatting`. A page needs nothing else; its fig
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -139,11 +139,6 @@ def each(rows: Iterable[Mapping[str, Any]], *keys: str) -> list[tuple[Any, Any]]
     return [(row, one) for row in rows for key in keys for one in row[key]]
 
 
-def zip_of(*lists: Sequence[Any]) -> list[tuple[Any, ...]]:
-    """Entries of lists of one length side by side."""
-    return list(zip(*lists, strict=True))
-
-
 def anchor(title: str) -> str:
     """Name of a section inside its page."""
     return "-".join("".join(c if c.isalnum() else " " for c in title.lower()).split())
@@ -214,7 +209,7 @@ def write_page(
     }
     environment.globals |= {key: getattr(formatting, key) for key in _CALLED}
     environment.globals |= {key: getattr(page, key) for key in ("section", "p", "table", "cells", "figures")}
-    environment.globals |= {"each": each, "pairs": zip_of, "product": product}
+    environment.globals |= {"each": each, "pairs": zip, "product": product}
     environment.globals |= {"POINTWISE": POINTWISE, "SIMULTANEOUS": SIMULTANEOUS}
     body = environment.get_template(template.name).render(v=values, drawn=drawn, **more)
     whole = environment.get_template("page.html")

@@ -110,7 +110,8 @@ def load_run(folder: Path) -> SavedRun:
     origin = (read_part(folder / ORIGINS, read_json, problems) or {}).get("fit", {})
     wanted = {**TABLES, **(_CHECK_TABLES if results.get("cross_check") else {})}
     tables = {
-        name: read_table(folder / "tables" / f"{name}.csv", problems, needs) for name, needs in wanted.items()
+        name: read_table(folder / "tables" / f"{name}.csv", problems, needs, "fit")
+        for name, needs in wanted.items()
     }
     draws = read_part(folder / "posterior.nc", posterior_draws, problems) or {}
     if not problems:
@@ -140,13 +141,23 @@ def read_json(path: Path) -> dict[str, Any]:
     return dict(json.loads(path.read_text(encoding="utf-8")))
 
 
-def read_table(
-    path: Path, problems: list[str], needs: Sequence[str] = (), *, verb: str = "fit"
-) -> pd.DataFrame:
-    """A saved table with the columns it `needs`; names that look like numbers stay names.
+def read_tables(
+    paths: Mapping[str, Path], verb: str, needs: Mapping[str, Sequence[str]] | None = None
+) -> dict[str, pd.DataFrame]:
+    """Saved tables by name, with the columns each `needs`; names that look like numbers stay names.
 
-    An empty file is a table without rows. What is missing or cannot be used is added to `problems`.
+    An empty file is a table without rows. InputError with all that is missing or cannot be used.
     """
+    problems: list[str] = []
+    tables = {
+        name: read_table(path, problems, (needs or {}).get(name, ()), verb) for name, path in paths.items()
+    }
+    refuse_if(problems)
+    return tables
+
+
+def read_table(path: Path, problems: list[str], needs: Sequence[str], verb: str) -> pd.DataFrame:
+    """One of them; what is wrong with it joins the problems."""
     table = read_part(path, _table, problems, verb)
     if table is None or not len(table.columns):
         return pd.DataFrame(columns=list(needs))

@@ -30,7 +30,7 @@ POSTERIOR = "posterior.nc"
 """File of a run folder that holds the tree."""
 _PORTION = 64
 """Draws predicted at a time."""
-_PRIOR_DRAWS = 200
+_PRIOR_DRAWS, _FEWER = 200, 32
 """Draws of the prior."""
 
 
@@ -87,7 +87,8 @@ def posterior_tree(fit: Fit) -> DataTree:
     free = [k for k, row in enumerate(table.rows) if row.free]
     variables = dict(zip(free, variable_names([table.names[k] for k in free]), strict=True))
     rng = np.random.default_rng([study.seed, 3])
-    prior = table.draw(_PRIOR_DRAWS, np.random.default_rng([study.seed, 9]))
+    count = _PRIOR_DRAWS if table.effects is None else _FEWER
+    prior = table.draw(count, np.random.default_rng([study.seed, 9]))
     fitted = _Series.of(posterior.samples)
     likelihood, predictive = _predicted(fit, fitted, draws.flat, rng, likelihood=True)
     _, before = _predicted(fit, fitted, prior, np.random.default_rng([study.seed, 10]), likelihood=False)
@@ -106,20 +107,21 @@ def posterior_tree(fit: Fit) -> DataTree:
         "observed_data": fitted.observed,
     }
     series = [fitted]
-    commanded = _Drives.of(study.fit)
-    groups["constant_data"] = commanded.values
-    drives = [commanded]
+    drives = _commanded(study.fit)
+    groups["constant_data"] = {name: one.drive for name, one in drives.items()}
     if study.held_out:
         samples, model = problem.simulated(study.held_out)
-        apart, later = _Series.of(samples), _Drives.of(study.held_out)
+        apart, later = _Series.of(samples), _commanded(study.held_out)
         drawn = record_draws(draws, model, samples, posterior.noise, held_out=True, seed=fit.run.plan.seed)
         names = {pair: name for name, pair in apart.origins.items()}
         groups["predictions"] = {
             names[record, axis.name]: (response + offset[0][:, None] + noises)[None].astype(np.float32)
             for (record, axis, _), _, _, response, noises, offset in drawn
         }
-        groups["predictions_constant_data"] = apart.observed | later.values
-        series, drives = [fitted, apart], [commanded, later]
+        groups["predictions_constant_data"] = apart.observed | {
+            name: one.drive for name, one in later.items()
+        }
+        series, drives = [fitted, apart], drives | later
     dims, coords = _dimensions(series, drives, [axis.name for axis in study.drive_axes])
     tree = arviz_base.from_dict(groups, dims=dims, coords=coords, pred_dims=dims, pred_coords=coords)
     _describe(tree, fit, variables, series)
@@ -127,7 +129,7 @@ def posterior_tree(fit: Fit) -> DataTree:
 
 
 def _dimensions(
-    series: Sequence[_Series], drives: Sequence[_Drives], axes: Sequence[str]
+    series: Sequence[_Series], drives: Mapping[str, Record], axes: Sequence[str]
 ) -> tuple[dict[str, list[str]], dict[str, Any]]:
     """Dimensions of every variable beyond chain and draw, and their coordinates."""
     dims: dict[str, list[str]] = {}
@@ -135,10 +137,8 @@ def _dimensions(
     for one in series:
         dims |= {name: [f"{name}_time"] for name in one.observed}
         coords |= {f"{name}_time": times for name, times in one.times.items()}
-    for each in drives:
-        dims |= {name: [f"{name}_time", "drive"] for name in each.values}
-        coords |= {f"{name}_time": times for name, times in each.times.items()}
-    return dims, coords
+    dims |= {name: [f"{name}_time", "drive"] for name in drives}
+    return dims, coords | {f"{name}_time": one.time for name, one in drives.items()}
 
 
 def _describe(tree: DataTree, fit: Fit, variables: Mapping[int, str], series: Sequence[_Series]) -> None:
@@ -219,21 +219,10 @@ class _Series:
         )
 
 
-@final
-@dataclass(frozen=True)
-class _Drives:
-    """Drives of some records, by variable name."""
-
-    values: dict[str, Matrix]
-    """(rows, axes) each."""
-    times: dict[str, Vector]
-
-    @classmethod
-    def of(cls, records: Sequence[Record]) -> _Drives:
-        """Of every record, row by row."""
-        names = variable_names([f"{record.name}_drive" for record in records])
-        pairs = list(zip(names, records, strict=True))
-        return cls({name: one.drive for name, one in pairs}, {name: one.time for name, one in pairs})
+def _commanded(records: Sequence[Record]) -> dict[str, Record]:
+    """Records by the names of the variables that hold their drives."""
+    names = variable_names([f"{record.name}_drive" for record in records])
+    return dict(zip(names, records, strict=True))
 
 
 def _predicted(
@@ -255,7 +244,7 @@ def _predicted(
         part = values[rows]
         # draws have bounded responses; those of the prior that have none are NaN
         known = posterior.responses(part) if likelihood else ()
-        plant = () if likelihood else responses(table, posterior.model, part)
+        plant = () if likelihood else responses(table, fit.problem.thrifty.posterior.model, part)
         for name, (r, axis) in fitted.places.items():
             seen, parameters = posterior.samples[r].axes[axis], posterior.noise_parameters(part, axis)
             noise = posterior.noise.draw(parameters, seen.gaps, rng)

@@ -9,7 +9,7 @@ narrow blocks would have had.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -100,6 +100,13 @@ class Discretisation:
             ),
         )
 
+    @classmethod
+    def of_json(cls, values: Mapping[str, Any]) -> Discretisation:
+        """From what `as_json` gave."""
+        own = {key: values[key] for key in ("parameter", "refinement", "blocks")}
+        moved = tuple(values["moved"])
+        return cls(shift=values["shift_sd"], error=values["shift_error_sd"], moved=moved, **own)
+
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
         return {
@@ -146,13 +153,11 @@ def narrowed(problem: Problem, shift: Callable[[Problem], float]) -> Problem:
 
     Not beyond `_FINEST` or `_MOST_CELLS`, where the measurement after sampling gives the remaining shift.
     """
-    while shift(problem) > LARGEST and _may_refine(problem):
+    while shift(problem) > LARGEST:
+        if problem.refinement >= _FINEST or 2 * _cells(problem) > _MOST_CELLS:
+            break
         problem = problem.refined(2)
     return problem
-
-
-def _may_refine(problem: Problem) -> bool:
-    return problem.refinement < _FINEST and 2 * _cells(problem) <= _MOST_CELLS
 
 
 def _cells(problem: Problem) -> int:

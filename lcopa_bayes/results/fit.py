@@ -24,6 +24,7 @@ from lcopa_bayes.results.datatree import POSTERIOR, posterior_tree, save_tree
 from lcopa_bayes.results.discretisation import Discretisation, discretisation, optima_of, resolved_optima
 from lcopa_bayes.results.firstlook import FirstLook
 from lcopa_bayes.results.frequency import FrequencyResponse, frequency_response
+from lcopa_bayes.results.nearby import surrogate_about
 from lcopa_bayes.results.prediction import Band, study_bands
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.residuals import Residual, residuals
@@ -39,10 +40,12 @@ from lcopa_bayes.sampling.draws import Draws, gather, shortfall
 from lcopa_bayes.sampling.evidence import Evidence, evidence_of
 from lcopa_bayes.sampling.nested import NestedPlan, nested
 from lcopa_bayes.sampling.sampler import Run, SamplePlan, sample
+from lcopa_bayes.sampling.weighted import Weighted
 from lcopa_bayes.sampling.weightedrun import QUICK_STARTS, STARTS, weighted_run
 
 if TYPE_CHECKING:
     from lcopa_bayes.results.integerrival import Rival
+    from lcopa_bayes.results.structure import Structure
 
 _QUICK = 4
 """How many times fewer steps a quick fit takes."""
@@ -79,6 +82,8 @@ class Fit(Predictive):
     """How a second, independent sampling method agrees; None without one."""
     rival: Rival | None = None
     """The same study with integer orders, and how it predicts; None when none was fitted."""
+    structure: Structure | None = None
+    """What other structures the records allow; None where the study states its terms."""
 
     @property
     def near(self) -> Posterior:
@@ -142,6 +147,8 @@ def fit(
     its records, these do not meet the requirements of a fit (`requirements`), or the folder cannot be written
     to; then nothing is written.
     """
+    if study.model.terms == "auto":
+        raise ValueError("the number of terms is not settled yet")
     if look is None:
         refuse_if(unmet(study))
     problem = look.problem if look else problem_of(study)
@@ -180,13 +187,30 @@ def fit(
         )
         draws = draws.limited(check.limitations(draws.grade))
     width = discretisation(problem, draws, jobs=jobs)
-    curves = step_curves(draws, problem.scales.span)
-    draws = draws.limited([*width.limitations, *too_fast(draws, curves, problem.scales.period)])
+    draws = draws.limited(width.limitations)
+    return _derived(problem, run, draws, weighed, width, check, judged=False)
+
+
+def _derived(
+    problem: Problem,
+    run: Run,
+    draws: Draws,
+    weighed: Evidence | None,
+    width: Discretisation,
+    check: CrossCheck | None = None,
+    *,
+    judged: bool,
+) -> Fit:
+    """The fit of a run and its draws; unless these are `judged` already, what speaks against the model limits
+    them."""
+    study, curves = problem.study, step_curves(draws, problem.scales.span)
+    if not judged:
+        draws = draws.limited(too_fast(draws, curves, problem.scales.period))
     shown = study_bands(problem, draws)
     remaining = residuals(draws, shown, problem.posterior.noise, problem.scales.period)
-    draws = draws.limited(
-        limitations(problem, draws, shown, remaining, np.random.default_rng([plan.seed, 4]))
-    )
+    if not judged:
+        rng = np.random.default_rng([run.plan.seed, 4])
+        draws = draws.limited(limitations(problem, draws, shown, remaining, rng))
     metrics = step_metrics(draws, curves, time_unit=study.time_unit)
     moved = sensitivity(draws, replace(problem.posterior, surrogate=run.surrogate))
     response = frequency_response(
@@ -206,6 +230,28 @@ def fit(
         frequency=response,
         cross_check=check,
     )
+
+
+def whole(fit: Predictive) -> Fit:
+    """A finished fit with all that follows from its draws, where it is read from its run folder; these stand
+    for the run."""
+    if isinstance(fit, Fit):
+        return fit
+    problem, draws, values = fit.problem, fit.draws, fit.to_json()
+    posterior, plan = problem.posterior, plan_of(problem, quick=False)
+    weighed = None
+    if values["log_evidence"] is not None:
+        by_ensemble = tuple(values["log_evidence_by_ensemble"])
+        weighed = Evidence(values["log_evidence"], values["log_evidence_sd"], by_ensemble)
+    level = (weighed.value, weighed.sd) if weighed else (np.nan, np.inf)
+    z = posterior.coordinates(draws.flat)
+    weighted = Weighted.equal(posterior, z, draws.log_density.ravel(), *level)
+    near = None
+    if posterior.simulation is not None:
+        near = surrogate_about(posterior, draws, np.random.default_rng([plan.seed, 11]))
+    run = Run((), plan, weighted, surrogate=near)
+    width = Discretisation.of_json(values["discretisation"])
+    return _derived(problem, run, draws, weighed, width, judged=True)
 
 
 def weighted_fit(
@@ -232,7 +278,4 @@ def plan_of(problem: Problem, *, quick: bool) -> SamplePlan:
         seconds=wanted.seconds,
         method=wanted.method or ("auto" if wanted.steps is None and wanted.thin is None else "ensembles"),
     )
-    if not quick:
-        return plan
-    steps = max(plan.thin, plan.steps // _QUICK)
-    return replace(plan, steps=steps)
+    return replace(plan, steps=max(plan.thin, plan.steps // _QUICK)) if quick else plan

@@ -7,7 +7,7 @@ every average follows from the weights themselves (Owen 2013, Monte Carlo theory
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from math import sqrt
 from typing import final
@@ -92,6 +92,15 @@ class Weighted:
             posterior.values(coordinates)[:, posterior.sampled],
             tuple(row.log_scale for row in rows),
         )
+
+    @classmethod
+    def equal(
+        cls, posterior: Posterior, coordinates: Matrix, log_density: Vector, log_evidence: float, sd: float
+    ) -> Weighted:
+        """Draws (draws, dimension) of equal weight, of a posterior whose log evidence is known [nat]."""
+        raw = np.full(len(coordinates), log_evidence)
+        drawn = cls.of(posterior, coordinates, log_density, raw, len(raw), smooth=False)
+        return replace(drawn, log_evidence_sd=sd)
 
     @cached_property
     def ess(self) -> float:

@@ -14,14 +14,15 @@ import pandas as pd
 from lcopa_bayes.comparison.candidatefit import CARD
 from lcopa_bayes.comparison.candidates import candidates_of, of_studies
 from lcopa_bayes.comparison.compare import compare as compared
+from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.data.settings import CandidateSettings
-from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_candidates
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.results.runfolder import opened, provenance
 from lcopa_bayes.results.stored import StoredResult
-from lcopa_bayes.verbs.sources import FitLike, study_of
+from lcopa_bayes.results.structure import settled
+from lcopa_bayes.verbs.sources import FitLike, finished, several, study_of
 
 
 @final
@@ -59,7 +60,7 @@ class Comparison(StoredResult):
 
 
 def compare(
-    study: FitLike | Sequence[Study],
+    study: FitLike | Sequence[FitLike],
     candidates: Sequence[str] | None = None,
     *,
     described: Path | str | Sequence[CandidateSettings] = (),
@@ -71,21 +72,24 @@ def compare(
 ) -> Comparison:
     """Fit several models of the same records, score them by evidence and by prediction, and decide.
 
-    Parameters: `study`, from which candidates are derived (of a fit, its study), or several studies of
-    the same records, which are the candidates; `candidates`, names such as ``fractional-2`` or
-    ``second-order``, by default those of the study or a short list; `described`, further candidates, or a
-    file of them; `jobs`, processes to use; `folder`, a run folder to write into, from which `resume` goes on;
-    `quick`, a quarter of the steps; `quiet`, no progress bar.
+    Parameters: `study`, from which candidates are derived (of a fit, its study), or several studies, fits or
+    run folders of the same records: these are the candidates, and finished fits are not made anew;
+    `candidates`, names such as ``fractional-2`` or ``second-order``, by default those of the study or a short
+    list; `described`, further candidates, or a file of them; `jobs`, processes to use; `folder`, a run folder
+    to write into, from which `resume` goes on; `quick`, a quarter of the steps; `quiet`, no progress bar.
 
     InputError for fewer than two different candidates, unknown names, different records, and as `fit`.
     """
-    several = not isinstance(study, str) and isinstance(study, Sequence)
-    if several and all(isinstance(one, Study) for one in study):  # type: ignore[union-attr]
-        models = of_studies(study)  # type: ignore[arg-type]
+    sources = several(study)
+    if sources:
+        if candidates or described:
+            raise InputError("several studies are the candidates; `--pick` and `--candidates` are of one")
+        fits = [finished(source) for source in sources]
+        models = of_studies([study_of(source) for source in sources], fits)
     else:
         named = isinstance(described, Path | str)
         chosen, more = load_candidates(Path(described)) if named else (None, described)  # type: ignore[arg-type]
-        single = study_of(study)  # type: ignore[arg-type]
+        single = settled(study_of(study))  # type: ignore[arg-type]
         if single.effects.use:  # its candidates have them or not, but never without their priors
             problem_of(single)
         models = candidates_of(single, more, candidates or chosen)  # type: ignore[arg-type]
@@ -97,7 +101,4 @@ def compare(
         values = compared(models, jobs=jobs, folder=path, resume=resume, quick=quick, quiet=quiet)
         outcome = sorted(one for pattern in Comparison.beside for one in path.glob(pattern))
         texts = {str(one.relative_to(path)): one.read_text(encoding="utf-8") for one in outcome}
-        result = Comparison(values, origin, texts)
-        if folder is not None:
-            result.save(folder)
-    return result
+        return Comparison(values, origin, texts).kept(folder)

@@ -18,10 +18,11 @@ from lcopa_bayes.bench.device import Device
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Axis
+from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.effects import Effected, effected
 from lcopa_bayes.model.effects import balance, sensor
 from lcopa_bayes.model.effects.catalogue import bundled, catalogue
-from lcopa_bayes.model.effects.commands import Hysteresis, RefreshHold
+from lcopa_bayes.model.effects.commands import Hysteresis, RefreshHold, SampledDrive
 from lcopa_bayes.model.effects.dynamics import (
     CubicStiffness,
     LevelDependentSpeed,
@@ -291,15 +292,17 @@ def test_moments_of_the_lag(rate: float):
 
 
 def test_balance_of_a_linear_force_is_a_geometric_series():
-    """``y = k * (f - a y)`` has the solution of a triangular system, at any window."""
+    """``y = k * (f - a y)`` has the solution of a triangular system."""
     n, a, rng = 300, 30.0, np.random.default_rng(3)
     kernel = np.exp(-np.arange(n) / 40.0)[None] / 40.0
     f = rng.normal(size=(1, n)).cumsum(axis=1)
     matrix = np.array([[kernel[0, i - j] if i >= j else 0.0 for j in range(n)] for i in range(n)])
     exact = np.linalg.solve(np.eye(n) + a * matrix, matrix @ f[0])
-    start = np.zeros((1, n))
-    told = balance.balanced(kernel, lambda blocks, y, one, two: f[:, blocks] - a * y, np.ones((1, 1)), start)
-    assert_allclose(told[0], exact, atol=1e-9)
+    found, lost = balance.marched(
+        kernel, lambda blocks, y, one, two: f[:, blocks] - a * y, np.ones((1, 1)), 1
+    )
+    assert_allclose(found[0, 0], exact, atol=1e-9)
+    assert not lost.any()
 
 
 def test_plants_iterated_together_end_where_each_does_by_itself():
@@ -445,3 +448,74 @@ def test_changes_a_rounding_apart_may_be_shifted(name):
     assert rest == 0.0
     np.testing.assert_array_equal(moved.values, [1.5, 0.5])
     assert (np.diff(moved.times) > 0).all()
+
+
+def fractional_plant(command) -> tuple[Problem, np.ndarray]:
+    """A plant of order 1.7."""
+    path = TransferPath(2.0, 0.3, (1.5**1.7,), (1.7,), 1.0)
+    device = Device(((path,),), ONE.drive_axes, ONE.response_axes, (0.0,))
+    made = problem(record(1, device=device, command=command, camera=0.1, noise_sd=0.0), terms=1)
+    return made, np.array([(LAG_VALUES | {"order_1": 1.7})[name] for name in made.posterior.table.names])
+
+
+@pytest.mark.parametrize(("effect", "psi"), [(CubicStiffness(), 0.5), (RiseFallAsymmetry(), 0.3)])
+def test_where_a_delayed_change_falls_within_a_block_moves_nothing(effect, psi):
+    """Against blocks eight times narrower the error is the same for every delay: a change of the drive that
+    falls within a block would move it to and fro."""
+    whole, values = fractional_plant(on_off(1.0, hold=9.0, at=0.35))
+    at, errors = whole.posterior.table.at("delay", 0), []
+    for part in (0.0, 0.25, 0.5, 0.75):
+        moved = values.copy()
+        moved[at] += 0.1 * part
+        models = [effected(one.posterior, values, [effect]) for one in (whole, whole.refined(8))]
+        coarse, fine = (model.responses(moved, np.array([psi]))[0][:, 0] for model in models)
+        errors.append(np.linalg.norm(coarse - fine))
+    assert np.ptp(errors) < 0.01 * max(errors)
+
+
+def test_a_force_that_turns_within_a_block_is_met_there():
+    """A switch is averaged over the block in which the response goes through 0, or turns: at the middle of
+    blocks alone each would count as a whole block or none."""
+    whole, values = fractional_plant(staircase([1.0, -1.0, 0.6], hold=4.0, start=0.35))
+    made = [
+        effected(whole.refined(k).posterior, values, [RiseFallAsymmetry()]).responses(values, np.array([0.5]))
+        for k in (1, 2, 4, 32)
+    ]
+    errors = [apart(one, made[-1]) for one in made[:-1]]
+    assert errors[1] < 0.15 * errors[0]
+    assert errors[2] < 0.06 * errors[0]
+
+
+def test_a_force_that_jumps_is_met_block_by_block():
+    """Newton's method fails where a force all but jumps with the direction; the balance still holds."""
+    n = 200
+    kernel = np.repeat(np.exp(-np.arange(n) / 3.0)[None] / 4.0, 2, axis=0)
+    f = np.array([2.0, -1.5])[:, None] * np.sin(np.arange(n) / 9.0)
+
+    def force(blocks, y, one, two):
+        return f[:, blocks] - y - 0.4 * np.tanh(1e5 * (y - one))
+
+    found, lost = balance.marched(kernel, force, np.ones((2, 1)), 2)
+    y = found[:, 0]
+    before = np.concatenate((np.zeros((2, 2)), y), axis=1)
+    v = force(slice(None), y, before[:, 1:-1], before[:, :-2])
+    again = np.array([np.convolve(k, own)[:n] for k, own in zip(kernel, v, strict=True)])
+    assert not lost.any()
+    assert_allclose(again, y, atol=1e-5)
+
+
+def test_a_sampled_drive_is_a_delay_that_coefficients_move():
+    """A drive that only lags, with a force: as commands, plant by plant, and as delays, all at once."""
+    whole, values = fractional_plant(staircase([1.0, -1.0, 0.6], hold=4.0, start=0.35))
+    kinds = [SampledDrive(), CubicStiffness()]
+    made = effected(whole.posterior, values, kinds)
+    psi = np.array([0.7, 0.4])
+    plants = [
+        made.plant(values * np.where(np.array(whole.posterior.table.names) == "gain", s, 1)) for s in (1, 1.2)
+    ]
+    together = made.simulator.moved_together([(plant, psi) for plant in plants])
+    for plant, moved in zip(plants, together, strict=True):
+        alone = made.simulator.moved(plant, psi)
+        assert_allclose(
+            moved[0].deflection, alone[0].deflection, atol=2e-5 * np.abs(alone[0].deflection).max()
+        )

@@ -19,7 +19,6 @@ from lcopa_bayes.data.settings import EffectsSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studywriter import write_study
 from lcopa_bayes.experiments.information import Bench, refit, with_effects
-from lcopa_bayes.identifiability import audit
 from lcopa_bayes.identifiability.curvature import sensitivities
 from lcopa_bayes.identifiability.profile import profile
 from lcopa_bayes.identifiability.symmetries import DIFFERENCED, structure
@@ -28,6 +27,7 @@ from lcopa_bayes.inference.likelihood import Landscape
 from lcopa_bayes.inference.nestedmodels import lifted
 from lcopa_bayes.inference.simulation import Simulation
 from lcopa_bayes.results.fit import plan_of
+from lcopa_bayes.results.nearby import surrogate_about
 from lcopa_bayes.sampling.weightedrun import weighted_run
 
 TRUTH = {
@@ -73,8 +73,9 @@ def test_profiles_by_a_surrogate_are_those_of_the_posterior(
     found = weighted_run(problem.posterior, plan_of(problem, quick=True), quick=True)
     assert found is not None
     draws, exact = found[1], Landscape(problem.posterior)
-    near = audit._near(exact, draws, np.random.default_rng(2), 1)
-    assert near is not None
+    surrogate = surrogate_about(problem.posterior, draws, np.random.default_rng(2))
+    assert surrogate is not None
+    near = Landscape.about(replace(problem.posterior, surrogate=surrogate), draws.flat)
     simulated, called = [], Simulation.__call__
     monkeypatch.setattr(Simulation, "__call__", lambda self, v: simulated.append(len(v)) or called(self, v))
     best = draws.flat[np.argmax(draws.log_density)]

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import TypeAlias, final
+from typing import TypeAlias
 
 import numpy as np
 from scipy import fft
-from scipy.linalg import toeplitz
-from scipy.linalg.lapack import dtrtrs
 
 from lcopa_bayes.core.arrays import Array, Flags, Index, Matrix
 
 Force: TypeAlias = Callable[[slice | Index, Matrix, Matrix, Matrix], Matrix]
 """(blocks, deviation of y, its values one and two blocks before) -> deviation of the force, each of
-(axes, blocks); blocks by their positions may come several times."""
+(rows, blocks); blocks by their positions may come several times."""
 
 TOLERANCE = 1e-12
 """Change of y in the last iteration over the largest y [-]."""
@@ -25,26 +22,14 @@ _DEPTH = 4
 """Earlier iterates that the acceleration combines (Anderson 1965, J. ACM 12)."""
 _LEVELS = 400
 """Most steps towards the level at rest [-]."""
-_DENSE = 128
-"""Longest stretch for a dense matrix [blocks]."""
+_STRETCH = 64
+"""Blocks that Newton's method solves at once [-]."""
 _NEWTON = 12
 _NUDGE = 1e-6
-_SINGULAR = 1e-3
-"""Below this a block's own feed-through leaves Newton's step undetermined [-]."""
-_LEAST = 2
-"""Stretches this short are iterated to the end."""
-_LONG_SWEEPS = 400
-_SHARES = (0.5, 0.2, 0.05)
-"""Steps of an iteration that would overshoot, over the distance to its target [-]."""
-
-
-@final
-class RunawayError(ArithmeticError):
-    """No bounded solution; carries the `block` where it was lost."""
-
-    def __init__(self, block: int) -> None:
-        self.block = block
-        super().__init__(f"the response runs away at block {block}")
+_JUMP = 1e-9
+"""Width of a bracket over the scale in which a force is taken to jump [-]."""
+_WIDENED, _HALVED = 60, 120
+"""Most steps towards a bracket of a root, and within it [-]."""
 
 
 def resting(force: Callable[[Matrix], Matrix], start: Matrix, scale: Matrix) -> tuple[Matrix, Flags]:
@@ -109,153 +94,127 @@ def _mixed(steps: Sequence[Matrix], points: Sequence[Matrix]) -> Matrix:
     return np.asarray(points[-1] - (weights.swapaxes(1, 2) @ apart)[:, 0])
 
 
-def balanced(kernel: Matrix, force: Force, scale: Matrix, guess: Matrix) -> Matrix:
-    """``y = kernel * force(y)``, causal convolution, (axes, n), where `iterated` fails on the whole.
+def marched(kernel: Matrix, force: Force, scale: Matrix, plants: int) -> tuple[Array, Flags]:
+    """``y = kernel * force(y)``, causal convolution, stretch by stretch where `iterated` fails on the whole:
+    (plants, axes, n), and which plants have no bounded solution, (plants,).
 
-    Parameters: kernel (axes, n), the impulse response in block means; scale (axes, 1), typical size of y;
-    guess (axes, n), y as far as an iteration got. The record is halved, the first half solved and its
-    convolution added to the second; stretches of up to 128 blocks are solved by Newton's method, or halved
-    further, down to two blocks, where the direct feed-through is small.
-    Raises RunawayError. Accuracy: 1e-12 of the scale per iteration.
+    Parameters: kernel (rows, n), the impulse response in block means, of every axis of every plant; scale
+    (rows, 1), typical size of y. A stretch is solved by Newton's method, for rows where that fails block by
+    block, each one equation. Accuracy: 1e-12 of the scale.
     """
-    y, v = np.zeros(kernel.shape), np.zeros(kernel.shape)
-    reach = min(kernel.shape[1], _DENSE)
-    operators = [np.asfortranarray(toeplitz(row[:reach], np.zeros(reach))) for row in kernel]
-    _Balance(kernel, operators, force, scale, guess, y, v).solve(0, kernel.shape[1], _DENSE)
-    return y
+    rows, n = kernel.shape
+    length, window = fft.next_fast_len(2 * n, real=True), min(n, _STRETCH)
+    spectrum = fft.rfft(kernel, length)
+    lags = np.subtract.outer(np.arange(window), np.arange(window))
+    operator = np.where(lags >= 0, kernel[:, np.maximum(lags, 0)], 0.0)
+    y, history, lost = np.zeros((rows, n + 2)), np.zeros((rows, n)), np.zeros(rows, dtype=bool)
+    for first in range(0, n, window):
+        own = slice(first, min(first + window, n))
+        size = own.stop - first
+        before, past = y[:, first : first + 2], history[:, own]
+        now, v, solved = _newton(operator[:, :size, :size], past, before, force, own, scale)
+        if not (solved | lost).all():
+            known = solved | lost
+            slow, pushed = _blockwise(operator[:, :size, :size], past, before, force, own, scale, known)
+            now, v = (np.where(solved[:, None], *pair) for pair in ((now, slow), (v, pushed)))
+        with np.errstate(invalid="ignore"):
+            lost |= ~(np.abs(now) < RUNAWAY * scale).all(axis=1)
+        y[:, first + 2 : own.stop + 2] = np.where(lost[:, None], 0.0, now)
+        product = spectrum * fft.rfft(np.where(lost[:, None], 0.0, v), length)
+        history[:, own.stop :] += fft.irfft(product, length)[:, size : n - first]
+    away: Flags = np.asarray(lost.reshape(plants, -1).any(axis=1))
+    return y[:, 2:].reshape(plants, -1, n), away
 
 
-@final
-@dataclass(frozen=True, eq=False)
-class _Balance:
-    """What is solved, and what of it is."""
+def _newton(
+    operator: Array, past: Matrix, before: Matrix, force: Force, own: slice, scale: Matrix
+) -> tuple[Matrix, Matrix, Flags]:
+    """``y = past + operator @ force(y)`` on a stretch, the force, both (rows, blocks), and what is solved,
+    (rows,). Slopes of the force, in y and in its two earlier values, are differences over 1e-6 of the scale.
+    """
+    rows, n = past.shape
+    nudge = _NUDGE * scale[..., None] * np.eye(4)[1:].T  # (rows, 4 variants, 3 arguments)
+    every = np.tile(np.arange(own.start, own.stop), 4)
+    y, solved = past, np.zeros(rows, dtype=bool)
+    out, pushed = past.copy(), np.zeros(past.shape)
+    for _ in range(_NEWTON):
+        with np.errstate(over="ignore", invalid="ignore"):
+            values = (y, *earlier(before, y))
+            varied = [(v[:, None] + nudge[:, :, k, None]).reshape(rows, -1) for k, v in enumerate(values)]
+            forces = force(every, *varied).reshape(rows, 4, n)
+            slopes = (forces[:, 1:] - forces[:, :1]) / (_NUDGE * scale[..., None])
+            residual = past - y + (operator @ forces[:, 0, :, None])[..., 0]
+            done = np.abs(residual / scale).max(axis=1) < TOLERANCE
+        new = done & ~solved
+        out[new], pushed[new] = (y + residual)[new], forces[new, 0]
+        solved |= done
+        usable = np.isfinite(slopes).all(axis=(1, 2)) & np.isfinite(residual).all(axis=1)
+        if solved.all() or not (usable & ~solved).any():
+            break
+        matrix = np.eye(n) - operator * slopes[:, :1]
+        for back in (1, 2):
+            matrix[:, :, :-back] -= operator[:, :, back:] * slopes[:, back, None, back:]
+        matrix[~usable], residual[~usable] = np.eye(n), 0.0
+        try:
+            y = y + np.linalg.solve(matrix, residual[..., None])[..., 0]
+        except np.linalg.LinAlgError:
+            break
+    return out, pushed, solved
 
-    kernel: Matrix
-    operators: list[Matrix]
-    """Convolution with each row of the kernel, over the longest dense stretch; its leading part over less."""
-    force: Force
-    scale: Matrix
-    """(axes, 1)."""
-    guess: Matrix
-    y: Matrix
-    v: Matrix
 
-    def solve(self, a: int, b: int, limit: int) -> int:
-        """Solve blocks a to b in place; `y` holds there what earlier forces leave, on return the response.
+def _blockwise(
+    operator: Array, past: Matrix, before: Matrix, force: Force, own: slice, scale: Matrix, known: Flags
+) -> tuple[Matrix, Matrix]:
+    """The same block by block, by regula falsi (Dowell and Jarratt 1971, BIT 11) with bisections between: a
+    force that all but jumps is met at the jump."""
+    y, v = np.concatenate((before, past), axis=1), np.zeros(past.shape)
+    for k in range(past.shape[1]):
+        before_it = past[:, k, None] + np.vecdot(operator[:, k, :k], v[:, :k])[:, None]
+        one, two, place = y[:, k + 1, None], y[:, k, None], slice(own.start + k, own.start + k + 1)
 
-        A stretch longer than `limit` is halved untried. Returns the limit that experience suggests.
-        """
-        n = b - a
-        if n <= max(limit, _LEAST):
-            history = self.y[:, a:b].copy()
-            before = np.concatenate((np.zeros((len(history), 2)), self.y[:, max(a - 2, 0) : a]), axis=1)[
-                :, -2:
-            ]
-            problem = history, before, slice(a, b)
-            if n > _LEAST:
-                solution = self._newton(*problem, self.guess[:, a:b])
-                solution = self._newton(*problem, history) if solution is None else solution
-            else:
-                solution = self._iterated(*problem)
-            if solution is not None:
-                self.y[:, a:b], self.v[:, a:b] = solution
-                return min(_DENSE, max(limit, 2 * n))
-            if n <= _LEAST:
-                raise RunawayError(a)
-            limit = n // 2
-        middle = (a + b) // 2
-        limit = self.solve(a, middle, limit)
-        self.y[:, middle:b] += convolved(self.kernel[:, :n], self.v[:, a:middle])[:, middle - a :]
-        return self.solve(middle, b, limit)
-
-    def _newton(
-        self, history: Matrix, before: Matrix, blocks: slice, start: Matrix
-    ) -> tuple[Matrix, Matrix] | None:
-        """Fixed point ``y = history + kernel * force(y)`` with its force, by Newton's method from `start`.
-
-        Slopes of the force, in y and in its two earlier values, are differences over 1e-6 of the scale; that
-        of one axis in another is for the iteration.
-        """
-        axes, n = history.shape
-        scale, operators = self.scale, self.operators
-        nudge = _NUDGE * scale[..., None] * np.eye(4)[1:].T  # (axes, 4 variants, 3 arguments)
-        every = np.tile(np.arange(blocks.start, blocks.stop), 4)
-        diagonal = np.arange(n)
-        y = start
-        for _ in range(_NEWTON):
+        def excess(
+            at: Matrix, place: slice = place, one: Matrix = one, two: Matrix = two, past: Matrix = before_it
+        ) -> Matrix:
             with np.errstate(over="ignore", invalid="ignore"):
-                one, two = earlier(before, y)
-                varied = [
-                    (value[:, None, :] + nudge[:, :, k, None]).reshape(axes, -1)
-                    for k, value in enumerate((y, one, two))
-                ]
-                forces = self.force(every, *varied).reshape(axes, 4, n)
-                v = forces[:, 0]
-                slopes = (forces[:, 1:] - forces[:, :1]) / (_NUDGE * scale[..., None])
-                residual = history - y
-                for i, operator in enumerate(operators):
-                    residual[i] += operator[:n, :n] @ v[i]
-            size = float(np.abs(residual / scale).max())
-            if not (size < RUNAWAY and np.isfinite(slopes.sum())):  # NaN too
-                return None
-            if size < TOLERANCE:
-                return y + residual, v
-            step = np.empty_like(y)
-            for i, operator in enumerate(operators):
-                matrix = operator[:n, :n] * -slopes[i, 0]
-                for back in (1, 2):
-                    if slopes[i, back].any():
-                        matrix[:, : n - back] -= operator[:n, back:n] * slopes[i, back, back:]
-                matrix[diagonal, diagonal] += 1.0
-                if not np.all(np.abs(matrix[diagonal, diagonal]) > _SINGULAR):
-                    return None
-                step[i] = dtrtrs(matrix, residual[i], lower=1)[0]
-            y = y + step
-        return None
+                return np.asarray(at - past - operator[:, :1, 0] * force(place, at, one, two))
 
-    def _iterated(self, history: Matrix, before: Matrix, blocks: slice) -> tuple[Matrix, Matrix] | None:
-        """The same for a few blocks by iteration, where the force turns too steeply for that by shorter
-        steps."""
-        kernel = self.kernel[:, : history.shape[1]]
+        now = _root(excess, 2 * one - two, scale, known[:, None])
+        y[:, k + 2, None] = np.where(np.isfinite(now), now, RUNAWAY * scale)
+        v[:, k, None] = force(place, y[:, k + 2, None], one, two)
+    return y[:, 2:], v
 
-        def force(y: Matrix) -> Matrix:
-            return self.force(blocks, y, *earlier(before, y))
 
-        def swept(plants: Index, y: Array) -> Array:
-            return (history + convolved(kernel, force(y[0])))[None]
-
-        found, solved = iterated(swept, history[None], self.scale[None], _LONG_SWEEPS)
-        if solved[0]:
-            return found[0], force(found[0])
-        for share in _SHARES:
-            y = history
-            for _ in range(_LONG_SWEEPS):
-                with np.errstate(over="ignore", invalid="ignore"):
-                    v = force(y)
-                    target = history + convolved(kernel, v)
-                    size = float(np.abs((target - y) / self.scale).max())
-                if not size < RUNAWAY:  # NaN too
-                    break
-                if size < TOLERANCE:
-                    return target, v
-                y = y + share * (target - y)
-        return None
+def _root(excess: Callable[[Matrix], Matrix], start: Matrix, scale: Matrix, known: Flags) -> Matrix:
+    """Where an excess that rises in the end is 0, (rows, 1); NaN where it is so nowhere near, or not asked
+    for because it is known, (rows, 1)."""
+    a, low = start, excess(start)
+    step = -low
+    b, high = a + step, excess(a + step)
+    for _ in range(_WIDENED):
+        outside = (np.sign(high) == np.sign(low)) & (np.abs(b) < RUNAWAY * scale) & ~known
+        if not outside.any():
+            break
+        step = np.where(outside, 2.0 * step, step)
+        a, low = np.where(outside, b, a), np.where(outside, high, low)
+        b = np.where(outside, b + step, b)
+        high = np.where(outside, excess(b), high)
+    found, done = np.where(low == 0.0, a, np.nan), ~(np.sign(high) * np.sign(low) < 0) | known
+    for count in range(_HALVED):
+        if done.all():
+            break
+        with np.errstate(divide="ignore", invalid="ignore"):
+            c = (a * high - b * low) / (high - low)
+        c = np.where(np.isfinite(c) & (count % 3 < 2), c, 0.5 * (a + b))
+        value = excess(c)
+        found = np.where(done, found, c)
+        beyond = np.sign(value) == np.sign(high)
+        a, b = np.where(beyond, a, c), np.where(beyond, c, b)
+        low, high = np.where(beyond, 0.5 * low, value), np.where(beyond, value, 0.5 * high)
+        done |= np.isnan(value) | (np.abs(value) <= TOLERANCE * scale) | (np.abs(b - a) <= _JUMP * scale)
+    return found
 
 
 def earlier(before: Matrix, y: Matrix) -> tuple[Matrix, Matrix]:
     """Values one and two blocks before those of `y`, from the two blocks before its first."""
     joined = np.concatenate((before, y), axis=1)
     return joined[:, 1:-1], joined[:, :-2]
-
-
-def convolved(kernel: Matrix, v: Matrix) -> Matrix:
-    """Causal convolution along the last axis, as long as the kernel."""
-    n, m = kernel.shape[1], v.shape[1]
-    if n <= 32:
-        out = np.zeros(kernel.shape)
-        for k in range(m):
-            out[:, k:] += v[:, k : k + 1] * kernel[:, : n - k]
-        return out
-    length = fft.next_fast_len(n + m - 1, real=True)
-    product = fft.rfft(kernel, length) * fft.rfft(v, length)
-    return np.asarray(fft.irfft(product, length)[:, :n])

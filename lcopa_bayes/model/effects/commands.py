@@ -8,7 +8,7 @@ from typing import ClassVar, Self, final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.arrays import Array, Vector
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.effects.effect import Card, Constant, DriveEffect, Ranges, Scene, single
 
@@ -243,8 +243,14 @@ class SampledDrive(DriveEffect):
         linear=True,
     )
 
+    lags = True
+
+    def lag(self, ranges: Ranges, psi: Array) -> Array:
+        """Half a period earlier where w is 1."""
+        return np.asarray(-0.5 * psi[0] * ranges.period)
+
     def commands(
         self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
     ) -> tuple[AxisDrive, float]:
         """All changes by the same time."""
-        return _shifted(drive, float(-0.5 * psi[0] * scene.ranges.period)), rest
+        return _shifted(drive, float(self.lag(scene.ranges, psi))), rest

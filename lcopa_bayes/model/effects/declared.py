@@ -78,15 +78,19 @@ class Declared:
 
     @property
     def forced(self) -> bool:
-        """Whether all that acts before the reading are forces that take many plants at once."""
-        acting = [kind for kind in self.kinds if issubclass(kind, (DriveEffect, ElementEffect, SensorEffect))]
+        """Whether all that acts before the reading are forces that take many plants at once, and lags."""
+        acting = any(issubclass(kind, (ElementEffect, SensorEffect)) for kind in self.kinds)
         forces = [kind for kind in self.kinds if issubclass(kind, ForceEffect)]
-        return bool(forces) and not acting and all(k.batched and not k.card.per_record for k in forces)
+        return (
+            bool(forces)
+            and not (acting or self.commanding)
+            and all(k.batched and not k.card.per_record for k in forces)
+        )
 
     @property
     def commanding(self) -> bool:
-        """Whether something changes the commands."""
-        return any(issubclass(kind, DriveEffect) for kind in self.kinds)
+        """Whether something changes the commands, and not only when they act."""
+        return any(issubclass(kind, DriveEffect) and not kind.lags for kind in self.kinds)
 
     @property
     def per_record(self) -> bool:

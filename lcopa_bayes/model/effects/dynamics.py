@@ -12,6 +12,7 @@ from lcopa_bayes.model.effects.effect import (
     Card,
     ElementEffect,
     ForceEffect,
+    Motion,
     Ranges,
     Scene,
     single,
@@ -36,9 +37,9 @@ class CubicStiffness(ForceEffect):
         mistaken_for="gain, time constants",
     )
 
-    def force(self, f: Matrix, y: Matrix, rate: Matrix, scene: Scene, psi: Vector) -> Matrix:
+    def force(self, f: Matrix, motion: Motion, scene: Scene, psi: Vector) -> Matrix:
         """Pointwise."""
-        return np.asarray(f - psi[0] * y * (y / scene.ranges.column) ** 2)
+        return np.asarray(f - psi[0] * motion.y * (motion.y / scene.ranges.column) ** 2)
 
 
 @final
@@ -56,11 +57,17 @@ class RiseFallAsymmetry(ForceEffect):
         mistaken_for="time constants and orders when every step is an on-step; exactly so without a fall",
     )
 
-    def force(self, f: Matrix, y: Matrix, rate: Matrix, scene: Scene, psi: Vector) -> Matrix:
-        """The viscous part of the force so far is ``f - y``."""
+    def force(self, f: Matrix, motion: Motion, scene: Scene, psi: Vector) -> Matrix:
+        """The viscous part of the force so far is ``f - y``.
+
+        The switch, ``x / sqrt(1 + x^2)`` of ``x = y rate / width``, is averaged over a block, along which x
+        moves evenly: taken at the middle alone, a turn would count as a whole block or none.
+        """
         width = _SHARP * scene.ranges.column**2 / scene.ranges.speed
-        falling = 0.5 * (1.0 - np.tanh(y * rate / width))
-        return np.asarray(y + (f - y) / (1.0 + psi[0] * falling))
+        (y, rate), (late, faster) = motion.ends(scene.grid.step)
+        one, two = y * rate / width, late * faster / width
+        rising = (one + two) / (np.sqrt(1.0 + one**2) + np.sqrt(1.0 + two**2))
+        return np.asarray(f - (f - motion.y) * (0.5 - 0.5 * rising) * psi[0] / (1.0 + psi[0]))
 
 
 @final
@@ -78,8 +85,9 @@ class LevelDependentSpeed(ForceEffect):
         mistaken_for="time constants and orders",
     )
 
-    def force(self, f: Matrix, y: Matrix, rate: Matrix, scene: Scene, psi: Vector) -> Matrix:
+    def force(self, f: Matrix, motion: Motion, scene: Scene, psi: Vector) -> Matrix:
         """The viscous part of the force so far is ``f - y``."""
+        y = motion.y
         return np.asarray(y + (f - y) / (1.0 + psi[0] * (1.0 - 2.0 * np.abs(y) / scene.ranges.column)))
 
 
@@ -107,8 +115,9 @@ class Overflow(ForceEffect):
         """From half the range to near its end."""
         return tuple(cls(level) for level in (0.5, 0.7, 0.8, 0.9, 0.95))
 
-    def force(self, f: Matrix, y: Matrix, rate: Matrix, scene: Scene, psi: Vector) -> Matrix:
+    def force(self, f: Matrix, motion: Motion, scene: Scene, psi: Vector) -> Matrix:
         """Pointwise."""
+        y = motion.y
         part = np.abs(y) / scene.ranges.column
         loss = 2.0 * y / (1.0 + np.sqrt(1.0 + 2.0 * psi[0] * part))
         beyond = scene.ranges.column * np.maximum(part - self.level, 0.0) * np.sign(y)

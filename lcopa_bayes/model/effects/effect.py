@@ -16,9 +16,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, Self, final
+from typing import Any, ClassVar, Literal, NamedTuple, Self, final
 
-from lcopa_bayes.core.arrays import Index, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.grid import Grid
 from lcopa_bayes.model.layout import Layout
@@ -228,6 +228,13 @@ class Effect(ABC):
 class DriveEffect(Effect):
     """Changes the commands of one drive axis."""
 
+    lags: ClassVar[bool] = False
+    """Whether all it does is to make every change act later by the same time, `lag`."""
+
+    def lag(self, ranges: Ranges, psi: Array) -> Array:
+        """That time [time unit], of coefficients (coefficients, ...)."""
+        raise NotImplementedError(f"{self.name} does more than delay its commands")
+
     @abstractmethod
     def commands(
         self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
@@ -243,6 +250,25 @@ class ElementEffect(Effect):
         """Factor on all time constants [-]."""
 
 
+@final
+class Motion(NamedTuple):
+    """Deflection of the direct paths on blocks, each (axes, blocks)."""
+
+    y: Matrix
+    """Block means [response unit]."""
+    rate: Matrix
+    """Derivative [response unit per time unit]."""
+    bend: Matrix
+    """Second derivative [response unit per time unit squared]."""
+
+    def ends(self, step: float) -> tuple[tuple[Matrix, Matrix], tuple[Matrix, Matrix]]:
+        """Deflection and derivative where each block, of width `step` [time unit], begins and ends."""
+        half = 0.5 * step
+        moved, turned = half * self.rate, half * self.bend
+        middle = self.y + 0.5 * half * turned
+        return (middle - moved, self.rate - turned), (middle + moved, self.rate + turned)
+
+
 class ForceEffect(Effect):
     """Changes the balance of forces in the direct paths: ``y + viscous(y) = v(f, y)`` instead of ``= f``."""
 
@@ -252,11 +278,11 @@ class ForceEffect(Effect):
     column of `Ranges` then have a value per row, (rows, 1), and no axis sees another."""
 
     @abstractmethod
-    def force(self, f: Matrix, y: Matrix, rate: Matrix, scene: Scene, psi: Vector) -> Matrix:
+    def force(self, f: Matrix, motion: Motion, scene: Scene, psi: Vector) -> Matrix:
         """Effective force v on each direct path, (axes, blocks) [response unit].
 
-        Parameters: f, the force so far (gain times delayed drive); y, deflection of the direct path;
-        rate, its derivative [response unit per time unit]; all (axes, blocks). Pointwise in time.
+        Parameters: f, the force so far (gain times delayed drive), (axes, blocks); motion of the direct
+        path. Pointwise in time.
         """
 
 

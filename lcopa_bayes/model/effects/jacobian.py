@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import TypeAlias
 
@@ -18,17 +18,6 @@ COEFFICIENT_STEP = 1e-3
 """Step of a coefficient, in prior standard deviations [-]."""
 
 
-def difference(
-    at: Callable[[float], list[Matrix]], step: float, *, upward: bool, here: list[Matrix] | None = None
-) -> list[Matrix]:
-    """Derivative of ``at(0)`` per unit, per record: second order, central or to one side."""
-    if upward:
-        base = at(0.0) if here is None else here
-        triples = zip(base, at(step), at(2 * step), strict=True)
-        return [(-3 * a + 4 * b - c) / (2 * step) for a, b, c in triples]
-    return [(a - b) / (2 * step) for a, b in zip(at(step), at(-step), strict=True)]
-
-
 def coefficient_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[Matrix]:
     """Derivative of the responses in psi, per record (samples, axes, coefficients) [response unit / unit].
 
@@ -37,30 +26,39 @@ def coefficient_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[
     for what other effects bend, where the effect is `linear`. Coefficients of one record are moved in all
     records at once: records do not see each other's.
     """
-    records = len(simulator.model.experiments)
-    here = simulator.finished(simulator.moved(plant, psi), psi)
-    out = [np.zeros((*y.shape, simulator.size)) for y in here]
-    first = 0
+    records, first = len(simulator.model.experiments), 0
+    cases, parts = [psi], list[tuple[Index, bool, Vector, slice]]()
     for effect in simulator.effects:
         coefficients = effect.coefficients(simulator.ranges)
+        repeats = records if effect.card.per_record else 1
         for k, coefficient in enumerate(coefficients):
-            repeats = records if effect.card.per_record else 1
             columns = first + k + len(coefficients) * np.arange(repeats)
             step = COEFFICIENT_STEP * coefficient.scale
-
-            def at(change: float, columns: Index = columns) -> list[Matrix]:
+            steps, weights = np.array([step]), np.array([-1.0, 1.0])
+            if not effect.linear and coefficient.one_signed and psi[columns].min() < step:
+                steps, weights = np.array([step, 2 * step]), np.array([-1.5, 2.0, -0.5])
+            elif not effect.linear:
+                steps, weights = np.array([step, -step]), np.array([0.0, 0.5, -0.5])
+            parts.append(
+                (
+                    columns,
+                    effect.card.per_record,
+                    weights / step,
+                    slice(len(cases), len(cases) + steps.size),
+                )
+            )
+            for each in steps:
                 moved = psi.copy()
-                moved[columns] += change
-                return simulator.finished(simulator.moved(plant, moved), moved)
-
-            if effect.linear:
-                slopes = [(b - a) / step for a, b in zip(here, at(step), strict=True)]
-            else:
-                upward = coefficient.one_signed and bool(psi[columns].min() < step)
-                slopes = difference(at, step, upward=upward, here=here)
-            for r, slope in enumerate(slopes):
-                out[r][..., columns[r if effect.card.per_record else 0]] = slope
-        first += len(coefficients) * (records if effect.card.per_record else 1)
+                moved[columns] += each
+                cases.append(moved)
+        first += len(coefficients) * repeats
+    moved_all = simulator.moved_together([(plant, each) for each in cases])
+    read = [simulator.finished(moved, each) for moved, each in zip(moved_all, cases, strict=True)]
+    out = [np.zeros((*y.shape, simulator.size)) for y in read[0]]
+    for columns, per_record, weights, place in parts:
+        for r, there in enumerate(zip(read[0], *read[place], strict=True)):
+            slope = sum(w * y for w, y in zip(weights, there, strict=True))
+            out[r][..., columns[r if per_record else 0]] = slope
     return out
 
 
@@ -82,13 +80,10 @@ def plant_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[dict[N
         return _linear_slopes(simulator, plant, psi)
     numbers = list(_numbers(simulator, plant))
     others = [_shifted(plant, number, step) for number, step in numbers]
-    base = simulator.moved(plant, psi)
-    here = simulator.finished(base, psi)
-    out: list[dict[Number, Matrix]] = [{} for _ in here]
     if simulator.bends(psi):
-        moved = simulator.moved_together(others, psi)
+        base, *moved = simulator.moved_together([(each, psi) for each in (plant, *others)])
     else:
-        exact = _linear_slopes(simulator, plant, psi)
+        base, exact = simulator.moved(plant, psi), _linear_slopes(simulator, plant, psi)
         delayed = any(isinstance(effect, DriveEffect) for effect in simulator.effects)  # commands may use it
         moved = [
             simulator.moved(other, psi)
@@ -99,6 +94,8 @@ def plant_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[dict[N
             ]
             for (number, step), other in zip(numbers, others, strict=True)
         ]
+    here = simulator.finished(base, psi)
+    out: list[dict[Number, Matrix]] = [{} for _ in here]
     for (number, step), each in zip(numbers, moved, strict=True):
         for r, there in enumerate(simulator.finished(each, psi)):
             out[r][number] = (there - here[r]) / step

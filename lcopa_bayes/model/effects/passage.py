@@ -11,17 +11,19 @@ import numpy as np
 from scipy import fft
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
-from lcopa_bayes.model.blockpulses import Spectrum
-from lcopa_bayes.model.effects.balance import RunawayError, balanced, earlier, iterated, resting
+from lcopa_bayes.model.blockpulses import Circle
+from lcopa_bayes.model.effects.balance import earlier, iterated, marched, resting
 from lcopa_bayes.model.effects.effect import (
     Effect,
     ElementEffect,
     ForceEffect,
+    Motion,
     Scene,
     SensorEffect,
     UnstableError,
 )
 from lcopa_bayes.model.forward import Dynamics, Experiment, ForwardModel, StepResponses, deflections
+from lcopa_bayes.model.grid import CUBIC
 from lcopa_bayes.model.layout import Layout
 from lcopa_bayes.model.stepresponse import transfer
 
@@ -30,10 +32,11 @@ Acting: TypeAlias = Sequence[tuple[Effect, Vector]]
 Forces: TypeAlias = Sequence[tuple[ForceEffect, Array]]
 """Forces with their coefficients: (coefficients,) of one plant, or (coefficients, plants times axes, 1), the
 constants that differ likewise."""
-Spectra: TypeAlias = dict[tuple[int, int, float, float], Spectrum]
-"""By element, number and width of the blocks, and the factor on time constants."""
-_SWEEPS = 100
-"""Most sweeps of the iteration [-]: what they do not bring to rest is solved by dividing the record."""
+Kernels: TypeAlias = dict[tuple[int, float, float], Matrix]
+"""Responses to an impulse by element, width of the blocks, and the factor on time constants."""
+_SWEEPS = 50
+"""Most sweeps of the iteration [-]: what they do not bring to rest is solved block by block."""
+RUNS_AWAY = "the response runs away"
 
 
 @final
@@ -85,11 +88,11 @@ def forced(
 ) -> Iterator[tuple[Array, dict[int, str]]]:
     """Of every record, deflections of many plants under forces, (axes, batch, samples) [response unit], and
     why some of the plants, by number, have no bounded response."""
-    spectra: Spectra = {}
+    kernels: Kernels = {}
     for experiment, scene, units in zip(
         model.experiments, scenes, model.unit_responses(dynamics), strict=True
     ):
-        passage = Passage(model.layout, experiment, scene, gains, dynamics, forces, spectra)
+        passage = Passage(model.layout, experiment, scene, gains, dynamics, forces, kernels)
         change, failures = passage.change()
         yield deflections(model.layout, scene.rest, gains, units) + change, failures
 
@@ -98,7 +101,7 @@ def passed(
     model: ForwardModel, scenes: Sequence[Scene], plant: Plant, acting: Sequence[Acting]
 ) -> list[Moved]:
     """Every record with effects on elements, forces and sensors; raises UnstableError."""
-    spectra: Spectra = {}
+    kernels: Kernels = {}
     out = []
     for experiment, scene, own, without in zip(
         model.experiments, scenes, acting, linear(model, scenes, plant), strict=True
@@ -113,7 +116,7 @@ def passed(
                 plant.gains[None],
                 plant.dynamics,
                 [(e, psi) for e, psi in own if isinstance(e, ForceEffect)],
-                spectra,
+                kernels,
                 stretch,
                 [(e, psi) for e, psi in own if isinstance(e, SensorEffect)],
             )
@@ -129,8 +132,8 @@ def passed(
 class Passage:
     """One record through one plant or many, with what acts between commands and reading.
 
-    Effects are simulated on blocks at fixed times, which misread the kink at an onset. So only the change
-    they make there is taken: it is added to the response of the linear plants.
+    Effects are simulated on blocks, which misread the kink at an onset. So only the change they make there is
+    taken: it is added to the response of the linear plants.
     """
 
     layout: Layout
@@ -141,8 +144,8 @@ class Passage:
     """(batch, responses, drives) [response unit per drive unit]."""
     dynamics: Dynamics
     forces: Forces
-    spectra: Spectra
-    """Of elements, (batch, points), shared by the records of these plants."""
+    kernels: Kernels
+    """Of elements, (batch, blocks), shared by the records of these plants."""
     stretch: float = 1.0
     """Factor on all time constants [-]."""
     filters: Sequence[tuple[SensorEffect, Vector]] = ()
@@ -151,88 +154,135 @@ class Passage:
     def change(self) -> tuple[Array, dict[int, str]]:
         """What effects add to the deflections at the samples, (axes, batch, samples) [response unit], and why
         some plants, by number, have no bounded response."""
-        ranges, batch, n = self.scene.ranges, len(self.gains), self.experiment.mesh.grid.n
-        linear, moved = np.zeros((ranges.axes, batch, n)), np.zeros((ranges.axes, batch, n))
-        for i, row in enumerate(self.layout.unit_of):
-            for j, unit in enumerate(row):
-                gain = self.gains[:, i, j, None]
-                linear[i] += gain * self._unit(unit, 1.0)
-                if not (self.forces and j == ranges.direct[i]):
-                    moved[i] += gain * self._unit(unit, self.stretch)
-        at_rest, failures = np.zeros((ranges.axes, batch)), dict[int, str]()
+        axes, batch, n = self.scene.ranges.axes, len(self.gains), self.experiment.mesh.grid.n
+        added, at_rest, failures = np.zeros((axes, batch, n)), np.zeros((axes, batch)), dict[int, str]()
         if self.forces:
-            at_rest, bent, failures = self._balanced()
-            moved += bent
-        for effect, psi in self.filters:
-            moved = np.stack([effect.filtered(moved[:, b], self.scene, psi) for b in range(batch)], axis=1)
-        read = self.experiment.mesh.reading((moved - linear).reshape(-1, n))
-        out = read.reshape(ranges.axes, batch, -1) + at_rest[..., None]
+            at_rest, added, failures = self._balanced()
+        if self.filters or self.stretch != 1.0:
+            linear, moved = self._linear(1.0), self._linear(self.stretch) + added
+            for effect, psi in self.filters:
+                moved = np.stack(
+                    [effect.filtered(moved[:, b], self.scene, psi) for b in range(batch)], axis=1
+                )
+            added = moved - linear
+        read = self.experiment.mesh.reading(added.reshape(-1, n))
+        out = read.reshape(axes, batch, -1) + at_rest[..., None]
         for b in np.flatnonzero(~np.isfinite(out).all(axis=(0, 2))).tolist():
             failures.setdefault(b, "the response is not finite")
         return out, failures
 
-    def _spectrum(self, element: int, stretch: float) -> Spectrum:
-        grid = self.experiment.mesh.grid
-        key = (element, grid.n, grid.step, stretch)
-        if key not in self.spectra:
+    def _kernel(self, element: int, n: int) -> Matrix:
+        """The first n block means of an element's response to an impulse, (batch, n)."""
+        step = self.experiment.mesh.grid.step
+        key = (element, step, self.stretch)
+        if key not in self.kernels or self.kernels[key].shape[1] < n:
             times, orders = self.dynamics.times[element], self.dynamics.orders[element]
-            self.spectra[key] = transfer(stretch * times, orders, self.experiment.circle, grid.step)
-        return self.spectra[key]
+            circle = Circle(n)
+            spectrum = transfer(self.stretch * times, orders, circle, step)
+            self.kernels[key] = circle.coefficients(spectrum)
+        return self.kernels[key][:, :n]
 
-    def _means(self, unit: int) -> Matrix:
-        """Block means of the delayed drive of a unit, (batch, blocks) [drive unit]."""
-        _, delay, axis = self.layout.units[unit]
-        late = self.dynamics.delays[:, delay]
-        return self.scene.drives[axis].block_means(self.experiment.edges, late)[0]
-
-    def _unit(self, unit: int, stretch: float) -> Array:
-        """Block means of a unit response with all time constants times `stretch`, (batch, blocks)."""
-        element, _, axis = self.layout.units[unit]
-        if not self.scene.drives[axis].moves:
-            return np.zeros((len(self.gains), self.experiment.mesh.grid.n))
-        circle = self.experiment.circle
-        return circle.coefficients(self._spectrum(element, stretch) * circle.spectrum(self._means(unit)))
+    def _linear(self, stretch: float) -> Array:
+        """Block means of the deflections of the plants alone from rest, with all time constants times
+        `stretch`, (axes, batch, blocks)."""
+        out = np.zeros((self.scene.ranges.axes, len(self.gains), self.experiment.mesh.grid.n))
+        circle, step = self.experiment.circle, self.experiment.mesh.grid.step
+        for i, row in enumerate(self.layout.unit_of):
+            for j, unit in enumerate(row):
+                element, delay, axis = self.layout.units[unit]
+                if not self.scene.drives[axis].moves:
+                    continue
+                late = self.dynamics.delays[:, delay]
+                means = self.scene.drives[axis].block_means(self.experiment.edges, late)[0]
+                times, orders = self.dynamics.times[element], self.dynamics.orders[element]
+                spectrum = transfer(stretch * times, orders, circle, step) * circle.spectrum(means)
+                out[i] += self.gains[:, i, j, None] * circle.coefficients(spectrum)
+        return out
 
     def _balanced(self) -> tuple[Matrix, Array, dict[int, str]]:
-        """What forces add to the level of the direct paths at rest, (axes, batch), deflection of these paths
-        from that level, (axes, batch, blocks), and why some plants have none."""
-        ranges, batch, n = self.scene.ranges, len(self.gains), self.experiment.mesh.grid.n
+        """What forces add to the level of the direct paths at rest, (axes, batch), and to their deflection
+        from it, (axes, batch, blocks), and why some plants have none.
+
+        On blocks that begin at the delayed first change of the drive: on others a change falls within a
+        block, and where it falls there moves the response by the square of a block's width, to and fro with
+        the delay. Where no axis sees another each has its own blocks.
+        """
+        ranges, batch, grid = self.scene.ranges, len(self.gains), self.experiment.mesh.grid
         direct = list(enumerate(ranges.direct.tolist()))
         gains = np.stack([self.gains[:, i, j] for i, j in direct], axis=1)
         rest = gains * self.scene.rest[ranges.direct]
-        means = np.stack([self._means(self.layout.unit_of[i][j]) for i, j in direct], axis=1)
-        spectra = [self._spectrum(self.layout.element_of[i][j], self.stretch) for i, j in direct]
-        kernel = np.stack([self.experiment.circle.coefficients(one) for one in spectra], axis=1)
-        f0 = rest.reshape(-1, 1)
+        drives = [self.scene.drives[j] for _, j in direct]
+        late = self.dynamics.delays[:, [self.layout.delay_of[i][j] for i, j in direct]]
+        starts = np.array([drive.times[0] if drive.moves else np.inf for drive in drives])
+        apart = all(effect.batched for effect, _ in self.forces)
+        begin = late if apart else np.repeat(late[:, :1], len(direct), axis=1)
+        starts = np.where(np.isfinite(starts) & apart, starts, min(starts.min(), grid.edges[-1]))
+        place = (grid.start - begin - starts) / grid.step
+        n = max(grid.n + int(np.floor(place.max())) + 3, 3)
+        means = np.stack(
+            [
+                drive.block_means(start + grid.step * np.arange(n + 1), np.unique(beyond))[0]
+                if (beyond == beyond[0]).all()
+                else drive.block_means(start + grid.step * np.arange(n + 1), beyond)[0]
+                for drive, start, beyond in zip(drives, starts, (late - begin).T, strict=True)
+            ],
+            axis=1,
+        )
+        kernel = np.stack([self._kernel(self.layout.element_of[i][j], n) for i, j in direct], axis=1)
+        f0, f = rest.reshape(-1, 1), gains[..., None] * means
         problem = _Forced(
             self.forces,
             replace(self.scene, ranges=replace(ranges, response=np.tile(ranges.response, batch))),
-            f0 + (gains[..., None] * means).reshape(len(f0), -1),
-            self.experiment.mesh.grid.step,
+            f0 + f.reshape(len(f0), -1),
+            grid.step,
         )
         every, scale = np.arange(len(f0)), problem.scene.ranges.column
-        level, settled = resting(lambda y: problem.acting(every, f0, y, np.zeros_like(y)), f0, scale)
-        places = every.reshape(batch, ranges.axes)
+        still = np.zeros_like(f0)
+        level, settled = resting(lambda y: problem.acting(every, f0, Motion(y, still, still)), f0, scale)
+        places = every.reshape(-1, 1 if apart else ranges.axes)
         length = fft.next_fast_len(2 * n - 1, real=True)
-        spectrum, before = fft.rfft(kernel, length), np.zeros((len(f0), 2))
+        before = np.zeros((len(f0), 2))
+        alone = fft.irfft(fft.rfft(kernel, length) * fft.rfft(f, length), length)[..., :n]
+        alone = alone.reshape(-1, n)
+        spectrum = fft.rfft(kernel, length).reshape(*places.shape, -1)
 
         def swept(plants: Index, y: Array) -> Array:
             rows, flat = places[plants].ravel(), y.reshape(-1, n)
             v = problem.deviation(level, rows, slice(None), flat, *earlier(before[rows], flat))
-            chosen = spectrum if plants.size == batch else spectrum[plants]
+            chosen = spectrum if plants.size == len(places) else spectrum[plants]
             return np.asarray(fft.irfft(chosen * fft.rfft(v.reshape(y.shape), length), length)[..., :n])
 
-        y, solved = iterated(swept, np.zeros(kernel.shape), scale.reshape(batch, -1, 1), _SWEEPS)
-        failures: dict[int, str] = {}
-        for b in np.flatnonzero(~solved).tolist():
-            try:
-                if not settled[places[b]].all():
-                    raise RunawayError(0)
-                force = partial(problem.deviation, level, places[b])
-                y[b] = balanced(kernel[b], force, scale[places[b]], y[b])
-            except RunawayError as error:
-                failures[b] = str(error)
-        return (level.reshape(rest.shape) - rest).T, np.moveaxis(y, 1, 0), failures
+        scales, start = scale.reshape(*places.shape, 1), alone.reshape(*places.shape, n)
+        if batch > 1:  # most batches are neighbours
+            own = len(places) // batch
+            near, known = iterated(swept, start[:own], scales[:own], _SWEEPS)
+            if known.all():
+                share = np.divide(gains, gains[0], out=np.ones_like(gains), where=gains[0] != 0.0)
+                start = (share[..., None] * near.reshape(-1, n)).reshape(start.shape)
+        y, solved = iterated(swept, start, scales, _SWEEPS)
+        failures = dict.fromkeys((places[~settled[places].all(axis=1), 0] // ranges.axes).tolist(), RUNS_AWAY)
+        slow = np.flatnonzero(~solved & settled[places].all(axis=1))
+        if slow.size:
+            rows = places[slow].ravel()
+            force = partial(problem.deviation, level, rows)
+            y[slow], lost = marched(kernel.reshape(-1, n)[rows], force, scale[rows], len(slow))
+            failures |= dict.fromkeys((places[slow[lost], 0] // ranges.axes).tolist(), RUNS_AWAY)
+        bent = _shifted(y.reshape(-1, n) - alone, place.ravel(), grid.n)
+        return (
+            (level.reshape(rest.shape) - rest).T,
+            bent.reshape(batch, ranges.axes, -1).swapaxes(0, 1),
+            failures,
+        )
+
+
+def _shifted(means: Matrix, place: Vector, n: int) -> Matrix:
+    """Means over n blocks, the first of which begins `place` blocks, (rows,), after the first of those of
+    `means`, (rows, blocks): the cubic through four of them. 0 before the first."""
+    first = np.floor(place).astype(int)
+    at = np.clip(first[:, None] + np.arange(n + 3), 0, means.shape[1])
+    taken = np.take_along_axis(np.pad(means, ((0, 0), (1, 0))), at, axis=1)
+    weights = np.vander(place - first + 1.0, 4, increasing=True) @ CUBIC
+    return np.asarray(sum(weights[:, k, None] * taken[:, k : k + n] for k in range(4)))
 
 
 @final
@@ -248,13 +298,13 @@ class _Forced:
     step: float
     """Width of a block [time unit]."""
 
-    def acting(self, rows: Index, f: Matrix, y: Matrix, rate: Matrix) -> Matrix:
+    def acting(self, rows: Index, f: Matrix, motion: Motion) -> Matrix:
         """The force that acts on some of the rows."""
         ranges = self.scene.ranges
         own = replace(self.scene, ranges=replace(ranges, response=ranges.response[rows]))
         for effect, psi in self.forces:
             one, mine = (effect, psi) if psi.ndim == 1 else (_of_rows(effect, rows), psi[:, rows])
-            f = one.force(f, y, rate, own, mine)
+            f = one.force(f, motion, own, mine)
         return f
 
     def deviation(
@@ -262,8 +312,11 @@ class _Forced:
     ) -> Matrix:
         """That force less the level (rows, 1), from y less the level and its values one and two blocks
         before."""
-        rate = (1.5 * y - 2.0 * one + 0.5 * two) / self.step
-        return self.acting(rows, self.f[rows][:, blocks], level[rows] + y, rate) - level[rows]
+        last, before = y - one, one - two
+        bend = (last - before) / self.step**2
+        rate = last / self.step + 0.5 * self.step * bend
+        motion = Motion(level[rows] + y, rate, bend)
+        return self.acting(rows, self.f[rows][:, blocks], motion) - level[rows]
 
 
 def _of_rows(effect: ForceEffect, rows: Index) -> ForceEffect:

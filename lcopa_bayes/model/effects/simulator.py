@@ -142,32 +142,39 @@ class Simulator:
             return passed(model, scenes, plant, [self._acting(acting, psi, r) for r in range(len(scenes))])
         return linear(model, scenes, plant, self.step_responses.get_or(plant.elements, dict))
 
-    def moved_together(self, plants: Sequence[Plant], psi: Vector) -> list[list[Moved]]:
-        """`moved` of many plants: at once where all that acts before the reading are forces that take many.
+    def moved_together(self, cases: Sequence[tuple[Plant, Vector]]) -> list[list[Moved]]:
+        """`moved` of many plants and coefficients: at once where all that acts before the reading are forces
+        that take many.
 
         Raises UnstableError.
         """
+        psis = np.array([psi for _, psi in cases])
         acting = [
-            (effect, psi[part])
+            (effect, psis[:, part])
             for effect, part in zip(self.effects, self._slices, strict=True)
-            if isinstance(effect, UPSTREAM) and psi[part].any()
+            if isinstance(effect, UPSTREAM) and psis[:, part].any()
         ]
         forces = [
-            (effect, own)
+            (effect, np.repeat(own.T, self.ranges.axes, axis=1)[..., None])
             for effect, own in acting
             if isinstance(effect, ForceEffect) and effect.batched and not effect.card.per_record
         ]
-        if not acting or len(forces) < len(acting):
-            return [self.moved(plant, psi) for plant in plants]
-        scenes = [self.scenes(plant, psi) for plant in plants]
+        lags = [(one, own) for one, own in acting if isinstance(one, DriveEffect) and one.lags]
+        if not forces or len(forces) + len(lags) < len(acting):
+            return [self.moved(plant, psi) for plant, psi in cases]
+        plants, records = [plant for plant, _ in cases], range(len(self.model.experiments))
         gains, dynamics = np.array([plant.gains for plant in plants]), joined([p.dynamics for p in plants])
+        for effect, own in lags:
+            dynamics = dynamics.later(effect.lag(self.ranges, own.T))
+        commanded = [self.scene(r, plants[0]) for r in records]
+        scenes = [self.scenes(plant, psi) for plant, psi in cases]
         out: list[list[Moved]] = [[] for _ in plants]
-        for r, (deflection, failures) in enumerate(forced(self.model, scenes[0], gains, dynamics, forces)):
+        for r, (deflection, failures) in enumerate(forced(self.model, commanded, gains, dynamics, forces)):
             if failures:
                 names = tuple(effect.name for effect, _ in forces)
                 raise UnstableError(names, self.model.experiments[r].name, next(iter(failures.values())))
-            for b, own in enumerate(out):
-                own.append(Moved(scenes[b][r], deflection[:, b].T))
+            for b, each in enumerate(out):
+                each.append(Moved(scenes[b][r], deflection[:, b].T))
         return out
 
     def _bending(self, psi: Vector) -> list[bool]:
