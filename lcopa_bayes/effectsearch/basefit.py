@@ -104,11 +104,11 @@ def measured(posterior: Posterior, residual: Vector, delay: float) -> tuple[Axis
     out = []
     scales = Scales.of([one.record for one in posterior.samples])
     for axis, response in enumerate(posterior.table.layout.responses):
-        found = axis_noise(posterior.samples, axis, delay, response.name, scales)
-        if found is None:
+        noise = axis_noise(posterior.samples, axis, delay, response.name, scales)
+        if noise is None:
             quiet = sum(p.values.size for p in quiet_pieces(posterior.samples, axis, delay))
-            found = joint_noise(axis_pieces(posterior, residual, axis), response.name, quiet, scales)
-        out.append(found)
+            noise = joint_noise(axis_pieces(posterior, residual, axis), response.name, quiet, scales)
+        out.append(noise)
     return tuple(out)
 
 

@@ -192,8 +192,8 @@ def _looped(
     before = _side(problem, start)
     cautions = (*base.caution, *_alone(study))
     if base.failed:
-        found = Findings(base.failed, cautions, False, np.nan, np.nan, (), (), 0, 0, "", 0, 0, "", np.nan)
-        verdict = decide(found)
+        failure = Findings(base.failed, cautions, False, np.nan, np.nan, (), (), 0, 0, "", 0, 0, "", np.nan)
+        verdict = decide(failure)
         return Loop(
             *(problem, base, enlarged, (), (), (), verdict, before, before, not study.held_out, cautions),
             outliers=outliers,

@@ -321,10 +321,10 @@ def _mixture(apart: Vector) -> float:
         return 0.0
     plain = -0.5 * (apart / scale) ** 2 - np.log(scale)
     z2 = (apart / core) ** 2
-    found = []
+    evidence = []
     for share in _SHARES:
         for width in _WIDTHS:
             inner = np.log1p(-share) - 0.5 * z2
             outer = np.log(share / width) - 0.5 * z2 / width**2
-            found.append(float((np.logaddexp(inner, outer) - np.log(core) - plain).sum()))
-    return float(logsumexp(found) - np.log(len(found)))
+            evidence.append(float((np.logaddexp(inner, outer) - np.log(core) - plain).sum()))
+    return float(logsumexp(evidence) - np.log(len(evidence)))

@@ -118,14 +118,14 @@ class Regression:
             low, high = self.model.bounds_about(x)
             width = np.where(np.isfinite(high - low), high - low, 1.0)
             about = low - 1e-9 * width, high + 1e-9 * width  # an order may be held by both its neighbours
-            found = least.search(x, self.model.template, about, evaluations=most, enough=enough)
-            before, x = cost, np.clip(found.x, low, high)
-            cost = float(found.cost)
+            search = least.search(x, self.model.template, about, evaluations=most, enough=enough)
+            before, x = cost, np.clip(search.x, low, high)
+            cost = float(search.cost)
             near = np.minimum(x - low, high - x) < _AT_END * width
             inner = (low != self.model.bounds[0]) | (high != self.model.bounds[1])
             if not (near & inner).any() or before - cost < gain:
                 break  # else a wall between two orders moves with them
-        return self.model.canonical(x), bool(found.status > 0)
+        return self.model.canonical(x), bool(search.status > 0)
 
     def descend(self, start: Vector, *, most: int = _EVALUATIONS, gain: float = GAIN) -> Optimum:
         """The optimum of `reached`, described."""

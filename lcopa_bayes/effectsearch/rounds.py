@@ -187,7 +187,8 @@ def _remains(linear: Refit, candidate: Refit) -> bool:
 
 
 def _accepted(candidate: Refit, seen: Trace, bar: float) -> bool:
-    others = (g for g in seen.traced if g.card.place == "generic" and not g.card.dynamics)
+    generics = (g for g in seen.traced if g.card.place == "generic")
+    others = (g for g in generics if not (candidate.dynamics and g.card.dynamics))
     generic = max((g.log_bayes_factor for g in others), default=-np.inf)
     ahead = candidate.log_bayes_factor > generic + MARGIN
     return (

@@ -14,11 +14,10 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basefit import BaseFit
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.regression import Regression
+from lcopa_bayes.effectsearch.verdict import MARGIN
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import problem_of
 
-_GAIN = 10.0
-"""Log evidence that the level must bring [nat]: a plant of too few terms is worth a few by it."""
 _EVALUATIONS = 60
 _STEPS = 8
 """Evaluations of the descent at each level tried [-]."""
@@ -34,7 +33,7 @@ class Mended(NamedTuple):
 
 
 def started(study: Study, fit: BaseFit) -> Mended | None:
-    """The study with one common drive before the first row of every record, when that is worth 10 nat.
+    """The study with one common drive before the first row of every record, when that is worth 3 nat.
 
     Before its first row the plant rests under the first row's drive; a record that begins while the plant
     moves would show the difference as a misfit of every slow effect at once. Where no record says or shows
@@ -53,22 +52,20 @@ def started(study: Study, fit: BaseFit) -> Mended | None:
 
     first = np.mean([one.drive[0] for one in study.fit], axis=0)
     ends = list(zip(low - reach, high + reach, strict=True))
-    found = minimize(
-        left, first, method="Powell", bounds=ends, options={"maxfev": _EVALUATIONS, "xtol": 1e-2}
-    )
-    if not np.isfinite(found.fun):
+    best = minimize(left, first, method="Powell", bounds=ends, options={"maxfev": _EVALUATIONS, "xtol": 1e-2})
+    if not np.isfinite(best.fun):
         return None
     count = fit.optimum.effective
     power = float(fit.optimum.residual @ fit.optimum.residual)
-    gain = 0.5 * count * np.log(power / found.fun) - 0.5 * first.size * np.log(count)
-    if not gain > _GAIN:
+    gain = 0.5 * count * np.log(power / best.fun) - 0.5 * first.size * np.log(count)
+    if not gain > MARGIN:
         return None
     levels = " and ".join(
         f"{value:.4g} {axis.unit} of {axis.name}"
-        for value, axis in zip(found.x, study.drive_axes, strict=True)
+        for value, axis in zip(best.x, study.drive_axes, strict=True)
     )
     return Mended(
-        _begun(study, found.x),
+        _begun(study, best.x),
         "No record shows the plant at rest, and it did not rest under the first row's drive: a drive before "
         f"the first row, the same for all records, was fitted ({levels}, worth {gain:.0f} nat); an early row "
         "with a drive and no response would state it.",

@@ -23,21 +23,21 @@ _NEAREST = 4
 """Rivals that are listed for each named effect [-]."""
 
 
-def results(found: Loop) -> dict[str, Any]:
+def results(result: Loop) -> dict[str, Any]:
     """Every number of the loop; `None` is open or undefined."""
-    trace, unit = found.trace, found.problem.study.time_unit
+    trace, unit = result.trace, result.problem.study.time_unit
     chances = trace.probabilities if trace else {}
     numbers: dict[str, Any] = {
-        "study": found.problem.study.name,
-        "verdict": found.verdict.kind,
-        "confidence": found.verdict.confidence,
-        "sentence": found.verdict.sentence,
-        "cautions": found.cautions,
-        "base_failed": found.base.failed,
-        "base_enlarged": found.enlarged,
+        "study": result.problem.study.name,
+        "verdict": result.verdict.kind,
+        "confidence": result.verdict.confidence,
+        "sentence": result.verdict.sentence,
+        "cautions": result.cautions,
+        "base_failed": result.base.failed,
+        "base_enlarged": result.enlarged,
         "time_unit": unit,
-        "grade": found.grade.level,
-        "grade_reason": found.grade.reason,
+        "grade": result.grade.level,
+        "grade_reason": result.grade.reason,
         "noise": [
             {
                 "axis": axis.name,
@@ -45,43 +45,43 @@ def results(found: Loop) -> dict[str, Any]:
                 **attributes(one.law, "sigma", "sigma_ar", "rho", "sd"),
                 **attributes(one, "samples", "source", "sentence"),
             }
-            for axis, one in zip(found.problem.study.response_axes, found.base.noise, strict=True)
+            for axis, one in zip(result.problem.study.response_axes, result.base.noise, strict=True)
         ],
-        "effects": _effects(found, chances),
-        "outliers": _outliers(found),
-        "before": side(found.before, found),
-        "after": side(found.after, found),
-        "unseen_by": in_turn(len(found.problem.study.fit)) if found.left_out else "held-out records",
+        "effects": _effects(result, chances),
+        "outliers": _outliers(result),
+        "before": side(result.before, result),
+        "after": side(result.after, result),
+        "unseen_by": in_turn(len(result.problem.study.fit)) if result.left_out else "held-out records",
         "survival": {one.name: one.survival for one in trace.traced} if trace else {},
         "invisible": [one.name for one in trace.traced if one.survival < SEEN] if trace else [],
-        "evidence": _evidence(found),
-        "rounds": [_round(one) for one in found.rounds],
-        "moved": moved(found),
-        "next_measurement": next_measurement(found),
-        "parameters": [found.estimate(k) for k in range(found.after.state.model.plant_size)],
+        "evidence": _evidence(result),
+        "rounds": [_round(one) for one in result.rounds],
+        "moved": moved(result),
+        "next_measurement": next_measurement(result),
+        "parameters": [result.estimate(k) for k in range(result.after.state.model.plant_size)],
         "residual": {
             when: [{"name": view.name, "axis": view.axis, "sentence": view.sentence} for view in shown]
-            for when, shown in _views(found).items()
+            for when, shown in _views(result).items()
         },
-        "seed": found.problem.study.seed,
+        "seed": result.problem.study.seed,
     }
     return plain(numbers)
 
 
-def drawn(found: Loop) -> dict[str, Any]:
+def drawn(result: Loop) -> dict[str, Any]:
     """What the figures need beyond `results`: residual views and residuals before and after."""
-    shown = {when: [view.as_json() for view in each] for when, each in _views(found).items()}
-    return plain({"views": shown, "curves": _curves(found)})
+    shown = {when: [view.as_json() for view in each] for when, each in _views(result).items()}
+    return plain({"views": shown, "curves": _curves(result)})
 
 
-def _views(found: Loop) -> dict[str, list[View]]:
-    unit = found.problem.study.time_unit
-    return {"before": views(found.before.state, unit), "after": views(found.after.state, unit)}
+def _views(result: Loop) -> dict[str, list[View]]:
+    unit = result.problem.study.time_unit
+    return {"before": views(result.before.state, unit), "after": views(result.after.state, unit)}
 
 
-def side(one: Side, found: Loop) -> dict[str, Any]:
+def side(one: Side, result: Loop) -> dict[str, Any]:
     """Errors before or after, pooled per axis and for each record."""
-    axes = [axis.name for axis in found.problem.study.response_axes]
+    axes = [axis.name for axis in result.problem.study.response_axes]
     noise = {score.axis: score.noise_sd for score in one.fit}
     fit = {axis: pooled_rmse(one.fit, axis) for axis in axes}
     unseen = {axis: pooled_rmse(one.unseen, axis) for axis in axes}
@@ -98,10 +98,10 @@ def side(one: Side, found: Loop) -> dict[str, Any]:
     }
 
 
-def _effects(found: Loop, chances: dict[str, float]) -> list[dict[str, Any]]:
-    model, optimum = found.after.state.model, found.after.state.optimum
+def _effects(result: Loop, chances: dict[str, float]) -> list[dict[str, Any]]:
+    model, optimum = result.after.state.model, result.after.state.optimum
     first, out = model.plant_size, []
-    for number, effect in enumerate(found.effects):
+    for number, effect in enumerate(result.effects):
         if effect.card.dynamics:
             continue
         own = [(k, one) for k, one in enumerate(model.effected.coefficients) if one.effect == number]
@@ -109,12 +109,12 @@ def _effects(found: Loop, chances: dict[str, float]) -> list[dict[str, Any]]:
             {
                 "name": effect.name,
                 **attributes(effect.card, "place", "formula", "source"),
-                "group": list(found.groups[number]),
-                "nearest": _nearest(found, effect.name),
+                "group": list(result.groups[number]),
+                "nearest": _nearest(result, effect.name),
                 "probability": chances.get(effect.name),
                 "constants": effect.constants,
                 "parameters": [
-                    found.estimate(first + k)
+                    result.estimate(first + k)
                     | {"prior_sd": float(model.scale[k]), "one_signed": one.coefficient.one_signed}
                     for k, one in own
                 ],
@@ -125,25 +125,25 @@ def _effects(found: Loop, chances: dict[str, float]) -> list[dict[str, Any]]:
     return out
 
 
-def _nearest(found: Loop, name: str) -> list[dict[str, Any]]:
+def _nearest(result: Loop, name: str) -> list[dict[str, Any]]:
     """Effects whose signatures lie closest to a named one, as what the base model cannot imitate of them."""
-    assert found.trace is not None
-    own = found.trace.of(name)
-    others = [one for one in found.trace.traced if one.signatures and one.name != name]
+    assert result.trace is not None
+    own = result.trace.of(name)
+    others = [one for one in result.trace.traced if one.signatures and one.name != name]
     angles = {one.name: own.signatures[own.best].cosine(one.signatures[one.best]) for one in others}
     ranked = sorted(angles, key=lambda other: -angles[other])[:_NEAREST]
     return [{"name": other, "cosine": angles[other]} for other in ranked]
 
 
-def _outliers(found: Loop) -> dict[str, Any] | None:
-    if found.outliers is None:
+def _outliers(result: Loop) -> dict[str, Any] | None:
+    if result.outliers is None:
         return None
     keys = ("count", "share", "width", "log_bayes_factor", "sentence")
-    return {key: getattr(found.outliers, key) for key in keys}
+    return {key: getattr(result.outliers, key) for key in keys}
 
 
-def _evidence(found: Loop) -> dict[str, Any]:
-    trace = found.trace
+def _evidence(result: Loop) -> dict[str, Any]:
+    trace = result.trace
     if trace is None:
         empty = dict.fromkeys(("threshold", "threshold_between", "p_value", "least_p_value"))
         return {**empty, "draws": 0, "classes": []}
@@ -193,11 +193,11 @@ def _round(one: Round) -> dict[str, Any]:
     }
 
 
-def _curves(found: Loop) -> list[dict[str, Any]]:
+def _curves(result: Loop) -> list[dict[str, Any]]:
     """Residuals before and after, thinned for drawing."""
-    pairs = [*zip(found.before.fit, found.after.fit, strict=True)]
-    if not found.left_out:
-        pairs += [*zip(found.before.unseen, found.after.unseen, strict=True)]
+    pairs = [*zip(result.before.fit, result.after.fit, strict=True)]
+    if not result.left_out:
+        pairs += [*zip(result.before.unseen, result.after.unseen, strict=True)]
     return [_curve(before, after) for before, after in pairs]
 
 
@@ -241,12 +241,12 @@ def words(numbers: dict[str, Any]) -> Sequence[str]:
     return out
 
 
-def moved(found: Loop) -> list[dict[str, Any]]:
+def moved(result: Loop) -> list[dict[str, Any]]:
     """Plant parameters that the effects moved by more than two standard deviations of the fit with them."""
-    if not found.effects:
+    if not result.effects:
         return []
-    before, after = found.before.state, found.after.state
-    base, n = found.base.model, after.model.plant_size
+    before, after = result.before.state, result.after.state
+    base, n = result.base.model, after.model.plant_size
     first, last = base.values(before.optimum.x), after.model.values(after.optimum.x)
     sds = np.sqrt(np.diag(after.covariance))[:n]
     out = []
@@ -267,22 +267,22 @@ def moved(found: Loop) -> list[dict[str, Any]]:
     return sorted(out, key=lambda row: -abs(row["shift_in_sd"]))
 
 
-def next_measurement(found: Loop) -> str:
+def next_measurement(result: Loop) -> str:
     """In words: what excitation splits a group, finds what is unexplained, or shows what stayed invisible."""
-    trace = found.trace
+    trace = result.trace
     if trace is None:
         return "Mend the base fit first: give it records in which it can follow the response."
-    if not found.base.noise_known:
+    if not result.base.noise_known:
         quiet = (
             "a stretch before the first command, or a repeat, so that the noise is known apart from the fit"
         )
         return f"Record {quiet}."
     cards = {one.name: one.card for one in trace.traced}
-    for group in found.groups:
+    for group in result.groups:
         if len(group) > 1:
             wanted = _wanted([cards[name] for name in group if name in cards])
             return f"To separate {', '.join(group)}, record {wanted}."
-    if found.verdict.kind == "unexplained":
+    if result.verdict.kind == "unexplained":
         near = [one for one in trace.traced if one.card.place != "generic"][:2]
         return f"To find what is missing, record {_wanted([one.card for one in near])}." if near else ""
     hidden = [one for one in trace.traced if one.survival < SEEN and one.card.place != "generic"]

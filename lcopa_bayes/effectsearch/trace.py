@@ -149,25 +149,25 @@ def trace(
     quiet, freedom = float(sum(noise_samples)), whitening.effective - optimum.x.size
     scale = Scale(quiet, freedom, np.array([residual @ residual]))
     present = {effect.name for effect in model.effects}
-    found: list[Traced] = []
+    effects: list[Traced] = []
     for kind in library:
         if kind.card.name in present or not kind.applies(model.plant.table.layout):
             continue
         if issubclass(kind, ScatterEffect):
             joint = "the noise is known from the residual alone" if whitening.dependence else ""
             scattered = -np.inf if joint else scatter_evidence(optimum.white)
-            found.append(Traced(kind.card, (), scattered, 0, joint))
+            effects.append(Traced(kind.card, (), scattered, 0, joint))
             continue
         commands = max(commands_of(one.record.drive) for one in whitening.samples)
         if kind.per_command and commands > MOST_COMMANDS:
             why = f"it follows every command by itself, and a record has {commands} (at most {MOST_COMMANDS})"
-            found.append(Traced(kind.card, (), -np.inf, 0, why))
+            effects.append(Traced(kind.card, (), -np.inf, 0, why))
             continue
-        found.append(_traced(state, project, residual, scale, kind))
-    found.sort(key=lambda one: -one.log_bayes_factor)
+        effects.append(_traced(state, project, residual, scale, kind))
+    effects.sort(key=lambda one: -one.log_bayes_factor)
     return against_chance(
-        Trace(tuple(found), LEAST, (LEAST, LEAST), np.nan, 0, residual, scale),
-        lambda count: _chance(project, whitening, found, rng, count, scale),
+        Trace(tuple(effects), LEAST, (LEAST, LEAST), np.nan, 0, residual, scale),
+        lambda count: _chance(project, whitening, effects, rng, count, scale),
         draws,
     )
 
@@ -232,13 +232,13 @@ def _traced(state: State, project: Projection, residual: Vector, scale: Scale, k
 def _chance(
     project: Projection,
     whitening: Whitening,
-    found: Sequence[Traced],
+    effects: Sequence[Traced],
     rng: np.random.Generator,
     draws: int,
     scale: Scale,
 ) -> Vector:
     """Largest log Bayes factor of each of `draws` residuals of the base model alone, (draws,) [nat]."""
-    listed = [one for traced in found for one in traced.signatures]
+    listed = [one for traced in effects for one in traced.signatures]
     if not listed:
         return np.zeros(draws)
     spans = [one.span for one in listed]
@@ -252,11 +252,11 @@ def _chance(
         one.evidence(inner[a:b], known) for one, a, b in zip(listed, edges[:-1], edges[1:], strict=True)
     ]
     start, by_effect = 0, []
-    for traced in found:
+    for traced in effects:
         count = len(traced.signatures)
         if count:
             by_effect.append(logsumexp(evidence[start : start + count], axis=0) - np.log(count))
         start += count
-    if any(one.scatters for one in found):
+    if any(one.scatters for one in effects):
         by_effect.append(np.array([scatter_evidence(column) for column in z.T]))
     return np.asarray(np.max(by_effect, axis=0))

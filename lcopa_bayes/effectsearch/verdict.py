@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, final
 
@@ -91,104 +91,96 @@ class Findings:
     differ from record to record."""
 
 
-def decide(found: Findings) -> Verdict:
+def decide(given: Findings) -> Verdict:
     """The verdict; an effect is never named from a base fit that failed."""
-    confidence: Confidence = "tentative" if found.cautions or found.failed else "firm"
-    if found.failed:
-        return Verdict("unexplained", "tentative", f"No effect is named, because {found.failed}.")
-    if not found.alarmed:
-        return _quiet(found, confidence)
-    named = ", ".join(found.effects)
-    confidence = confidence if found.apart or not found.effects else "tentative"
-    if not found.effects and found.dynamics:
-        return Verdict(
-            "unexplained",
-            confidence,
-            f"Unmodelled linear dynamics are missing (worth {found.gained:.0f} nat): a further lag, a zero, "
-            "or paths that differ in what the model lets them share explain the residual as well as any "
-            "effect. No name is forced; more `terms`, or `share` and `delay` by path in [model], may help.",
+    confidence: Confidence = "tentative" if given.cautions or given.failed else "firm"
+    if given.failed:
+        return Verdict("unexplained", "tentative", f"No effect is named, because {given.failed}.")
+    if not given.alarmed:
+        return _quiet(given, confidence)
+    refused = _refused(given)
+    if refused:
+        apart = given.apart or not given.effects
+        return Verdict("unexplained", confidence if apart else "tentative", refused)
+    named, one = ", ".join(given.effects), len(given.effects) == 1
+    rest = " Nothing significant remains."
+    if given.remaining > given.remaining_threshold:
+        rest = (
+            f" What remains is significant ({given.remaining_name}, {given.remaining:.0f} nat) but small: "
+            f"{_percent(given.share)} of what the base model leaves to explain is accounted for."
         )
-    if not found.effects:
-        return Verdict(
-            "unexplained",
-            confidence,
-            f"Something is missing (log Bayes factor {found.largest:.0f} nat against "
-            f"{found.threshold:.1f} by chance), and the residual is {found.excess:.2f} times the noise; but "
-            "no effect of the library survives a full refit: no name is forced.",
-        )
-    left = found.remaining > found.remaining_threshold
-    if left and found.generic > found.gained + MARGIN:
-        return Verdict(
-            "unexplained",
-            confidence,
-            f"Something is missing, and {found.generic_name} describes it better by "
-            f"{found.generic - found.gained:.0f} nat than the nearest named effect ({named}): no name "
-            "is forced.",
-        )
-    if left and not found.share >= found.enough:
-        return Verdict(
-            "unexplained",
-            confidence,
-            f"The nearest effect ({named}) accounts for {_percent(found.share)} of what the base model "
-            "leaves to explain, "
-            f"and {found.remaining_name} remains with {found.remaining:.0f} nat: no name is forced.",
-        )
-    if found.unseen > UNSEEN:
-        return Verdict(
-            "unexplained",
-            confidence,
-            f"The nearest effect ({named}) takes up what the fitted records leave, but "
-            f"{_percent(found.unseen)} of the squared error beyond noise stays on the records held out: no "
-            "name is forced.",
-        )
-    if found.risen > RISEN:
-        return Verdict(
-            "unexplained",
-            confidence,
-            f"The nearest effect ({named}) takes up what the fitted records leave, but the error on the "
-            f"records held out is {found.risen:.2f} times as large with it: no name is forced.",
-        )
-    rest = (
-        f" What remains is significant ({found.remaining_name}, {found.remaining:.0f} nat) but small: "
-        f"{_percent(found.share)} of what the base model leaves to explain is accounted for."
-        if left
-        else " Nothing significant remains."
-    )
-    verb = "was" if len(found.effects) == 1 else "were"
-    if found.dynamics or found.reached > REACHED:
-        rest += " Linear dynamics without a name are missing too." if found.dynamics else ""
-        if found.reached > REACHED:
-            rest += f" On unseen records the error stays at {found.reached:.2f} times the noise."
-        said = f"{named} {verb} missing, but not all that is, worth {found.gained:.0f} nat together."
+    confidence = confidence if given.apart else "tentative"
+    said = f"{named} {'was' if one else 'were'} missing"
+    if given.dynamics or given.reached > REACHED:
+        rest += " Linear dynamics without a name are missing too." if given.dynamics else ""
+        if given.reached > REACHED:
+            rest += f" On unseen records the error stays at {given.reached:.2f} times the noise."
+        said += f", but not all that is, worth {given.gained:.0f} nat together."
         return Verdict("partly explained", "tentative", said + rest)
-    if set(found.effects) <= set(found.disturbances):
-        return Verdict(
-            "disturbance",
-            confidence,
-            f"{named} disturb(s) the records; the plant stays as it is, the noise model changes." + rest,
+    if set(given.effects) <= set(given.disturbances):
+        said = f"{named} disturb(s) the records; the plant stays as it is, the noise model changes."
+        return Verdict("disturbance", confidence, said + rest)
+    return Verdict("explained", confidence, f"{said}, worth {given.gained:.0f} nat." + rest)
+
+
+def _refused(given: Findings) -> str:
+    """Why nothing is named though something is missing; empty where something is."""
+    if given.dynamics and not given.effects:
+        return (
+            f"Unmodelled linear dynamics are missing (worth {given.gained:.0f} nat): a further lag, a zero, "
+            "or paths that differ in what the model lets them share explain the residual as well as any "
+            "effect. No name is forced; more `terms`, or `share` and `delay` by path in [model], may help."
         )
-    return Verdict("explained", confidence, f"{named} {verb} missing, worth {found.gained:.0f} nat." + rest)
+    if not given.effects:
+        return (
+            f"Something is missing (log Bayes factor {given.largest:.0f} nat against {given.threshold:.1f} "
+            f"by chance), and the residual is {given.excess:.2f} times the noise; but no effect of the "
+            "library survives a full refit: no name is forced."
+        )
+    nearest = f"The nearest effect ({', '.join(given.effects)})"
+    if given.remaining > given.remaining_threshold:
+        if given.generic > given.gained + MARGIN:
+            return (
+                f"{nearest} is behind {given.generic_name}, which describes what is missing better by "
+                f"{given.generic - given.gained:.0f} nat: no name is forced."
+            )
+        if not given.share >= given.enough:
+            return (
+                f"{nearest} accounts for {_percent(given.share)} of what the base model leaves to explain, "
+                f"and {given.remaining_name} remains with {given.remaining:.0f} nat: no name is forced."
+            )
+    if given.unseen > UNSEEN:
+        return (
+            f"{nearest} takes up what the fitted records leave, but {_percent(given.unseen)} of the squared "
+            "error beyond noise stays on the records held out: no name is forced."
+        )
+    if given.risen > RISEN:
+        return (
+            f"{nearest} takes up what the fitted records leave, but the error on the records held out is "
+            f"{given.risen:.2f} times as large with it: no name is forced."
+        )
+    return ""
 
 
-def _quiet(found: Findings, confidence: Confidence) -> Verdict:
+def _quiet(given: Findings, confidence: Confidence) -> Verdict:
     """The verdict where the fitted records show nothing."""
     nothing = (
         "Nothing is missing that these records could show: the largest log Bayes factor of any effect is "
-        f"{found.largest:.1f} nat, and chance alone reaches {found.threshold:.1f} once in a hundred times."
+        f"{given.largest:.1f} nat, and chance alone reaches {given.threshold:.1f} once in a hundred times."
     )
-    if found.missed > 0:
+    if given.missed > 0:
         return Verdict(
             "unexplained",
             confidence,
-            f"The records held out are missed by {found.missed:.1f} times the residual of the fit, more than "
+            f"The records held out are missed by {given.missed:.1f} times the residual of the fit, more than "
             "it leaves uncertain, though the fitted ones show no effect (the largest log Bayes factor is "
-            f"{found.largest:.1f} nat): no name is forced.",
+            f"{given.largest:.1f} nat): no name is forced.",
         )
-    if found.scatter > found.threshold:
+    if given.scatter > given.threshold:
         return Verdict(
             "disturbance",
             confidence,
-            f"{nothing} But the noise is not normal ({found.scatter:.0f} nat): a few samples lie far "
+            f"{nothing} But the noise is not normal ({given.scatter:.0f} nat): a few samples lie far "
             "outside, so that intervals are narrower than they should be; a Student noise would hold them.",
         )
     return Verdict("clean", confidence, nothing)
@@ -212,8 +204,3 @@ def widened(verdict: Verdict, wider: Mapping[str, float]) -> Verdict:
 
 def _percent(share: float) -> str:
     return f"{100 * share:.0f} %"
-
-
-def joined(names: Sequence[str]) -> str:
-    """`a, b or c`."""
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} or {names[-1]}"
