@@ -7,20 +7,20 @@ import gc
 import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, final
+from typing import TYPE_CHECKING, Any
 
 import lcopa_bayes
 
 # verbs are imported when they run, so that help and refusals come at once
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.verbs import commandline
-from lcopa_bayes.verbs.commandline import EXAMPLES, PROGRAM, RUNS, CommandParser, Version, refused
+from lcopa_bayes.verbs.commandline import PROGRAM, RUNS, USAGES, CommandParser, Version, refused
 
 if TYPE_CHECKING:
     from lcopa_bayes.paper.intervals import Scan
+    from lcopa_bayes.results.result import Result
     from lcopa_bayes.verbs.sources import FitLike
 
 _CODES = "exit codes: 0 done, 2 the input cannot be used (nothing is written), 130 interrupted"
@@ -35,37 +35,12 @@ BUNDLED = ("paper-step-x", "paper-step")
 """Studies of records like the paper's, whose run folders hold evidence on its claims."""
 
 
-class Reported(Protocol):
-    """A result with values and a page."""
-
-    def to_json(self) -> dict[str, Any]: ...  # noqa: D102
-    def report(self, folder: Path | str, *, jobs: int = 1) -> Path: ...  # noqa: D102
-
-
 Derived = Callable[[argparse.Namespace, Any], object]
 """An argument of a public function from the options and the study or fit."""
 
 
-@final
-@dataclass(frozen=True)
-class Outcome:
-    """What a verb prints."""
-
-    values: Mapping[str, Any]
-    """With ``--json``."""
-    text: str
-    """For a reader."""
-
-
-@final
-@dataclass(frozen=True)
-class Verb:
-    """A verb of the command line."""
-
-    text: str
-    """What it does, in a line."""
-    options: Callable[[argparse.ArgumentParser], None]
-    perform: Callable[[argparse.Namespace], Outcome]
+Outcome = tuple[Mapping[str, Any], str]
+"""What a verb prints: values with ``--json``, a text for a reader."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -74,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser(given).parse_args(given)
     gc.set_threshold(*_COLLECTED)
     try:
-        outcome = _outcome(options, [PROGRAM, *given])
+        values, text = _outcome(options, [PROGRAM, *given])
     except InputError as error:
         return refused(error.problems, as_json=options.json)
     except FloatingPointError as error:  # a prior that reaches where the model cannot be computed
@@ -84,9 +59,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"interrupted{resume}", file=sys.stderr)
         return INTERRUPTED
     if options.json:
-        print(json.dumps(outcome.values, allow_nan=False))
+        print(json.dumps(values, allow_nan=False))
     elif not options.quiet:
-        print(outcome.text)
+        print(text)
     return 0
 
 
@@ -94,39 +69,43 @@ def _outcome(options: argparse.Namespace, command: Sequence[str]) -> Outcome:
     from lcopa_bayes.results.runfolder import commanded
 
     with commanded(command):
-        return VERBS[options.verb].perform(options)
+        return VERBS[options.verb](options)
 
 
 def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
-    """All verbs, with the options of the one that is given first."""
+    """All verbs with their options."""
     raw = argparse.RawDescriptionHelpFormatter
-    parser = CommandParser(prog=PROGRAM, description=lcopa_bayes.__doc__, epilog=_CODES, formatter_class=raw)
+    about = str(lcopa_bayes.__doc__).partition("\n")[0]
+    parser = CommandParser(prog=PROGRAM, description=about, epilog=_CODES, formatter_class=raw)
     parser.given = given
-    completed = given[:1] == ["--print-completion"]
-    if completed:
+    if given[:1] == ["--print-completion"]:
         import shtab
 
         shtab.add_argument_to(parser, ["--print-completion"])
     parser.add_argument("--version", action=Version, nargs=0, help="print the version")
     verbs = parser.add_subparsers(required=True, metavar="VERB", dest="verb", parser_class=CommandParser)
-    for name, verb in VERBS.items():
-        example = f"example: {PROGRAM} {name} {EXAMPLES[name]}"
+    for name, usage in USAGES.items():
+        example = f"example: {PROGRAM} {name} {usage.example}"
         own = verbs.add_parser(
-            name, help=verb.text, description=verb.text, epilog=f"{example}\n\n{_CODES}", formatter_class=raw
+            name,
+            help=usage.text,
+            description=usage.text,
+            epilog=f"{example}\n\n{_CODES}",
+            formatter_class=raw,
         )
         own.given = given
         parser.verbs = {**parser.verbs, name: own}
         own.add_argument("--quiet", action="store_true", help="no progress, no closing words")
         own.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
-        if completed or name in given[:1]:
-            verb.options(own)
+        for option, how in usage.options:
+            own.add_argument(option, **how)
     return parser
 
 
-def _reported(result: Reported, folder: Path, jobs: int = 1) -> Outcome:
+def _reported(result: Result, folder: Path, jobs: int = 1) -> Outcome:
     """What a verb prints of a result, with the page it wrote in `jobs` processes."""
     page = result.report(folder, jobs=jobs)
-    return Outcome(result.to_json() | {"report": str(page)}, f"{result}\n\nreport: {page}")
+    return result.to_json() | {"report": str(page)}, f"{result}\n\nreport: {page}"
 
 
 def _source(options: argparse.Namespace) -> FitLike:
@@ -210,8 +189,8 @@ def _truth(options: argparse.Namespace, study: Any) -> object:
 
 
 def _given(options: argparse.Namespace, *keys: str) -> dict[str, Any]:
-    """Options by the names under which a public function takes them."""
-    return {key: getattr(options, key) for key in keys}
+    """Those of these options that are given, by the names under which a public function takes them."""
+    return {key: getattr(options, key) for key in keys if hasattr(options, key)}
 
 
 def _new(options: argparse.Namespace) -> Outcome:
@@ -220,13 +199,13 @@ def _new(options: argparse.Namespace) -> Outcome:
         options.folder, options.files, overwrite=options.overwrite, **_given(options, *keys)
     )
     after = f"lcopa-bayes check {options.folder}"
-    return Outcome(result.to_json() | {"folder": str(options.folder)}, f"{result}\n\nnext: {after}")
+    return result.to_json() | {"folder": str(options.folder)}, f"{result}\n\nnext: {after}"
 
 
 def _explain(options: argparse.Namespace) -> Outcome:
     term = " ".join(options.term)
     text = lcopa_bayes.explain(term, runs=RUNS)
-    return Outcome({"term": term, "text": text}, text)
+    return {"term": term, "text": text}, text
 
 
 def _predict(options: argparse.Namespace) -> Outcome:
@@ -266,7 +245,7 @@ def _report(options: argparse.Namespace) -> Outcome:
     verbs = list(origins(options.folder))
     results = [load_result(options.folder, verb) for verb in verbs] or [load_result(options.folder)]
     pages = [str(result.report(options.folder)) for result in results]
-    return Outcome({"pages": pages, "report": pages[0]}, "\n".join(f"report: {page}" for page in pages))
+    return {"pages": pages, "report": pages[0]}, "\n".join(f"report: {page}" for page in pages)
 
 
 def _simulate(options: argparse.Namespace) -> Outcome:
@@ -275,100 +254,57 @@ def _simulate(options: argparse.Namespace) -> Outcome:
     simulation = simulate(options.campaign, seed=options.seed)
     paths = simulation.save(options.out, overwrite=options.overwrite)
     verdict = f"{len(simulation.records)} records in {options.out}"
-    return Outcome({"verdict": verdict, "files": [str(path) for path in paths]}, verdict)
+    return {"verdict": verdict, "files": [str(path) for path in paths]}, verdict
 
 
 def _scan(options: argparse.Namespace, study: Any) -> Scan:
     """The scan of the command line; an order without an interval is scanned up to the one above it."""
     from lcopa_bayes.paper.intervals import Interval, Scan
 
+    stated = _given(options, "order_step", "stiffness", "rounds")
+    least = stated.get("order_step", Scan.order_step)
     given: Sequence[Sequence[float] | None] = (options.alpha, options.beta, options.gamma)
     orders: list[Interval] = []
     for ends in given:
         top = orders[-1].high if orders else 2.0
         # an interval that ends below the smallest scanned order leaves nothing below it but itself
-        orders.append(Interval(*ends) if ends else Interval(min(options.order_step, top), top))
+        orders.append(Interval(*ends) if ends else Interval(min(least, top), top))
     return Scan(
         orders=tuple(orders) if any(given) else None,
-        order_step=options.order_step,
         delay=Interval(*options.delay) if options.delay else None,
         whole_blocks=not options.any_delay,
-        stiffness=tuple(options.stiffness),
-        rounds=options.rounds,
+        **stated | ({"stiffness": tuple(stated["stiffness"])} if "stiffness" in stated else {}),
     )
 
 
 _SAMPLING = ("resume", "quick", "quiet")
 """Options of every verb that samples."""
-VERBS: Mapping[str, Verb] = {
-    "new": Verb("records and a study from spreadsheets and loggers' tables", commandline.new, _new),
-    "check": Verb(
-        "what was understood of a study, without fitting it", commandline.study, _on_study("check", anew=True)
+VERBS: Mapping[str, Callable[[argparse.Namespace], Outcome]] = {
+    "new": _new,
+    "check": _on_study("check", anew=True),
+    "look": _on_study("look", anew=True),
+    "run": _on_study("fit", *_SAMPLING, "cross_check", anew=True, rival=_rival),
+    "fit": _on_study("fit", *_SAMPLING, "cross_check", anew=True),
+    "audit": _on_study("audit", *_SAMPLING),
+    "design": _on_study("design", *_SAMPLING, "bench_time", "repeats", "amplitude", "refresh", "with_prior"),
+    "compare": _on_study("compare", *_SAMPLING, "candidates", "described"),
+    "loop": _on_study("loop", "quick", "as_stated"),
+    "calibrate": _on_study(
+        "calibrate",
+        *(*_SAMPLING, "replicas", "around", "engine", "dask"),
+        inside="calibration",
+        anew=True,
+        truth=_truth,
     ),
-    "look": Verb(
-        "least squares and residual within seconds, before sampling",
-        commandline.study,
-        _on_study("look", anew=True),
-    ),
-    "run": Verb(
-        "all stages the study names, then the report",
-        commandline.fit,
-        _on_study("fit", *_SAMPLING, "cross_check", anew=True, rival=_rival),
-    ),
-    "fit": Verb(
-        "posterior, bands and step metrics, with a report",
-        commandline.fit,
-        _on_study("fit", *_SAMPLING, "cross_check", anew=True),
-    ),
-    "audit": Verb(
-        "what the records determine, parameter by parameter",
-        commandline.sampled,
-        _on_study("audit", *_SAMPLING),
-    ),
-    "design": Verb(
-        "which drive to measure next",
-        commandline.design,
-        _on_study("design", *_SAMPLING, "bench_time", "repeats", "amplitude", "refresh", "with_prior"),
-    ),
-    "compare": Verb(
-        "integer against fractional orders, number of terms",
-        commandline.compare,
-        _on_study("compare", *_SAMPLING, "candidates", "described"),
-    ),
-    "loop": Verb(
-        "what the model lacks: residual, effect, errors after",
-        commandline.loop,
-        _on_study("loop", "quick", "as_stated"),
-    ),
-    "calibrate": Verb(
-        "simulation-based calibration and coverage of the whole inference of a study, with a report",
-        commandline.calibrate,
-        _on_study(
-            "calibrate",
-            *_SAMPLING,
-            *("replicas", "around", "engine", "dask"),
-            inside="calibration",
-            anew=True,
-            truth=_truth,
-        ),
-    ),
-    "predict": Verb(
-        "bands for a drive nobody has measured, by a finished fit", commandline.predict, _predict
-    ),
-    "identify": Verb(
-        "the paper's own least-squares scan, with a report",
-        commandline.identify,
-        _on_study("identify", "posterior", "quiet", module="papers", scan=_scan),
-    ),
-    "optics": Verb(
-        "far field, director, chain from volts to angle, with figures", commandline.optics, _optics
-    ),
-    "claims": Verb("the paper's claims, each with a computed verdict", commandline.claims, _claims),
-    "explain": Verb("what a term means, with an example from the last fit", commandline.explain, _explain),
-    "report": Verb("render the pages of a run folder again", commandline.report, _report),
-    "simulate": Verb("measure a campaign file on the virtual bench", commandline.simulate, _simulate),
+    "predict": _predict,
+    "identify": _on_study("identify", "posterior", "quiet", module="papers", scan=_scan),
+    "optics": _optics,
+    "claims": _claims,
+    "explain": _explain,
+    "report": _report,
+    "simulate": _simulate,
 }
-"""Every verb by name, in the order of the help."""
+"""What performs each verb."""
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
-from lcopa_bayes.core.arrays import Vector, finite
+from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.optics.director import Cell, Field
 
@@ -54,11 +54,9 @@ class Quadrature:
 
     def positions(self, tilts: Vector) -> Vector:
         """Positions in the lower half of the cell, [0, 1/2] [-], at tilts [rad] from pretilt to `largest`."""
-        low = self.cell.pretilt
-        values = finite(tilts, name="tilts", lower=low, upper=self.largest, unit="rad")
         whole = self._integral(lambda t: self._weight(t)[1])
         out = [
-            0.5 - 0.5 * self._integral(lambda t: self._weight(t)[1], self._reach(x)) / whole for x in values
+            0.5 - 0.5 * self._integral(lambda t: self._weight(t)[1], self._reach(x)) / whole for x in tilts
         ]
         return np.array(out)
 
@@ -106,17 +104,16 @@ def quadrature(cell: Cell, voltage: float, *, field: Field = Field.UNIFORM) -> Q
     Raises InputError at and below threshold without pretilt, at 0 V with pretilt, and where the middle tilt
     comes within 1e-12 rad of pi/2, where no digits remain.
     """
-    volts = float(finite(voltage, name="voltage", lower=0.0, unit="V"))
     flat = cell.threshold if cell.pretilt == 0 else 0.0
     top = cos(cell.pretilt)
 
     def excess(x: float) -> float:  # x = log(cosine gap): resolves both ends of (0, top)
-        return Quadrature(cell, field, top / (1 + exp(x))).voltage - volts
+        return Quadrature(cell, field, top / (1 + exp(x))).voltage - voltage
 
     low, high = -27.0, 27.0
-    if volts <= flat * (1 + 1e-9) or excess(low) > 0:
-        raise InputError(f"at {volts:.9g} V the director is flat; give a voltage above {flat:.9g} V.")
+    if voltage <= flat * (1 + 1e-9) or excess(low) > 0:
+        raise InputError(f"at {voltage:.9g} V the director is flat; give a voltage above {flat:.9g} V.")
     if excess(high) < 0:
-        raise InputError(f"at {volts:.6g} V the middle tilt is pi/2 to rounding; use `director.equilibrium`.")
+        raise InputError(f"at {voltage:.6g} V the middle tilt is pi/2 to rounding.")
     root = float(brentq(excess, low, high, xtol=1e-13, rtol=1e-14))
     return Quadrature(cell, field, top / (1 + exp(root)))

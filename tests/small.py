@@ -93,7 +93,7 @@ def study(
         seed,
         tuple(fit),
         tuple(held_out),
-        model=model,
+        model={"terms": 1, **model},
         priors=stated,
         noise={"kind": noise},
         sampler=sampler,

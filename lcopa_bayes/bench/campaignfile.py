@@ -26,10 +26,7 @@ Times are milliseconds, angles radians. A table ``[undeclared]`` with `effects`,
 
 from __future__ import annotations
 
-import json
-import os
-import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -42,9 +39,9 @@ from lcopa_bayes.bench.device import PAPER_BENCH, PAPER_DEVICE, Bench, Device, s
 from lcopa_bayes.bench.inversion import unsuited
 from lcopa_bayes.bench.undeclared import UndeclaredPlan
 from lcopa_bayes.core.errors import InputError, nearest, refuse_if
-from lcopa_bayes.core.files import read_tables, writable_folder, write_text, writing
+from lcopa_bayes.core.files import read_tables
 from lcopa_bayes.core.rules import FLAG, Rule, is_number, whole
-from lcopa_bayes.data.record import Axis, Record, save_record
+from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.model.path import TransferPath
 
 _TEXT = Rule("text", lambda value: isinstance(value, str) and value != "")
@@ -231,61 +228,3 @@ def _axis_command(
     low, high = entry["prbs"]
     duration = float(record["duration"]) - at
     return prbs(low, high, hold=entry["hold"], duration=duration, rng=rng, start=at, rest=rest)
-
-
-def write_campaign(
-    folder: Path,
-    records: Sequence[Record],
-    *,
-    name: str,
-    seed: int,
-    held_out: Sequence[str] = (),
-    settings: str = "",
-    overwrite: bool = False,
-) -> tuple[Path, ...]:
-    """Write one CSV per record and a ``study.toml`` that names them; return the paths, study last.
-
-    Parameters: `name` and `seed` of the study; `held_out`, names of records not for fitting; `settings`,
-    further tables of the study file. Everything is written beside its place first and then renamed, the study
-    last: a campaign cut short leaves no file half written and no new study without its records. Raises
-    InputError when a file is there already (unless `overwrite`), names repeat or cannot be file names, no
-    record remains to fit, or the folder or a file in it cannot be written.
-    """
-    names = [record.name for record in records]
-    fit = [each for each in names if each not in held_out]
-    targets = [folder / f"{each}.csv" for each in names] + [folder / "study.toml"]
-    problems = [
-        f"record name {each!r} occurs {names.count(each)} times"
-        for each in sorted({*names})
-        if names.count(each) > 1
-    ]
-    problems += [
-        f"record name {each!r} cannot be a file name; use letters, digits, '-' and '_'"
-        for each in names
-        if not each.replace("-", "").replace("_", "").isalnum()
-    ]
-    if not fit:
-        problems.append("no record remains to fit; hold out fewer")
-    problems += [
-        f"{path} is there already; choose another folder or allow to overwrite"
-        for path in targets
-        if path.exists() and not overwrite
-    ]
-    refuse_if(problems)
-    lines = ["[study]", f"name = {json.dumps(name, ensure_ascii=False)}"]
-    lines += [f'time_unit = "{records[0].time_unit}"', f"seed = {seed}", "", "[records]"]
-    roles = {"fit": fit, "held_out": [each for each in names if each in held_out]}
-    lines += [f"{role} = {json.dumps([f'{each}.csv' for each in own])}" for role, own in roles.items() if own]
-    lines += ["", settings] if settings else []
-    writable_folder(folder)
-    with writing(folder), tempfile.TemporaryDirectory(prefix=".campaign-", dir=folder) as beside:
-        try:
-            for record, target in zip(records, targets, strict=False):
-                save_record(record, Path(beside) / target.name)
-            write_text(Path(beside) / "study.toml", "\n".join(lines) + "\n")
-        except InputError as error:  # name the file that was wanted
-            raise InputError([p.replace(beside, str(folder)) for p in error.problems]) from error
-        for target in targets:
-            with writing(target):
-                os.replace(Path(beside) / target.name, target)
-    return tuple(targets)

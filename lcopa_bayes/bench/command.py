@@ -10,16 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
-from lcopa_bayes.core.errors import InputError, refuse_if
+from lcopa_bayes.core.errors import InputError
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Command:
-    """Piecewise constant drive: `rest` before ``times[0]``, then ``values[i]`` from ``times[i]`` on.
-
-    Raises InputError unless the times increase and every row of `values` has one entry per drive axis.
-    """
+    """Piecewise constant drive: `rest` before ``times[0]``, then ``values[i]`` from ``times[i]`` on."""
 
     times: Vector
     """Instants of change [ms], (n_changes,), increasing; may be empty."""
@@ -29,18 +26,8 @@ class Command:
     """Drive before the first instant [drive unit], (n_drives,); the device rests under it."""
 
     def __post_init__(self) -> None:
-        times, rest = frozen(self.times, name="times"), frozen(self.rest, name="rest")
-        values = frozen(self.values, name="values", ndim=2)
-        problems = []
-        if rest.size == 0:
-            problems.append("a command needs at least one drive axis; `rest` is empty")
-        if values.shape != (times.size, rest.size):
-            problems.append(f"`values` must have shape {(times.size, rest.size)}; got {values.shape}")
-        if (np.diff(times) <= 0).any():
-            problems.append("`times` must increase")
-        refuse_if(problems)
-        for name, value in (("times", times), ("values", values), ("rest", rest)):
-            object.__setattr__(self, name, value)
+        for name, ndim in (("times", 1), ("values", 2), ("rest", 1)):
+            object.__setattr__(self, name, frozen(getattr(self, name), name=name, ndim=ndim))
 
     @property
     def jumps(self) -> Matrix:

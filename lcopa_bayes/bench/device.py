@@ -6,10 +6,10 @@ Measuring on the virtual bench: refresh, camera, noise, and the record they leav
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from math import inf, isfinite, sqrt
-from typing import Annotated, Protocol, TypeAlias, final
+from typing import Annotated, TypeAlias, final
 
 import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial, chebyshev
@@ -132,16 +132,8 @@ ACCURACY = 1e-9
 """Error of a response [-], of the steady deflection per unit drive and per unit jump."""
 
 
-class Responsive(Protocol):
-    """Anything that responds to a command: a device, or a device with a hidden effect."""
-
-    @property
-    def drive_axes(self) -> tuple[Axis, ...]: ...  # noqa: D102
-    @property
-    def response_axes(self) -> tuple[Axis, ...]: ...  # noqa: D102
-    @property
-    def time_unit(self) -> str: ...  # noqa: D102
-    def response(self, command: Command, time: ArrayLike, *, exposure: float = 0.0) -> Matrix: ...  # noqa: D102
+Responding: TypeAlias = Callable[..., Matrix]
+"""What answers commands as `Device.response` does, with effects that a device lacks."""
 
 
 @final
@@ -179,17 +171,8 @@ class Device:
         command's resting drive, then one step response per change. With an `exposure` > 0 [ms] each
         value is the mean over the exposure that ends at its time, taken exactly by the integral of the
         step response. Accuracy: `ACCURACY`, plus rounding 1e-13 time/exposure when there is an exposure.
-        Raises InputError for a command with another number of axes or a negative exposure.
         """
         time = frozen(time, name="time")
-        problems = []
-        if command.rest.size != len(self.drive_axes):
-            problems.append(
-                f"the device has {len(self.drive_axes)} drive axes; the command {command.rest.size}"
-            )
-        if not 0 <= exposure < inf:
-            problems.append(f"an exposure must be at least 0 and finite; got {exposure}")
-        refuse_if(problems)
         out = np.tile(np.array(self.offsets), (time.size, 1))
         jumps = command.jumps
         for i, row in enumerate(self.paths):
@@ -277,8 +260,16 @@ PAPER_BENCH = Bench(
 """Ta et al. 2026, Section 5.1: refresh 1 kHz, camera 10 kHz; noise as large as the fit error reported."""
 
 
-def truth(device: Responsive, bench: Bench, command: Command, *, duration: float, name: str) -> Record:
-    """The record without noise.
+def truth(
+    device: Device,
+    bench: Bench,
+    command: Command,
+    *,
+    duration: float,
+    name: str,
+    responding: Responding | None = None,
+) -> Record:
+    """The record without noise, of the device or of what is `responding` in its place.
 
     Rows: one before everything, a camera period before time 0 or before the first change if that is
     earlier, with the resting drive and no response; the camera samples ``0, camera, 2 camera, ...``
@@ -299,12 +290,12 @@ def truth(device: Responsive, bench: Bench, command: Command, *, duration: float
     response = np.full((time.size, len(device.response_axes)), np.nan)
     obeyed = command.refreshed(bench.refresh)
     sampled = np.searchsorted(time, camera)
-    response[sampled] = device.response(obeyed, camera, exposure=bench.exposure)
+    response[sampled] = (responding or device.response)(obeyed, camera, exposure=bench.exposure)
     return Record(name, time, drive, response, device.drive_axes, device.response_axes, device.time_unit)
 
 
 def simulate(
-    device: Responsive,
+    device: Device,
     bench: Bench,
     command: Command,
     *,
@@ -317,9 +308,7 @@ def simulate(
     response = np.array(clean.response)
     sampled = ~np.isnan(response[:, 0])
     response[sampled] += bench.noise(int(sampled.sum()), response.shape[1], rng)
-    return Record(
-        name, clean.time, clean.drive, response, clean.drive_axes, clean.response_axes, clean.time_unit
-    )
+    return replace(clean, response=response)
 
 
 def _rounded(time: ArrayLike) -> Vector:

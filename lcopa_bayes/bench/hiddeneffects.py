@@ -14,7 +14,6 @@ from lcopa_bayes.bench.command import Command
 from lcopa_bayes.bench.device import Device
 from lcopa_bayes.bench.inversion import unit_step
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.data.record import Axis
 from lcopa_bayes.model.path import Normalisation, TransferPath
 
 Balance: TypeAlias = Callable[[Vector, Vector, Vector, int], Vector]
@@ -136,21 +135,6 @@ class HiddenDevice:
     shot: Shot
     steps: int = STEPS
 
-    @property
-    def drive_axes(self) -> tuple[Axis, ...]:
-        """Axes of the drive."""
-        return self.device.drive_axes
-
-    @property
-    def response_axes(self) -> tuple[Axis, ...]:
-        """Axes of the response."""
-        return self.device.response_axes
-
-    @property
-    def time_unit(self) -> str:
-        """Unit of every time."""
-        return self.device.time_unit
-
     def response(self, command: Command, time: ArrayLike, *, exposure: float = 0.0) -> Matrix:
         """Responses at `time` [ms], (n, n_responses); the first axis pairs with the first drive, and so on.
 
@@ -165,7 +149,10 @@ class HiddenDevice:
         device = stretched(self.device, float(np.prod(factors)))
         exposure += sum(effect.exposure for effect in self.effects)
         lags = [effect.lag for effect in self.effects if effect.lag > 0]
-        at = times if not lags else _fine(times)
+        at = times
+        if lags:  # a lag is integrated between the samples
+            inner = times[:-1, None] + np.diff(times)[:, None] * np.arange(_FINE) / _FINE
+            at = np.append(inner.ravel(), times[-1])
         y = device.response(command, at, exposure=exposure) - offsets
         balances = [effect.balance for effect in self.effects if effect.balance is not None]
         if balances:
@@ -238,13 +225,6 @@ def bent(
     table = CubicSpline(nodes, np.concatenate((level[:, None], y), axis=1), axis=1)
     out = np.where(times[:, None] <= start, level, table(np.maximum(times, start)).T)
     return np.asarray(out)
-
-
-def _fine(times: Vector) -> Vector:
-    """The times with `_FINE` points per interval."""
-    part = np.arange(_FINE) / _FINE
-    inner = times[:-1, None] + np.diff(times)[:, None] * part
-    return np.append(inner.ravel(), times[-1])
 
 
 def _lagging(at: Vector, y: Matrix, lag: float) -> Matrix:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import pi
 from types import ModuleType
 from typing import ClassVar, Literal, final
@@ -206,38 +206,27 @@ def campaign(
     for number, schedule in enumerate(schedules):
         shot = shot_of(device, (number + 0.5) / len(schedules) - 0.5, rng)
         name = f"run{number + 1:02d}"
-        clean = _taken(device, plant, shot, bench, schedule, name, steps)
+        taken = [
+            truth(
+                device,
+                bench,
+                schedule.command,
+                duration=schedule.duration,
+                name=name,
+                responding=HiddenDevice(device, acting, shot, steps).response,
+            )
+            for acting in dict.fromkeys((plant, tuple(hidden)))
+        ]
+        clean, response = taken[0], np.array(taken[-1].response)
         exact[name] = clean.response
-        shaken = (
-            clean
-            if len(plant) == len(hidden)
-            else _taken(device, tuple(hidden), shot, bench, schedule, name, steps)
-        )
-        response = np.array(shaken.response)
         sampled = ~np.isnan(response[:, 0])
         noise = bench.noise(int(sampled.sum()), response.shape[1], rng)
         for effect in hidden:
             if effect.noise is not None:
                 noise = effect.noise(noise, rng)
         response[sampled] += noise
-        axes = (clean.drive_axes, clean.response_axes)
-        record = Record(name, clean.time, clean.drive, response, *axes, clean.time_unit)
-        (held_out if schedule.held_out else fit).append(record)
+        (held_out if schedule.held_out else fit).append(replace(clean, response=response))
     return Campaign(tuple(fit), tuple(held_out), exact, tuple(hidden), device, correlation)
-
-
-def _taken(
-    device: Device,
-    hidden: tuple[Hidden, ...],
-    shot: Shot,
-    bench: Bench,
-    schedule: Schedule,
-    name: str,
-    steps: int,
-) -> Record:
-    """A record without noise."""
-    disturbed = HiddenDevice(device, hidden, shot, steps)
-    return truth(disturbed, bench, schedule.command, duration=schedule.duration, name=name)
 
 
 def shot_of(device: Device, epoch: float, rng: np.random.Generator) -> Shot:

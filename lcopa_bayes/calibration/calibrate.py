@@ -84,7 +84,7 @@ class Store:
             raise InputError(
                 f"{path}: not a replica this program wrote, or damaged ({error}); {_ADVICE}"
             ) from None
-        raise InputError(f"{path}: made from other records, settings, truths or seed; {_ADVICE}")
+        raise InputError(f"{path}: of other records, settings, truths or seed; {_ADVICE}")
 
 
 MOST = 99_999
@@ -159,7 +159,7 @@ def calibrate(
         with Progress(
             total=replicas, initial=len(done), unit="replica", quiet=quiet, desc="calibrating"
         ) as bar:
-            for outcome in crew.finished(_attempt, missing, replication.lost) if missing else ():
+            for outcome in crew.finished(Replication.attempt, missing, replication.lost) if missing else ():
                 if isinstance(outcome, Failure):
                     failures.append(outcome)
                 else:
@@ -176,7 +176,3 @@ def calibrate(
             f"{failures[0].replica} with seed {failures[0].seed}, ended in {failures[0].error}"
         )
     return Calibration(replication, tuple(done[number] for number in sorted(done)), tuple(failures))
-
-
-def _attempt(replication: Replication, number: int) -> Outcome | Failure:
-    return replication.attempt(number)

@@ -102,8 +102,7 @@ def measured(
         for axis, observed in enumerate(samples.axes):
             noise = posterior.noise.draw(posterior.noise_parameters(values, axis), observed.gaps, rng)[0]
             response[rows[observed.index], axis] = clean[observed.index, axis] + noise
-        axes = (record.drive_axes, record.response_axes)
-        out.append(Record(record.name, record.time, record.drive, response, *axes, record.time_unit))
+        out.append(replace(record, response=response))
     return tuple(out)
 
 

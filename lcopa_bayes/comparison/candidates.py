@@ -55,8 +55,7 @@ class Candidate:
     @property
     def terms(self) -> int:
         """Viscous terms of the richest element [-]."""
-        terms = self.study.model.terms
-        return max(terms.values()) if isinstance(terms, Mapping) else terms
+        return self.study.model.most_terms
 
 
 def known_settings(name: str, study: Study) -> CandidateSettings:
@@ -65,7 +64,7 @@ def known_settings(name: str, study: Study) -> CandidateSettings:
     while (result := re.fullmatch(rf"(.+)-({'|'.join(VARIANTS)})", base)) is not None:
         base = result[1]
         variants.append(result[2])
-    most = _most_terms(study.model)
+    most = study.model.most_terms
     settings: dict[str, object] = {}
     fractional = re.fullmatch(r"fractional-([1-6])", base)
     if fractional:
@@ -172,7 +171,7 @@ def of_studies(studies: Sequence[Study], fits: Sequence[Predictive | None]) -> t
 
 def _short_list(study: Study) -> list[str]:
     """A few candidates that ask how many terms, and whether fractional ones."""
-    model, most = study.model, _most_terms(study.model)
+    model, most = study.model, study.model.most_terms
     if study.effects.use:
         return [STUDY, f"{STUDY}-no-effects"]
     plain = model.orders == "free" and not isinstance(model.terms, Mapping) and most <= _MOST
@@ -182,10 +181,6 @@ def _short_list(study: Study) -> list[str]:
     if len(study.drive_axes) != len(study.response_axes):  # do its paths have anything in common?
         fractional.insert(1, "fractional-1-shared")
     return [*own, *fractional, *(["first-order"] if most <= 2 and not own else []), "second-order"]
-
-
-def _most_terms(model: ModelSettings) -> int:
-    return max(model.terms.values()) if isinstance(model.terms, Mapping) else model.terms
 
 
 def _same(one: Candidate, other: Candidate) -> bool:
@@ -238,15 +233,15 @@ def _uncrossed(
 
 def _direct_terms(model: ModelSettings) -> int:
     if isinstance(model.terms, Mapping):
-        return model.terms.get("direct", max(model.terms.values()))
-    return model.terms
+        return model.terms.get("direct", model.most_terms)
+    return model.most_terms
 
 
 def _about(study: Study, model: ModelSettings, cross: bool) -> str:
     if isinstance(model.terms, Mapping):
         terms = ", ".join(f"{name} {count}" for name, count in model.terms.items()) + " terms"
     else:
-        terms = f"{model.terms} term{'s' if model.terms > 1 else ''}"
+        terms = f"{model.most_terms} term{'s' if model.most_terms > 1 else ''}"
     orders = (
         "free orders"
         if model.orders == "free"

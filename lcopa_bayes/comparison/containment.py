@@ -27,8 +27,7 @@ from lcopa_bayes.inference.nestedmodels import lifted
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.sampling.convergence import Limitation
-from lcopa_bayes.sampling.coordinates import Chart
-from lcopa_bayes.sampling.evidence import charted_density
+from lcopa_bayes.sampling.coordinates import Chart, charted_density
 from lcopa_bayes.sampling.knownmodes import around
 
 TOLERANCE = 0.5

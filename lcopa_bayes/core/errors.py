@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 
 
 class InputError(ValueError):
@@ -21,6 +22,15 @@ def refuse_if(problems: Sequence[str]) -> None:
     """Raise InputError when there are problems."""
     if problems:
         raise InputError(problems)
+
+
+@contextmanager
+def gathered(problems: list[str], where: str = "") -> Iterator[None]:
+    """What is refused within joins the problems, each after `where`."""
+    try:
+        yield
+    except InputError as error:
+        problems += [f"{where}{problem}" for problem in error.problems]
 
 
 def nearest(word: str, known: Iterable[str]) -> str:

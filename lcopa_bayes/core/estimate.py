@@ -99,5 +99,5 @@ def _plain(value: Any) -> Any:
     if isinstance(value, int | np.integer):
         return int(value)
     if isinstance(value, float | np.floating):
-        return float(value) if np.isfinite(value) else None
+        return float(value) + 0.0 if np.isfinite(value) else None  # no negative zero
     return value

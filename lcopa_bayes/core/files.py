@@ -5,14 +5,12 @@ from __future__ import annotations
 import errno
 import json
 import os
-import re
 import tempfile
 import tomllib
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
-from io import FileIO, RawIOBase
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any
 
 from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.core.estimate import plain
@@ -72,91 +70,10 @@ def writing(path: Path) -> Iterator[None]:
     """Within it, what the system refuses becomes an InputError about `path`."""
     try:
         yield
-    except (OSError, RuntimeError) as error:
-        number = _number(error)
-        if number is None and not isinstance(error, OSError):
-            raise  # not the system's word
-        reason = os.strerror(number) if number else str(error) or type(error).__name__
-        remedy = _REMEDIES.get(number or 0, _REMEDY)
+    except OSError as error:
+        reason = os.strerror(error.errno) if error.errno else str(error) or type(error).__name__
+        remedy = _REMEDIES.get(error.errno or 0, _REMEDY)
         raise InputError(f"{path}: cannot be written ({reason}); {remedy}") from error
-
-
-def _number(error: OSError | RuntimeError) -> int | None:
-    """The system's error number; HDF5 hides it in its text."""
-    if isinstance(error, OSError) and error.errno:
-        return error.errno
-    hidden = re.search(r"errno = (\d+)", str(error))
-    return int(hidden[1]) if hidden else None
-
-
-@final
-class Enduring(RawIOBase):
-    """A binary file for HDF5 to write into that fails only afterwards.
-
-    HDF5 does not survive a failed write: it cannot close the file and crashes the process later. So a
-    refused write is remembered and everything after it dropped; `enduring` raises it at the end.
-    """
-
-    def __init__(self, raw: FileIO) -> None:
-        super().__init__()
-        self.failure: OSError | None = None
-        self._raw = raw
-
-    def write(self, data: Any) -> int:
-        """Write all of `data`; a raw file may take only a part at a time."""
-        left = memoryview(data).cast("B")
-        size = left.nbytes
-        while left.nbytes and self.failure is None:
-            try:
-                left = left[self._raw.write(left) :]
-            except OSError as error:
-                self.failure = error
-        return size
-
-    def truncate(self, size: int | None = None) -> int:
-        """Set the length of the file."""
-        try:
-            return self._raw.truncate(size)
-        except OSError as error:
-            self.failure = self.failure or error
-            return size or 0
-
-    def readinto(self, buffer: Any) -> int:
-        """Fill `buffer`; what a refused write left out reads as zeros."""
-        view = memoryview(buffer).cast("B")
-        got = self._raw.readinto(view) or 0
-        view[got:] = bytes(view.nbytes - got)
-        return view.nbytes
-
-    def read(self, size: int = -1) -> bytes:
-        """The next bytes."""
-        return self._raw.read(size) or b""
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Move to a place."""
-        return self._raw.seek(offset, whence)
-
-    def tell(self) -> int:
-        """The place in the file."""
-        return self._raw.tell()
-
-    def flush(self) -> None:
-        """Nothing is buffered."""
-
-
-@contextmanager
-def enduring(path: Path) -> Iterator[Enduring]:
-    """A new file at `path` for HDF5; raises the first refused write once HDF5 is done with it."""
-    with FileIO(path, "w+") as raw:
-        file = Enduring(raw)
-        try:
-            yield file
-        except Exception as error:
-            if file.failure is None:
-                raise
-            raise file.failure from error
-        if file.failure is not None:
-            raise file.failure
 
 
 def writable_folder(path: Path) -> Path:
@@ -171,6 +88,17 @@ def writable_folder(path: Path) -> Path:
             "choose another with --out"
         ) from None
     return path
+
+
+def read_json(path: Path, remedy: str) -> dict[str, Any]:
+    """The JSON object in a file; InputError with the `remedy` when it cannot be read."""
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(values, dict):
+            raise ValueError("no JSON object")
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); {remedy}") from None
+    return values
 
 
 def read_tables(path: Path, known: Collection[str]) -> tuple[dict[str, Any], list[str]]:

@@ -72,7 +72,7 @@ class Workers(Generic[S]):
 
     def map(self, function: Callable[[T], R], inputs: Sequence[T]) -> Iterator[R]:
         """Results of a function that needs nothing shared, in the order of the inputs."""
-        return self.each(_Alone(function), inputs)
+        return self.each(partial(_alone, function), inputs)
 
 
 @final
@@ -181,15 +181,9 @@ def _cluster(shared: S, address: str) -> Iterator[Workers[S]]:
         raise InputError(f"--dask {address}: the scheduler was lost ({error}); {_ADVICE}") from None
 
 
-@final
-class _Alone(Generic[T, R]):
-    """Task: a function of the input alone."""
-
-    def __init__(self, function: Callable[[T], R]) -> None:
-        self._function = function
-
-    def __call__(self, shared: object, one: T) -> R:
-        return self._function(one)
+def _alone(function: Callable[[T], R], shared: object, one: T) -> R:
+    """A function of the input alone as a task."""
+    return function(one)
 
 
 def _same(shared: S) -> S:

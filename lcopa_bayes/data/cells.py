@@ -100,8 +100,8 @@ def read_cells(path: Path) -> CellTable:
     """The file as text; InputError when there is none or it cannot be read."""
     try:
         if not path.exists():
-            beside = (file.name for file in path.parent.glob("*") if file.suffix.lower() in SUFFIXES)
-            refuse(path, f"no such file{nearest(path.name, beside)}")
+            beside = (f for f in path.parent.glob("[!.]*") if f.is_dir() or f.suffix.lower() in SUFFIXES)
+            refuse(path, f"no such file{nearest(path.name, (f.name for f in beside))}")
         if path.suffix.lower() not in SUFFIXES or not path.is_file():
             refuse(path, f"is not a record; expected a file ending in {' or '.join(SUFFIXES)}")
         return _csv_cells(path) if path.suffix.lower() == ".csv" else frame_cells(pd.read_parquet(path), path)

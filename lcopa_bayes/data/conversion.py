@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import final
 
 import numpy as np
@@ -67,16 +67,6 @@ class Mapped:
 
 
 @final
-@dataclass(eq=False)
-class Converted:
-    """Records of tables, and how these were read."""
-
-    records: list[Record] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-    """What was taken for what, one sentence each."""
-
-
-@final
 @dataclass(frozen=True)
 class _Column:
     """A header: its words, its unit, and how its cells read in every table."""
@@ -108,33 +98,35 @@ class _Column:
         return bool(levels <= _LEVELS or np.median(size) > _QUANTA * size.min())
 
 
-def convert(tables: Sequence[CellTable], mapped: Mapped) -> Converted:
-    """Records of tables that share their headers, one each, and what was taken for what.
+def convert(tables: Sequence[CellTable], mapped: Mapped) -> tuple[list[Record], list[str]]:
+    """Records of tables that share their headers, one each, and in a sentence each what was taken for what.
 
     InputError with everything that is ambiguous, absent or unreadable, and what to state.
     """
-    out, shared = Converted(), [name for name in tables[0].names if all(name in t.names for t in tables)]
+    records: list[Record] = []
+    notes: list[str] = []
+    shared = [name for name in tables[0].names if all(name in t.names for t in tables)]
     if not shared:
         raise InputError(
             f"{tables[0].path} and {tables[-1].path} have no header in common; convert them one by one"
         )
-    signs = [decimal_sign(table, mapped.decimal) for table in tables]
-    refuse_if([sign.problem for sign in signs if sign.problem])
+    problems: list[str] = []
+    signs = [decimal_sign(table, problems, mapped.decimal) for table in tables]
+    refuse_if(problems)
     columns = {
         name: _Column(
             name,
             axis_of(name),
             tuple(
-                numbers(table.columns[table.names.index(name)], sign.sign)
+                numbers(table.columns[table.names.index(name)], sign)
                 for table, sign in zip(tables, signs, strict=True)
             ),
         )
         for name in shared
     }
-    time, times, unit = _time(tables, columns, mapped, out.notes)
+    time, times, unit = _time(tables, columns, mapped, notes)
     left = {name: one for name, one in columns.items() if name not in time}
-    drives, responses = _roles(tables[0], left, mapped, out.notes)
-    problems: list[str] = []
+    drives, responses = _roles(tables[0], left, mapped, notes)
     for k, table in enumerate(tables):
         late = np.flatnonzero(np.diff(times[k]) <= 0).tolist()
         rule = "the time does not come after that of the row before; sort the rows, and keep one of two alike"
@@ -151,15 +143,15 @@ def convert(tables: Sequence[CellTable], mapped: Mapped) -> Converted:
             problems.append(f"{table.path}: the first row has no value of the drive {first[0]!r}; fill it in")
             continue
         if any(np.isnan(columns[name].values[k]).any() for name in drives.values()):
-            out.notes.append(f"{table.path.name}: an empty cell of a drive holds the value above it.")
+            notes.append(f"{table.path.name}: an empty cell of a drive holds the value above it.")
         measured = np.column_stack([columns[name].values[k] for name in responses.values()])
-        out.records.append(
+        records.append(
             Record(
                 table.path.stem, times[k], np.column_stack(held), measured, (*drives,), (*responses,), unit
             )
         )
     refuse_if(problems)
-    return out
+    return records, notes
 
 
 def axis_of(header: str) -> Axis:

@@ -19,7 +19,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from lcopa_bayes.core.arrays import Matrix, Vector, frozen
-from lcopa_bayes.core.errors import InputError, nearest, refuse_if
+from lcopa_bayes.core.errors import InputError, gathered, nearest, refuse_if
 from lcopa_bayes.core.files import write_whole
 from lcopa_bayes.core.rules import rebuilt
 from lcopa_bayes.core.units import TIME_UNITS, in_time_unit
@@ -219,7 +219,7 @@ def _columns(table: CellTable, time_unit: str | None, *, responses: bool) -> Col
 def columns_of(
     frame: pd.DataFrame, name: str, time_unit: str | None = None, *, responses: bool = True
 ) -> Columns:
-    """`load_columns` of a frame whose columns are named as those of a file; `name` stands for the file."""
+    """`load_columns` of a frame whose columns are named as those of a file, under the name `name`."""
     return replace(_columns(frame_cells(frame, Path(name)), time_unit, responses=responses), name=name)
 
 
@@ -254,10 +254,8 @@ def records_of(
     out: list[Record] = []
     problems: list[str] = []
     for number, one in enumerate(several(given), start=1):
-        try:
+        with gathered(problems):
             out.append(_record_of_any(one, time_unit, f"{called}-{number}"))
-        except InputError as error:
-            problems += error.problems
     refuse_if(problems)
     return tuple(out)
 

@@ -45,7 +45,12 @@ def _are_orders(value: object) -> bool:
     return value == "free" or bool(some)
 
 
-_TERMS = replace(whole(1, 6), each=whole(1, 6))
+_TERMS = Rule(
+    'a whole number from 1 to 6, or "auto"',
+    lambda value: value == "auto" or whole(1, 6).holds(value),
+    ("auto",),
+    each=whole(1, 6),
+)
 _ORDERS = Rule('"free" or numbers in (0, 2], such as [2, 1]', _are_orders)
 _EXPOSURE = Rule("a time, zero or more", lambda value: is_number(value) and value >= 0)
 
@@ -84,9 +89,9 @@ class RecordsSettings(Ruled):
 class ModelSettings(Ruled):
     """Table ``[model]``."""
 
-    terms: Annotated[int | Mapping[str, int], _TERMS] = 1
-    """Viscous terms [-] of every element, 1 to 6, or of each element by name; in a study file that
-    states `orders` the default is their number."""
+    terms: Annotated[int | Literal["auto"] | Mapping[str, int], _TERMS] = "auto"
+    """Viscous terms [-] of every element, 1 to 6, or of each element by name; "auto": the records choose, and
+    what paths share too; in a study file that states `orders` the default is their number."""
     orders: Annotated[Literal["free"] | tuple[float, ...], _ORDERS] = "free"
     """Fractional orders [-] in (0, 2], not increasing, one per term; "free": estimated."""
     share: Share | None = None
@@ -111,9 +116,17 @@ class ModelSettings(Ruled):
         share = self.share or ("paper" if alike or isinstance(self.terms, Mapping) else "none")
         return replace(self, share=share, delay=self.delay or ("shared" if alike else "path"))
 
+    @property
+    def most_terms(self) -> int:
+        """Terms of the richest element [-]; 1 before the records have chosen."""
+        each = self.terms.values() if isinstance(self.terms, Mapping) else (self.terms,)
+        return max(1 if terms == "auto" else terms for terms in each)
+
     def contradictions(self) -> list[str]:
         """Elements without a number of terms, and orders that are not one per term or that increase."""
         each = self.terms if isinstance(self.terms, Mapping) else {"": self.terms}
+        if self.terms == "auto" and isinstance(self.orders, tuple):
+            return ['`terms = "auto"` needs free orders; state the number of terms, or leave `orders` out']
         if not each:
             return ["`terms` names no element; give a number or one number per element"]
         if not isinstance(self.orders, tuple):
@@ -284,16 +297,15 @@ class CandidateSettings(Ruled):
 
     def model(self, own: ModelSettings) -> ModelSettings:
         """Settings of the model, what is left out from `own`; InputError when they contradict each other."""
-        terms, orders = self.terms, self.orders
-        if terms is None and isinstance(orders, tuple):
-            terms = max(1, len(orders))
+        stated, orders = self.terms, self.orders
+        if stated is None and isinstance(orders, tuple):
+            stated = max(1, len(orders))
         if orders is None:
-            orders = own.orders if terms is None else "free"
+            orders = own.orders if stated is None else "free"
         share = self.share or own.share
-        if terms is None:
-            terms = own.terms
-            if isinstance(terms, Mapping) and share != own.share:  # other elements than the study names
-                terms = max(terms.values())
+        terms = own.terms if stated is None else stated
+        if stated is None and isinstance(terms, Mapping) and share != own.share:  # other elements than the
+            terms = own.most_terms  # study names
         return replace(
             own,
             terms=terms,

@@ -1,6 +1,6 @@
 """Tables as people save them: spreadsheets and text of any separator, encoding and decimal sign.
 
-Everything is read as text first, with the line or row it stands in, so that a message can quote it. Above the
+Everything is read as text first, with its line or row, so that a message can quote it. Above the
 header there may be lines of remarks, below it a line of units.
 
 Numbers and time stamps in the notations of spreadsheets.
@@ -14,10 +14,8 @@ import re
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from itertools import count, product, zip_longest
 from pathlib import Path
-from typing import final
 from zipfile import BadZipFile
 
 import numpy as np
@@ -147,7 +145,7 @@ def _tabled(path: Path, rows: Sequence[tuple[int, list[str]]], width: int) -> Ce
     units = _units(above[-1]) if len(above) > 1 and _filled(above[-2]) > 1 else None
     header = above[-2] if units else above[-1]
     if _filled(header) < 2:
-        raise InputError(f"{path}, line {rows[first][0]}: no line of column names stands above the numbers")
+        raise InputError(f"{path}, line {rows[first][0]}: there is no line of column names above the numbers")
     names = [
         f"{name} [{unit}]" if units and unit else name
         for name, unit in zip_longest(header, (units or [])[: len(header)], fillvalue="")
@@ -206,42 +204,30 @@ _FORMATS = (*(f"{date} {clock}" for date, clock in product(_DATES, _CLOCKS)), *_
 _DAY = 86_400.0
 
 
-@final
-@dataclass(frozen=True)
-class Sign:
-    """A decimal sign, or why it is ambiguous."""
-
-    sign: str = "."
-    problem: str = ""
-
-
-def decimal_sign(table: CellTable, stated: str = "") -> Sign:
-    """The decimal sign of a table's numbers, ``.`` or ``,``.
+def decimal_sign(table: CellTable, problems: list[str], stated: str = "") -> str:
+    """The decimal sign of a table's numbers, ``.`` or ``,``; where it cannot be told, `problems` say why.
 
     A comma that three digits follow may separate thousands: where no other number of the table decides, the
     sign has to be stated.
     """
     if stated:
-        return (
-            Sign(stated)
-            if stated in (".", ",")
-            else Sign(problem=f"the decimal sign {stated!r} is not . or ,")
-        )
+        problems += [] if stated in (".", ",") else [f"the decimal sign {stated!r} is not . or ,"]
+        return stated
     cells = (_SPACES.sub("", cell) for column in table.columns for cell in column)
     commas = [cell for cell in cells if "," in cell and _PLAIN.fullmatch(cell)]
-    if not commas:
-        return Sign()
     for cell in commas:
         if "." in cell:
-            return Sign(max(",.", key=cell.rfind))
+            return max(",.", key=cell.rfind)
         if cell.count(",") > 1:
-            return Sign(".")
+            return "."
         if not re.fullmatch(r"[+-]?[1-9]\d{0,2},\d{3}", cell):
-            return Sign(",")
-    return Sign(
-        problem=f"{table.path}: {commas[0]!r} may be a number of thousands or have a decimal comma; state "
-        "the decimal sign with --decimal"
-    )
+            return ","
+    problems += [
+        f"{table.path}: {cell!r} may be a number of thousands or have a decimal comma; state the decimal "
+        "sign with --decimal"
+        for cell in commas[:1]
+    ]
+    return "."
 
 
 def numbers(cells: Sequence[str], sign: str) -> Vector:

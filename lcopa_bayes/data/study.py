@@ -10,8 +10,9 @@ from types import MappingProxyType
 from typing import Any, final
 
 import numpy as np
+import pandas as pd
 
-from lcopa_bayes.core.errors import InputError, refuse_if
+from lcopa_bayes.core.errors import gathered, refuse_if
 from lcopa_bayes.core.rules import rebuilt
 from lcopa_bayes.core.units import in_time_unit
 from lcopa_bayes.data.record import Axis, Record, RecordLike, records_of, several
@@ -158,6 +159,26 @@ class Study:
         """The same study with another seed."""
         return replace(self, seed=seed)
 
+    def summary(self) -> pd.DataFrame:
+        """One row per record: samples, first and last time [`time_unit`], axes [units], and whether it is
+        held out."""
+        return pd.DataFrame(
+            [
+                {
+                    "record": one.name,
+                    "samples": one.time.size,
+                    "begin": one.time[0],
+                    "end": one.time[-1],
+                    "time_unit": one.time_unit,
+                    "drives": ", ".join(f"{axis.name} [{axis.unit}]" for axis in one.drive_axes),
+                    "responses": ", ".join(f"{axis.name} [{axis.unit}]" for axis in one.response_axes),
+                    "held_out": held_out,
+                }
+                for held_out, records in ((False, self.fit), (True, self.held_out))
+                for one in records
+            ]
+        )
+
     def __repr__(self) -> str:
         """Its records, without their numbers and the settings."""
         return f"Study({self.name!r}, fit={list(self.fit)}, held_out={list(self.held_out)})"
@@ -180,11 +201,9 @@ def _records(
     """Records to fit and held out; those read here come in one time unit. What is wrong joins `problems`."""
     out: list[tuple[Record, ...]] = []
     for given, called in ((several(fit), "record"), (several(held_out), "held-out")):
-        try:
+        read: tuple[Record, ...] = ()
+        with gathered(problems):
             read = records_of(given, called=called)
-        except InputError as error:
-            problems += error.problems
-            read = ()
         unit = time_unit or next((record.time_unit for role in (*out, read) for record in role), None)
         as_given = read and all(isinstance(one, Record) for one in given)
         out.append(read if as_given else records_of(read, unit))

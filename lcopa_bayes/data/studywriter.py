@@ -5,13 +5,16 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lcopa_bayes.core.files import writable_folder, write_text
+from lcopa_bayes.core.errors import InputError, refuse_if
+from lcopa_bayes.core.files import writable_folder, write_text, writing
+from lcopa_bayes.core.rules import FOLDER
 from lcopa_bayes.data.record import Axis, Record, save_record
 from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.data.study import Study
@@ -52,6 +55,49 @@ def write_study(study: Study, path: Path, *, note: str = "") -> tuple[Path, ...]
             lines += ["", f"[{name}]", *rows] if rows else []
     write_text(path, "\n".join(lines).lstrip("\n") + "\n")
     return (*files["fit"], *files["held_out"], path)
+
+
+def write_folder(
+    folder: Path, study: Study, *, notes: Sequence[str] = (), settings: str = "", overwrite: bool = False
+) -> tuple[Path, ...]:
+    """Write the records of a study and a `study.toml` that names them into one folder; returns the paths,
+    the study file last.
+
+    Parameters: `notes`, comments at its head; `settings`, tables after those of the study and its records.
+    Everything is written beside its place first and then renamed, the study last: a folder cut short holds
+    no file half written and no new study without its records. InputError when a file is there already
+    (unless `overwrite`), a record has no name for a file, or one cannot be written.
+    """
+    roles = {"fit": study.fit, "held_out": study.held_out}
+    names = [record.name for records in roles.values() for record in records]
+    targets = [*(folder / f"{name}.csv" for name in names), folder / "study.toml"]
+    problems = [one for name in names for one in FOLDER.problems("record name", name)]
+    problems += [
+        f"{path}: is there already; choose another folder or allow --overwrite"
+        for path in targets
+        if path.exists() and not overwrite
+    ]
+    refuse_if(problems)
+    heading = _tables(study)["study"]
+    files = {role: [f"{record.name}.csv" for record in records] for role, records in roles.items()}
+    lines = [*(f"# {note}" for note in notes), "", "[study]"]
+    lines += [*(f"{key} = {_toml(value)}" for key, value in heading.items()), "", "[records]"]
+    lines += [f"{role} = {_toml(own)}" for role, own in files.items() if own]
+    if not study.held_out:
+        lines.append('# held_out = ["another.csv"]  # only predicted: the best check of a model')
+    text = "\n".join([*lines, "", settings.strip()]).strip()
+    writable_folder(folder)
+    with writing(folder), tempfile.TemporaryDirectory(prefix=".study-", dir=folder) as beside:
+        try:
+            for record, target in zip((*study.fit, *study.held_out), targets, strict=False):
+                save_record(record, Path(beside) / target.name)
+            write_text(Path(beside) / "study.toml", f"{text}\n")
+        except InputError as error:  # name the file that was wanted
+            raise InputError([one.replace(beside, str(folder)) for one in error.problems]) from error
+        for target in targets:
+            with writing(target):
+                os.replace(Path(beside) / target.name, target)
+    return tuple(targets)
 
 
 def study_to_json(study: Study) -> dict[str, Any]:

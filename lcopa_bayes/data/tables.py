@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, TypeVar
 
-from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.core.errors import gathered, nearest
 from lcopa_bayes.core.rules import FLAG, Ruled
 from lcopa_bayes.data.settings import (
     STAGES,
@@ -36,11 +36,9 @@ def settings_from(kind: type[S], table: object, where: str, problems: list[str])
     known = {one.name for one in dataclasses.fields(kind)}  # type: ignore[arg-type]
     problems += [f"{where}: unknown key {key!r}{nearest(key, known)}" for key in table if key not in known]
     values = {key: tuple(v) if isinstance(v, list) else v for key, v in table.items() if key in known}
-    try:
+    with gathered(problems, f"{where}: "):
         return kind(**values)
-    except InputError as error:
-        problems += [f"{where}: {problem}" for problem in error.problems]
-        return None
+    return None
 
 
 def prior_settings(
@@ -53,7 +51,7 @@ def prior_settings(
         return {}
     priors = {}
     for name, value in table.items():
-        try:
+        with gathered(problems, f"{where}: "):
             if isinstance(value, PriorSettings):
                 priors[name] = value
             elif isinstance(value, Mapping):
@@ -61,8 +59,6 @@ def prior_settings(
                 priors[name] = PriorSettings(name, dist=value.get("dist"), parameters=parameters)
             else:
                 priors[name] = PriorSettings(name, fixed=value)
-        except InputError as error:
-            problems += [f"{where}: {problem}" for problem in error.problems]
     wrong = {} if improper else {name: prior for name, prior in priors.items() if prior.improper}
     problems += [
         f"{where}: prior of {name!r}: {prior.dist} is no distribution; only a candidate of a comparison may "

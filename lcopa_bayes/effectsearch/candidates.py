@@ -24,12 +24,14 @@ _NAMED = 8
 """Named effects that are ranked [-]."""
 NEAR = 0.7
 """Candidates reach this share of the best log Bayes factor [-]."""
+_RIVAL = 0.2
+"""Share of the best log Bayes factor from which linear dynamics without a name are refitted [-]."""
 ROUGH = 5.0
 """Residual over noise beyond which the linear evidence is too rough to choose by [-]."""
 _INSTANCES = 16
 """Instances descended from, those of largest evidence [-]."""
 _FORCED = 3
-"""The same beside a force that is already there [-]."""
+"""The same beside a force that is already there, and of linear dynamics [-]."""
 _STEPS = 12
 _SIZES = (1.0, -1.0)
 """Coefficients from which a single one is also started, with fitted and with integer orders [prior sd]."""
@@ -39,7 +41,7 @@ def refitted(state: State, seen: Trace) -> tuple[list[Refit], list[str]]:
     """Refits of what may be named, by falling evidence; what could not be refitted and why.
 
     Candidates come near the best of all. Effects that the base model imitates to first order are tried too,
-    from the size of their prior.
+    from the size of their prior. So are the classes of linear dynamics, which a name must beat.
     """
     named = [one for one in seen.traced if one.card.place != "generic" and one.signatures][:_NAMED]
     worth = {one.name: one.signatures[one.best] for one in named if one.log_bayes_factor > 0}
@@ -55,13 +57,19 @@ def refitted(state: State, seen: Trace) -> tuple[list[Refit], list[str]]:
         blind = [one for one in _blind(seen) if one.name not in near]
         worth |= {one.name: one.signatures[one.best] for one in blind}
         sizes |= {one.name: np.ones(worth[one.name].columns.shape[1]) for one in blind}
+    worthy = _RIVAL * max(reached.values(), default=0.0)
+    for one in seen.traced if sizes or seen.alarmed else ():
+        if one.card.dynamics and one.signatures and one.log_bayes_factor >= worthy:
+            worth[one.name] = one.signatures[one.best]
+            sizes[one.name] = worth[one.name].amplitude(seen.residual)
     done: list[Refit] = []
     failures: list[str] = []
     for name, amplitude in sizes.items():
         effect, reached_at = worth[name].effect, None
         try:
-            if far and movable(seen.of(name)):
-                effect, reached_at = descended(state, seen, seen.of(name))
+            traced = seen.of(name)
+            if (far or traced.card.dynamics) and movable(traced):
+                effect, reached_at = descended(state, seen, traced)
                 amplitude = reached_at[-amplitude.size :] / state.model.having(effect).scale
             added = [(effect, amplitude)]
             done.append(
@@ -98,7 +106,8 @@ def descended(state: State, seen: Trace, traced: Traced) -> tuple[Effect, Vector
 
     ArithmeticError when no instance has a bounded response.
     """
-    forced = any(isinstance(effect, ForceEffect) for effect in state.model.effects)
+    dynamics = traced.card.dynamics
+    forced = dynamics or any(isinstance(effect, ForceEffect) for effect in state.model.effects)
     listed = sorted(traced.signatures, key=lambda one: -seen.alone(one))
     best: tuple[float, Effect, Vector] | None = None
     for signature in listed[: _FORCED if forced else _INSTANCES]:
@@ -123,12 +132,15 @@ def _starts(state: State, signature: Signature, seen: Trace, *, forced: bool) ->
     model = state.model.having(*state.model.effects, signature.effect)
     linear = signature.amplitude(seen.residual)
     unit = model.scale[-linear.size :]
+    rows = model.posterior.table.rows
+    straight = state.optimum.x.copy()
+    for position, k in enumerate(state.model.columns):
+        if rows[k].kind == "order":
+            straight[position] = max(np.round(straight[position]), 1.0)
+    if signature.effect.card.dynamics:
+        sizes = [(state.optimum.x, linear), (straight, linear), (straight, np.ones_like(linear))]
+        return [np.concatenate([x, size * unit]) for x, size in sizes]
     starts = [np.concatenate([state.optimum.x, size * unit]) for size in (linear, 0.3 * linear)]
     if linear.size == 1 and not forced:
-        rows = model.posterior.table.rows
-        straight = state.optimum.x.copy()
-        for position, k in enumerate(state.model.columns):
-            if rows[k].kind == "order":
-                straight[position] = max(np.round(straight[position]), 1.0)
         starts += [np.append(x, size * unit) for x in (state.optimum.x, straight) for size in _SIZES]
     return starts

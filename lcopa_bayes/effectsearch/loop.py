@@ -26,6 +26,7 @@ from lcopa_bayes.effectsearch.scores import (
     fit_scores,
     held_out_scores,
     left_out_scores,
+    over_noise,
     risen,
 )
 from lcopa_bayes.effectsearch.terms import fitted_base
@@ -46,6 +47,7 @@ from lcopa_bayes.model.effects.effect import Effect
 from lcopa_bayes.sampling.convergence import Grade
 from lcopa_bayes.sampling.draws import Draws
 
+_TEMPERATURES = ("K", "degC", "mK", "degF")
 _ASTRAY = (
     "the draws of the study predict the records held out worse than its optimum does and are not used: "
     "intervals and bands are those of a Laplace approximation there"
@@ -76,7 +78,8 @@ class Loop:
     """What was changed in the base model before anything was traced; empty when nothing was."""
     rounds: tuple[Round, ...]
     effects: tuple[Effect, ...]
-    """Named effects of the final model; none when the verdict is `unexplained` or `clean`."""
+    """Effects of the final model, perhaps linear dynamics without a name among them; none when the verdict is
+    `unexplained` or `clean`."""
     groups: tuple[tuple[str, ...], ...]
     """For each effect, the names it is confounded with, its own first."""
     verdict: Verdict
@@ -95,7 +98,8 @@ class Loop:
     @property
     def names(self) -> tuple[str, ...]:
         """What is named: the effects, and outliers."""
-        return (*(e.name for e in self.effects), *([OUTLIERS] if self.outliers else []))
+        named = (effect.name for effect in self.effects if not effect.card.dynamics)
+        return (*named, *([OUTLIERS] if self.outliers else []))
 
     @property
     def grade(self) -> Grade:
@@ -162,9 +166,18 @@ def loop(
             f"{study.name}: uses {', '.join(study.effects.use)} already; `loop` starts from the plant alone, "
             "so leave `use` out of [effects]"
         )
-    kinds = list(catalogue(study.effects.add, study.folder).values()) if library is None else list(library)
+    kinds = offered(study) if library is None else list(library)
     with threadpool_limits(1):  # many small products: more threads only wait for each other
         return _looped(study, kinds, jobs=jobs, sample=sample, quick=quick, as_stated=as_stated)
+
+
+def offered(study: Study) -> list[type[Effect]]:
+    """Effects of the catalogue that can occur where a study measures: temperatures are responses of a thermal
+    plant, anything else may be of any."""
+    known = catalogue(study.effects.add, study.folder).values()
+    if not all(axis.unit in _TEMPERATURES for axis in study.response_axes):
+        return list(known)
+    return [kind for kind in known if not kind.card.fields or "thermal" in kind.card.fields]
 
 
 def _looped(
@@ -195,16 +208,20 @@ def _looped(
         default=None,
     )
     reached = _side(problem, searched.state)
-    names = tuple(effect.name for effect in searched.state.model.effects)
+    added = searched.state.model.effects
+    names = tuple(effect.name for effect in added if not effect.card.dynamics)
+    apart = bool(added) and all(effect.card.per_record for effect in added)
     verdict = decide(
         Findings(
             failed="",
             cautions=cautions,
-            alarmed=first.alarmed or bool(names),
+            alarmed=first.alarmed or bool(added),
             largest=first.largest,
             threshold=first.threshold,
             effects=names,
-            disturbances=tuple(e.name for e in searched.state.model.effects if e.card.disturbance),
+            dynamics=len(names) < len(added),
+            apart=searched.apart,
+            disturbances=tuple(e.name for e in added if e.card.disturbance),
             gained=searched.gained,
             generic=generic.log_bayes_factor if generic else -np.inf,
             generic_name=generic.name if generic else "",
@@ -220,15 +237,16 @@ def _looped(
             if study.held_out
             else np.nan,
             risen=risen(before.unseen, reached.unseen) if study.held_out else np.nan,
+            reached=np.nan if apart else over_noise(reached.fit, reached.unseen, clear=not last.alarmed),
         )
     )
     if outliers is not None:
         verdict = beside(verdict, outliers.sentence)
-    named = verdict.kind in ("explained", "disturbance")
+    named = verdict.kind in ("explained", "partly explained", "disturbance")
     last_state, sampled = searched.state if named else start, None
     wider = last_state.model.wider
     verdict = widened(verdict, {name: wider[name] for name in names if named and name in wider})
-    if verdict.kind == "unexplained" or last.alarmed:  # something significant remains
+    if verdict.kind in ("unexplained", "partly explained") or last.alarmed:  # something significant remains
         white, residual = last_state.whitening, last_state.optimum.residual
         last_state = replace(last_state, widening=Widening.of(white.samples, residual, white.noise))
     if sample and declarable(study, last_state.model.effects):

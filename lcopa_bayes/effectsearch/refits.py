@@ -80,6 +80,21 @@ class Refit:
         return float(log_scores(self.optimum, apart).sum() - log_scores(self.before, apart).sum())
 
     @property
+    def dynamics(self) -> bool:
+        """Whether it adds linear dynamics without a name."""
+        return any(e.card.dynamics for e in self.model.effects if e.name in self.added)
+
+    @property
+    def unnamed(self) -> bool:
+        """Whether linear dynamics without a name were there before."""
+        return any(e.card.dynamics for e in self.model.effects if e.name not in self.added)
+
+    @property
+    def linear(self) -> bool:
+        """Whether all it adds is linear and does not change with time."""
+        return all(e.card.linear for e in self.model.effects if e.name in self.added)
+
+    @property
     def taken(self) -> float:
         """Share of the residual's power that the new effects take [-]."""
         return 1.0 - self.optimum.cost / self.before.cost

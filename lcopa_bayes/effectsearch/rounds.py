@@ -21,7 +21,7 @@ from lcopa_bayes.effectsearch.signature import (
     signature_of,
 )
 from lcopa_bayes.effectsearch.trace import Trace, Traced, trace
-from lcopa_bayes.effectsearch.verdict import MARGIN
+from lcopa_bayes.effectsearch.verdict import FIRM, MARGIN
 from lcopa_bayes.model.effects.effect import Effect
 
 MOST = 3
@@ -65,6 +65,12 @@ class Search:
     """Half the residual power that the effects took, over that and what the best class left would
     take [-]."""
 
+    @property
+    def apart(self) -> bool:
+        """Whether every effect brought enough evidence for a firm name, and is confounded with no other."""
+        brought = (one.chosen.log_bayes_factor for one in self.rounds if one.chosen)
+        return all(worth >= FIRM for worth in brought) and all(len(each) == 1 for each in self.groups)
+
 
 def search(
     start: State,
@@ -78,7 +84,8 @@ def search(
     """Add effects one at a time, up to three, while evidence, records left out and significance all speak
     for it, from a record that is `alone` only large ones; then try pairs where something remains, and
     take back what is no longer significant."""
-    state, rounds, groups = start, [], {}
+    state, rounds = start, []
+    groups: dict[str, tuple[str, ...]] = {}
     for number in range(MOST + 1):
         seen = trace(state, library, rng, noise_samples=noise_samples, draws=draws)
         if not (seen.alarmed or state.whitening.dependence) or number == MOST:
@@ -87,13 +94,18 @@ def search(
         refits, failures = refitted(state, seen)
         # what one refit leaves is not noise alone: a further effect must stand out from it
         bar = seen.threshold + (MARGIN if number else 0.0)
-        chosen = _leader([one for one in refits if _accepted(one, seen, bar) and (not alone or _large(one))])
+        likely = [one for one in accepted(refits, seen, bar) if not alone or _large(one)]
+        chosen = _leader(_beside_dynamics(likely, [one for one in refits if one.dynamics]))
+        if chosen is not None and chosen.dynamics and groups:
+            chosen = None  # beside a named effect they are what remains, which the verdict weighs
         rounds.append(Round(seen, tuple(refits), tuple(failures), chosen))
         if chosen is None:
             break
-        groups[chosen.added[0]] = group(state, chosen, refits, seen)
+        if not chosen.dynamics:
+            groups[chosen.added[0]] = group(state, chosen, refits, seen)
         state = _kept(chosen)
-    if rounds[-1].trace.alarmed and rounds[0].trace.alarmed and not alone:
+    unnamed = any(effect.card.dynamics for effect in state.model.effects)
+    if rounds[-1].trace.alarmed and rounds[0].trace.alarmed and not (alone or unnamed):
         paired = _paired(start, state, rounds[0].trace)
         if paired is not None:
             state = _state(paired)
@@ -123,13 +135,60 @@ def _gained(start: State, state: State, quiet: float) -> tuple[float, float]:
 
 def leading(start: State, seen: Trace) -> float:
     """Largest log Bayes factor of a single named effect that would be accepted, 0 without any [nat]."""
-    refits, _ = refitted(start, seen)
-    accepted = [one.log_bayes_factor for one in refits if _accepted(one, seen, seen.threshold)]
-    return max(accepted, default=0.0)
+    likely = accepted(refitted(start, seen)[0], seen, seen.threshold)
+    return max((one.log_bayes_factor for one in likely if not one.dynamics), default=0.0)
+
+
+def accepted(refits: Sequence[Refit], seen: Trace, bar: float) -> list[Refit]:
+    """Refits that may be kept, by falling evidence.
+
+    What linear dynamics without a name explain as well is no evidence of a name: a zero, a further lag, or
+    paths that differ in what the model lets them share look like many effects.
+    """
+    linear = max((one.log_bayes_factor for one in refits if one.dynamics), default=-np.inf)
+    ahead = (one for one in refits if one.dynamics or one.log_bayes_factor > linear + MARGIN)
+    # beside such dynamics a linear effect is one more of them
+    ahead = (one for one in ahead if one.dynamics or not (one.linear and one.unnamed))
+    return [one for one in ahead if _accepted(one, seen, bar)]
+
+
+def _beside_dynamics(likely: Sequence[Refit], dynamics: Sequence[Refit]) -> list[Refit]:
+    """Accepted refits from the first on that linear `dynamics` leave something to explain.
+
+    A linear effect is one of the dynamics; it must remain beside those of no more coefficients, and beats
+    the others by its few. Any other effect must remain beside each of them.
+    """
+    for number, one in enumerate(likely):
+        rivals = [each for each in dynamics if not (one.linear and len(each.new) > len(one.new))]
+        if one.dynamics or all(_remains(rival, one) for rival in rivals):
+            return list(likely[number:])
+    return []
+
+
+def _remains(linear: Refit, candidate: Refit) -> bool:
+    """Whether the effects of a refit are worth naming beside linear dynamics.
+
+    They are where they are ahead by more than the coefficients of these can cost.
+    """
+    if candidate.log_bayes_factor - linear.log_bayes_factor > MARGIN * (1 + len(linear.new)):
+        return True
+    kept = {e.name for e in linear.model.effects}
+    first = candidate.model.plant_size
+    added = []
+    for effect in candidate.model.effects:
+        if effect.name not in kept:
+            where = np.array(candidate.places(effect.name))
+            added.append((effect, candidate.optimum.x[where] / candidate.model.scale[where - first]))
+    try:
+        both = refit(linear.model, linear.optimum, linear.whitening, added, linear.quiet)
+    except ArithmeticError:
+        return False
+    return both.log_bayes_factor > MARGIN and both.significant
 
 
 def _accepted(candidate: Refit, seen: Trace, bar: float) -> bool:
-    generic = max((g.log_bayes_factor for g in seen.traced if g.card.place == "generic"), default=-np.inf)
+    others = (g for g in seen.traced if g.card.place == "generic" and not g.card.dynamics)
+    generic = max((g.log_bayes_factor for g in others), default=-np.inf)
     ahead = candidate.log_bayes_factor > generic + MARGIN
     return (
         candidate.log_bayes_factor > bar

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.stats import norm
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.core.covariance import covariance_of
+from lcopa_bayes.core.covariance import covariance_of, root_of
 from lcopa_bayes.core.estimate import LEVEL, attributes
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.crossvalidation import groups, shifts
@@ -186,7 +186,7 @@ def _laplace(state: State, seed: int) -> tuple[Draws, Noise]:
     free = np.flatnonzero(~optimum.stuck)
     covariance = covariance_of(optimum.information[np.ix_(free, free)])
     x = np.tile(optimum.x, (_TRIES * _DRAWS, 1))
-    x[:, free] += rng.multivariate_normal(np.zeros(free.size), covariance, len(x), method="eigh")
+    x[:, free] += rng.standard_normal((len(x), free.size)) @ root_of(covariance).T
     low, high = model.bounds
     inside = ((x >= low) & (x <= high))[:, free].all(axis=1)
     inside &= model.supported(x, every=False)
@@ -293,6 +293,18 @@ def risen(before: Sequence[Score], after: Sequence[Score]) -> float:
     """Largest root mean square error of any axis over that before [-]; NaN without samples."""
     axes = sorted({one.axis for one in before})
     ratios = [pooled_rmse(after, axis) / (pooled_rmse(before, axis) or 1.0) for axis in axes]
+    return max(ratios, default=float("nan"))
+
+
+def over_noise(fit: Sequence[Score], unseen: Sequence[Score], *, clear: bool) -> float:
+    """Largest root mean square error of any axis on unseen records over the noise [-]; NaN without samples.
+
+    Where nothing significant is left in it, the residual of the fit knows the noise as well as quiet samples.
+    """
+    ratios = []
+    for axis in sorted({one.axis for one in unseen}):
+        noise = [one.noise_sd for one in unseen if one.axis == axis]
+        ratios.append(pooled_rmse(unseen, axis) / max(noise[0], pooled_rmse(fit, axis) if clear else 0.0))
     return max(ratios, default=float("nan"))
 
 

@@ -14,10 +14,11 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basefit import BaseFit
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.regression import Regression
-from lcopa_bayes.effectsearch.verdict import MARGIN
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import problem_of
 
+_GAIN = 10.0
+"""Log evidence that the level must bring [nat]: a plant of too few terms is worth a few by it."""
 _EVALUATIONS = 60
 _STEPS = 8
 """Evaluations of the descent at each level tried [-]."""
@@ -33,7 +34,7 @@ class Mended(NamedTuple):
 
 
 def started(study: Study, fit: BaseFit) -> Mended | None:
-    """The study with one common drive before the first row of every record, when that is worth 3 nat.
+    """The study with one common drive before the first row of every record, when that is worth 10 nat.
 
     Before its first row the plant rests under the first row's drive; a record that begins while the plant
     moves would show the difference as a misfit of every slow effect at once. Where no record says or shows
@@ -60,7 +61,7 @@ def started(study: Study, fit: BaseFit) -> Mended | None:
     count = fit.optimum.effective
     power = float(fit.optimum.residual @ fit.optimum.residual)
     gain = 0.5 * count * np.log(power / found.fun) - 0.5 * first.size * np.log(count)
-    if not gain > MARGIN:
+    if not gain > _GAIN:
         return None
     levels = " and ".join(
         f"{value:.4g} {axis.unit} of {axis.name}"

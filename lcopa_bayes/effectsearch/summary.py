@@ -102,6 +102,8 @@ def _effects(found: Loop, chances: dict[str, float]) -> list[dict[str, Any]]:
     model, optimum = found.after.state.model, found.after.state.optimum
     first, out = model.plant_size, []
     for number, effect in enumerate(found.effects):
+        if effect.card.dynamics:
+            continue
         own = [(k, one) for k, one in enumerate(model.effected.coefficients) if one.effect == number]
         out.append(
             {

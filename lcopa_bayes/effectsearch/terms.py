@@ -1,4 +1,4 @@
-"""How many viscous terms the base model needs before anything is called missing."""
+"""How many viscous terms the base model needs and what its paths share, before anything is missing."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Base(NamedTuple):
 
 def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: bool, draws: int) -> Base:
     """The base fit; with one free viscous term stated and not `as_stated`, of the number the evidence asks
-    for.
+    for and its paths with elements and delays of their own where it asks for these.
 
     A plant with too few terms is no undeclared effect, and would be named as one; one with a term too many
     may imitate an effect. So a further term is a candidate like any other: it is added when it is worth more
@@ -73,9 +73,10 @@ def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: boo
             base = _based(study)._replace(sentence=f"{base.sentence} {better.sentence}".strip())
     if as_stated or study.model.terms != 1 or study.model.orders != "free":
         return base
+    base, study = _apart(study, base)
     for terms in range(2, _MOST + 1):
         try:
-            wider = _wider(study, base, terms)
+            wider = _wider(replace(study, model=replace(study.model, terms=terms)), base, terms)
         except ArithmeticError:
             break
         gain = _gain(base, wider)
@@ -98,12 +99,29 @@ def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: boo
     return base
 
 
-def _wider(study: Study, base: Base, terms: int) -> Base:
-    """The base fit with more terms, also from the optimum with fewer, which it contains.
+def _apart(study: Study, base: Base) -> tuple[Base, Study]:
+    """Base fit and study with an element and a delay of each path, where that is worth 10 nat."""
+    layout = base.problem.posterior.table.layout
+    if len(layout.paths) == len(layout.elements) == len(layout.delays):
+        return base, study
+    apart = replace(study, model=replace(study.model, share="none", delay="path"))
+    try:
+        wider = _wider(apart, base, 0)
+    except ArithmeticError:
+        return base, study
+    gain = _gain(base, wider)
+    if wider.fit.failed or not (gain > _GAIN or base.fit.failed):
+        return base, study
+    said = f"Every path has an element and a delay of its own, which is worth {gain:.0f} nat."
+    return wider._replace(sentence=f"{base.sentence} {said}".strip()), apart
 
-    Where it stays less likely than that, it has failed.
+
+def _wider(study: Study, base: Base, terms: int) -> Base:
+    """The base fit of a study that contains that of another, also from the optimum of the latter.
+
+    Where it stays less likely than that, it has failed. `terms` separates its random numbers from others'.
     """
-    wider = _based(replace(study, model=replace(study.model, terms=terms)), terms, contained=base)
+    wider = _based(study, terms, contained=base)
     regression = wider.fit.regression
     inner = Regression(base.fit.model, regression.whitening).descend(base.fit.optimum.x)
     if wider.fit.optimum.cost <= inner.cost + _BELOW:

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, final
 
-Kind = Literal["clean", "explained", "disturbance", "unexplained"]
+Kind = Literal["clean", "explained", "partly explained", "disturbance", "unexplained"]
 Confidence = Literal["firm", "tentative"]
 
-EXPLAINED = 0.9
+EXPLAINED = 0.95
 """Share of the residual power that effects can take which the named ones must take when something significant
 remains [-]; with the noise known well it is their share of the log evidence."""
 ALONE = 0.8
@@ -21,6 +21,10 @@ RISEN = 1.05
 """Error on held-out records with effects, or of draws, over that without from which neither is used [-]."""
 MARGIN = 3.0
 """Log evidence by which a generic class or another set must win [nat]."""
+FIRM = 30.0
+"""Log evidence that every effect must have brought where names are firm [nat]."""
+REACHED = 1.1
+"""Root mean square error over noise that an explained axis has on unseen records at most [-]."""
 
 
 @final
@@ -78,6 +82,13 @@ class Findings:
     risen: float = math.nan
     """Largest error of any axis on held-out records with the effects over that without [-]; NaN without such
     records."""
+    dynamics: bool = False
+    """Whether linear dynamics without a name were added."""
+    apart: bool = True
+    """Whether each effect brought 30 nat and is confounded with no other."""
+    reached: float = math.nan
+    """Largest error of any axis on unseen records over the noise, with the effects [-]; NaN where these
+    differ from record to record."""
 
 
 def decide(found: Findings) -> Verdict:
@@ -88,6 +99,15 @@ def decide(found: Findings) -> Verdict:
     if not found.alarmed:
         return _quiet(found, confidence)
     named = ", ".join(found.effects)
+    confidence = confidence if found.apart or not found.effects else "tentative"
+    if not found.effects and found.dynamics:
+        return Verdict(
+            "unexplained",
+            confidence,
+            f"Unmodelled linear dynamics are missing (worth {found.gained:.0f} nat): a further lag, a zero, "
+            "or paths that differ in what the model lets them share explain the residual as well as any "
+            "effect. No name is forced; more `terms`, or `share` and `delay` by path in [model], may help.",
+        )
     if not found.effects:
         return Verdict(
             "unexplained",
@@ -135,6 +155,12 @@ def decide(found: Findings) -> Verdict:
         else " Nothing significant remains."
     )
     verb = "was" if len(found.effects) == 1 else "were"
+    if found.dynamics or found.reached > REACHED:
+        rest += " Linear dynamics without a name are missing too." if found.dynamics else ""
+        if found.reached > REACHED:
+            rest += f" On unseen records the error stays at {found.reached:.2f} times the noise."
+        said = f"{named} {verb} missing, but not all that is, worth {found.gained:.0f} nat together."
+        return Verdict("partly explained", "tentative", said + rest)
     if set(found.effects) <= set(found.disturbances):
         return Verdict(
             "disturbance",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from math import isfinite
 from operator import call
 from typing import Any, final
@@ -12,11 +13,12 @@ from scipy.stats import chi2
 
 from lcopa_bayes.bench.device import Bench as VirtualBench
 from lcopa_bayes.bench.device import truth
+from lcopa_bayes.calibration.replica import device_of
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.core.estimate import LEVEL, attributes, plain
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.experiments.design import LINEAR, Design
-from lcopa_bayes.experiments.information import Bench, Trial, device_of
+from lcopa_bayes.experiments.information import Bench, Trial, with_effects
 
 REPLICAS = 12
 """Records simulated and fitted per drive."""
@@ -185,14 +187,17 @@ def confirmed(design: Design, *, jobs: int = 1, replicas: int = REPLICAS) -> dic
 def _confirmed(design: Design, chosen: int, where: str, replicas: int, jobs: int) -> Confirmation:
     """Both drives at one truth; a replica has the same noise whatever the number of processes."""
     problem, period = design.fit.problem, design.limits.period
-    device = device_of(problem, design.draws[chosen])
+    values, table = design.draws[chosen], problem.posterior.table
+    device = device_of(table, values, 0, time_unit=problem.study.time_unit)
+    responding = None if table.effects is None else partial(with_effects, problem, values)
     camera = VirtualBench(camera=period, exposure=problem.study.exposure)
     tasks = []
     for which, each in enumerate((design.winner, design.step)):
-        clean = truth(device, camera, each.candidate.command, duration=each.time, name="simulated")
+        drive, name = each.candidate.command, "simulated"
+        clean = truth(device, camera, drive, duration=each.time, name=name, responding=responding)
         bench = Bench(problem, each.time, period)
         tasks += [
-            Trial(bench, clean, design.draws[chosen], design.names, (problem.study.seed, 9, chosen, which, k))
+            Trial(bench, clean, values, design.names, (problem.study.seed, 9, chosen, which, k))
             for k in range(replicas)
         ]
     with workers(None, jobs=min(jobs, replicas)) as crew:

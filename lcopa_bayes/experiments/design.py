@@ -221,23 +221,20 @@ class Design:
     @property
     def factor(self) -> Estimate:
         """`factors` of the winner: median and interval over the draws."""
-        return self._over_draws("factor over the plain step", self.factors(self.winner))
+        return self.over_draws("factor over the plain step", self.factors(self.winner))
 
     @property
     def linear(self) -> float:
         """Share of the draws at which the winner's worst bound is small enough to be believed [-]."""
         return float(np.mean(self.winner.worst(self.determined) <= LINEAR))
 
-    def _over_draws(self, name: str, column: Vector) -> Estimate:
+    def over_draws(self, name: str, column: Vector) -> Estimate:
+        """What the draws of the posterior say of a number [-]."""
         return Estimate.of(name, "-", column, ess=float(column.size), grade=self.fit.draws.grade.level)
 
     def estimate(self, promise: Promise, name: str) -> Estimate:
         """Expected relative standard deviation of a parameter, with its spread over the draws."""
-        return self._over_draws(name, promise.relative[:, self.names.index(name)])
-
-    def worst_of(self, promise: Promise) -> Estimate:
-        """Worst relative standard deviation over the parameters, with its spread over the draws."""
-        return self._over_draws("worst", promise.worst(self.determined))
+        return self.over_draws(name, promise.relative[:, self.names.index(name)])
 
     def best(self, name: str, row: tuple[Promise, ...]) -> Promise:
         """Best drive for one parameter at one bench time."""

@@ -16,11 +16,9 @@ from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from lcopa_bayes.bench.command import Command
-from lcopa_bayes.bench.device import Device
-from lcopa_bayes.calibration import replica
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.data.drive import AxisDrive
-from lcopa_bayes.data.record import Axis, Record
+from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.effects import effect_slopes
@@ -195,10 +193,10 @@ class Bench:
         if not any(row.free and row.place.first == axis for row in offsets):
             return np.asarray(white[:-1])
         level = white[-1] / np.linalg.norm(white[-1])
-        left = white[:-1] - np.outer(white[:-1] @ level, level)
-        before, after = (np.linalg.norm(part, axis=1) for part in (white[:-1], left))
-        left[after <= _NOTHING * before] = 0.0  # what is left of a constant is rounding
-        return np.asarray(left)
+        varying = white[:-1] - np.outer(white[:-1] @ level, level)
+        before, after = (np.linalg.norm(part, axis=1) for part in (white[:-1], varying))
+        varying[after <= _NOTHING * before] = 0.0  # what remains of a constant is rounding
+        return np.asarray(varying)
 
 
 def effected_model(
@@ -244,50 +242,20 @@ class Trial:
         return _errors(problem, again, result, values, self.names), _leaning(again, result, self.names)
 
 
-@final
-@dataclass(frozen=True, eq=False)
-class EffectedDevice:
-    """A plant with effects, simulated by the model itself: no device of the virtual bench has them."""
-
-    problem: Problem
-    values: Vector
-    """Table values, (rows,)."""
-
-    @property
-    def drive_axes(self) -> tuple[Axis, ...]:
-        """Axes of the drive."""
-        return self.problem.study.drive_axes
-
-    @property
-    def response_axes(self) -> tuple[Axis, ...]:
-        """Axes of the response."""
-        return self.problem.study.response_axes
-
-    @property
-    def time_unit(self) -> str:
-        """Unit of all times."""
-        return self.problem.study.time_unit
-
-    def response(self, command: Command, time: ArrayLike, *, exposure: float = 0.0) -> Matrix:
-        """Responses at `time`, (times, axes) [response unit], on blocks as narrow as those of the fit."""
-        times: Vector = np.asarray(time, dtype=float)
-        table, posterior = self.problem.posterior.table, self.problem.posterior
-        assert table.effects is not None
-        step = min(one.mesh.lattice.step for one in posterior.model.experiments)
-        blocks = max(2, round(float(times[-1]) / step))
-        mesh = Mesh.of_samples(times, 0.0, blocks=blocks, exposure=exposure)
-        model = effected_model(table.layout, table.effects, command, mesh, times)
-        moved = Simulation(table, model).responses(self.values[None])[0][:, 0].T
-        levels = [table.offset(self.values[None], i, 0)[0] for i in range(moved.shape[1])]
-        return np.asarray(moved + levels)
-
-
-def device_of(problem: Problem, values: Vector) -> Device | EffectedDevice:
-    """The plant of table values as a device of the virtual bench."""
-    table, study = problem.posterior.table, problem.study
-    if table.effects is not None:
-        return EffectedDevice(problem, values)
-    return replica.device_of(table, values, 0, time_unit=study.time_unit)
+def with_effects(
+    problem: Problem, values: Vector, command: Command, time: ArrayLike, *, exposure: float = 0.0
+) -> Matrix:
+    """Responses at `time` of a plant with effects, (times, axes) [response unit], by the model itself on
+    blocks as narrow as those of the fit: no device of the virtual bench has its effects."""
+    times: Vector = np.asarray(time, dtype=float)
+    table, posterior = problem.posterior.table, problem.posterior
+    assert table.effects is not None
+    step = min(one.mesh.lattice.step for one in posterior.model.experiments)
+    blocks = max(2, round(float(times[-1]) / step))
+    mesh = Mesh.of_samples(times, 0.0, blocks=blocks, exposure=exposure)
+    model = effected_model(table.layout, table.effects, command, mesh, times)
+    moved = Simulation(table, model).responses(values[None])[0][:, 0].T
+    return np.asarray(moved + [table.offset(values[None], i, 0)[0] for i in range(moved.shape[1])])
 
 
 def _noisy(problem: Problem, clean: Record, values: Vector, rng: np.random.Generator) -> Record:
@@ -298,8 +266,7 @@ def _noisy(problem: Problem, clean: Record, values: Vector, rng: np.random.Gener
     for axis in range(response.shape[1]):
         parameters = posterior.noise_parameters(values[None], axis)
         response[sampled, axis] += posterior.noise.draw(parameters, gaps, rng)[0]
-    axes = (clean.drive_axes, clean.response_axes)
-    return Record(clean.name, clean.time, clean.drive, response, *axes, clean.time_unit)
+    return replace(clean, response=response)
 
 
 def refit(problem: Problem, record: Record, bench: Bench) -> Problem:

@@ -59,7 +59,7 @@ def _row(result: Design, promise: Promise) -> dict[str, Any]:
         "words": promise.candidate.words if promise.excites else "excites nothing that could be seen",
         "changes": promise.candidate.command.times.size,
         "time": promise.time,
-        "worst": result.worst_of(promise).as_json() if among.any() else None,
+        "worst": result.over_draws("worst", promise.worst(among)).as_json() if among.any() else None,
         "factor_over_step": quantile(result.factors(promise), 0.5) if among.any() else None,
         "typical": promise.typical(among) if among.any() else None,
         "relative_sd": [
@@ -75,6 +75,16 @@ def _parameter(result: Design, name: str, unit: str) -> dict[str, Any]:
     best = result.best(name, result.here)
     sizes = np.abs(result.draws[:, result.fit.draws.table.names.index(name)])
     spread: Vector = best.relative[:, at] * sizes
+    estimates = (
+        {}
+        if reason
+        else {
+            "relative_sd": result.estimate(best, name),
+            "sd": Estimate.of(name, unit, spread, ess=float(spread.size), grade=result.fit.draws.grade.level),
+            "relative_sd_step": result.estimate(result.step, name),
+            "relative_sd_winner": result.estimate(result.winner, name),
+        }
+    )
     needed_words = "not by any drive tried"
     if needed is not None:
         needed_words = f"{'at most ' * needed[1]}{needed[0]:.3g} {result.fit.study.time_unit}"
@@ -83,14 +93,8 @@ def _parameter(result: Design, name: str, unit: str) -> dict[str, Any]:
         "unit": unit,
         "reason": reason,
         "best_drive": None if reason else best.candidate.name,
-        "relative_sd": None if reason else result.estimate(best, name).as_json(),
-        "sd": None
-        if reason
-        else Estimate.of(
-            name, unit, spread, ess=float(spread.size), grade=result.fit.draws.grade.level
-        ).as_json(),
-        "relative_sd_step": None if reason else result.estimate(result.step, name).as_json(),
-        "relative_sd_winner": None if reason else result.estimate(result.winner, name).as_json(),
+        **dict.fromkeys(("relative_sd", "sd", "relative_sd_step", "relative_sd_winner")),
+        **{key: one.as_json() for key, one in estimates.items()},
         "time_for_10_percent": None if needed is None else needed[0],
         "time_is_upper_bound": needed is not None and needed[1],
         "time_words": needed_words,

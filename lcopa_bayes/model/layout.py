@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, final
@@ -152,8 +152,8 @@ def _distinct(table: list[list[str]]) -> tuple[str, ...]:
 
 def _terms(names: tuple[str, ...], model: ModelSettings) -> list[int]:
     """Number of viscous terms of each element."""
-    if isinstance(model.terms, int):
-        return [model.terms] * len(names)
+    if not isinstance(model.terms, Mapping):
+        return [model.most_terms] * len(names)
     problems = [
         f"[model] terms names the element {key!r}, which this plant does not have{nearest(key, names)}"
         for key in model.terms

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import inf, nextafter, pi
+from math import inf, nextafter
 from typing import final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector, finite, frozen
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
 from lcopa_bayes.model.literature import PAPER, StatedOptics
 from lcopa_bayes.optics.director import CELLS, Cell, Field, equilibrium, paper_cell
 
@@ -34,15 +33,12 @@ class DirectorCurve:
 def director_curve(
     cell: Cell, voltages: ArrayLike, *, field: Field = Field.UNIFORM, cells: int = CELLS
 ) -> DirectorCurve:
-    """Solve `director.equilibrium` of `cell` at `voltages` (m,) [V], continuing from the highest downwards.
+    """`director.equilibrium` of `cell` at ascending `voltages` (m,) [V], continued from the highest down.
 
     Downwards the previous profile lies on the tilted branch, which the flat state below threshold would not.
-    `field` and `cells` go to `equilibrium`, whose errors apply; InputError unless the voltages ascend.
+    `field` and `cells` go to `equilibrium`, whose errors apply.
     """
-    volts = frozen(finite(np.atleast_1d(voltages), name="voltages", lower=0.0, unit="V"), name="voltages")
-    if volts.size == 0 or (np.diff(volts) <= 0).any():
-        raise InputError("`voltages` must hold at least one value and ascend strictly [V]: sort them.")
-    profiles = []
+    volts, profiles = frozen(voltages, name="voltages"), []
     guess: Vector | None = None
     for volt in volts[::-1]:
         profile = equilibrium(cell, float(volt), field=field, cells=cells, guess=guess)
@@ -69,12 +65,10 @@ class TiltLaw:
     """Voltage from which the upper branch is counted [V]."""
     knee: float
     """First voltage of the upper branch [V]."""
-    limit: float
-    """Last voltage of the upper branch [V]."""
 
     def __call__(self, voltage: ArrayLike) -> Array:
-        """Mean tilt [rad] at voltages [V] in ``[0, limit]``; InputError outside."""
-        u = finite(voltage, name="voltage", lower=0.0, upper=self.limit, unit="V")
+        """Mean tilt [rad] at voltages [V]."""
+        u = np.asarray(voltage, dtype=float)
         return np.asarray(np.where(u < self.knee, self.low * u, self.high * (u - self.origin) + self.start))
 
     @property
@@ -102,12 +96,10 @@ def best_law(curve: DirectorCurve, optics: StatedOptics = PAPER.optics) -> TiltL
     u, mean = curve.voltage, curve.mean
     upper = (u >= optics.knee_voltage) & (u <= optics.largest_voltage)
     lower = u < optics.knee_voltage
-    if upper.sum() < 2 or not u[lower].any():
-        raise InputError("the solved curve needs voltages on both branches of the law: solve a wider range.")
     low = float(u[lower] @ mean[lower] / (u[lower] @ u[lower]))
     high, start = np.polyfit(u[upper] - optics.knee_voltage, mean[upper], 1)
-    knee, limit = optics.knee_voltage, optics.largest_voltage
-    return TiltLaw(low=low, high=float(high), start=float(start), origin=knee, knee=knee, limit=limit)
+    knee = optics.knee_voltage
+    return TiltLaw(low=low, high=float(high), start=float(start), origin=knee, knee=knee)
 
 
 @final
@@ -119,8 +111,6 @@ class FitQuality:
     """First voltage [V]."""
     upper: float
     """Last voltage [V]."""
-    points: int
-    """Solved voltages compared [-]."""
     r_squared: float
     """1 - residual over total sum of squares [-]; negative where the mean of the curve does better."""
     largest_relative_error: float
@@ -138,14 +128,8 @@ class FitQuality:
 
 
 def fit_quality(curve: DirectorCurve, law: TiltLaw, lower: float, upper: float) -> FitQuality:
-    """Compare `law` with `curve` at its solved voltages in ``[lower, upper]`` [V].
-
-    Raises InputError for a range beyond the solved range, or with fewer than three voltages in it.
-    """
-    finite([lower, upper], name="range", lower=curve.voltage[0], upper=curve.voltage[-1], unit="V")
+    """Compare `law` with `curve` at its solved voltages in ``[lower, upper]`` [V]."""
     inside = (curve.voltage >= lower) & (curve.voltage <= upper)
-    if inside.sum() < 3:
-        raise InputError(f"fewer than three solved voltages in [{lower:.6g}, {upper:.6g}] V: solve more.")
     solved, error = curve.mean[inside], law(curve.voltage[inside]) - curve.mean[inside]
     relative = np.full(error.shape, inf)
     np.divide(np.abs(error), solved, out=relative, where=solved > 0)
@@ -153,7 +137,6 @@ def fit_quality(curve: DirectorCurve, law: TiltLaw, lower: float, upper: float) 
     return FitQuality(
         lower=float(curve.voltage[inside][0]),
         upper=float(curve.voltage[inside][-1]),
-        points=int(inside.sum()),
         r_squared=1 - float(error @ error) / float(((solved - solved.mean()) ** 2).sum()),
         largest_relative_error=float(relative.max()),
         largest_error=float(np.abs(error).max()),
@@ -177,8 +160,6 @@ class TiltLawCheck:
     """Change of the solved mean tilt over 2 mV about the knee [rad]; small when there is no jump."""
     largest_printed_tilt: float
     """[rad]; no mean tilt out of the plates can exceed pi/2."""
-    tilt_limit: float = pi / 2
-    """[rad]."""
 
 
 RANGES = ("whole", "lower branch", "upper branch", "tilted")
@@ -226,5 +207,4 @@ def _law(optics: StatedOptics, origin: float) -> TiltLaw:
         start=optics.tilt_intercept_high,
         origin=origin,
         knee=optics.knee_voltage,
-        limit=optics.largest_voltage,
     )

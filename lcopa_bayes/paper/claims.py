@@ -6,7 +6,7 @@ from lcopa_bayes.model.literature import PAPER
 from lcopa_bayes.paper import auditclaims, comparisonclaims, modelclaims, numericsclaims, opticsclaims
 from lcopa_bayes.paper.auditclaims import from_audit
 from lcopa_bayes.paper.comparisonclaims import from_comparison, jointly, uncompared
-from lcopa_bayes.paper.verdict import Claim, Evidence, Judged
+from lcopa_bayes.paper.verdict import Claim, Evidence, Verdict
 
 CLAIMS: tuple[Claim, ...] = (
     Claim(
@@ -152,7 +152,6 @@ CLAIMS: tuple[Claim, ...] = (
 )
 
 
-def judge(evidence: Evidence | None = None) -> tuple[Judged, ...]:
-    """Every claim with its verdict, computed from the printed numbers and the evidence at hand."""
-    at_hand = evidence or Evidence()
-    return tuple(Judged(claim, claim.test(PAPER, at_hand)) for claim in CLAIMS)
+def judge(evidence: Evidence | None = None) -> dict[str, Verdict]:
+    """The verdict on each claim by its id, from the printed numbers and the evidence at hand."""
+    return {claim.id: claim.test(PAPER, evidence or Evidence()) for claim in CLAIMS}

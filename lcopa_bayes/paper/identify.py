@@ -12,7 +12,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.arrays import Vector
-from lcopa_bayes.core.errors import InputError, refuse_if
+from lcopa_bayes.core.errors import InputError, gathered, refuse_if
 from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.core.parallel import Progress, workers
 from lcopa_bayes.data.settings import ModelSettings, NoiseSettings
@@ -91,12 +91,8 @@ class Identified:
     """Equation error over blocks, per unit of left side [response unit]; see `equation_rmse`."""
     output_rmse: float
     """Response minus model over samples [response unit]."""
-    candidates: int | None = None
-    """Candidates scanned [-]; None for a fit."""
-    physical: int | None = None
-    """Of these, with positive viscosities and stiffness [-]."""
-    unconstrained_rmse: float | None = None
-    """Least output error among candidates of any sign, over blocks [response unit]."""
+    scanned: Scanned | None = None
+    """The scan that it is the winner of; None for a fit."""
 
 
 @final
@@ -159,10 +155,8 @@ def scannable(study: Study, plan: Scan | None = None) -> tuple[PathData, ...]:
     paths = path_data(study)
     problems: list[str] = []
     for data in paths:
-        try:
+        with gathered(problems, f"path {data.name}: "):
             plan.first_round(data.terms, data.span, data.records[0].blocks.grid.step)
-        except InputError as error:
-            problems += [f"path {data.name}: {problem}" for problem in error.problems]
     refuse_if(problems)
     return paths
 
@@ -193,9 +187,8 @@ def _identify(study: Study, data: PathData, plan: Scan, bar: Progress | None = N
         ):
             if bar is not None:
                 bar.set_description(f"{data.name}, {title}")
-            blocks = [each.blocks for each in data.records]
-            best = scan(blocks, count, data.span, limits, normalisation=normalisation, bar=bar)
-            scanned.append(_of_scan(f"scan, {title}", data, best))
+            best = scan(data.blocks, count, data.span, limits, normalisation=normalisation, bar=bar)
+            scanned.append(_described(f"scan, {title}", data, best.model, best))
         winner = scanned[0].model
         if bar is not None:
             bar.set_description(f"{data.name}, output error")
@@ -205,6 +198,9 @@ def _identify(study: Study, data: PathData, plan: Scan, bar: Progress | None = N
         )
         rival = scanned[2].model
         stiff = output_error_fit(study, data, rng, terms=len(whole), orders=whole, start=rival)
+        with_k = {
+            k: least_squares(data.blocks, winner.orders, winner.delay, known=k) for k in plan.stiffness
+        }  # Eq. 63 solved anew at the winner's orders and delay
         return Identification(
             data,
             scanned[0],
@@ -212,28 +208,15 @@ def _identify(study: Study, data: PathData, plan: Scan, bar: Progress | None = N
             _described("output error", data, free),
             scanned[2],
             _described("output error, integer orders", data, stiff),
-            tuple((k, output_rmse(data.records, _with_stiffness(data, winner, k))) for k in plan.stiffness),
+            tuple((k, output_rmse(data.records, model)) for k, model in with_k.items()),
         )
 
 
-def _with_stiffness(data: PathData, winner: TransferPath, stiffness: float) -> TransferPath:
-    """Eq. 63 solved anew at the winner's orders and delay with another k."""
-    blocks = [each.blocks for each in data.records]
-    return least_squares(blocks, winner.orders, winner.delay, known=stiffness)
-
-
-def _described(method: str, data: PathData, model: TransferPath) -> Identified:
-    blocks = [each.blocks for each in data.records]
-    return Identified(method, model, equation_rmse(blocks, model), output_rmse(data.records, model))
-
-
-def _of_scan(method: str, data: PathData, scanned: Scanned) -> Identified:
-    return replace(
-        _described(method, data, scanned.model),
-        candidates=scanned.candidates,
-        physical=scanned.physical,
-        unconstrained_rmse=scanned.unconstrained_rmse,
-    )
+def _described(
+    method: str, data: PathData, model: TransferPath, scanned: Scanned | None = None
+) -> Identified:
+    errors = equation_rmse(data.blocks, model), output_rmse(data.records, model)
+    return Identified(method, model, *errors, scanned)
 
 
 def results(study: Study, identified: tuple[Identification, ...], plan: Scan | None = None) -> dict[str, Any]:
@@ -277,7 +260,7 @@ def _path(identified: Identification, stiffness: float, time_unit: str) -> dict[
 
 
 def _model(identified: Identified, stiffness: float, time_unit: str) -> dict[str, Any]:
-    model = identified.model
+    model, scanned = identified.model, identified.scanned
     return {
         "method": identified.method,
         "orders": model.orders,
@@ -290,7 +273,8 @@ def _model(identified: Identified, stiffness: float, time_unit: str) -> dict[str
         },
         "steady": model.steady,
         "physical": model.physical,
-        **attributes(identified, "equation_rmse", "output_rmse", "candidates"),
-        "physical_candidates": identified.physical,
-        "unconstrained_output_rmse": identified.unconstrained_rmse,
+        **attributes(identified, "equation_rmse", "output_rmse"),
+        "candidates": scanned and scanned.candidates,
+        "physical_candidates": scanned and scanned.physical,
+        "unconstrained_output_rmse": scanned and scanned.unconstrained_rmse,
     }

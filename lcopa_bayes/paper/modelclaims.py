@@ -116,7 +116,7 @@ def integer_rival(stated: Stated = PAPER) -> Rival:
     study = Study("integer rival", None, "ms", 0, (record,), model=settings)
     data = path_data(study)[0]
     plan = Scan(orders=tuple(Interval(order, order) for order in orders), whole_blocks=False)
-    start = scan([each.blocks for each in data.records], len(orders), data.span, plan).model
+    start = scan(data.blocks, len(orders), data.span, plan).model
     model = output_error_fit(
         study, data, np.random.default_rng(0), terms=len(orders), orders=orders, start=start, starts=4
     )
@@ -205,7 +205,9 @@ def crosstalk_gains(stated: Stated, evidence: Evidence) -> Verdict:
     """
     wanted = stated.records.crosstalk_gains
     rules = crosstalk_rules(stated)
-    gaps = {name: _gap(pair, wanted) for name, pair in rules.items()}
+    gaps = {
+        name: max(abs(a / b - 1) for a, b in zip(pair, wanted, strict=True)) for name, pair in rules.items()
+    }
     name = min(gaps, key=gaps.__getitem__)
     hit = [rule for rule, pair in rules.items() if _matches(pair, wanted)]
     yx, xy = rules[hit[0] if hit else name]
@@ -288,10 +290,6 @@ def two_axis_steady(stated: Stated, evidence: Evidence) -> Verdict:
         f"{100 * SETTLED_PART:.0f} % of the record."
     )
     return Verdict(Kind.of(min(gaps) <= limit), min(gaps), "rad", how)
-
-
-def _gap(pair: tuple[float, float], wanted: tuple[float, float]) -> float:
-    return max(abs(a / b - 1) for a, b in zip(pair, wanted, strict=True))
 
 
 def _matches(pair: tuple[float, float], wanted: tuple[float, float]) -> bool:

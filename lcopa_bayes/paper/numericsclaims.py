@@ -30,7 +30,6 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.data.settings import ModelSettings
@@ -47,20 +46,10 @@ from lcopa_bayes.paper.verdict import Evidence, Kind, Verdict
 @final
 @dataclass(frozen=True)
 class WaveletBasis:
-    """The constant and the wavelets of Eq. 37 with m = 1 on levels 1..K, N = 2^K functions in all.
-
-    InputError unless N is a power of two, 2 or more.
-    """
+    """The constant and the wavelets of Eq. 37 with m = 1 on levels 1..K, N = 2^K functions in all."""
 
     n: int
     """N [-]."""
-
-    def __post_init__(self) -> None:
-        if isinstance(self.n, bool) or not isinstance(self.n, int) or self.n < 2 or self.n & (self.n - 1):
-            raise InputError(
-                f"wavelets need a power of two of blocks, 2 or more; got {self.n!r}: resample the record or "
-                "use block pulses, which take any number"
-            )
 
     def functions(self, t: Vector) -> Matrix:
         """Phi(t) of Eq. 40, ordered by level and place, at t [-] in [0, 1); (N, points)."""

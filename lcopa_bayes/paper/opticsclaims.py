@@ -46,7 +46,7 @@ def tilt_law(stated: Stated, evidence: Evidence) -> Verdict:
     jump, solved = checks[0].printed_jump, max(check.solved_change for check in checks)
     physical = abs(jump) <= abs(solved) or solved >= PHYSICAL_JUMP * jump
     fitted = best[0].r_squared > optics.tilt_fit_r_squared and close < optics.tilt_fit_error
-    top, limit = checks[0].largest_printed_tilt, checks[0].tilt_limit
+    top = checks[0].largest_printed_tilt
     how = (
         f"Over 0 to {optics.largest_voltage:g} V Eq. 24 has R^2 = {printed:.3f} as printed and "
         f"{best[0].r_squared:.3f} in its best reading (stated above {optics.tilt_fit_r_squared:g}; the best "
@@ -56,7 +56,7 @@ def tilt_law(stated: Stated, evidence: Evidence) -> Verdict:
         f"{100 * optics.tilt_fit_error:g} %). Its "
         f"jump of {jump:.3f} rad at {optics.knee_voltage:g} V compares with a solved change of {solved:.1e} "
         f"rad over 2 mV; at {optics.largest_voltage:g} V it says {top:.3f} rad, and no tilt exceeds "
-        f"{limit:.3f} rad."
+        f"{pi / 2:.3f} rad."
     )
     return Verdict(Kind.of(fitted and physical), best[0].r_squared, "-", how)
 

@@ -122,6 +122,11 @@ class PathData:
     records: tuple[PathRecord, ...]
 
     @property
+    def blocks(self) -> list[Blocks]:
+        """Those of every record."""
+        return [each.blocks for each in self.records]
+
+    @property
     def span(self) -> float:
         """Shortest time from a record's first drive change to its end [time unit]."""
         return min(float(each.blocks.grid.edges[-1] - each.blocks.drive.times[0]) for each in self.records)

@@ -76,7 +76,6 @@ def step_table(
     identified: Sequence[Identification],
     *,
     posterior: Mapping[str, Any] | None = None,
-    stated: Stated = PAPER,
 ) -> list[dict[str, Any]]:
     """Metrics of every path that every model of `KINDS` gives, for the largest step of its records.
 
@@ -97,7 +96,7 @@ def step_table(
             kind: step_of(one.model, size, data.span) | {"RMSE": one.output_rmse}
             for kind, one in models.items()
         }
-        shown = any(paper_figure(originals[r.record.name], stated) == "Fig. 13" for r in data.records)
+        shown = any(paper_figure(originals[r.record.name]) == "Fig. 13" for r in data.records)
         axes = (study.response_axes[data.response].name, study.drive_axes[data.drive].name)
         units = {"time": study.time_unit, "response": data.response_unit}
         for metric, (kind, _, _) in METRICS.items():
@@ -107,7 +106,7 @@ def step_table(
                 "metric": metric,
                 "unit": units.get(kind, kind),
                 "values": {name: one[metric] for name, one in metrics.items()},
-                "printed": _printed(metric, stated) if shown and axes == ("x", "x") else {},
+                "printed": _printed(metric) if shown and axes == ("x", "x") else {},
                 "posterior": _from_posterior(posterior, metric, data.name, axes[0], size),
             }
             rows.append(plain(row))
@@ -125,9 +124,9 @@ def load_posterior(folder: Path, study: Study) -> Mapping[str, Any]:
     return results
 
 
-def _printed(metric: str, stated: Stated) -> dict[str, float]:
+def _printed(metric: str) -> dict[str, float]:
     """Columns of Table 1."""
-    given, field = stated.records, METRICS[metric][1]
+    given, field = PAPER.records, METRICS[metric][1]
     if metric == "RMSE":
         return {"fractional": given.fractional_rmse, "integer": given.integer_rmse}
     return {column: float(getattr(getattr(given, column), field)) for column in PRINTED} if field else {}

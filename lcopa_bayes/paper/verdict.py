@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, TypeAlias, final
 
-from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.model.literature import Stated
 
 
@@ -75,24 +74,3 @@ class Claim:
     source: str
     """Section or equation of Ta et al. 2026."""
     test: Test
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Judged:
-    """A claim with its verdict."""
-
-    claim: Claim
-    verdict: Verdict
-
-    def as_json(self) -> dict[str, Any]:
-        """Plain values."""
-        return plain(
-            {
-                "id": self.claim.id,
-                "verdict": self.verdict.kind.value,
-                **attributes(self.verdict, "number", "unit", "how"),
-                "text": self.claim.text,
-                "source": self.claim.source,
-            }
-        )

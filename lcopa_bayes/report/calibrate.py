@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
 
 from lcopa_bayes.report.formatting import figures, percent
 from lcopa_bayes.report.page import Drawings, write_graded
-from lcopa_bayes.report.theme import BAND, HELD_OUT, INK, NOISE, Drawing, blank, grid, plain, svg_of
+from lcopa_bayes.report.theme import BAND, HELD_OUT, INK, NOISE, Drawing, blank, grid, paged, plain, svg_of
 
+Draw: TypeAlias = Callable[[Axes, Mapping[str, Any], Mapping[str, Any]], None]
 _PER_FIGURE = 18
 """Most quantities on one figure of ranks."""
 
@@ -39,10 +40,14 @@ def _drawn(results: Mapping[str, Any]) -> Drawings:
         f"in which the whole curve of uniform ranks lies {bound}. The p-value is that of this test, each "
         "quantity on its own."
     )
+
+    def pages(stem: str, draw: Draw, caption: str) -> tuple[Drawing, ...]:
+        return paged(stem, results["ranks"], _PER_FIGURE, lambda part: _panels(part, results, draw), caption)
+
     return {
         "coverage": [Drawing("calibration_coverage", _dots(results), coverage)],
-        "ranks": _pages(results, "calibration_ranks", ranks, 1.35, _histogram),
-        "differences": _pages(results, "calibration_ecdf", differences, 1.35, _difference),
+        "ranks": pages("calibration_ranks", _histogram, ranks),
+        "differences": pages("calibration_ecdf", _difference, differences),
         "replicas": _replicas(results),
     }
 
@@ -71,26 +76,15 @@ def _dots(results: Mapping[str, Any]) -> str:
     return svg_of(figure)
 
 
-def _pages(
-    results: Mapping[str, Any],
-    stem: str,
-    caption: str,
-    height: float,
-    draw: Callable[[Axes, Mapping[str, Any], Mapping[str, Any]], None],
-) -> tuple[Drawing, ...]:
-    """Figures of up to `_PER_FIGURE` panels, one per quantity."""
-    out = []
-    pages = -(-len(results["ranks"]) // _PER_FIGURE)
-    for number, part in enumerate(np.array_split(np.arange(len(results["ranks"])), pages), start=1):
-        rows = [results["ranks"][k] for k in part]
-        figure, panels = grid(len(rows), columns=3, height=height)
-        for panel, row in zip(panels, rows, strict=True):
-            draw(panel, row, results)
-            panel.set_title(plain(row["parameter"]), fontsize=7.5)
-        for panel in panels[-3:]:
-            panel.set_xlabel("rank [-]")
-        out.append(Drawing(f"{stem}_{number:02d}", svg_of(figure), caption))
-    return tuple(out)
+def _panels(rows: Sequence[Mapping[str, Any]], results: Mapping[str, Any], draw: Draw) -> str:
+    """One panel per quantity."""
+    figure, panels = grid(len(rows), columns=3, height=1.35)
+    for panel, row in zip(panels, rows, strict=True):
+        draw(panel, row, results)
+        panel.set_title(plain(row["parameter"]), fontsize=7.5)
+    for panel in panels[-3:]:
+        panel.set_xlabel("rank [-]")
+    return svg_of(figure)
 
 
 def _histogram(panel: Axes, row: Mapping[str, Any], results: Mapping[str, Any]) -> None:

@@ -12,11 +12,10 @@ from typing import Any
 import pandas as pd
 from matplotlib.axes import Axes
 
-from lcopa_bayes.core.errors import refuse_if
+from lcopa_bayes.report import records
 from lcopa_bayes.report.page import Drawings, Verdict, write_graded
-from lcopa_bayes.report.savedrun import TABLES, SavedRun, read_table
-from lcopa_bayes.report.sections import records
-from lcopa_bayes.report.sections.records import draw_drives
+from lcopa_bayes.report.records import draw_drives
+from lcopa_bayes.report.savedrun import TABLES, SavedRun, read_tables
 from lcopa_bayes.report.theme import HELD_OUT, SEEN, Drawing, blank, draw_line, label, plain, svg_of
 from lcopa_bayes.results.firstlook import TABLES as SHOWN
 
@@ -28,10 +27,8 @@ def write_check(folder: Path) -> Path:
 
     InputError when a file of the check is missing or cannot be used.
     """
-    problems: list[str] = []
-    path = folder / "tables" / "check_records.csv"
-    table = read_table(path, _COLUMNS, problems, verb="check")
-    refuse_if(problems)
+    paths = {"records": folder / "tables" / "check_records.csv"}
+    table = read_tables(paths, "check", {"records": _COLUMNS})["records"]
 
     def drawn(values: Mapping[str, Any]) -> Drawings:
         unit = str(values["time_unit"])
@@ -50,12 +47,7 @@ def write_look(folder: Path) -> Path:
 
     InputError when a file of the look is missing or cannot be used.
     """
-    problems: list[str] = []
-    tables = {
-        name: read_table(folder / "tables" / f"look_{name}.csv", TABLES[name], problems, verb="look")
-        for name in SHOWN
-    }
-    refuse_if(problems)
+    tables = read_tables({name: folder / "tables" / f"look_{name}.csv" for name in SHOWN}, "look", TABLES)
     return write_graded(
         folder, "look", "first look", lambda values: records.drawn(SavedRun(values, {}, tables, {}))
     )

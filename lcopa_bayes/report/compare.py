@@ -11,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from lcopa_bayes.comparison.compare import folder_name
-from lcopa_bayes.core.errors import refuse_if
 from lcopa_bayes.report.formatting import figures
 from lcopa_bayes.report.page import Drawings, Verdict, write_graded
+from lcopa_bayes.report.savedrun import read_tables
 from lcopa_bayes.report.theme import (
     CYCLE,
     NOISE,
@@ -54,15 +54,9 @@ def _verdict(results: Mapping[str, Any]) -> Verdict:
 
 def _curves(folder: Path, results: Mapping[str, Any]) -> dict[str, pd.DataFrame]:
     """Curves of every candidate that has any; InputError when a table cannot be read."""
-    out, problems = {}, []
-    for row in results["models"]:
-        path = folder / "candidates" / folder_name(str(row["name"])) / "tables" / "curves.csv"
-        try:
-            out[str(row["name"])] = pd.read_csv(path, dtype={"record": str, "axis": str, "unit": str})
-        except (OSError, ValueError) as error:
-            problems.append(f"{path}: cannot be read ({error}); run `compare` again with --resume")
-    refuse_if(problems)
-    return out
+    tables, names = folder / "candidates", [str(row["name"]) for row in results["models"]]
+    paths = {name: tables / folder_name(name) / "tables" / "curves.csv" for name in names}
+    return read_tables(paths, "compare")
 
 
 def _evidence(results: Mapping[str, Any]) -> list[Drawing]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from math import floor, isfinite, log10
 from typing import Any
@@ -13,6 +14,8 @@ NOT_REACHED = "open (not reached within the record)"
 NONE = "–"  # noqa: RUF001
 """An entry that is not defined."""
 _MINUS = "−"  # noqa: RUF001
+_HYPHEN = re.compile(r"(?<![\w.)\]-])-(?=\.?\d)")
+_NO_SIGN = re.compile(f"{_MINUS}(0(?:\\.0*)?)(?![\\d.])")
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _PLAIN_FROM, _PLAIN_TO = 1e-3, 1e6
 """Between these sizes numbers are printed without a power of ten."""
@@ -72,6 +75,11 @@ def with_error(value: float | None, error: float | None, places: int = 2, *, bar
     return f"{value:.{places}f}" if error is None else f"{value:.{places}f} ± {error:.{places}f}"
 
 
+def signed(text: str) -> str:
+    """Text with true minus signs before its numbers, and none before a zero."""
+    return _NO_SIGN.sub(r"\1", _HYPHEN.sub(_MINUS, text))
+
+
 def sentence(clause: str) -> str:
     """A clause with a capital and a full stop."""
     return stopped(f"{clause[0].upper()}{clause[1:]}")
@@ -98,4 +106,4 @@ def _printed(value: float, places: int) -> str:
         text = f"{mantissa}×10{str(power).translate(_RAISED)}"  # noqa: RUF001
     else:
         text = f"{round(value, places):.{max(0, places)}f}"
-    return text.replace("-", _MINUS)
+    return signed(text)

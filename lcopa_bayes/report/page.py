@@ -7,7 +7,7 @@ result through the functions of `formatting`. A page needs nothing else; its fig
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -129,6 +129,8 @@ class Page:
 def _cell(kind: str, value: object) -> Markup:
     number = kind == "number" and isinstance(value, float)
     text = formatting.figures(value) if value is None or number else value  # type: ignore[arg-type]
+    if kind in ("number", "interval", "prose"):
+        text = formatting.signed(str(text))
     return Markup('<td class="{}">{}</td>').format(f"{kind} {text}" if kind == "grade" else kind, text)
 
 
@@ -137,19 +139,14 @@ def each(rows: Iterable[Mapping[str, Any]], *keys: str) -> list[tuple[Any, Any]]
     return [(row, one) for row in rows for key in keys for one in row[key]]
 
 
-def zip_of(*lists: Sequence[Any]) -> list[tuple[Any, ...]]:
-    """Entries of lists of one length side by side."""
-    return list(zip(*lists, strict=True))
-
-
 def anchor(title: str) -> str:
     """Name of a section inside its page."""
     return "-".join("".join(c if c.isalnum() else " " for c in title.lower()).split())
 
 
 def tied(text: str) -> Markup:
-    """A paragraph without line breaks in numbers with a percent sign, nor in p-values."""
-    words = re.sub(r"[ \n]+", " ", escape(text)).strip()
+    """A paragraph with true minus signs, without line breaks in percentages and p-values."""
+    words = formatting.signed(re.sub(r"[ \n]+", " ", escape(text)).strip())
     return Markup(words.replace(" %", "\u00a0%").replace("p = ", "p\u00a0=\u00a0"))
 
 
@@ -212,7 +209,7 @@ def write_page(
     }
     environment.globals |= {key: getattr(formatting, key) for key in _CALLED}
     environment.globals |= {key: getattr(page, key) for key in ("section", "p", "table", "cells", "figures")}
-    environment.globals |= {"each": each, "pairs": zip_of, "product": product}
+    environment.globals |= {"each": each, "pairs": zip, "product": product}
     environment.globals |= {"POINTWISE": POINTWISE, "SIMULTANEOUS": SIMULTANEOUS}
     body = environment.get_template(template.name).render(v=values, drawn=drawn, **more)
     whole = environment.get_template("page.html")

@@ -1,50 +1,38 @@
-"""Which page shows the result of which verb.
-
-Pages about the paper, drawn from their run folders: static optics, identification, claims.
-"""
+"""Which page shows the result of which verb, and the page of a fit."""
 
 from __future__ import annotations
 
 import inspect
-from collections import ChainMap
 from collections.abc import Callable, Mapping
-from math import log10
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
-import pandas as pd
-
-from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.inference import defaultpriors
-from lcopa_bayes.model.path import Normalisation
-from lcopa_bayes.paper.staticoptics import OpticsPlan, static_optics
-from lcopa_bayes.paper.steptable import KINDS, PRINTED
+from lcopa_bayes.report import draws, records, responses
 from lcopa_bayes.report.audit import write_audit
 from lcopa_bayes.report.calibrate import write_calibration
 from lcopa_bayes.report.check import write_check, write_look
+from lcopa_bayes.report.claims import write_claims
 from lcopa_bayes.report.compare import write_comparison
 from lcopa_bayes.report.design import write_design
-from lcopa_bayes.report.formatting import interval
+from lcopa_bayes.report.identify import write_identification
 from lcopa_bayes.report.loop import write_loop
+from lcopa_bayes.report.optics import write_optics
 from lcopa_bayes.report.page import Drawings, write_graded
 from lcopa_bayes.report.predict import write_prediction
 from lcopa_bayes.report.savedrun import SavedRun, load_run
-from lcopa_bayes.report.sections import (
-    claimfigures,
-    identification,
-    optics,
-    pairs,
-    parameters,
-    records,
-    responses,
-    sampling,
-)
 from lcopa_bayes.report.theme import look
-from lcopa_bayes.results.stored import stored_values
 
-_PARTS = (pairs, parameters, records, responses, sampling)
-"""What draws the report of a fit."""
+Part: TypeAlias = Callable[[SavedRun], Drawings]
+_PARTS: tuple[Part, ...] = (
+    draws.pairs,
+    draws.parameters,
+    records.drawn,
+    responses.drawn,
+    draws.sampling,
+)
+"""What draws the page of a fit."""
 
 
 def write_report(folder: Path, *, jobs: int = 1) -> Path:
@@ -55,14 +43,14 @@ def write_report(folder: Path, *, jobs: int = 1) -> Path:
     """
     run = load_run(folder)
     with workers(run, jobs=jobs) as crew:
-        parts = list(crew.each(_drawn, range(len(_PARTS))))
+        parts = list(crew.each(_drawn, _PARTS))
 
     rules = inspect.cleandoc(defaultpriors.__doc__ or "")
     return write_graded(
         folder,
         "fit",
         "",
-        lambda _: dict(ChainMap(*parts)),
+        lambda _: {key: one for part in parts for key, one in part.items()},
         file="results.json",
         name="report.html",
         run=run,
@@ -70,73 +58,10 @@ def write_report(folder: Path, *, jobs: int = 1) -> Path:
     )
 
 
-def _drawn(run: SavedRun, number: int) -> dict[str, Any]:
+def _drawn(run: SavedRun, part: Part) -> Drawings:
     """A part of the report."""
     with look():
-        return dict(_PARTS[number].drawn(run))
-
-
-def write_optics(folder: Path) -> Path:
-    """`optics.html` with far fields, director, tilt law and chain; returns its path.
-
-    All is solved again for the plan in `optics.json`; InputError when that file cannot be used.
-    """
-    plan = stored_values(folder, "optics", ("plan",))["plan"]
-    try:
-        calculated = static_optics(OpticsPlan(**plan))
-    except TypeError as error:
-        raise InputError(f"{folder / 'optics.json'}: holds no plan ({error}); run `optics` again") from None
-    return write_graded(
-        folder,
-        "optics",
-        "Static optics of the array",
-        lambda values: optics.drawn(calculated),
-        box=None,
-        calculated=calculated,
-        decibel=lambda intensity: 10 * log10(intensity),
-    )
-
-
-def write_identification(folder: Path) -> Path:
-    """`identify.html` with models, Table 1 and records; returns its path.
-
-    InputError when `identify.json` or a table of samples cannot be used.
-    """
-    values = stored_values(folder, "identify", ("study", "time_unit", "paths", "step_metrics", "records"))
-    try:
-        samples = [pd.read_csv(folder / entry["samples"]) for entry in values["records"]]
-    except (OSError, ValueError) as error:
-        raise InputError(f"{folder}: samples cannot be read ({error}); run `identify` again") from None
-
-    def drawn(values: Mapping[str, Any]) -> Drawings:
-        both = zip(values["records"], samples, strict=True)
-        return {"records": [identification.drawing(*one, values["time_unit"]) for one in both]}
-
-    def credible(one: Mapping[str, Any]) -> str:
-        lower, upper = one["lower"], one["upper"]
-        return interval(lower, upper, None if None in (lower, upper) else abs(upper - lower) / 4)
-
-    return write_graded(
-        folder,
-        "identify",
-        "identification",
-        drawn,
-        box=None,
-        normalisations=[one.value for one in Normalisation],
-        kinds=KINDS,
-        columns=PRINTED,
-        credible_interval=credible,
-    )
-
-
-def write_claims(folder: Path) -> Path:
-    """`claims.html` with every claim, its verdict and the figures behind them; returns its path.
-
-    InputError when `claims.json` cannot be used.
-    """
-    return write_graded(
-        folder, "claims", "Claims of the paper", lambda values: {"claims": claimfigures.drawn()}, box=None
-    )
+        return part(run)
 
 
 _PAGES: Mapping[str, Callable[[Path], Path]] = {

@@ -9,10 +9,10 @@ from typing import Any
 import pandas as pd
 from matplotlib.axes import Axes
 
-from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.report.page import Drawings, write_graded
-from lcopa_bayes.report.sections.records import BANDS as RESPONSE
-from lcopa_bayes.report.sections.records import above_drives, draw_response
+from lcopa_bayes.report.records import BANDS as RESPONSE
+from lcopa_bayes.report.records import above_drives, draw_response
+from lcopa_bayes.report.savedrun import read_tables
 from lcopa_bayes.report.theme import BAND, HELD_OUT, NOISE, Drawing, draw_line, legend_above, svg_of
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
 from lcopa_bayes.results.newdrive import BANDS, DRIVES
@@ -27,13 +27,8 @@ def write_prediction(folder: Path) -> Path:
 
     InputError when a file of the prediction is missing or cannot be used.
     """
-    path = folder / "tables"
-    try:
-        bands, drives = (
-            pd.read_csv(path / name, dtype={"axis": str, "unit": str}) for name in (BANDS, DRIVES)
-        )
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); run `predict` to write it") from None
+    paths = {name: folder / "tables" / name for name in (BANDS, DRIVES)}
+    bands, drives = read_tables(paths, "predict").values()
 
     def drawn(values: Mapping[str, Any]) -> Drawings:
         curves = [

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, final
+from typing import Any, TypeVar, final
 
 import numpy as np
 import pandas as pd
@@ -19,6 +19,7 @@ from lcopa_bayes.results.datatree import posterior_draws
 from lcopa_bayes.results.runfolder import ORIGINS
 from lcopa_bayes.results.summary import IMPORTANCE
 
+T = TypeVar("T")
 _WORDS = ("record", "axis", "unit", "name", "path", "prior", "from")
 _FLAGS = ("held_out", "log_scale", "integrated_out")
 TABLES: Mapping[str, tuple[str, ...]] = {
@@ -48,12 +49,6 @@ _CHECK_TABLES: Mapping[str, tuple[str, ...]] = {
     "cross_check_density": ("name", "log_scale", "left", "right", "ensembles", "nested")
 }
 """The same of a run that was checked by a second method."""
-_RESULTS = (
-    *("study", "verdict", "overview", "grade", "grade_reason", "time_unit"),
-    *("parameters", "fixed", "held_out", "fit_scores", "step_metrics", "residual_tests"),
-    *("sampler", "modes", "sensitivity", "cross_check"),
-)
-_PROVENANCE = ("command", "seed", "inputs_sha256", "python", "versions")
 
 
 @final
@@ -111,71 +106,61 @@ def load_run(folder: Path) -> SavedRun:
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such run folder; give the folder `fit` wrote")
     problems: list[str] = []
-    results = _json(folder / "results.json", _RESULTS, problems)
-    origin = _json(folder / ORIGINS, ("fit",), problems).get("fit", {})
-    problems += [
-        f"{folder / ORIGINS}: the key {key!r} of the fit is missing; run `fit` again with this version of "
-        "lcopa-bayes"
-        for key in _PROVENANCE
-        if origin and key not in origin
-    ]
+    results = read_part(folder / "results.json", read_json, problems) or {}
+    origin = (read_part(folder / ORIGINS, read_json, problems) or {}).get("fit", {})
     wanted = {**TABLES, **(_CHECK_TABLES if results.get("cross_check") else {})}
     tables = {
-        name: read_table(folder / "tables" / f"{name}.csv", needs, problems) for name, needs in wanted.items()
+        name: read_table(folder / "tables" / f"{name}.csv", problems, needs, "fit")
+        for name, needs in wanted.items()
     }
-    draws = _draws(folder / "posterior.nc", problems)
+    draws = read_part(folder / "posterior.nc", posterior_draws, problems) or {}
     if not problems:
-        absent = [row["name"] for row in results["parameters"] if row["name"] not in draws]
         problems += [
-            f"{folder / 'posterior.nc'}: no draws of {name!r}, which results.json lists; "
+            f"{folder / 'posterior.nc'}: no draws of {row['name']!r}, which results.json lists; "
             "both must come from the same run, so run `fit` again"
-            for name in absent
+            for row in results["parameters"]
+            if row["name"] not in draws
         ]
     refuse_if(problems)
     return SavedRun(results, origin, tables, draws)
 
 
-def _missing(path: Path, verb: str = "fit") -> str:
-    return f"{path}: this file of the run folder is missing; run `{verb}` again to write it"
-
-
-def _json(path: Path, needs: tuple[str, ...], problems: list[str]) -> dict[str, Any]:
+def read_part(path: Path, read: Callable[[Path], T], problems: list[str], verb: str = "fit") -> T | None:
+    """What `read` makes of a file of the run folder of `verb`; None, and a problem more, where it cannot."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        return read(path)
     except FileNotFoundError:
-        problems.append(_missing(path))
-        return {}
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        problems.append(f"{path}: cannot be read as JSON ({error}); run `fit` again to write it")
-        return {}
-    if not isinstance(content, dict):
-        problems.append(f"{path}: expected a JSON object; run `fit` again to write it")
-        return {}
-    problems += [
-        f"{path}: the key {key!r} is missing; run `fit` again with this version of lcopa-bayes"
-        for key in needs
-        if key not in content
-    ]
-    return content
+        problems.append(f"{path}: this file of the run folder is missing; run `{verb}` again to write it")
+    except (OSError, ValueError, KeyError) as error:
+        problems.append(f"{path}: cannot be read ({error}); run `{verb}` again to write it")
+    return None
 
 
-def read_table(path: Path, needs: tuple[str, ...], problems: list[str], *, verb: str = "fit") -> pd.DataFrame:
-    """A CSV table of `verb` whose names stay names even when they look like numbers; empty when it has no
-    rows. What is missing or cannot be used is added to `problems`."""
-    empty = pd.DataFrame(columns=list(needs))
-    try:
-        text = path.read_text(encoding="utf-8")
-        if not text.strip():
-            return empty
-        words = dict.fromkeys(_WORDS, str)
-        absent = {name: ["", "nan"] for name in needs if name not in (*_WORDS, *_FLAGS)}
-        table = pd.read_csv(io.StringIO(text), dtype=words, keep_default_na=False, na_values=absent)
-    except FileNotFoundError:
-        problems.append(_missing(path, verb))
-        return empty
-    except (OSError, ValueError) as error:
-        problems.append(f"{path}: cannot be read as a table ({error}); run `{verb}` again to write it")
-        return empty
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object."""
+    return dict(json.loads(path.read_text(encoding="utf-8")))
+
+
+def read_tables(
+    paths: Mapping[str, Path], verb: str, needs: Mapping[str, Sequence[str]] | None = None
+) -> dict[str, pd.DataFrame]:
+    """Saved tables by name, with the columns each `needs`; names that look like numbers stay names.
+
+    An empty file is a table without rows. InputError with all that is missing or cannot be used.
+    """
+    problems: list[str] = []
+    tables = {
+        name: read_table(path, problems, (needs or {}).get(name, ()), verb) for name, path in paths.items()
+    }
+    refuse_if(problems)
+    return tables
+
+
+def read_table(path: Path, problems: list[str], needs: Sequence[str], verb: str) -> pd.DataFrame:
+    """One of them; what is wrong with it joins the problems."""
+    table = read_part(path, _table, problems, verb)
+    if table is None or not len(table.columns):
+        return pd.DataFrame(columns=list(needs))
     problems += [
         f"{path}: the column {name!r} is missing; run `{verb}` again with this version of lcopa-bayes"
         for name in needs
@@ -184,12 +169,11 @@ def read_table(path: Path, needs: tuple[str, ...], problems: list[str], *, verb:
     return table
 
 
-def _draws(path: Path, problems: list[str]) -> dict[str, Matrix]:
-    if not path.exists():
-        problems.append(_missing(path))
-        return {}
-    try:
-        return posterior_draws(path)
-    except (OSError, ValueError, KeyError) as error:
-        problems.append(f"{path}: cannot be read as draws ({error}); run `fit` again to write it")
-        return {}
+def _table(path: Path) -> pd.DataFrame:
+    text = path.read_text(encoding="utf-8")
+    if not text.strip():
+        return pd.DataFrame()
+    names = text.partition("\n")[0].strip().split(",")
+    absent = {name: ["", "nan"] for name in names if name not in (*_WORDS, *_FLAGS)}
+    words = dict.fromkeys(_WORDS, str)
+    return pd.read_csv(io.StringIO(text), dtype=words, keep_default_na=False, na_values=absent)

@@ -4,7 +4,8 @@ A grade by the sampling says how well a posterior is known, not whether its mode
 model against its records are limitations of every number: a residual that the noise model does not explain,
 bands that hold too many or too few samples, held-out records that its bands do not hold, a residual far
 above the scatter at rest, noise whose parameters are at the end of their priors, a resonance that the samples
-do not resolve, and priors in conflict with the data (`conflicts`).
+do not resolve, records that contradict each other (`data.agreement`), and priors in conflict with the data
+(`conflicts`).
 
 Conflicts of priors with data: parameters that a prior far from the data pulls towards itself.
 
@@ -22,6 +23,8 @@ import numpy as np
 from scipy.stats import binom
 
 from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.data.agreement import disagreements
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.model.stepresponse import denominator
@@ -208,6 +211,7 @@ def limitations(
     """Limitations of the numbers of a fit, from its bands and residuals."""
     fitted = [band for band in shown if not band.held_out]
     return (
+        *_disagreeing(problem.study),
         *_unexplained(
             [one for one in remaining if not one.held_out],
             [_coverage(problem, draws, b, rng) for b in fitted],
@@ -218,6 +222,14 @@ def limitations(
         *resonances(draws, problem.scales.period, problem.study.time_unit),
         *conflicts(draws),
     )
+
+
+def _disagreeing(study: Study) -> Iterator[Limitation]:
+    """Records that one plant cannot follow."""
+    for one in disagreements((*study.fit, *study.held_out)):
+        yield Limitation(
+            "unusable" if one.gross else "tentative", f"records disagree: {one.reason}", one.remedy
+        )
 
 
 @final

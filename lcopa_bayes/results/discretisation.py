@@ -157,13 +157,11 @@ def narrowed(problem: Problem, shift: Callable[[Problem], float]) -> Problem:
 
     Not beyond `_FINEST` or `_MOST_CELLS`, where the measurement after sampling gives the remaining shift.
     """
-    while shift(problem) > LARGEST and _may_refine(problem):
+    while shift(problem) > LARGEST:
+        if problem.refinement >= _FINEST or 2 * _cells(problem) > _MOST_CELLS:
+            break
         problem = problem.refined(2)
     return problem
-
-
-def _may_refine(problem: Problem) -> bool:
-    return problem.refinement < _FINEST and 2 * _cells(problem) <= _MOST_CELLS
 
 
 def _cells(problem: Problem) -> int:

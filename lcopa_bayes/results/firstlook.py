@@ -15,9 +15,11 @@ import numpy as np
 import pandas as pd
 from scipy.special import logsumexp
 
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.covariance import root_of
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.estimate import Estimate, plain
+from lcopa_bayes.data.agreement import disagreements
 from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
@@ -41,8 +43,9 @@ _SIMULATED = 200
 """... where each takes a simulation with effects."""
 _SHOWN = 400
 """Draws of equal weight behind bands and intervals."""
-_FEWEST = 20.0
-"""Effective draws below which the Gaussian is shown as it is."""
+_FEWEST = 20
+"""Effective draws below which the Gaussian is shown as it is; draws inside the priors below which it is
+narrowed."""
 _STREAM = 13
 """Marks the randomness of a first look."""
 _CLOSE = 0.3
@@ -87,7 +90,8 @@ class FirstLook:
     @property
     def verdict(self) -> str:
         """How well the best optimum follows the records, and what the numbers rest on."""
-        parts = []
+        study = self.problem.study
+        parts = [f"Records disagree: {one}." for one in disagreements((*study.fit, *study.held_out))]
         for held, name in ((False, "Fitted"), (True, "Held out")):
             shown = [band for band in self.bands if band.held_out == held]
             if shown:
@@ -146,16 +150,25 @@ def first_look(study: Study) -> FirstLook:
     InputError when the study does not fit its records, these do not meet the requirements of a fit, or no
     search leads to a plant inside the priors. With effects a look costs many simulations.
     """
+    return look_at(*searched(study))
+
+
+def searched(study: Study) -> tuple[Problem, tuple[Optimum, ...]]:
+    """A study prepared for inference and its least-squares optima, best first; InputError as `first_look`."""
     refuse_if(unmet(study))
     problem = problem_of(study)
-    rng = np.random.default_rng([study.seed, _STREAM])
     optima = optima_of(problem)
     if not optima:
         raise InputError(
             f"{study.name}: no least-squares search leads to a plant inside the priors; widen them or "
             "check the units of the records"
         )
-    posterior = problem.posterior
+    return problem, optima
+
+
+def look_at(problem: Problem, optima: tuple[Optimum, ...]) -> FirstLook:
+    """The first look that follows from known optima, best first."""
+    posterior, rng = problem.posterior, np.random.default_rng([problem.study.seed, _STREAM])
     draws, share = _near(posterior, optima[0], rng)
     shown = study_bands(problem, draws)
     same = np.tile(optima[0].values, (1, 4, 1))  # a simultaneous band needs four draws
@@ -170,13 +183,10 @@ def _near(posterior: Posterior, optimum: Optimum, rng: np.random.Generator) -> t
     count = _DRAWS if posterior.simulation is None else _SIMULATED
     centre = posterior.coordinates(optimum.values[None])[0]
     root = root_of(optimum.covariance)
-    kept = [np.zeros((1, centre.size))]
-    for _ in range(_TRIED):
-        standard = rng.standard_normal((count, centre.size))
-        kept.append(standard[np.isfinite(posterior.log_prior(centre + standard @ root.T))])
-        if sum(map(len, kept)) >= count:
-            break
-    standard = np.concatenate(kept)[:count]
+    standard = _inside(posterior, centre, root, count, rng)
+    while len(standard) < _FEWEST:  # an optimum in a corner of the priors, or at their end
+        root = 0.5 * root
+        standard = _inside(posterior, centre, root, count, rng)
     z = centre + standard @ root.T
     density = posterior.log_density(z)
     log_weights, _ = smoothed(density + 0.5 * (standard**2).sum(axis=1))
@@ -186,3 +196,17 @@ def _near(posterior: Posterior, optimum: Optimum, rng: np.random.Generator) -> t
     chosen = chosen[:_SHOWN]
     completed = posterior.complete(z[chosen], rng)
     return Draws(posterior.table, completed[None], density[None, chosen], (), 1.0), worth / len(z)
+
+
+def _inside(
+    posterior: Posterior, centre: Vector, root: Matrix, count: int, rng: np.random.Generator
+) -> Matrix:
+    """The centre and standard normal draws that are inside the priors once scaled by `root`, `count` of them
+    unless few are, (draws, dimension)."""
+    kept = [np.zeros((1, centre.size))]
+    for _ in range(_TRIED):
+        standard = rng.standard_normal((count, centre.size))
+        kept.append(standard[np.isfinite(posterior.log_prior(centre + standard @ root.T))])
+        if sum(map(len, kept)) >= count:
+            break
+    return np.concatenate(kept)[:count]

@@ -45,6 +45,7 @@ from lcopa_bayes.sampling.weightedrun import QUICK_STARTS, STARTS, weighted_run
 
 if TYPE_CHECKING:
     from lcopa_bayes.results.integerrival import Rival
+    from lcopa_bayes.results.structure import Structure
 
 _QUICK = 4
 """How many times fewer steps a quick fit takes."""
@@ -81,6 +82,8 @@ class Fit(Predictive):
     """How a second, independent sampling method agrees; None without one."""
     rival: Rival | None = None
     """The same study with integer orders, and how it predicts; None when none was fitted."""
+    structure: Structure | None = None
+    """What other structures the records allow; None where the study states its terms."""
 
     @property
     def near(self) -> Posterior:
@@ -144,6 +147,8 @@ def fit(
     its records, these do not meet the requirements of a fit (`requirements`), or the folder cannot be written
     to; then nothing is written.
     """
+    if study.model.terms == "auto":
+        raise ValueError("the number of terms is not settled yet")
     if look is None:
         refuse_if(unmet(study))
     problem = look.problem if look else problem_of(study)
@@ -273,7 +278,4 @@ def plan_of(problem: Problem, *, quick: bool) -> SamplePlan:
         seconds=wanted.seconds,
         method=wanted.method or ("auto" if wanted.steps is None and wanted.thin is None else "ensembles"),
     )
-    if not quick:
-        return plan
-    steps = max(plan.thin, plan.steps // _QUICK)
-    return replace(plan, steps=steps)
+    return replace(plan, steps=max(plan.thin, plan.steps // _QUICK)) if quick else plan

@@ -189,8 +189,9 @@ def predict(
     else:
         driven, predicted = _unmeasured(problem, draws, driven, offset)
     fitted, times = fitted_range(problem), predicted[0].time
-    squared = _squared(draws, fitted.centres(driven, times))
-    grade = draws.grade
+    # squared gains of the paths, median over draws, weigh the drive's frequencies
+    magnitude, _ = transfer_function(draws.table, draws.thinned(_WEIGHTS), fitted.centres(driven, times))
+    squared, grade = np.median(magnitude, axis=2) ** 2, draws.grade
     return Prediction(
         study=study.name,
         driven=driven,
@@ -208,12 +209,6 @@ def fitted_range(problem: Problem) -> FittedRange:
     """What the fit records of a study cover."""
     study, scales = problem.study, problem.scales
     return FittedRange(study.fit, study.drive_axes, scales.span, scales.period, study.time_unit)
-
-
-def _squared(draws: Draws, frequency: Vector) -> Array:
-    """Median magnitude squared of every path, (responses, drives, frequencies)."""
-    magnitude, _ = transfer_function(draws.table, draws.thinned(_WEIGHTS), frequency)
-    return np.asarray(np.median(magnitude, axis=2) ** 2)
 
 
 def _recorded(problem: Problem, draws: Draws, record: Record) -> tuple[Record, list[Band]]:

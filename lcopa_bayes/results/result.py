@@ -100,5 +100,5 @@ def shown(value: object) -> str:
     if value is None or value != value:
         return ""
     if isinstance(value, float):
-        return f"{value:.4g}" if abs(value) < 10 else f"{value:.2f}"
+        return f"{value + 0.0:.4g}" if abs(value) < 10 else f"{value:.2f}"  # no negative zero
     return str(value)

@@ -21,7 +21,7 @@ import numpy as np
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import attributes, plain
-from lcopa_bayes.core.files import save_json, writable_folder, writing
+from lcopa_bayes.core.files import read_json, save_json, writable_folder, writing
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.sampling.sampler import SamplePlan
@@ -87,13 +87,10 @@ def origins(folder: Path) -> dict[str, Mapping[str, Any]]:
     """Provenance of each verb whose result a folder holds, the last one last; InputError when it cannot be
     read."""
     path = folder / ORIGINS
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except (FileNotFoundError, NotADirectoryError):
+    if not path.exists():
         return {}
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); {_OTHER}") from None
-    if not (isinstance(values, dict) and all(isinstance(one, dict) for one in values.values())):
+    values = read_json(path, _OTHER)
+    if not all(isinstance(one, dict) for one in values.values()):
         raise InputError(f"{path}: was written by another version of lcopa-bayes; {_OTHER}")
     return values
 

@@ -6,7 +6,6 @@ blocks were narrowed, and what its grade rests on. Other files of the folder are
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -21,7 +20,7 @@ import xarray as xr
 from lcopa_bayes.core.arrays import Array
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import plain
-from lcopa_bayes.core.files import writable_folder, write_whole
+from lcopa_bayes.core.files import read_json, writable_folder, write_whole
 from lcopa_bayes.data.studywriter import study_from_json, study_to_json
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.parameters import ParameterTable
@@ -55,12 +54,7 @@ class SavedFit(Predictive):
 
     def to_json(self) -> dict[str, Any]:
         """Every number of the fit as plain values; InputError when its file is missing or cut short."""
-        path = self.folder / self.file
-        try:
-            values = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise InputError(f"{path}: cannot be read ({error}); {_CUT}") from None
-        return dict(values)
+        return read_json(self.folder / self.file, _CUT)
 
     def to_datatree(self) -> xr.DataTree:
         """Draws, data and prior in the ArviZ groups, as `fit` wrote them."""
@@ -103,16 +97,13 @@ def load_fit(folder: Path | str) -> SavedFit:
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such run folder; give the folder `fit` wrote")
     path = folder / NAME
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not path.is_file():
         raise InputError(
             f"{path}: this file of the run folder is missing: it was written by another version, or "
             f"no fit has finished there; {_AGAIN}"
-        ) from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as JSON ({error}); {_CUT}") from None
-    given = values.get("version") if isinstance(values, dict) else None
+        )
+    values = read_json(path, _CUT)
+    given = values.get("version")
     if given != version("lcopa-bayes"):
         known = f"lcopa-bayes {given}" if given else "another version"
         raise InputError(f"{path}: was written by {known}, this is {version('lcopa-bayes')}; {_AGAIN}")

@@ -110,23 +110,25 @@ def power_scaled(
             for word, side in (("prior", prior), ("likelihood", likelihood))
             if side.k > limit or np.isnan(side.value[k])
         ]
-        if bad:
-            note = f"{'; '.join(bad)}: sample more steps"
-            row = (np.nan, np.nan, np.nan, np.nan, prior.k, likelihood.k, grade, "not trusted", note)
-        else:
-            note = _note(a, a_error, b, b_error, flat=prior.flat)
-            row = (
-                float(a),
-                float(a_error),
-                float(b),
-                float(b_error),
-                prior.k,
-                likelihood.k,
-                grade,
-                _diagnosis(a, b),
-                note,
+        note = (
+            f"{'; '.join(bad)}: sample more steps" if bad else _note(a, a_error, b, b_error, flat=prior.flat)
+        )
+        said: Diagnosis = "not trusted" if bad else _diagnosis(a, b)
+        a, a_error, b, b_error = np.full(4, np.nan) if bad else (a, a_error, b, b_error)
+        out.append(
+            Sensitivity(
+                name,
+                prior=float(a),
+                prior_mcse=float(a_error),
+                likelihood=float(b),
+                likelihood_mcse=float(b_error),
+                prior_k=prior.k,
+                likelihood_k=likelihood.k,
+                grade=grade,
+                diagnosis=said,
+                note=note,
             )
-        out.append(Sensitivity(name, *row))  # type: ignore[arg-type]
+        )
     return tuple(sorted(out, key=lambda each: (_RANK[each.diagnosis], -np.nan_to_num(each.prior))))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any, ClassVar, TypeVar
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import plain
-from lcopa_bayes.core.files import save_json, writable_folder, write_text
+from lcopa_bayes.core.files import read_json, save_json, writable_folder, write_text
 from lcopa_bayes.results.datatree import POSTERIOR
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.result import Result
@@ -65,6 +64,12 @@ class StoredResult(Result):
             add_origin(path, self.verb, self.origin)
         return path
 
+    def kept(self: R, folder: Path | str | None) -> R:
+        """The result, saved where a folder is given."""
+        if folder is not None:
+            self.save(folder)
+        return self
+
     def report(self, folder: Path | str, *, jobs: int = 1) -> Path:
         """Write the page of the result, and that of the fit it rests on, into a run folder, saving both there
         first where they are not there yet, figures in `jobs` processes; returns the path of the page.
@@ -80,12 +85,12 @@ class StoredResult(Result):
         path, origin = folder / cls.file, origins(folder).get(cls.verb)
         if origin is None:
             raise InputError(f"{folder}: holds no result of `{cls.verb}`; run it to write one")
+        values = read_json(path, f"run `{cls.verb}` again")
+        names = sorted(one for pattern in cls.beside for one in folder.glob(pattern) if one.is_file())
         try:
-            values = json.loads(path.read_text(encoding="utf-8"))
-            names = sorted(one for pattern in cls.beside for one in folder.glob(pattern) if one.is_file())
             texts = {str(one.relative_to(folder)): one.read_text(encoding="utf-8") for one in names}
         except (OSError, ValueError) as error:
-            raise InputError(f"{path}: cannot be read ({error}); run `{cls.verb}` again") from None
+            raise InputError(f"{folder}: cannot be read ({error}); run `{cls.verb}` again") from None
         kept = any((folder / one).exists() for one in (NAME, POSTERIOR))
         fit = load_fit(folder) if cls.rests_on_fit and kept else None
         if fit is not None and origin.get("draws_sha256") != fit.draws.sha256:
@@ -106,13 +111,8 @@ def stored_values(
     They are in `file`, by default the one named after the verb.
     """
     path = folder / (file or f"{verb}.json")
-    try:
-        values: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: cannot be read ({error}); give the run folder that `{verb}` wrote"
-        ) from None
-    absent = [key for key in needs if key not in values] if isinstance(values, dict) else list(needs)
+    values = read_json(path, f"give the run folder that `{verb}` wrote")
+    absent = [key for key in needs if key not in values]
     if absent:
         raise InputError(f"{path}: lacks {', '.join(absent)}; run `{verb}` again")
     return values

@@ -21,8 +21,6 @@ from lcopa_bayes.sampling.convergence import Grade, shares_grade
 if TYPE_CHECKING:
     from lcopa_bayes.results.firstlook import FirstLook
     from lcopa_bayes.results.fit import Fit
-if TYPE_CHECKING:
-    from lcopa_bayes.results.fit import Fit
 
 _NAMED = 8
 """Most parameters named in a sentence."""
@@ -89,8 +87,8 @@ def _fitted(fit: Fit) -> str:
     parts = []
     for axis, response in enumerate(fit.draws.table.layout.responses):
         own = [band for band in fit.bands if band.axis == response.name and not band.held_out]
-        left = np.concatenate([band.observed - band.plant[2] for band in own])
-        said = f"{response.name} is left with {np.sqrt(np.mean(left**2)):.3g} {response.unit} rms"
+        residual = np.concatenate([band.observed - band.plant[2] for band in own])
+        said = f"the residual of {response.name} is {np.sqrt(np.mean(residual**2)):.3g} {response.unit} rms"
         still = [one.quiet(axis).values for one in fit.problem.posterior.samples]
         free = sum(max(0, values.size - 1) for values in still)
         if free >= _AT_REST:
@@ -177,8 +175,7 @@ def verdict(fit: Fit) -> str:
             f"At least one step response has not reached its steady state within the longest record "
             f"({100 * slow:.0f} % of draws are more than 2 % away): algebraic tails are slow."
         )
-    if fit.rival is not None:
-        parts.append(fit.rival.sentence)
+    parts += [one.sentence for one in (fit.structure, fit.rival) if one is not None]
     return " ".join(parts)
 
 
@@ -218,12 +215,13 @@ def results(fit: Fit) -> dict[str, Any]:
             "log_evidence": fit.evidence.value if fit.evidence else None,
             "log_evidence_sd": fit.evidence.sd if fit.evidence else None,
             "log_evidence_by_ensemble": fit.evidence.by_ensemble if fit.evidence else (),
-            "log_evidence_grade": _evidence_grade(fit),
+            "log_evidence_grade": Grade.worst([fit.evidence.grade, grade]).level if fit.evidence else None,
             "cross_check": None if fit.cross_check is None else fit.cross_check.as_json(),
             "discretisation": fit.discretisation.as_json(),
             "residual_rms": residual_rms(fit),
             "held_out": scores(fit, held_out=True),
             "rival": fit.rival.as_json() if fit.rival else None,
+            "structure": fit.structure.as_json() if fit.structure else None,
             "fit_scores": scores(fit, held_out=False),
             "modes": [
                 r.as_json() | {"grade": fit.draws.level(r.parameter, shares_grade(r))}
@@ -235,11 +233,6 @@ def results(fit: Fit) -> dict[str, Any]:
             "sampler": _sampler(fit),
         }
     )
-
-
-def _evidence_grade(fit: Fit) -> str | None:
-    """No better than the draws' grade: an evidence counts only the modes they have visited."""
-    return Grade.worst([fit.evidence.grade, fit.draws.grade]).level if fit.evidence else None
 
 
 def residual_rms(fit: Fit) -> dict[str, float]:

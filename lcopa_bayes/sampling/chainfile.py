@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import final
 
@@ -11,7 +12,7 @@ import h5py
 import numpy as np
 
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.core.files import enduring, write_whole
+from lcopa_bayes.core.files import write_whole
 from lcopa_bayes.sampling.ensemble import Ensemble
 from lcopa_bayes.sampling.weighted import Weighted
 
@@ -36,7 +37,8 @@ def save_chain(path: Path, chain: Chain, fingerprint: str) -> None:
     """
 
     def write(beside: Path) -> None:
-        with enduring(beside) as raw, h5py.File(raw, "w") as file:
+        image = BytesIO()  # HDF5 does not survive a failed write
+        with h5py.File(image, "w") as file:
             file.attrs["fingerprint"] = fingerprint
             if chain.weighted is not None:
                 _write_weighted(file.create_group("weighted"), chain.weighted)
@@ -51,6 +53,7 @@ def save_chain(path: Path, chain: Chain, fingerprint: str) -> None:
                 group.create_dataset("random_keys", data=keys)
                 group.attrs["random_rest"] = np.array([position, has_gauss, gauss], dtype=float)
                 group.attrs["digest"] = _digest(ensemble)
+        beside.write_bytes(image.getbuffer())
 
     try:
         write_whole(path, write)

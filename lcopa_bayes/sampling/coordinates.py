@@ -1,22 +1,29 @@
 """A chart of the posterior: coordinates without bounds in which its ridges are close to straight.
 
 Elements are given by their shape at fixed frequencies (`shapecoordinates`) in place of their time constants,
-gains by their ratio to the element's level, and what lies between two finite ends by its logit. In the chart
-a few ellipsoids cover a posterior that is thin and curved in the sampled coordinates.
+gains by their ratio to the element's level, and what lies between two finite ends by its probit: a density
+that is highest at an end has a tail there like that of a normal one. In the chart a few ellipsoids cover a
+posterior that is thin and curved in the sampled coordinates.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import final
+from typing import Any, final
 
 import numpy as np
-from scipy.special import expit, log_expit, logit
+from scipy.special import ndtr, ndtri
 
 from lcopa_bayes.core.arrays import Flags, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.moves import Terrain
+
+_PORTION = 256
+"""Draws whose density one process computes at once."""
+Mapped = Callable[..., Iterable[Any]]
+"""A map of a function over tasks, here or in other processes."""
 
 
 @final
@@ -38,7 +45,7 @@ class Chart:
 
     @cached_property
     def _bounded(self) -> Flags:
-        """Columns charted by their logit; times and gains of charted elements follow the shape."""
+        """Columns charted by their probit; times and gains of charted elements follow the shape."""
         bounded = np.isfinite(self.low) & np.isfinite(self.high)
         for element in self.terrain.elements:
             bounded[element.following] = False
@@ -69,7 +76,7 @@ class Chart:
                     log_volume -= shape.log_level
         width = (self.high - self.low)[self._bounded]
         with np.errstate(divide="ignore"):
-            y[:, self._bounded] = logit((z[:, self._bounded] - self.low[self._bounded]) / width)
+            y[:, self._bounded] = ndtri((z[:, self._bounded] - self.low[self._bounded]) / width)
         log_volume -= self._log_steepness(y)
         return y, log_volume
 
@@ -83,7 +90,7 @@ class Chart:
         """Sampled coordinates of charted coordinates, and which points of the chart have any, (batch,)."""
         z = y.copy()
         width = (self.high - self.low)[self._bounded]
-        z[:, self._bounded] = self.low[self._bounded] + width * expit(y[:, self._bounded])
+        z[:, self._bounded] = self.low[self._bounded] + width * ndtr(y[:, self._bounded])
         exists: Flags = np.asarray(((z > self.low) & (z < self.high))[:, self._bounded].all(axis=1))
         exists &= self.terrain.in_order(z)
         for element, frequencies in zip(self.terrain.elements, self._frequencies, strict=True):
@@ -97,7 +104,27 @@ class Chart:
         return z, np.asarray(exists & np.isfinite(z).all(axis=1))
 
     def _log_steepness(self, y: Matrix) -> Vector:
-        """Log of the product of d coordinate / d logit, (batch,)."""
-        logits = y[:, self._bounded]
+        """Log of the product of d coordinate / d probit, (batch,)."""
+        probits = y[:, self._bounded]
         width = (self.high - self.low)[self._bounded]
-        return np.asarray((np.log(width) + log_expit(logits) + log_expit(-logits)).sum(axis=1))
+        return np.asarray((np.log(width / np.sqrt(2 * np.pi)) - 0.5 * probits**2).sum(axis=1))
+
+
+def charted_density(posterior: Posterior, chart: Chart, y: Matrix, mapped: Mapped = map) -> Vector:
+    """Log posterior density of charted coordinates, (batch,); -inf where the chart has no point.
+
+    `mapped` does portions of a batch, here or in other processes.
+    """
+    z, exists = chart.uncharted(y)
+    out = np.full(len(y), -np.inf)
+    if exists.any():
+        _, log_volume = chart.charted(z[exists])
+        density = posterior.log_density(z[exists]) if mapped is map else spread(posterior, z[exists], mapped)
+        out[exists] = density + posterior.table.log_permutations - log_volume
+    return out
+
+
+def spread(posterior: Posterior, z: Matrix, mapped: Mapped) -> Vector:
+    """Log density of sampled coordinates portion by portion, (batch,)."""
+    portions = np.array_split(z, max(1, len(z) // _PORTION))
+    return np.concatenate(list(mapped(posterior.log_density, portions)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import sqrt
 from typing import final
 
 import numpy as np
@@ -19,7 +20,6 @@ from lcopa_bayes.sampling.convergence import (
     Level,
     Limitation,
     Quality,
-    between,
     limited,
     overall,
     qualities,
@@ -200,34 +200,31 @@ def _resampled(
 ) -> Draws:
     """Draws at positions of weighted draws.
 
-    Parts of the weighted draws take the place of the ensembles of a sampler: being independent, they let
-    R-hat and scatter show a mean that depends on a few draws. Effective sample sizes are those of the weights
-    and of the number of draws together.
+    Effective sample sizes, modes and their shares are those of the weights, the sizes together with the
+    number of draws. Parts of the weighted draws take the place of the ensembles of a sampler in R-hat.
     """
     values = _completed(posterior, weighted.coordinates[chosen.ravel()], rng)
     values = values.reshape(*chosen.shape, -1)
-    multimodal, rows = [], posterior.table.rows
-    # an effective size of independent draws joined with the number of those delivered; infinite where fixed
-    centre, tail = (
-        own * chosen.size / (own + chosen.size)
-        for own in (np.minimum(worth, 1e12) for worth in (weighted.centre_ess, weighted.tail_ess))
-    )
+    rows, multimodal = posterior.table.rows, []
+
+    def joined(worth: Vector) -> Vector:
+        return 1 / (1 / worth + 1 / chosen.size)
+
+    centre, tail = joined(weighted.centre_ess), joined(weighted.tail_ess)
+    for at, k in enumerate(posterior.sampled):
+        if edges := weighted.boundaries[at]:
+            shares, worth = weighted.shares(at)
+            errors = np.sqrt(shares * (1 - shares) / joined(worth))
+            multimodal.append(Modes(rows[k].name, rows[k].unit, edges, shares[None], errors[None]))
     sizes = {k: (float(centre[at]), float(tail[at])) for at, k in enumerate(posterior.sampled)}
     linear = (float(min(centre, default=weighted.ess)), float(min(tail, default=weighted.ess)))
-    for at, k in enumerate(posterior.sampled):
-        # draws are in random order: a few of them take the place of a walker
-        walkers = values[..., k].reshape(len(chosen), -1, 1)
-        modes = modes_of(rows[k].name, rows[k].unit, walkers, log_scale=rows[k].log_scale)
-        if modes.boundaries:
-            by_weights = weighted.share_errors(weighted.sampled[:, at], modes.boundaries)
-            multimodal.append(replace(modes, errors=np.hypot(modes.errors, by_weights)))
     measured = tuple(
         with_shares(
             Quality(
                 row.name,
-                *sizes.get(k, linear),
+                *(size := sizes.get(k, linear)),
                 float(array_stats.rhat_nested(values[..., k], np.arange(len(chosen)))),  # type: ignore[no-untyped-call]
-                scatter=between(values[:, None, :, k])[1],
+                scatter=sqrt(len(chosen) / size[0]),
             ),
             multimodal,
         )

@@ -8,17 +8,16 @@ populations that have not reached the same modes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, final
+from typing import final
 
 import numpy as np
 from scipy.special import logsumexp
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Vector
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.convergence import Grade, Level
-from lcopa_bayes.sampling.coordinates import Chart
+from lcopa_bayes.sampling.coordinates import Chart, charted_density
 from lcopa_bayes.sampling.mixture import Mixture, spread_evenly
 from lcopa_bayes.sampling.sampler import Run
 
@@ -29,10 +28,6 @@ _TENTATIVE = 2.0
 """Above it the estimates of the ensembles differ [nat]."""
 _BRIDGED = 3_000
 """Draws of each side of a bridge."""
-_PORTION = 256
-"""Draws whose density one process computes at once."""
-Mapped = Callable[..., Iterable[Any]]
-"""A map of a function over tasks, here or in other processes."""
 _SETTLED = 1e-10
 """Change of the log ratio at which the iteration of a bridge stops [nat]."""
 
@@ -127,23 +122,3 @@ def bridge(posterior_side: Vector, mixture_side: Vector, ess: float) -> tuple[fl
 def _relative_variance(log_terms: Vector) -> float:
     terms = np.exp(log_terms - log_terms.max())
     return float(np.var(terms) / np.mean(terms) ** 2)
-
-
-def charted_density(posterior: Posterior, chart: Chart, y: Matrix, mapped: Mapped = map) -> Vector:
-    """Log posterior density of charted coordinates, (batch,); -inf where the chart has no point.
-
-    `mapped` does portions of a batch, here or in other processes.
-    """
-    z, exists = chart.uncharted(y)
-    out = np.full(len(y), -np.inf)
-    if exists.any():
-        _, log_volume = chart.charted(z[exists])
-        density = posterior.log_density(z[exists]) if mapped is map else spread(posterior, z[exists], mapped)
-        out[exists] = density + posterior.table.log_permutations - log_volume
-    return out
-
-
-def spread(posterior: Posterior, z: Matrix, mapped: Mapped) -> Vector:
-    """Log density of sampled coordinates portion by portion, (batch,)."""
-    portions = np.array_split(z, max(1, len(z) // _PORTION))
-    return np.concatenate(list(mapped(posterior.log_density, portions)))

@@ -28,8 +28,8 @@ _SPREAD = 2.0
 """Width of the first proposal over that of the conditional posterior [-]."""
 _OVERALL = 0.3
 """Share of the first proposal that spans all points picked [-]."""
-_OPTIMA, _AGAIN = 2, 4
-"""Starts of the search for optima, and descents from those that have a mass."""
+_OPTIMA, _AGAIN = 4, 4
+"""Further starts of the search for optima, and descents from those that have a mass."""
 _AROUND, _WIDER = 0.3, 2.5
 """Share of the first proposal around optima, and widening of half of it [-]."""
 NEIGHBOURS = 6
@@ -38,10 +38,10 @@ NEIGHBOURS = 6
 
 def first_proposal(
     outer: Outer, rng: np.random.Generator, done: Done, known: Sequence[Optimum] = ()
-) -> tuple[Product, Matrix]:
+) -> tuple[Product, Matrix, Sequence[Optimum]]:
     """A proposal from the prior of the orders and estimates of delays and noise, in part around
-    least-squares optima; and table values of points to start from. `done` performs a task at table values
-    from others; `known` are the optima where these are known."""
+    least-squares optima; table values of points to start from; and these optima. `done` performs a task at
+    table values from others; `known` are optima that are known already."""
     posterior = outer.posterior
     values = _nearly_white(posterior, posterior.table.draw(_PILOT, rng))
     pilot = Optima(pilot=True)
@@ -54,7 +54,9 @@ def first_proposal(
     if not outer.orders.all():
         rest, chosen = _rest(outer, rng, done, values, objective)
         values = np.concatenate([values, chosen])
-    optima: Sequence[Optimum] = weighty(known or find_optima(posterior, rng, starts=_OPTIMA))
+    optima: Sequence[Optimum] = weighty(
+        [*known, *find_optima(posterior, rng, starts=_OPTIMA, near=list(values))]
+    )
     for _ in range(_AGAIN):  # plant and correlated noise, found in turn, draw each other along
         optima = again(posterior, optima)
     at = np.array([one.values for one in optima]).reshape(-1, values.shape[1])
@@ -75,7 +77,7 @@ def first_proposal(
             wider = replace(around, factors=_WIDER * around.factors)
             part = Blend(part, around.blended(wider, 0.5), _AROUND)
         parts.append(part)
-    return Product(outer.groups, tuple(parts)), np.concatenate([values, at])
+    return Product(outer.groups, tuple(parts)), np.concatenate([values, at]), optima
 
 
 def _rest(

@@ -13,8 +13,8 @@ with several modes, and what a caller falls back to where `Importance.good` is f
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import final
 
 import numpy as np
@@ -22,9 +22,9 @@ import numpy as np
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.sampling.coordinates import Chart
-from lcopa_bayes.sampling.evidence import Mapped, charted_density
+from lcopa_bayes.sampling.coordinates import Chart, Mapped, charted_density
 from lcopa_bayes.sampling.importanceweights import effective, usable_k
+from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.proposal import Seen, around, fitted, split, weighty
 from lcopa_bayes.sampling.weighted import Weighted, tail_smoothed
 
@@ -34,7 +34,8 @@ k = 0.4 at an efficiency of 0.2 while a third of its mass was not covered."""
 _MOST = 12
 """Components beyond which a further attempt takes more draws alone [-]."""
 _SURPLUS = 1.25
-"""Effective draws for every centre and tail over those wanted [-]: resampling costs the rest."""
+"""Effective draws for every centre, tail and share of a mode over those wanted [-]: resampling costs the
+rest."""
 _LIGHT = 0.2
 """Pareto k at which the proposal is fitted no further, if it is efficient [-]."""
 
@@ -65,6 +66,9 @@ class ImportancePlan:
     """Effective draws of a good attempt."""
     efficient: bool = True
     """Whether a good attempt is close to the posterior."""
+    promising: float = 0.0
+    """Effective draws per draw of the last proposal that was learned from, below which no further attempt is
+    made [-]."""
 
 
 @final
@@ -73,6 +77,8 @@ class Importance:
     """Weighted draws of a posterior around its optima."""
 
     weighted: Weighted
+    proposal: Mixture
+    """That they are drawn from, in the chart of the posterior."""
     modes: int
     """Optima the proposal started from."""
     evaluations: int
@@ -84,7 +90,7 @@ class Importance:
         own, least = self.weighted, LEAST_EFFICIENCY if efficient else 0.0
         if own.pareto_k > usable_k(own.count) or own.ess < max(wanted, least * own.count):
             return False
-        return bool(min(own.centre_ess.min(), own.tail_ess.min()) >= _SURPLUS * wanted)
+        return own.smallest_ess >= _SURPLUS * wanted
 
 
 def importance(
@@ -93,8 +99,10 @@ def importance(
     rng: np.random.Generator,
     plan: ImportancePlan = ImportancePlan(),
     mapped: Mapped = map,
+    late: Callable[[], bool] = lambda: False,
 ) -> Importance:
-    """Importance sampling around given optima, one or more; `mapped` spreads the density over processes.
+    """Importance sampling around given optima, one or more; `mapped` spreads the density over processes. Once
+    it is `late` no further attempt is made.
 
     FloatingPointError where the density is NaN.
     """
@@ -105,6 +113,7 @@ def importance(
     for effort in plan.efforts:
         if seen.proposals and len(core.means) < _MOST:
             core = split(core, rng)
+        worth = np.inf
         for _ in range(effort.rounds):
             y = proposal.draw(effort.learning, rng)
             seen = seen.joined(proposal, len(y), y, charted_density(posterior, chart, y, mapped))
@@ -112,23 +121,26 @@ def importance(
             if np.isneginf(log_weights).all():
                 break
             own, k = tail_smoothed(seen.last_weights())
+            worth = effective(own) / len(y)
             core, proposal = fitted(core, np.concatenate(seen.points), log_weights)
-            if k <= _LIGHT and effective(own) > LEAST_EFFICIENCY * effort.learning:
+            if k <= _LIGHT and worth > LEAST_EFFICIENCY:
                 break
-        y = proposal.draw(effort.draws, rng)
+        last = worth < plan.promising or late()
+        y = proposal.draw(effort.learning if last else effort.draws, rng)
         density = charted_density(posterior, chart, y, mapped)
-        weighted = _weighed(posterior, chart, y, density, density - proposal.log_density(y))
-        if good := weighted.good(plan.wanted, efficient=plan.efficient):
+        weighted = _weighted(posterior, chart, y, density, density - proposal.log_density(y))
+        spent = sum(map(len, seen.points)) + len(y)
+        result = Importance(weighted, proposal, len(chosen), spent)
+        if last or result.good(plan.wanted, efficient=plan.efficient):
             break
         seen = seen.joined(proposal, len(y), y, density)
-    spent = sum(map(len, seen.points)) + (len(y) if good else 0)
-    return replace(weighted, modes=len(chosen), evaluations=spent)
+    return result
 
 
-def _weighed(posterior: Posterior, chart: Chart, y: Matrix, charted: Vector, raw: Vector) -> Importance:
+def _weighted(posterior: Posterior, chart: Chart, y: Matrix, charted: Vector, raw: Vector) -> Weighted:
     """Charted draws of one proposal with their densities in the chart and their log weights."""
     z, exists = chart.uncharted(y)
     usable = exists & np.isfinite(charted)
     z = z[usable]
     density = charted[usable] + chart.charted(z)[1] - posterior.table.log_permutations
-    return Importance(Weighted.of(posterior, z, density, raw[usable], len(y), smooth=True), 0, 0)
+    return Weighted.of(posterior, z, density, raw[usable], len(y), smooth=True)

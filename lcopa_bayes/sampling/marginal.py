@@ -20,6 +20,7 @@ others, they count anew from there.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from math import ceil
 from typing import NamedTuple, final
 
@@ -30,7 +31,9 @@ from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.parallel import Progress, Workers
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.sampling.coordinates import Chart
 from lcopa_bayes.sampling.firstproposal import NEIGHBOURS, best_near, first_proposal, nearest
+from lcopa_bayes.sampling.importance import Effort, ImportancePlan, importance
 from lcopa_bayes.sampling.importanceweights import effective, usable_k
 from lcopa_bayes.sampling.mixture import spread_evenly
 from lcopa_bayes.sampling.mixturemoves import learned
@@ -64,6 +67,9 @@ _FIRST, _WALKED = 0.1, 0.3
 """Shares of the first proposal in all others, and of where walkers went [-]."""
 _SETTLED, _HELPFUL = 300.0, 0.1
 """Effective draws of all points, and per draw of the next proposal, from which draws count."""
+_AGREE = 2.0
+"""Standard errors by which the log evidence may change in a round after which draws count: where a proposal
+has just met a mode it changes by more, and the next ones are adapted to it [-]."""
 _LEARNED = 0.15
 """Share of the last of these in proposals whose draws count: wider than they are [-]."""
 _LOST = 0.03
@@ -85,6 +91,13 @@ _SPARE = 1.15
 """Factor on the estimated number of draws needed [-]."""
 _TASK = 64
 """Points of a task."""
+_DIRECT = ImportancePlan(
+    (Effort(3_000, 1_000, 6), Effort(4_000, 2_000, 6), Effort(8_000, 3_000, 4)), promising=0.05
+)
+"""Work of an attempt to draw around optima alone."""
+_ATTEMPTS, _STRAY, _SPARSE, _NEGLIGIBLE = 2, 3, 30.0, 0.01
+"""Such attempts, points that a second one begins at, at most, posterior density over that of a proposal from
+which it does not cover a point, and posterior mass of such points that may be missed [-]."""
 
 
 @final
@@ -139,7 +152,8 @@ class Search:
         """Weighted draws equivalent to `wanted` independent ones for the centre, the tails and the shares of
         modes of every sampled parameter, from a search of the whole prior; None where no number of draws in
         reach gives them: ensembles may then start from the `population`."""
-        return self._improved(*first_proposal(self.outer, self._rng, self._done, self._optima), wanted)
+        first, starts, optima = first_proposal(self.outer, self._rng, self._done, self._optima)
+        return self._improved(first, starts, wanted, optima)
 
     def around(self, z: Matrix, wanted: float) -> Weighted | None:
         """The same from points (n, dimension) of the sampled coordinates where ensembles have been."""
@@ -161,10 +175,14 @@ class Search:
             out.append((z[chosen], density[chosen]))
         return out
 
-    def _improved(self, first: Product, starts: Matrix, wanted: float) -> Weighted | None:
-        """The same from a first proposal, whose points begin at the nearest of the table values `starts`."""
+    def _improved(
+        self, first: Product, starts: Matrix, wanted: float, optima: Sequence[Optimum] = ()
+    ) -> Weighted | None:
+        """The same from a first proposal, whose points begin at the nearest of the table values `starts`;
+        draws around `optima` alone where these and the first points are enough."""
         proposal: Proposal = first
         seen, count, walked = Seen(), _LEARNING * self._difficulty, None
+        level, reached = -np.inf, 0.0
         for number in range(_ROUNDS):
             if self._late():
                 return None
@@ -176,15 +194,57 @@ class Search:
             self._log_weights = log_weights = seen.log_weights()
             if not np.isfinite(log_weights).any():
                 return None
+            if number == 0 and optima:
+                direct = self._direct(optima, seen, wanted)
+                if direct is not None:
+                    return direct
             if number % _WALKING == _WALKING - 1:
                 walked = self._walked()
             proposal = self._adapted(first, seen, walked)
             expected = seen.efficiency(proposal, log_weights)
+            before, level = (level, reached), float(logsumexp(log_weights) - np.log(sum(seen.counts)))
             reached = effective(log_weights - logsumexp(log_weights))
-            if expected > _HELPFUL and reached > _SETTLED:
+            agree = abs(level - before[0]) <= _AGREE / np.sqrt(max(before[1], 1.0)) and reached > before[1]
+            if expected > _HELPFUL and reached > _SETTLED and (agree or number + 1 >= _PATIENCE):
                 return self._last(first, proposal, seen, wanted, expected)
             if number + 1 >= _PATIENCE and reached < _FEW:
                 return None
+        return None
+
+    def _direct(self, optima: Sequence[Optimum], seen: Seen, wanted: float) -> Weighted | None:
+        """Draws of a proposal around optima, a tenth of the cost of points; None where it does not come close
+        to the posterior, or does not cover what points of the whole prior show. A few of these may be far out
+        in a tail, one draw heavy by chance: a second attempt begins there too, and would find a mode."""
+        posterior, chart = self.posterior, Chart.of(self.posterior)
+        log_weights = seen.log_weights()
+        drawn = np.isfinite(log_weights)
+        z, density, log_weights = (
+            each[drawn] for each in (self._points[0].coordinates, self._points[0].log_density, log_weights)
+        )
+        y, log_volume = chart.charted(z)
+        explored = np.zeros(len(y), dtype=bool)
+        for _ in range(_ATTEMPTS):
+            tried = importance(
+                posterior,
+                optima,
+                self._rng,
+                replace(_DIRECT, wanted=wanted),
+                lambda _, portions: self._crew.each(_density, portions),
+                self._late,
+            )
+            weighted = tried.weighted
+            if not tried.good(wanted):
+                return None
+            log_ratio = density + posterior.table.log_permutations - log_volume - weighted.log_evidence
+            missed = (log_ratio - tried.proposal.log_density(y) > np.log(_SPARSE)) & ~explored
+            mass = np.exp(log_weights[missed] - weighted.log_evidence).sum() / sum(seen.counts)
+            if mass < _NEGLIGIBLE:
+                return weighted
+            if missed.sum() > _STRAY:
+                return None
+            explored |= missed
+            places = zip(posterior.values(z[missed]), density[missed], strict=True)
+            optima = [*optima, *(Optimum(at, optima[0].covariance, float(level)) for at, level in places)]
         return None
 
     def _last(
@@ -206,7 +266,7 @@ class Search:
                 return None
             drawn += count
             weighted = self._weighted(halves, len(seen.counts), since)
-            worth = weighted.smallest_ess(self._rng) if weighted.ess > 2.0 else 0.0
+            worth = weighted.smallest_ess if weighted.ess > 2.0 else 0.0
             enough = worth >= wanted or (self._late() and worth >= _FEW)
             if enough and weighted.pareto_k <= usable_k(weighted.count):
                 if not self._misses(proposals[0], weighted, self._walked(), halves[0]):
@@ -333,3 +393,7 @@ class Search:
             parts.append(part)
             self._bar.update(len(part[0]))
         return [np.concatenate(each) for each in zip(*parts, strict=True)]
+
+
+def _density(posterior: Posterior, z: Matrix) -> Vector:
+    return posterior.log_density(z)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise
 from math import sqrt
@@ -120,25 +120,83 @@ class Modes:
 
 
 def modes_of(parameter: str, unit: str, values: Array, *, log_scale: bool = False) -> Modes:
-    """Modes of a parameter's marginal from draws (ensembles, walkers, draws) [unit].
+    """Modes of a parameter's marginal from draws (ensembles, walkers, draws) [unit], as by `boundaries`.
 
-    The pooled draws, by their logarithm with `log_scale`, are smoothed with a Gaussian narrower than
-    Silverman's (1986, Density Estimation, Eq. 3.31) for the effective sample size. From all minima of that
-    density those are removed that cut off less than `LEAST_SHARE` and then, the least certain first, those
-    not below `DEPTH` times the lower mode beside them by `CERTAINTY` Monte Carlo errors of that difference.
     Errors come from the scatter between walkers; an ensemble that stays in one mode gets that of one
     walker, 1 / walkers. ValueError unless draws are finite, and positive with `log_scale`.
     """
     if values.ndim != 3 or not np.isfinite(values).all() or (log_scale and values.min() <= 0):
         raise ValueError(f"{parameter}: draws must be finite, (ensembles, walkers, draws), positive for logs")
-    x = np.log(values) if log_scale else values
-    boundaries = _boundaries(x)
-    mode = np.searchsorted(boundaries, x)
-    on = np.stack([mode == k for k in range(boundaries.size + 1)]).astype(float)
+    chains = values.reshape(-1, values.shape[-1])
+    ess = float(array_stats.ess(chains, method="bulk")) if np.ptp(chains) > 0 else np.nan  # type: ignore[no-untyped-call]
+    edges = boundaries(
+        values.ravel(),
+        np.full(values.size, 1 / values.size),
+        ess,
+        lambda each: _batch_error(each.reshape(chains.shape)),
+        log_scale=log_scale,
+    )
+    mode = np.searchsorted(edges, values)
+    on = np.stack([mode == k for k in range(len(edges) + 1)]).astype(float)
     shares = on.mean(axis=(2, 3)).T
     errors = np.array([[_error(visits) for visits in ensemble] for ensemble in on.swapaxes(0, 1)])
-    back = np.exp(boundaries) if log_scale else boundaries
-    return Modes(parameter, unit, tuple(float(b) for b in back), shares, errors)
+    return Modes(parameter, unit, edges, shares, errors)
+
+
+def boundaries(
+    values: Vector,
+    weights: Vector,
+    ess: float,
+    error: Callable[[Vector], float],
+    *,
+    log_scale: bool = False,
+) -> tuple[float, ...]:
+    """Minima between the modes of a marginal, increasing, from draws with normalised weights, (draws,).
+
+    The draws, by their logarithm with `log_scale`, are smoothed with a Gaussian narrower than Silverman's
+    (1986, Density Estimation, Eq. 3.31) for the effective sample size `ess` [draws]. From all minima of that
+    density those are removed that cut off less than `LEAST_SHARE` and then, the least certain first, those
+    not below `DEPTH` times the lower mode beside them by `CERTAINTY` Monte Carlo errors of that difference.
+    `error` gives the Monte Carlo error of the mean of anything known at the draws, (draws,).
+    """
+    order = np.argsort(values, kind="stable")
+    x = np.log(values[order]) if log_scale else values[order]
+    cumulative = np.concatenate([[0.0], np.cumsum(weights[order])])
+    low, quarter, three_quarters, high = x[
+        np.minimum(np.searchsorted(cumulative[1:], [_TAIL, 0.25, 0.75, 1 - _TAIL]), x.size - 1)
+    ]
+    sd = float(np.sqrt(weights[order] @ (x - weights[order] @ x) ** 2))
+    scale = min(sd, float(three_quarters - quarter) / 1.34) or sd
+    effective = float(np.clip(ess, *_SMOOTHED_AS)) if ess > 0 else _SMOOTHED_AS[0]
+    width = _NARROW * 0.9 * scale * float(effective**-0.2)
+    if not (high > low and width > 0):
+        return ()
+    counts, edges = np.histogram(x, bins=_CELLS, range=(low, high), weights=weights[order])
+    cell = (high - low) / _CELLS
+    density = gaussian_filter1d(counts, width / cell, mode="reflect", truncate=5.0)
+    centre = 0.5 * (edges[1:] + edges[:-1])
+    as_given = np.log(values) if log_scale else values
+    bottoms = _bottoms(density)
+    while bottoms.size:
+        tops = _tops(density, bottoms)
+        shares = np.diff(cumulative[np.searchsorted(x, [-np.inf, *centre[bottoms], np.inf])])
+        lower = [min(pair, key=lambda at: density[at]) for pair in pairwise(tops)]
+        slight = np.flatnonzero(np.minimum(shares[:-1], shares[1:]) < LEAST_SHARE)
+        if slight.size:  # the shallowest first: parts of one mode are merged before two modes
+            bottoms = np.delete(bottoms, slight[np.argmax((density[bottoms] / density[lower])[slight])])
+            continue
+        certain = []
+        for top, bottom in zip(lower, bottoms, strict=True):
+            # ``DEPTH f(top) - f(bottom)`` of the smoothed density over its Monte Carlo error
+            kernel = DEPTH * np.exp(-0.5 * ((as_given - centre[top]) / width) ** 2)
+            kernel -= np.exp(-0.5 * ((as_given - centre[bottom]) / width) ** 2)
+            uncertain = error(kernel)
+            # no draw is near either: nothing is certain
+            certain.append(float(weights @ kernel) / uncertain if uncertain > 0 else 0.0)
+        if min(certain) >= CERTAINTY:
+            break
+        bottoms = np.delete(bottoms, int(np.argmin(certain)))
+    return tuple(float(at) for at in (np.exp(centre[bottoms]) if log_scale else centre[bottoms]))
 
 
 def _error(visits: Matrix) -> float:
@@ -155,45 +213,6 @@ def _batch_error(chains: Matrix) -> float:
     return float(chains.mean(axis=1).std(ddof=1) / np.sqrt(chains.shape[0]))
 
 
-def _boundaries(x: Array) -> Vector:
-    """Minima of the density of the pooled draws, increasing."""
-    chains = x.reshape(-1, x.shape[-1])
-    low, high = np.quantile(x, [_TAIL, 1 - _TAIL])
-    width = _width(chains)
-    if not (high > low and width > 0):
-        return np.empty(0)
-    counts, edges = np.histogram(chains, bins=_CELLS, range=(low, high))
-    cell = (high - low) / _CELLS
-    density = gaussian_filter1d(counts.astype(float), width / cell, mode="reflect", truncate=5.0)
-    centre = 0.5 * (edges[1:] + edges[:-1])
-    bottoms = _bottoms(density)
-    while bottoms.size:
-        tops = _tops(density, bottoms)
-        shares = np.diff(np.searchsorted(np.sort(x, axis=None), [-np.inf, *centre[bottoms], np.inf])) / x.size
-        lower = [min(pair, key=lambda at: density[at]) for pair in pairwise(tops)]
-        slight = np.flatnonzero(np.minimum(shares[:-1], shares[1:]) < LEAST_SHARE)
-        if slight.size:  # the shallowest first: parts of one mode are merged before two modes
-            bottoms = np.delete(bottoms, slight[np.argmax((density[bottoms] / density[lower])[slight])])
-            continue
-        certain = [
-            _certainty(chains, centre[top], centre[bottom], width)
-            for top, bottom in zip(lower, bottoms, strict=True)
-        ]
-        if min(certain) >= CERTAINTY:
-            break
-        bottoms = np.delete(bottoms, int(np.argmin(certain)))
-    return np.asarray(centre[bottoms])
-
-
-def _width(chains: Matrix) -> float:
-    """Width of smoothing."""
-    quarter, three_quarters = np.quantile(chains, [0.25, 0.75])
-    scale = min(float(chains.std()), float(three_quarters - quarter) / 1.34) or float(chains.std())
-    ess = float(array_stats.ess(chains, method="bulk")) if np.ptp(chains) > 0 else np.nan  # type: ignore[no-untyped-call]
-    effective = float(np.clip(ess, *_SMOOTHED_AS)) if ess > 0 else _SMOOTHED_AS[0]
-    return _NARROW * 0.9 * scale * float(effective**-0.2)
-
-
 def _bottoms(density: Vector) -> Index:
     """Positions of the minima between modes, the middle of those that are wide."""
     steps = np.flatnonzero(np.diff(density))
@@ -206,11 +225,3 @@ def _tops(density: Vector, bottoms: Sequence[int] | Index) -> list[int]:
     """Positions of the highest points between the bottoms."""
     ends = [0, *(int(b) for b in bottoms), density.size]
     return [a + int(np.argmax(density[a:b])) for a, b in pairwise(ends)]
-
-
-def _certainty(chains: Matrix, top: float, bottom: float, width: float) -> float:
-    """``DEPTH f(top) - f(bottom)`` of the smoothed density over its Monte Carlo error [-]."""
-    kernel = DEPTH * np.exp(-0.5 * ((chains - top) / width) ** 2)
-    kernel -= np.exp(-0.5 * ((chains - bottom) / width) ** 2)
-    error = _batch_error(kernel)
-    return float(kernel.mean()) / error if error > 0 else 0.0  # no draw is near either: nothing is certain

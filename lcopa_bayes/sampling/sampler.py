@@ -53,7 +53,7 @@ _DELIVERED = 500
 """Fewest importance draws of a batch that are delivered."""
 _PER_WANTED = 10.0
 """Delivered draws per effective draw wanted [-] ..."""
-_SURPLUS = 1.12
+SURPLUS = 1.12
 """... and effective importance draws: 1.12 and 10 times as many are together worth 1.007 times as many."""
 
 
@@ -192,7 +192,7 @@ def sample(
     ensembles = stored.ensembles
     rounds = max(2, -(-plan.steps // (_ROUND * plan.thin)))
     done = ensembles[0].steps // (_ROUND * plan.thin) if ensembles else 0
-    wanted = _SURPLUS * plan.target_ess
+    wanted = SURPLUS * plan.target_ess
     searched = plan.method == "auto" and applies(posterior)
     with workers(posterior, jobs=jobs) as crew:
         seeds = np.random.SeedSequence(plan.seed).spawn(plan.ensembles)

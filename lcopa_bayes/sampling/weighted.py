@@ -7,9 +7,8 @@ every average follows from the weights themselves (Owen 2013, Monte Carlo theory
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from math import sqrt
 from typing import final
 
@@ -20,7 +19,7 @@ from scipy.stats import norm
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.importanceweights import effective, smoothed
-from lcopa_bayes.sampling.modes import modes_of
+from lcopa_bayes.sampling.modes import boundaries
 
 BATCHES = 4
 """Independent parts of weighted draws, compared as ensembles are."""
@@ -28,8 +27,6 @@ CHAIN = 8
 """Resampled draws that take the place of one walker."""
 _TAILS = (0.05, 0.95)
 """Quantiles whose error counts."""
-_LOOKED_AT = 4_000
-"""Resampled draws in which modes are sought."""
 
 
 @final
@@ -113,7 +110,7 @@ class Weighted:
     @cached_property
     def centre_ess(self) -> Vector:
         """Effective sample size for the mean of each sampled parameter's normal scores, (parameters,)."""
-        weights, out = np.exp(self.log_weights), []
+        weights, out = self._weights, []
         for column in self.sampled.T:
             rank = np.argsort(column, kind="stable")
             below = np.empty(column.size)
@@ -124,7 +121,7 @@ class Weighted:
     @cached_property
     def tail_ess(self) -> Vector:
         """The smaller effective sample size of the 5 and the 95 % quantile, (parameters,)."""
-        weights, out = np.exp(self.log_weights), []
+        weights, out = self._weights, []
         for column in self.sampled.T:
             rank = np.argsort(column, kind="stable")
             beyond = np.cumsum(weights[rank])
@@ -132,33 +129,35 @@ class Weighted:
             out.append(min(_worth((column <= end).astype(float), weights) for end in ends))
         return np.array(out)
 
-    def smallest_ess(self, rng: np.random.Generator) -> float:
+    @cached_property
+    def boundaries(self) -> tuple[tuple[float, ...], ...]:
+        """Between the modes of each sampled parameter, in its unit; a function of the weights alone."""
+        columns = zip(self.sampled.T, self.centre_ess, self.logarithmic, strict=True)
+        return tuple(
+            boundaries(column, self._weights, ess, partial(error_of, self._weights), log_scale=logarithmic)
+            for column, ess, logarithmic in columns
+        )
+
+    def shares(self, parameter: int) -> tuple[Vector, Vector]:
+        """Posterior mass of each mode of a sampled parameter, and the number of independent draws that give
+        it as accurately, (modes,)."""
+        edges = self.boundaries[parameter]
+        mode = np.searchsorted(edges, self.sampled[:, parameter])
+        inside = [(mode == k).astype(float) for k in range(len(edges) + 1)]
+        worth = [_worth(one, self._weights) for one in inside]
+        return np.array([self._weights @ one for one in inside]), np.array(worth)
+
+    @property
+    def smallest_ess(self) -> float:
         """Smallest effective sample size of a centre, a tail or a mode's share [draws]."""
         if not self.log_weights.size:
             return 0.0
-        chosen = self.resampled(_LOOKED_AT, rng).reshape(BATCHES, -1, CHAIN)
-        worth = [*self.centre_ess, *self.tail_ess]
-        for column, logarithmic in zip(self.sampled.T, self.logarithmic, strict=True):
-            modes = modes_of("", "", column[chosen], log_scale=logarithmic)
-            worth += self.share_ess(column, modes.boundaries)
-        return float(np.min(worth))
+        shares = [self.shares(k)[1] for k, edges in enumerate(self.boundaries) if edges]
+        return float(np.min(np.concatenate([self.centre_ess, self.tail_ess, *shares])))
 
-    def share_ess(self, column: Vector, boundaries: Sequence[float]) -> list[float]:
-        """Effective sample size for the shares of the modes of a parameter [draws]; none without
-        boundaries."""
-        if not boundaries:
-            return []
-        mode, weights = np.searchsorted(boundaries, column), np.exp(self.log_weights)
-        return [_worth((mode == k).astype(float), weights) for k in range(len(boundaries) + 1)]
-
-    def share_errors(self, column: Vector, boundaries: Sequence[float]) -> Matrix:
-        """Standard errors of the shares of the modes of a parameter by the weights, (batches, modes) [-]."""
-        mode, out = np.searchsorted(boundaries, column), []
-        for part in self.parts:
-            weights = np.exp(self.log_weights[part] - logsumexp(self.log_weights[part]))
-            inside = [(mode[part] == k).astype(float) for k in range(len(boundaries) + 1)]
-            out.append([np.sqrt(weights**2 @ (own - weights @ own) ** 2) for own in inside])
-        return np.array(out)
+    @cached_property
+    def _weights(self) -> Vector:
+        return np.asarray(np.exp(self.log_weights))
 
     @property
     def parts(self) -> tuple[slice, ...]:
@@ -166,16 +165,9 @@ class Weighted:
         size = self.log_weights.size
         return tuple(slice(k * size // BATCHES, (k + 1) * size // BATCHES) for k in range(BATCHES))
 
-    def resampled(self, count: int, rng: np.random.Generator, *, part: slice = slice(None)) -> Index:
-        """Positions of `count` draws with equal weights, in random order, by systematic resampling of a
-        `part` of the draws."""
-        return np.asarray(
-            np.arange(self.log_weights.size)[part][resampled(self.log_weights[part], count, rng)]
-        )
-
     def batches(self, count: int, rng: np.random.Generator) -> Index:
         """Positions of resampled draws, `count` of every part, (batches, count)."""
-        return np.stack([self.resampled(count, rng, part=part) for part in self.parts])
+        return np.stack([part.start + resampled(self.log_weights[part], count, rng) for part in self.parts])
 
 
 def tail_smoothed(log_weights: Vector) -> tuple[Vector, float]:
@@ -196,17 +188,19 @@ def resampled(log_weights: Vector, count: int, rng: np.random.Generator) -> Inde
     return np.asarray(rng.permutation(np.minimum(np.searchsorted(share / share[-1], at), share.size - 1)))
 
 
+def error_of(weights: Vector, values: Vector) -> float:
+    """Standard error of the mean of values, (draws,), of independent draws with normalised weights.
+
+    Its square is itself an average, which few draws may dominate: n of them know it to ``sqrt(2 / n)``, and
+    by twice that it is taken larger.
+    """
+    terms = weights**2 * (values - weights @ values) ** 2
+    total = float(terms.sum())
+    return sqrt(total * (1 + 2 * sqrt(2 * float(terms @ terms)) / total)) if total > 0 else 0.0
+
+
 def _worth(values: Vector, weights: Vector) -> float:
     """Number of independent draws that give the mean as accurately as the normalised weights; infinite where
-    nothing varies.
-
-    The variance of the mean is itself an average, which few draws may dominate: n of them know it to
-    ``sqrt(2 / n)``, and by twice that it is taken larger.
-    """
-    apart = (values - weights @ values) ** 2
-    terms = weights**2 * apart
-    variance, error = float(weights @ apart), float(terms.sum())
-    if error == 0.0:
-        return np.inf
-    dominating = error**2 / float(terms @ terms)
-    return variance / error / (1 + 2 * sqrt(2 / dominating))
+    nothing varies."""
+    error = error_of(weights, values)
+    return float(weights @ (values - weights @ values) ** 2) / error**2 if error > 0 else np.inf

@@ -21,9 +21,9 @@ from lcopa_bayes.inference.optimum import Optimum, find_optima
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.surrogate import Surrogate
 from lcopa_bayes.sampling.convergence import Limitation, qualities
+from lcopa_bayes.sampling.coordinates import Mapped, spread
 from lcopa_bayes.sampling.draws import Draws, gather
 from lcopa_bayes.sampling.ensemble import Ensemble, advance
-from lcopa_bayes.sampling.evidence import Mapped, spread
 from lcopa_bayes.sampling.importance import LEAST_EFFICIENCY, Effort, ImportancePlan, importance
 from lcopa_bayes.sampling.importanceweights import effective, usable_k
 from lcopa_bayes.sampling.mixture import Mixture

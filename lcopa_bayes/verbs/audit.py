@@ -59,7 +59,4 @@ def audit(
     fitted = basis(source, jobs=jobs, folder=folder, resume=resume, quick=quick, quiet=quiet)
     values = audited(fitted, jobs=jobs).as_json()
     values["next_measurement"] = next_measurement(fitted, values["parameters"])
-    result = AuditResult(values, origin_of(fitted, "audit"), fit=fitted)
-    if folder is not None:
-        result.save(folder)
-    return result
+    return AuditResult(values, origin_of(fitted, "audit"), fit=fitted).kept(folder)

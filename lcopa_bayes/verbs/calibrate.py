@@ -24,6 +24,7 @@ from lcopa_bayes.results.discretisation import LARGEST
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.runfolder import opened, provenance
 from lcopa_bayes.results.stored import StoredResult
+from lcopa_bayes.results.structure import settled
 from lcopa_bayes.sampling.importanceweights import LARGEST_K
 from lcopa_bayes.verbs.sources import StudyLike, study_of
 
@@ -289,7 +290,7 @@ def calibrate(
     InputError for input that cannot be used, when a worker is lost, when not one replica could be done, and
     for a folder as `fit`.
     """
-    wanted = study_of(study)
+    wanted = settled(study_of(study))
     origin = plain(provenance(wanted, "calibrate"))
     with opened(folder, origin) as place:
         calibration = calibrated(
@@ -308,7 +309,4 @@ def calibrate(
         texts = {
             f"tables/{name}.csv": table.to_csv(index=False) for name, table in tables(calibration).items()
         }
-        result = CalibrationResult(results(calibration), origin, texts)
-        if place is not None:
-            result.save(place)
-    return result
+        return CalibrationResult(results(calibration), origin, texts).kept(place)

@@ -15,6 +15,7 @@ import pandas as pd
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.data.agreement import disagreements
 from lcopa_bayes.data.drive import axis_drives, first_change
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.requirements import unmet
@@ -24,6 +25,7 @@ from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.results.runfolder import provenance
 from lcopa_bayes.results.stored import StoredResult
+from lcopa_bayes.results.structure import with_least_terms
 from lcopa_bayes.verbs.sources import StudyLike, study_of
 
 _EVEN = 0.01
@@ -42,18 +44,23 @@ def inventory(study: Study) -> dict[str, Any]:
 
     InputError where its settings do not fit its records.
     """
-    problem, obstacles = problem_of(study), unmet(study)
+    problem, obstacles = problem_of(with_least_terms(study)), unmet(study)
+    disagree = [str(one) for one in disagreements((*study.fit, *study.held_out))]
     rows = problem.posterior.table.rows
     sentences = [*_of_plant(problem), *_of_model(problem)]
+    if study.model.terms == "auto":
+        sentences.append("A fit lets the records choose more terms, and what paths share.")
     verdict = f"To mend before a fit: {'; '.join(obstacles)}." if obstacles else "The records can be fitted."
+    verdict = " ".join([verdict, *(f"Records disagree: {one}." for one in disagree)])
     return plain(
         {
             "study": study.name,
             "time_unit": study.time_unit,
             "verdict": verdict,
-            "grade": "unusable" if obstacles else "reliable",
+            "grade": "unusable" if obstacles else "tentative" if disagree else "reliable",
             "grade_reason": verdict,
             "problems": obstacles,
+            "disagreements": disagree,
             "sentences": sentences,
             "records": [
                 *(_record(one, problem, held_out=False) for one in study.fit),
@@ -249,10 +256,7 @@ def check(study: StudyLike, *, folder: Path | str | None = None) -> CheckResult:
         ignore_index=True,
     )
     texts = {"tables/check_records.csv": records.to_csv(index=False)}
-    result = CheckResult(inventory(wanted), provenance(wanted, "check"), texts)
-    if folder is not None:
-        result.save(folder)
-    return result
+    return CheckResult(inventory(wanted), provenance(wanted, "check"), texts).kept(folder)
 
 
 def _table(record: Record, *, held_out: bool) -> pd.DataFrame:

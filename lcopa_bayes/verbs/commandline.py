@@ -10,9 +10,10 @@ import json
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import NoReturn, final
+from typing import Any, NoReturn, TypeAlias, final
 
 from lcopa_bayes.core.errors import nearest
 
@@ -69,26 +70,40 @@ class Version(argparse.Action):
 
 RUNS = Path("runs")
 """Where run folders go unless `--out` names another."""
-EXAMPLES: Mapping[str, str] = {
-    "new": "oven step1.xlsx step2.csv --drive 'Heater [%]'",
-    "check": "oven",
-    "look": "oven",
-    "run": "studies/paper-step",
-    "fit": "on.csv off.csv --held-out both.csv",
-    "audit": "runs/paper-step",
-    "design": "runs/paper-step --time 1000",
-    "compare": "studies/paper-step --pick fractional-2 second-order",
-    "loop": "studies/undeclared --quick",
-    "calibrate": "studies/paper-step-x --replicas 20 --quick",
-    "predict": "runs/paper-step drive.csv",
-    "identify": "studies/paper-step-x",
-    "optics": "--targets 1 2 3",
-    "claims": "--out runs/claims",
-    "explain": "R-hat",
-    "report": "runs/paper-step",
-    "simulate": "studies/paper-step/campaign.toml --out bench",
-}
-"""A command line of every verb, without the verb."""
+Option: TypeAlias = tuple[str, Mapping[str, Any]]
+"""Name and, as argparse takes them, what it means."""
+
+
+@final
+@dataclass(frozen=True)
+class Usage:
+    """What a verb does, a command line of it without the verb, and its options."""
+
+    text: str
+    example: str
+    options: tuple[Option, ...]
+
+
+def _option(name: str, words: str, **how: Any) -> Option:
+    return name, {"help": words, **how}
+
+
+def _flag(name: str, words: str) -> Option:
+    return _option(name, words, action="store_true")
+
+
+def _path(name: str, words: str, **how: Any) -> Option:
+    return _option(name, words, type=Path, **how)
+
+
+def _number(name: str, words: str, **how: Any) -> Option:
+    """A number, or several; what is not given has the default of the calculation."""
+    return _option(name, words, **{"type": float, "default": argparse.SUPPRESS} | how)
+
+
+def _choice(name: str, words: str, *known: str) -> Option:
+    """One of several words, the first by default."""
+    return _option(name, words, choices=known, default=known[0])
 
 
 def _whole(least: int) -> Callable[[str], int]:
@@ -102,257 +117,219 @@ def _whole(least: int) -> Callable[[str], int]:
     return read
 
 
-def study(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
-    """Of verbs about a study."""
-    parser.add_argument(
-        "source", nargs="+", type=Path, help="study folder or file, record files, or the run folder of a fit"
-    )
-    parser.add_argument("--held-out", nargs="+", type=Path, default=[], help="records not to fit")
-    parser.add_argument("--out", type=Path, help=f"run folder (default: {out})")
-    parser.add_argument("--seed", type=_whole(0), help="seed in place of the study's")
+_ENDS: Mapping[str, Any] = {"nargs": 2, "metavar": ("LOW", "HIGH"), "default": None}
+_COLUMN = "by header or number, perhaps with a new name: 'heater [%%]=Column B'"
+_QUICK = _flag("--quick", "a quarter of the steps or replicas: to see that it runs")
+_OVERWRITE = _flag("--overwrite", "replace files that are there")
 
 
-def parallel(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
-    """Of verbs about a study that use several processes."""
-    study(parser, out)
-    parser.add_argument("--jobs", type=_whole(1), help="processes, at most one per core (default: all cores)")
-
-
-def sampled(parser: argparse.ArgumentParser, out: str = "runs/<study>") -> None:
-    """Of verbs that sample."""
-    parallel(parser, out)
-    parser.add_argument("--resume", action="store_true", help="go on with an interrupted run")
-    _quick(parser)
-
-
-def _quick(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--quick", action="store_true", help="a quarter of the steps or replicas: to see that it runs"
+def _about(out: str = "runs/<study>") -> tuple[Option, ...]:
+    """Options of verbs about a study."""
+    return (
+        _path("source", "study folder or file, record files, or the run folder of a fit", nargs="+"),
+        _path("--held-out", "records not to fit", nargs="+", default=[]),
+        _path("--out", f"run folder (default: {out})"),
+        _option("--seed", "seed in place of the study's", type=_whole(0)),
     )
 
 
-def fit(parser: argparse.ArgumentParser) -> None:
-    """Of `fit` and `run`."""
-    sampled(parser)
-    parser.add_argument(
-        "--cross-check",
-        action="store_true",
-        help="sample by a second, independent method too; where they disagree, grades are lowered",
-    )
+def _parallel(out: str = "runs/<study>") -> tuple[Option, ...]:
+    """Options of verbs about a study that use several processes."""
+    jobs = _option("--jobs", "processes, at most one per core (default: all cores)", type=_whole(1))
+    return (*_about(out), jobs)
 
 
-def compare(parser: argparse.ArgumentParser) -> None:
-    """Of `compare`."""
-    sampled(parser)
-    parser.add_argument(
-        "--candidates",
-        type=Path,
-        default=(),
-        dest="described",
-        metavar="FILE",
-        help="[compare] and [[candidates]] (TOML)",
-    )
-    parser.add_argument("--pick", nargs="+", dest="candidates", metavar="NAME", help="candidates by name")
+def _sampled(out: str = "runs/<study>") -> tuple[Option, ...]:
+    """Options of verbs that sample."""
+    return (*_parallel(out), _flag("--resume", "go on with an interrupted run"), _QUICK)
 
 
-def loop(parser: argparse.ArgumentParser) -> None:
-    """Of `loop`."""
-    parallel(parser)
-    _quick(parser)
-    parser.add_argument(
-        "--as-stated", action="store_true", help="keep the number of viscous terms the study states"
-    )
-
-
-def new(parser: argparse.ArgumentParser) -> None:
-    """Of `new`."""
-    parser.add_argument("folder", type=Path, help="folder for the records and their study")
-    parser.add_argument("files", nargs="+", type=Path, help="tables: text of any separator, or workbooks")
-    parser.add_argument("--held-out", nargs="+", type=Path, default=[], help="tables not to fit")
-    column = "by header or number, perhaps with a new name: 'heater [%%]=Column B'"
-    parser.add_argument("--time", default="", metavar="COLUMN", help="the time column")
-    parser.add_argument(
-        "--drive", nargs="+", default=[], dest="drives", metavar="COLUMN", help=f"drives, {column}"
-    )
-    parser.add_argument(
-        "--response", nargs="+", default=[], dest="responses", metavar="COLUMN", help=f"responses, {column}"
-    )
-    parser.add_argument("--time-unit", default="", help="unit of a numeric time column")
-    parser.add_argument("--decimal", default="", help="decimal sign, . or ,")
-    parser.add_argument(
-        "--time-format", default="", help="format of time stamps, as '%%d.%%m.%%Y %%H:%%M:%%S'"
-    )
-    parser.add_argument("--sheet", help="sheet of a workbook")
-    parser.add_argument("--overwrite", action="store_true", help="replace files that are there")
-
-
-def explain(parser: argparse.ArgumentParser) -> None:
-    """Of `explain`."""
-    parser.add_argument("term", nargs="+", help="a word of a page or a message")
-
-
-def claims(parser: argparse.ArgumentParser) -> None:
-    """Of `claims`."""
-    parser.add_argument("--out", type=Path, default=RUNS / "claims", help="folder for the page")
-    parser.add_argument(
-        "--audit",
-        type=Path,
-        nargs="+",
-        metavar="RUNFOLDER",
-        help="run folders of audits, to decide I1-I6 (default: those of the bundled studies)",
-    )
-    parser.add_argument(
-        "--compare",
-        type=Path,
-        metavar="RUNFOLDER",
-        help="run folder of a comparison, to decide M1, M2, M4 and I5 (default: of a bundled study)",
-    )
-
-
-def predict(parser: argparse.ArgumentParser) -> None:
-    """Of `predict`."""
-    parser.add_argument("folder", type=Path, metavar="RUNFOLDER", help="run folder of a fit")
-    parser.add_argument(
-        "drive", type=Path, help="record file without responses; with responses it is scored too"
-    )
-    parser.add_argument("--out", type=Path, help="folder (default: RUNFOLDER/predict/<drive>)")
-    parser.add_argument(
-        "--offset",
-        choices=["fitted", "zero"],
-        default="fitted",
-        help="add the offset of the fit records to the response, or none",
-    )
-
-
-def report(parser: argparse.ArgumentParser) -> None:
-    """Of `report`."""
-    parser.add_argument("folder", type=Path, help="run folder")
-
-
-def simulate(parser: argparse.ArgumentParser) -> None:
-    """Of `simulate`."""
-    parser.add_argument("campaign", type=Path, help="campaign file (TOML)")
-    parser.add_argument("--out", type=Path, required=True, help="folder for the records and their study")
-    parser.add_argument("--seed", type=_whole(0), help="seed in place of the campaign's")
-    parser.add_argument("--overwrite", action="store_true", help="replace records that are there")
-
-
-def design(parser: argparse.ArgumentParser) -> None:
-    """Of `design`."""
-    sampled(parser)
-    parser.add_argument(
-        "--time",
-        type=float,
-        dest="bench_time",
-        help="bench time [time unit of the study] (default: 40 spans)",
-    )
-    parser.add_argument("--repeats", type=int, default=1, help="records to take (default: 1)")
-    parser.add_argument(
-        "--amplitude", type=float, help="largest deviation from rest [drive unit] (default: the records')"
-    )
-    parser.add_argument("--refresh", type=float, help="time between drive changes (default: 10 samples)")
-    parser.add_argument("--with-prior", action="store_true", help="count the priors as information")
-
-
-def calibrate(parser: argparse.ArgumentParser) -> None:
-    """Of `calibrate`."""
-    sampled(parser, "runs/calibration/<study>")
-    parser.add_argument("--replicas", type=int, default=100, help="simulated studies (default: 100)")
-    parser.add_argument(
-        "--around",
-        type=Path,
-        metavar="RUNFOLDER",
-        help="draw truths from the posterior of a fit, not the prior",
-    )
-    parser.add_argument(
-        "--truth",
-        nargs="+",
-        default=[],
-        metavar="NAME=VALUE",
-        help="true values in every replica, or LOW:HIGH to draw them from, in the units of the study",
-    )
-    parser.add_argument(
-        "--engine",
-        choices=["importance", "sampling"],
-        default="importance",
-        help="importance sampling, the ensembles where it does not hold; or always the ensembles",
-    )
-    parser.add_argument(
-        "--dask", metavar="ADDRESS", help="scheduler of a Dask cluster that does the replicas"
-    )
-
-
-def identify(parser: argparse.ArgumentParser) -> None:
-    """Of `identify`."""
-    from lcopa_bayes.paper.intervals import Scan
-
-    plan = Scan()
-    parallel(parser)
-    for name, which in (("alpha", "largest"), ("beta", "second"), ("gamma", "third")):
-        parser.add_argument(
-            f"--{name}",
-            nargs=2,
-            type=float,
-            metavar=("LOW", "HIGH"),
-            help=f"scanned interval of the {which} order, within (0, 2]",
-        )
-    parser.add_argument(
-        "--delay",
-        nargs=2,
-        type=float,
-        metavar=("LOW", "HIGH"),
-        help="scanned interval of the delay [time unit of the study]",
-    )
-    parser.add_argument("--order-step", type=float, default=plan.order_step, help="spacing of scanned orders")
-    parser.add_argument("--any-delay", action="store_true", help="refine the delay below a whole block")
-    parser.add_argument(
-        "--stiffness",
-        nargs="+",
-        type=float,
-        default=plan.stiffness,
-        help="values of k; the first is reported",
-    )
-    parser.add_argument("--rounds", type=int, default=plan.rounds, help="refinements around the best")
-    parser.add_argument("--posterior", type=Path, help="run folder of a fit, to show its intervals beside")
-
-
-def optics(parser: argparse.ArgumentParser) -> None:
-    """Of `optics`."""
-    from lcopa_bayes.optics.director import Field
-    from lcopa_bayes.paper.staticoptics import OpticsPlan
-
-    plan = OpticsPlan()
-    parser.add_argument("--out", type=Path, default=RUNS / "optics", help="folder for the page")
-    parser.add_argument(
-        "--elements", type=int, default=plan.elements, help="elements along an axis (default: the paper's 32)"
-    )
-    parser.add_argument("--pitch", type=float, help="distance of elements [m] (default: 1.2 wavelengths)")
-    parser.add_argument(
-        "--wavelength",
-        type=float,
-        default=plan.wavelength,
-        help="wavelength [m] (default: the paper's 1064e-9)",
-    )
-    parser.add_argument(
-        "--fill-factor",
-        type=float,
-        default=plan.fill_factor,
-        help="element width over pitch, for the lobe table",
-    )
-    parser.add_argument(
-        "--targets",
-        dest="targets_deg",
-        nargs="+",
-        type=float,
-        metavar="DEG",
-        default=plan.targets_deg,
-        help="steering angles [deg] (default: Fig. 3)",
-    )
-    parser.add_argument("--voltages", nargs="+", type=float, metavar="V", default=plan.voltages, help="[V]")
-    parser.add_argument("--pretilt", type=float, default=plan.pretilt, help="tilt at the plates [rad]")
-    parser.add_argument(
-        "--field",
-        choices=[field.value for field in Field],
-        default=plan.field,
-        help="how the voltage spreads over the cell",
-    )
+_FIT = (
+    *_sampled(),
+    _flag(
+        "--cross-check", "sample by a second, independent method too; where they disagree, grades are lowered"
+    ),
+)
+USAGES: Mapping[str, Usage] = {
+    "new": Usage(
+        "records and a study from spreadsheets and loggers' tables",
+        "oven step1.xlsx step2.csv --drive 'Heater [%]'",
+        (
+            _path("folder", "folder for the records and their study"),
+            _path("files", "tables: text of any separator, or workbooks", nargs="+"),
+            _path("--held-out", "tables not to fit", nargs="+", default=[]),
+            _option("--time", "the time column", default="", metavar="COLUMN"),
+            _option("--drive", f"drives, {_COLUMN}", nargs="+", default=[], dest="drives", metavar="COLUMN"),
+            _option(
+                "--response",
+                f"responses, {_COLUMN}",
+                nargs="+",
+                default=[],
+                dest="responses",
+                metavar="COLUMN",
+            ),
+            _option("--time-unit", "unit of a numeric time column", default=""),
+            _option("--decimal", "decimal sign, . or ,", default=""),
+            _option("--time-format", "format of time stamps, as '%%d.%%m.%%Y %%H:%%M:%%S'", default=""),
+            _option("--sheet", "sheet of a workbook"),
+            _OVERWRITE,
+        ),
+    ),
+    "check": Usage("what was understood of a study, without fitting it", "oven", _about()),
+    "look": Usage("least squares and residual within seconds, before sampling", "oven", _about()),
+    "run": Usage("all stages the study names, then the report", "studies/paper-step", _FIT),
+    "fit": Usage(
+        "posterior, bands and step metrics, with a report", "on.csv off.csv --held-out both.csv", _FIT
+    ),
+    "audit": Usage("what the records determine, parameter by parameter", "runs/paper-step", _sampled()),
+    "design": Usage(
+        "which drive to measure next",
+        "runs/paper-step --time 1000",
+        (
+            *_sampled(),
+            _number(
+                "--time",
+                "bench time [time unit of the study] (default: 40 spans)",
+                dest="bench_time",
+                default=None,
+            ),
+            _option("--repeats", "records to take (default: 1)", type=int, default=1),
+            _number(
+                "--amplitude",
+                "largest deviation from rest [drive unit] (default: the records')",
+                default=None,
+            ),
+            _number("--refresh", "time between drive changes (default: 10 samples)", default=None),
+            _flag("--with-prior", "count the priors as information"),
+        ),
+    ),
+    "compare": Usage(
+        "integer against fractional orders, number of terms",
+        "studies/paper-step --pick fractional-2 second-order",
+        (
+            *_sampled(),
+            _path(
+                "--candidates",
+                "[compare] and [[candidates]] (TOML)",
+                default=(),
+                dest="described",
+                metavar="FILE",
+            ),
+            _option("--pick", "candidates by name", nargs="+", dest="candidates", metavar="NAME"),
+        ),
+    ),
+    "loop": Usage(
+        "what the model lacks: residual, effect, errors after",
+        "studies/undeclared --quick",
+        (*_parallel(), _QUICK, _flag("--as-stated", "keep the number of viscous terms the study states")),
+    ),
+    "calibrate": Usage(
+        "simulation-based calibration and coverage of the whole inference of a study, with a report",
+        "studies/paper-step-x --replicas 20 --quick",
+        (
+            *_sampled("runs/calibration/<study>"),
+            _option("--replicas", "simulated studies (default: 100)", type=int, default=100),
+            _path("--around", "draw truths from the posterior of a fit, not the prior", metavar="RUNFOLDER"),
+            _option(
+                "--truth",
+                "true values in every replica, or LOW:HIGH to draw them from, in the units of the study",
+                nargs="+",
+                default=[],
+                metavar="NAME=VALUE",
+            ),
+            _choice(
+                "--engine",
+                "importance sampling, the ensembles where it does not hold; or always the ensembles",
+                "importance",
+                "sampling",
+            ),
+            _option("--dask", "scheduler of a Dask cluster that does the replicas", metavar="ADDRESS"),
+        ),
+    ),
+    "predict": Usage(
+        "bands for a drive nobody has measured, by a finished fit",
+        "runs/paper-step drive.csv",
+        (
+            _path("folder", "run folder of a fit", metavar="RUNFOLDER"),
+            _path("drive", "record file without responses; with responses it is scored too"),
+            _path("--out", "folder (default: RUNFOLDER/predict/<drive>)"),
+            _choice(
+                "--offset", "add the offset of the fit records to the response, or none", "fitted", "zero"
+            ),
+        ),
+    ),
+    "identify": Usage(
+        "the paper's own least-squares scan, with a report",
+        "studies/paper-step-x",
+        (
+            *_parallel(),
+            _number("--alpha", "scanned interval of the largest order, within (0, 2]", **_ENDS),
+            _number("--beta", "scanned interval of the second order, within (0, 2]", **_ENDS),
+            _number("--gamma", "scanned interval of the third order, within (0, 2]", **_ENDS),
+            _number("--delay", "scanned interval of the delay [time unit of the study]", **_ENDS),
+            _number("--order-step", "spacing of scanned orders (default: 0.1)"),
+            _flag("--any-delay", "refine the delay below a whole block"),
+            _number("--stiffness", "values of k; the first is reported", nargs="+"),
+            _number("--rounds", "refinements around the best (default: 4)", type=int),
+            _path("--posterior", "run folder of a fit, to show its intervals beside"),
+        ),
+    ),
+    "optics": Usage(
+        "far field, director, chain from volts to angle, with figures",
+        "--targets 1 2 3",
+        (
+            _path("--out", "folder for the page", default=RUNS / "optics"),
+            _number("--elements", "elements along an axis (default: the paper's 32)", type=int),
+            _number("--pitch", "distance of elements [m] (default: 1.2 wavelengths)"),
+            _number("--wavelength", "wavelength [m] (default: the paper's 1064e-9)"),
+            _number("--fill-factor", "element width over pitch, for the lobe table (default: 1)"),
+            _number(
+                "--targets",
+                "steering angles [deg] (default: Fig. 3)",
+                dest="targets_deg",
+                nargs="+",
+                metavar="DEG",
+            ),
+            _number("--voltages", "[V] (default: 1 to 5)", nargs="+", metavar="V"),
+            _number("--pretilt", "tilt at the plates [rad] (default: 0)"),
+            _choice("--field", "how the voltage spreads over the cell", "uniform", "self-consistent"),
+        ),
+    ),
+    "claims": Usage(
+        "the paper's claims, each with a computed verdict",
+        "--out runs/claims",
+        (
+            _path("--out", "folder for the page", default=RUNS / "claims"),
+            _path(
+                "--audit",
+                "run folders of audits, to decide I1-I6 (default: those of the bundled studies)",
+                nargs="+",
+                metavar="RUNFOLDER",
+            ),
+            _path(
+                "--compare",
+                "run folder of a comparison, to decide M1, M2, M4 and I5 (default: of a bundled study)",
+                metavar="RUNFOLDER",
+            ),
+        ),
+    ),
+    "explain": Usage(
+        "what a term means, with an example from the last fit",
+        "R-hat",
+        (_option("term", "a word of a page or a message", nargs="+"),),
+    ),
+    "report": Usage(
+        "render the pages of a run folder again", "runs/paper-step", (_path("folder", "run folder"),)
+    ),
+    "simulate": Usage(
+        "measure a campaign file on the virtual bench",
+        "studies/paper-step/campaign.toml --out bench",
+        (
+            _path("campaign", "campaign file (TOML)"),
+            _path("--out", "folder for the records and their study", required=True),
+            _option("--seed", "seed in place of the campaign's", type=_whole(0)),
+            _OVERWRITE,
+        ),
+    ),
+}
+"""Every verb by name, in the order of the help."""

@@ -21,6 +21,7 @@ from lcopa_bayes.data.studyfile import load_candidates
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.results.runfolder import opened, provenance
 from lcopa_bayes.results.stored import StoredResult
+from lcopa_bayes.results.structure import settled
 from lcopa_bayes.verbs.sources import FitLike, finished, several, study_of
 
 
@@ -88,7 +89,7 @@ def compare(
     else:
         named = isinstance(described, Path | str)
         chosen, more = load_candidates(Path(described)) if named else (None, described)  # type: ignore[arg-type]
-        single = study_of(study)  # type: ignore[arg-type]
+        single = settled(study_of(study))  # type: ignore[arg-type]
         if single.effects.use:  # its candidates have them or not, but never without their priors
             problem_of(single)
         models = candidates_of(single, more, candidates or chosen)  # type: ignore[arg-type]
@@ -100,7 +101,4 @@ def compare(
         values = compared(models, jobs=jobs, folder=path, resume=resume, quick=quick, quiet=quiet)
         outcome = sorted(one for pattern in Comparison.beside for one in path.glob(pattern))
         texts = {str(one.relative_to(path)): one.read_text(encoding="utf-8") for one in outcome}
-        result = Comparison(values, origin, texts)
-        if folder is not None:
-            result.save(folder)
-    return result
+        return Comparison(values, origin, texts).kept(folder)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
 import pandas as pd
 
@@ -18,6 +18,7 @@ from lcopa_bayes.experiments.design import design as designed
 from lcopa_bayes.experiments.summary import as_json
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.results.stored import StoredResult, origin_of
+from lcopa_bayes.results.structure import with_least_terms
 from lcopa_bayes.verbs.fit import basis
 from lcopa_bayes.verbs.sources import FitLike, study_of
 
@@ -94,24 +95,15 @@ def design(
     InputError as `fit`, for limits or a bench time that cannot be used, and when no parameter of the plant is
     free.
     """
-    wanted = {"time": bench_time, "repeats": repeats, "amplitude": amplitude, "refresh": refresh}
-    checked(problem_of(study_of(source)), **wanted)  # type: ignore[arg-type]  # before a long fit
+    wanted: dict[str, Any] = {"time": bench_time, "repeats": repeats}
+    wanted |= {"amplitude": amplitude, "refresh": refresh}
+    checked(problem_of(with_least_terms(study_of(source))), **wanted)  # before a long fit
     fit = basis(source, jobs=jobs, folder=folder, resume=resume, quick=quick, quiet=quiet)
-    planned = designed(
-        fit,
-        time=bench_time,
-        repeats=repeats,
-        amplitude=amplitude,
-        refresh=refresh,
-        with_prior=with_prior,
-        draws=DRAWS // _QUICK if quick else DRAWS,
-    )
+    draws = DRAWS // _QUICK if quick else DRAWS
+    planned = designed(fit, **wanted, with_prior=with_prior, draws=draws)
     trials = confirmed(planned, jobs=jobs, replicas=REPLICAS // 2 if quick else REPLICAS)
     values, texts = as_json(planned) | trials | {"template": None}, {}
     if values["winner"] is not None:
         texts[TEMPLATE] = template(fit.study, planned.limits, planned.winner.candidate.command, planned.time)
         values["template"] = TEMPLATE
-    result = DesignResult(values, origin_of(fit, "design"), texts, fit)
-    if folder is not None:
-        result.save(folder)
-    return result
+    return DesignResult(values, origin_of(fit, "design"), texts, fit).kept(folder)

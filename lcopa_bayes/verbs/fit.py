@@ -15,6 +15,7 @@ from lcopa_bayes.results.integerrival import integer_rival
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.result import write_page
 from lcopa_bayes.results.runfolder import opened, provenance
+from lcopa_bayes.results.structure import structure_of
 from lcopa_bayes.verbs.look import look_result
 from lcopa_bayes.verbs.sources import FitLike, StudyLike, finished, study_of
 
@@ -42,11 +43,13 @@ def fit(
     written to, holds another study's results, or is being written by another run; then nothing is written.
     """
     wanted = study_of(study)
+    structure = structure_of(wanted)
+    wanted = structure.chosen.study if structure else wanted
     with opened(folder, provenance(wanted, "fit")) as place:
         seen: FirstLook | None = None
         drawn: AbstractContextManager[None] = nullcontext()
         if place is not None and not (quiet or resume or wanted.effects.use):
-            seen = first_look(wanted)
+            seen = structure.look if structure else first_look(wanted)
             look_result(seen).save(place)
             drawn = meanwhile(write_page, ("look", place, 1), _announced, jobs=jobs)
         with drawn:
@@ -62,6 +65,7 @@ def fit(
             )
         if rival:
             fitted = replace(fitted, rival=integer_rival(fitted, jobs=jobs, quick=quick, quiet=quiet))
+        fitted = replace(fitted, structure=structure)
         if place is not None:
             fitted.save(place)
     return fitted

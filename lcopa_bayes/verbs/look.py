@@ -11,6 +11,7 @@ import pandas as pd
 from lcopa_bayes.results.firstlook import FirstLook, first_look
 from lcopa_bayes.results.runfolder import provenance
 from lcopa_bayes.results.stored import StoredResult
+from lcopa_bayes.results.structure import structure_of
 from lcopa_bayes.verbs.sources import StudyLike, study_of
 
 
@@ -35,10 +36,9 @@ def look(study: StudyLike, *, folder: Path | str | None = None) -> LookResult:
     of a few searches, intervals and bands are of draws about it, which know of no other mode. InputError as
     `fit`, and where no search leads to a plant inside the priors.
     """
-    result = look_result(first_look(study_of(study)))
-    if folder is not None:
-        result.save(folder)
-    return result
+    wanted = study_of(study)
+    structure = structure_of(wanted)
+    return look_result(structure.look if structure else first_look(wanted)).kept(folder)
 
 
 def look_result(seen: FirstLook) -> LookResult:

@@ -18,12 +18,13 @@ from lcopa_bayes.effectsearch.summary import drawn, results, words
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.results.runfolder import opened, provenance
 from lcopa_bayes.results.stored import StoredResult
+from lcopa_bayes.results.structure import settled
 from lcopa_bayes.verbs.sources import FitLike, study_of
 
 CURVES = "loop_curves.json"
 """File of the residuals and views that the page draws."""
 EXPLAINED = "explained.toml"
-"""File of the study with what a loop found."""
+"""File of the study with the effects that a loop identified."""
 
 
 @final
@@ -32,7 +33,7 @@ class LoopResult(StoredResult):
     """What the model of a study lacks."""
 
     study: Study | None = None
-    """The study with the effects that were found declared, named as the study and ``-explained``: what `fit`,
+    """The study with the identified effects declared, named as the study and ``-explained``: what `fit`,
     `audit` and `compare` take."""
 
     verb, file, beside = "loop", "loop.json", (CURVES,)
@@ -57,12 +58,14 @@ class LoopResult(StoredResult):
         return pd.DataFrame(rows, columns=pd.Index([*columns, "confounded_with"]))
 
     def save(self, folder: Path | str) -> Path:
-        """Write the result into a run folder, with `explained.toml`, the study of what was found, and its
-        records; returns the folder. InputError as `StoredResult.save`."""
+        """Write the result into a run folder, with `explained.toml`, the study with the identified effects,
+        and its records; returns the folder. InputError as `StoredResult.save`."""
         with opened(folder, self.origin) as path:
             if self.study is not None:
                 write_study(
-                    self.study, path / EXPLAINED, note=f"{self.values['study']} with what `loop` found."
+                    self.study,
+                    path / EXPLAINED,
+                    note=f"{self.values['study']} with the effects that `loop` identified.",
                 )
             return super().save(path)
 
@@ -90,14 +93,11 @@ def loop(
     `jobs`, processes to use; `folder`, a run folder to write into; `quick`, fewer chance residuals and
     shorter ensembles. InputError as `fit`.
     """
-    wanted = study_of(study)
+    wanted = settled(study_of(study))
     problem_of(wanted)  # what is wrong with the study is said before anything is written
     origin = plain(provenance(wanted, "loop"))
     with opened(folder, origin):
         outcome = searched(wanted, jobs=jobs, quick=quick, as_stated=as_stated)
         curves = json.dumps(plain(drawn(outcome)), indent=1, allow_nan=False) + "\n"
         values = results(outcome) | {"explained": EXPLAINED}
-        result = LoopResult(values, origin, {CURVES: curves}, study=outcome.study)
-        if folder is not None:
-            result.save(folder)
-    return result
+        return LoopResult(values, origin, {CURVES: curves}, study=outcome.study).kept(folder)

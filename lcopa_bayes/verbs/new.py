@@ -9,18 +9,17 @@ from typing import Any, final
 
 import pandas as pd
 
-from lcopa_bayes.core.errors import InputError, refuse_if
-from lcopa_bayes.core.files import writable_folder, write_text
+from lcopa_bayes.core.errors import gathered, refuse_if
 from lcopa_bayes.data.cells import CellTable
 from lcopa_bayes.data.conversion import Mapped, convert
-from lcopa_bayes.data.record import Record, save_record
 from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.data.spreadsheet import read_spreadsheet
 from lcopa_bayes.data.study import Study
+from lcopa_bayes.data.studywriter import write_folder
 
 _SETTINGS = """\
 [model]
-# terms = 1  # viscous terms of every element; `loop` and `compare` say whether more are needed
+# terms = 1  # viscous terms of every element; without it the records choose
 # share = "none"  # every path has an element of its own; "all": one for all
 # delay = "path"  # every path has a delay of its own; "shared": one for all
 # offset = "record"  # "shared" where all records rest at the same level
@@ -60,20 +59,8 @@ class NewStudy:
         }
 
     def summary(self) -> pd.DataFrame:
-        """One row per record: its axes, rows and span [time unit]."""
-        return pd.DataFrame(
-            [
-                {
-                    "record": one.name,
-                    "drives": ", ".join(f"{axis.name} [{axis.unit}]" for axis in one.drive_axes),
-                    "responses": ", ".join(f"{axis.name} [{axis.unit}]" for axis in one.response_axes),
-                    "rows": one.time.size,
-                    "span": float(one.time[-1] - one.time[0]),
-                    "unit": one.time_unit,
-                }
-                for one in (*self.study.fit, *self.study.held_out)
-            ]
-        )
+        """One row per record; see `Study.summary`."""
+        return self.study.summary()
 
     def __str__(self) -> str:
         parts = [self.summary().to_string(index=False), "\n".join(self.notes)]
@@ -85,42 +72,8 @@ class NewStudy:
 
         InputError when files of these names are there, unless `overwrite`, or one cannot be written.
         """
-        folder = Path(folder)
-        records = (*self.study.fit, *self.study.held_out)
-        paths = [*(folder / f"{record.name}.csv" for record in records), folder / "study.toml"]
-        there = [path for path in paths if path.exists()]
-        if there and not overwrite:
-            raise InputError(
-                [f"{path}: is there already; choose another folder or allow --overwrite" for path in there]
-            )
-        writable_folder(folder)
-        for record, path in zip(records, paths, strict=False):
-            save_record(record, path)
-        write_text(paths[-1], self._file())
-        return tuple(paths)
-
-    def _file(self) -> str:
-        def listed(records: Sequence[Record]) -> str:
-            return ", ".join(f'"{record.name}.csv"' for record in records)
-
-        held = self.study.held_out
-        lines = [
-            "# What was understood of the tables:",
-            *(f"# - {one}" for one in self.notes),
-            "",
-            "[study]",
-            f'name = "{self.study.name}"',
-            f'time_unit = "{self.study.time_unit}"',
-            "seed = 0",
-            "",
-            "[records]",
-            f"fit = [{listed(self.study.fit)}]",
-            f"held_out = [{listed(held)}]"
-            if held
-            else '# held_out = ["another.csv"]  # only predicted: the best check of a model',
-            "",
-        ]
-        return "\n".join(lines) + "\n" + _SETTINGS
+        notes = ["What was understood of the tables:", *(f"- {one}" for one in self.notes)]
+        return write_folder(Path(folder), self.study, notes=notes, settings=_SETTINGS, overwrite=overwrite)
 
 
 def new(
@@ -154,10 +107,8 @@ def new(
     problems: list[str] = []
     tables: list[CellTable] = []
     for path in paths:
-        try:
+        with gathered(problems):
             tables.append(read_spreadsheet(path, sheet=sheet))
-        except InputError as error:
-            problems += error.problems
     stems = [path.stem for path in paths]
     problems += [
         f"{path}: another table is called {path.stem!r} too; rename one"
@@ -168,9 +119,9 @@ def new(
         problems.append("no table: name one or more files")
     refuse_if(problems)
     stated = Mapped(time, tuple(drives), tuple(responses), time_unit, decimal, time_format)
-    converted = convert(tables, stated)
-    own, apart = converted.records[: len(fitted)], converted.records[len(fitted) :]
+    records, notes = convert(tables, stated)
+    own, apart = records[: len(fitted)], records[len(fitted) :]
     study = Study(folder.resolve().name, fit=own, held_out=apart)
-    result = NewStudy(study, tuple(converted.notes), tuple(unmet(study)))
+    result = NewStudy(study, tuple(notes), tuple(unmet(study)))
     result.save(folder, overwrite=overwrite)
     return result

@@ -11,9 +11,10 @@ from typing import final
 
 import pandas as pd
 
+from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.core.files import writable_folder
 from lcopa_bayes.paper.auditclaims import load_audit
-from lcopa_bayes.paper.claims import judge
+from lcopa_bayes.paper.claims import CLAIMS, judge
 from lcopa_bayes.paper.comparisonclaims import load_comparison
 from lcopa_bayes.paper.identify import identify as identified
 from lcopa_bayes.paper.identify import results, scannable
@@ -23,6 +24,7 @@ from lcopa_bayes.paper.steptable import load_posterior, panels, step_table
 from lcopa_bayes.paper.verdict import Evidence, Kind
 from lcopa_bayes.results.runfolder import provenance
 from lcopa_bayes.results.stored import StoredResult
+from lcopa_bayes.results.structure import settled
 from lcopa_bayes.verbs.sources import FitLike, study_of
 
 
@@ -105,7 +107,7 @@ def identify(
     whose intervals are shown too; `folder`, a run folder to write into; `jobs`, processes to use; `quiet`, no
     progress bar. InputError when records, intervals or folders cannot be used.
     """
-    wanted, plan = study_of(study), scan or Scan()
+    wanted, plan = settled(study_of(study)), scan or Scan()
     beside = None if posterior is None else load_posterior(Path(posterior), wanted)
     scannable(wanted, plan)
     if folder is not None:
@@ -118,10 +120,7 @@ def identify(
         texts[f"tables/{stem}.csv"] = str(samples.to_csv(index=False, float_format="%.9g"))
     table = step_table(wanted, models, posterior=beside)
     values = results(wanted, models, plan) | {"step_metrics": table, "records": shown}
-    result = IdentifyResult(values, provenance(wanted, "identify"), texts)
-    if folder is not None:
-        result.save(folder)
-    return result
+    return IdentifyResult(values, provenance(wanted, "identify"), texts).kept(folder)
 
 
 def claims(*, audits: Sequence[Path | str] = (), comparison: Path | str | None = None) -> ClaimsResult:
@@ -135,7 +134,12 @@ def claims(*, audits: Sequence[Path | str] = (), comparison: Path | str | None =
         tuple(load_audit(Path(folder)) for folder in audits),
         None if comparison is None else load_comparison(Path(comparison)),
     )
-    rows = [each.as_json() for each in judge(evidence=evidence)]
+    verdicts = judge(evidence)
+    rows = [
+        {"id": claim.id, "verdict": verdict.kind.value}
+        | plain(attributes(verdict, "number", "unit", "how") | attributes(claim, "text", "source"))
+        for claim, verdict in zip(CLAIMS, verdicts.values(), strict=True)
+    ]
     counts = Counter(row["verdict"] for row in rows)
     said = ", ".join(f"{counts[kind.value]} {kind.value}" for kind in Kind)
     values = {"verdict": f"{len(rows)} claims of Ta et al. 2026: {said}.", "claims": rows}

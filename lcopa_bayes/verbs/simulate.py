@@ -10,9 +10,10 @@ from typing import Any, final
 import numpy as np
 import pandas as pd
 
-from lcopa_bayes.bench.campaignfile import load_plan, write_campaign
+from lcopa_bayes.bench.campaignfile import load_plan
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
+from lcopa_bayes.data.studywriter import write_folder
 from lcopa_bayes.results.result import notebook_table
 
 
@@ -21,55 +22,24 @@ from lcopa_bayes.results.result import notebook_table
 class Simulation:
     """Records of a campaign, and the study of them."""
 
-    name: str
-    """Of the campaign and of its study."""
-    seed: int
-    """Seed of the noise."""
-    records: tuple[Record, ...]
-    """In the order of the campaign."""
-    held_out: tuple[str, ...]
-    """Names of the records that are not to be fitted."""
+    study: Study
+    """With the seed of the noise and the settings of the campaign."""
     settings: str = ""
-    """Further tables of the study file (TOML)."""
+    """These settings as tables of a study file (TOML)."""
 
     @property
-    def study(self) -> Study:
-        """The study of these records, with the settings of the campaign."""
-        tables: dict[str, Any] = tomllib.loads(self.settings)
-        return Study(
-            self.name,
-            seed=self.seed,
-            fit=[record for record in self.records if record.name not in self.held_out],
-            held_out=[record for record in self.records if record.name in self.held_out],
-            model=tables.get("model"),
-            priors=tables.get("priors"),
-            noise=tables.get("noise"),
-            sampler=tables.get("sampler"),
-        )
+    def records(self) -> tuple[Record, ...]:
+        """The fitted ones first."""
+        return (*self.study.fit, *self.study.held_out)
 
     @property
     def verdict(self) -> str:
         """How many records there are."""
-        return f"{len(self.records)} records of {self.name}, seed {self.seed}"
+        return f"{len(self.records)} records of {self.study.name}, seed {self.study.seed}"
 
     def summary(self) -> pd.DataFrame:
-        """One row per record: samples, first and last time [`time_unit`], axes, and whether it is held
-        out."""
-        return pd.DataFrame(
-            [
-                {
-                    "record": record.name,
-                    "samples": record.time.size,
-                    "begin": record.time[0],
-                    "end": record.time[-1],
-                    "time_unit": record.time_unit,
-                    "drives": ", ".join(axis.name for axis in record.drive_axes),
-                    "responses": ", ".join(axis.name for axis in record.response_axes),
-                    "held_out": record.name in self.held_out,
-                }
-                for record in self.records
-            ]
-        )
+        """One row per record; see `Study.summary`."""
+        return self.study.summary()
 
     def to_json(self) -> dict[str, Any]:
         """The summary as plain values."""
@@ -80,15 +50,7 @@ class Simulation:
 
         InputError when one is there already, unless `overwrite`, and when the folder cannot be written to.
         """
-        return write_campaign(
-            Path(folder),
-            self.records,
-            held_out=self.held_out,
-            name=self.name,
-            seed=self.seed,
-            settings=self.settings,
-            overwrite=overwrite,
-        )
+        return write_folder(Path(folder), self.study, settings=self.settings, overwrite=overwrite)
 
     def _repr_html_(self) -> str:
         return notebook_table(self.summary())
@@ -102,5 +64,9 @@ def simulate(campaign: Path | str, *, seed: int | None = None) -> Simulation:
     """
     plan = load_plan(Path(campaign))
     chosen = plan.seed if seed is None else seed
-    records = plan.run(np.random.default_rng(chosen))
-    return Simulation(plan.name, chosen, records, tuple(plan.held_out), plan.settings)
+    roles: dict[bool, list[Record]] = {False: [], True: []}
+    for record in plan.run(np.random.default_rng(chosen)):
+        roles[record.name in plan.held_out].append(record)
+    settings: dict[str, Any] = tomllib.loads(plan.settings)
+    study = Study(plan.name, seed=chosen, fit=roles[False], held_out=roles[True], **settings)
+    return Simulation(study, plan.settings)

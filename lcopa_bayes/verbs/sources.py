@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeAlias
 
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.errors import InputError, gathered
 from lcopa_bayes.data.requirements import unmet_apart_from_rest
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import BrokenStudyError, load_study
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.savedfit import NAME, load_fit
+from lcopa_bayes.results.structure import with_least_terms
 
 StudyLike: TypeAlias = Study | Path | str | Sequence[Path | str]
 """A study, its folder or file, or record files to make one of."""
@@ -34,10 +35,8 @@ def study_of(source: FitLike, *, held_out: Sequence[Path] = ()) -> Study:
         return load_study(source, held_out=held_out)  # type: ignore[arg-type]
     except BrokenStudyError as broken:
         problems = [*broken.problems, *unmet_apart_from_rest(broken.study)]
-        try:
-            problem_of(broken.study)
-        except InputError as error:
-            problems += error.problems
+        with gathered(problems):
+            problem_of(with_least_terms(broken.study))
         raise InputError(problems) from None
 
 

@@ -8,7 +8,6 @@ be compared between machines, and between hours of one machine.
 
 from __future__ import annotations
 
-import argparse
 import ctypes
 import json
 import os
@@ -20,7 +19,6 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +27,7 @@ import pandas as pd
 from comparison import Spread, ratio
 from probe import SAMPLING
 
-from lcopa_bayes.cli import VERBS
+from lcopa_bayes.verbs.commandline import USAGES
 
 HERE = Path(__file__).parent
 STUDIES = HERE.parent
@@ -181,7 +179,7 @@ class Workshop:
             out += ["--pick", *CANDIDATES]
         if verb == "calibrate":
             out += ["--replicas", REPLICAS[self.quick]]
-        known = options_of(verb)
+        known = [option for option, _ in USAGES[verb].options]
         if "--jobs" in known:
             out += ["--jobs", str(self.jobs)]
         if self.quick and "--quick" in known:
@@ -229,14 +227,6 @@ class Workshop:
         results = fit_results(said) if cell.verb == "fit" and outcome == "done" else {}
         message = "" if outcome == "done" else (problem or said).strip().rpartition("\n")[2][:200]
         return Measurement(*spent, around, outcome, message, counts, results)
-
-
-@cache
-def options_of(verb: str) -> str:
-    """Help on the options of a verb."""
-    parser = argparse.ArgumentParser()
-    VERBS[verb].options(parser)
-    return parser.format_help()
 
 
 _SUBREAPER = 36

@@ -66,6 +66,8 @@ def frozen() -> dict[str, Any]:
     held = {
         "explained": verdict.EXPLAINED,
         "alone": verdict.ALONE,
+        "firm": verdict.FIRM,
+        "reached": verdict.REACHED,
         "single": rounds.SINGLE,
         "clear": rounds.CLEAR,
         "margin": verdict.MARGIN,

@@ -8,6 +8,8 @@ import numpy as np
 from scipy.stats import beta
 
 Row = Mapping[str, Any]
+NAMING = ("explained", "partly explained", "disturbance")
+"""Verdicts that name effects."""
 EQUIVALENT = {"duffing_with_memory": {"cubic_stiffness"}, "fringing_gain": {"odd_curvature"}}
 """Outsiders whose leading term the catalogue has: naming it, and nothing else, counts as right. A gain that
 changes with the deflection is an odd curvature of every axis while one axis moves."""
@@ -81,7 +83,12 @@ def sheet(rows: Sequence[Row], targets: Mapping[str, Any], seen: float) -> list[
     hidden = [row for row in [*by["named"], *by["plain"]] if (_survival(row) or 1.0) <= seen and row["named"]]
     single = [*by["named"], *by["plain"]]
     saying = [row for row in single if row["named"]]
-    corrected = [row for row in by["named"] if row["verdict"] in ("explained", "disturbance")]
+    firm = [
+        row
+        for row in [*single, *by["pair"], *by["outside"]]
+        if row["verdict"] in NAMING and row["confidence"] == "firm"
+    ]
+    corrected = [row for row in by["named"] if row["verdict"] in NAMING]
     widened = [row for row in [*by["named"], *by["outside"]] if row["verdict"] == "unexplained"]
     plants = [row for row in corrected if not row["disturbance"]]
     ratio = [row["after"]["held_out_truth_rmse"] / row["before"]["held_out_truth_rmse"] for row in plants]
@@ -143,6 +150,7 @@ def sheet(rows: Sequence[Row], targets: Mapping[str, Any], seen: float) -> list[
         ),
         share("elsewhere the group holds the truth", hidden, _grouped, targets["right_when_named"], "least"),
         share("right when it says anything", saying, _grouped, targets["right_when_named"], "least"),
+        share("right when it is firm", firm, _right, targets["right_when_firm"], "least"),
         share(
             "outsiders left unexplained",
             [r for r in by["outside"] if r["alarmed"]],
@@ -214,6 +222,12 @@ def _grouped(row: Row) -> bool:
 def _outside(row: Row) -> bool:
     allowed = EQUIVALENT.get(row["truth"][0], set())
     return row["verdict"] == "unexplained" or (bool(row["named"]) and set(row["named"]) <= allowed)
+
+
+def _right(row: Row) -> bool:
+    """Whether no name is wrong: each is hidden, or the leading term of what is."""
+    truth = set(row["truth"]).union(*(EQUIVALENT.get(name, set()) for name in row["truth"]))
+    return set(row["named"]) <= truth
 
 
 def _both(row: Row) -> bool:

@@ -132,6 +132,7 @@ def test_nearly_every_effect_is_covered():
         "pointing_drift",
         "sampled_drive",
         "unmodelled_linear",
+        "unmodelled_lag",
         "unmodelled_smooth",
         "unmodelled_nonlinear",
     }

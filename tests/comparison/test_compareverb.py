@@ -147,7 +147,7 @@ def compared(*, verdict: str = "warranted", answer: str = "not an integer", orde
 
 
 def verdict_of(claim: str, told: dict) -> str:
-    judged = {each.claim.id: each.verdict for each in judge(evidence=Evidence(compare=told))}
+    judged = judge(Evidence(compare=told))
     return judged[claim].kind.value
 
 
@@ -191,7 +191,7 @@ def test_m4_tells_what_prediction_gains_with_its_error():
     three = {"elpd": 110.0, "elpd_difference": 0.0, "elpd_difference_sd": 0.0}
     two = {"elpd": 100.0, "elpd_difference": -10.0, "elpd_difference_sd": 4.0}
     evidence = Evidence(compare=compared(three=three, two=two))
-    how = next(each.verdict.how for each in judge(evidence=evidence) if each.claim.id == "M4")
+    how = judge(evidence)["M4"].how
     assert "by +10.00 ± 4.00 nats" in how
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from lcopa_bayes.core import files
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.core.files import enduring, writable_folder, write_text, write_whole
+from lcopa_bayes.core.files import writable_folder, write_text, write_whole
 
 
 def test_a_file_is_written_and_replaced(tmp_path):
@@ -82,9 +82,6 @@ def test_a_folder_without_permission_is_told(tmp_path, monkeypatch):
         writable_folder(tmp_path / "new")
 
 
-HDF5 = "Can't decrement id ref count (file write failed: time = now, errno = 28, error message = 'No space')"
-
-
 @pytest.mark.parametrize(
     ("failure", "reason", "remedy"),
     [
@@ -94,8 +91,6 @@ HDF5 = "Can't decrement id ref count (file write failed: time = now, errno = 28,
         (PermissionError(errno.EACCES, "any"), "Permission denied", "another folder with --out"),
         (OSError(errno.EROFS, "any"), "Read-only file system", "another folder with --out"),
         (OSError(errno.EIO, "any"), "Input/output error", "another folder with --out"),
-        (RuntimeError(HDF5), "No space left on device", "free some space"),
-        (OSError(f"Unable to flush ({HDF5})"), "No space left on device", "free some space"),
         (OSError("odd"), "odd", "another folder with --out"),
     ],
 )
@@ -124,46 +119,3 @@ def test_what_the_system_refuses_is_told_with_file_reason_and_remedy(
 def test_a_folder_that_is_gone_is_told(tmp_path):
     with pytest.raises(InputError, match="No such file or directory"):
         write_text(tmp_path / "gone" / "a.txt", "new")
-
-
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs a device that is always full")
-def test_a_full_device_fails_only_once_hdf5_is_done():
-    """HDF5 itself would crash the process."""
-    taken = []
-
-    def fill():
-        with enduring(files.Path("/dev/full")) as file:
-            taken.extend([file.write(b"some bytes"), file.write(b"more"), file.flush()])
-
-    with pytest.raises(OSError, match="No space left") as caught:
-        fill()
-    assert taken == [10, 4, None]
-    assert caught.value.errno == errno.ENOSPC
-
-
-def test_an_enduring_file_takes_pieces_and_reads_back(tmp_path):
-    class Sparing(files.FileIO):
-        def write(self, data):
-            return super().write(bytes(data)[:3])
-
-    with Sparing(tmp_path / "a", "w+") as raw:
-        file = files.Enduring(raw)
-        assert file.write(bytearray(b"0123456789")) == 10
-        assert (file.seek(2), file.tell(), file.read(3)) == (2, 2, b"234")
-        buffer = bytearray(8)
-        assert file.readinto(buffer) == 8
-        assert bytes(buffer) == b"56789\0\0\0"
-        file.truncate(4)
-    assert (tmp_path / "a").read_bytes() == b"0123"
-
-
-def test_what_hdf5_says_after_a_refused_write_does_not_hide_it(tmp_path):
-    def act(failure):
-        with enduring(tmp_path / "a") as file:
-            file.failure = failure
-            raise RuntimeError("unable to close")
-
-    with pytest.raises(OSError, match="first"):
-        act(OSError("first"))
-    with pytest.raises(RuntimeError, match="unable to close"):
-        act(None)

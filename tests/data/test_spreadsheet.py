@@ -51,7 +51,7 @@ def table(
 
 
 def read(path: Path, **stated: str | tuple[str, ...]) -> Record:
-    return convert([read_spreadsheet(path)], Mapped(**stated)).records[0]  # type: ignore[arg-type]
+    return convert([read_spreadsheet(path)], Mapped(**stated))[0][0]  # type: ignore[arg-type]
 
 
 NOTATIONS = st.tuples(
@@ -177,8 +177,9 @@ def test_columns_are_meant_by_header_by_name_and_by_number():
 def test_the_decimal_sign_is_recognised_or_asked_for(cells, sign, tmp_path):
     path = tmp_path / "x.csv"
     path.write_text("a;b\n" + "\n".join(f"1;{cell}" for cell in cells))
-    known = decimal_sign(read_spreadsheet(path))
-    assert (known.sign if not known.problem else "") == sign
+    problems: list[str] = []
+    known = decimal_sign(read_spreadsheet(path), problems)
+    assert (known if not problems else "") == sign
 
 
 def test_numbers_in_foreign_notation():
@@ -190,9 +191,9 @@ def test_numbers_in_foreign_notation():
 
 def test_roles_follow_words_then_data_and_may_be_stated(tmp_path):
     path = table(tmp_path / "x.csv", ("t [ms]", "channel 1", "channel 2"))
-    out = convert([read_spreadsheet(path)], Mapped())
-    assert [axis.name for axis in out.records[0].drive_axes] == ["channel_1"]
-    assert any("constant but for few jumps" in note for note in out.notes)
+    (record,), notes = convert([read_spreadsheet(path)], Mapped())
+    assert [axis.name for axis in record.drive_axes] == ["channel_1"]
+    assert any("constant but for few jumps" in note for note in notes)
     swapped = read(path, drives=("force [N]=channel 2",), responses=("2",))
     assert swapped.drive_axes == (Axis("force", "N"),)
     assert_array_equal(swapped.drive[:, 0], RESPONSE)
@@ -212,9 +213,10 @@ def test_a_drive_is_constant_in_a_dark_record_and_logged_only_when_it_changes(tm
     table(tmp_path / "on.csv")
     rows = [f"{TIME[k]},{'0.0' if k == 0 else ''},{RESPONSE[k]}" for k in range(N)]
     (tmp_path / "dark.csv").write_text("Time [s],Heater [%],T1 (°C)\n" + "\n".join(rows))
-    out = convert([read_spreadsheet(tmp_path / name) for name in ("on.csv", "dark.csv")], Mapped())
-    assert_array_equal(out.records[1].drive, np.zeros((N, 1)))
-    assert any("holds the value above" in note for note in out.notes)
+    tables = [read_spreadsheet(tmp_path / name) for name in ("on.csv", "dark.csv")]
+    (_, dark), notes = convert(tables, Mapped())
+    assert_array_equal(dark.drive, np.zeros((N, 1)))
+    assert any("holds the value above" in note for note in notes)
 
 
 BROKEN = {

@@ -313,6 +313,10 @@ FOUND = Findings("", (), True, 50.0, 3.0, ("a",), (), 48.0, 20.0, "smooth", 1.0,
         ({"unseen": 0.8}, "unexplained"),
         ({"risen": 1.04}, "explained"),
         ({"risen": 1.06}, "unexplained"),
+        ({"reached": 1.09}, "explained"),
+        ({"reached": 1.11}, "partly explained"),
+        ({"dynamics": True}, "partly explained"),
+        ({"dynamics": True, "effects": ()}, "unexplained"),
     ],
 )
 def test_the_verdict_follows_from_what_was_found(change, kind):

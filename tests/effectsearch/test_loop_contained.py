@@ -22,6 +22,7 @@ STUDY = study(
     ),
     offset="shared",
 )
+TWO = replace(STUDY, model=replace(STUDY.model, terms=2))
 PAIR = [bundled()["odd_curvature"](), bundled()["overdrive_pulse"](1.0)]
 
 
@@ -50,8 +51,8 @@ def astray(heeds_near):
 def test_more_terms_are_at_least_as_likely_as_fewer(base, monkeypatch, heeds_near):
     """Though the wider fit's own starts lead astray: from the smaller model's optimum, at first or again."""
     monkeypatch.setattr(terms, "base_fit", astray(heeds_near))
-    lost = terms._based(replace(STUDY, model=replace(STUDY.model, terms=2)), 2)
-    wider = terms._wider(STUDY, base, 2)
+    lost = terms._based(TWO, 2)
+    wider = terms._wider(TWO, base, 2)
     inner = Regression(base.fit.model, wider.fit.regression.whitening).descend(base.fit.optimum.x)
     assert wider.fit.optimum.cost <= inner.cost + 0.5
     assert wider.fit.failed == ""
@@ -63,7 +64,7 @@ def test_more_terms_that_stay_less_likely_are_no_base(base, monkeypatch):
     """Where no start reaches what the smaller model does, the wider one is not used."""
     monkeypatch.setattr(terms, "base_fit", astray(False))
     monkeypatch.setattr(Regression, "best", lambda self, starts: self.at(starts[0]))
-    wider = terms._wider(STUDY, base, 2)
+    wider = terms._wider(TWO, base, 2)
     assert "less likely than that of fewer" in wider.fit.failed
 
 

@@ -70,7 +70,7 @@ def assert_scored(found: Loop) -> None:
         assert all(score["rmse"] < 1.3 * NOISE for score in scores), scores
 
 
-@pytest.mark.parametrize("axes", [1, 2])
+@pytest.mark.parametrize("axes", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_the_whole_catalogue_with_dark_records_fitted_and_held_out(axes: int):
     found = loop(with_dark(axes), quick=True)
     assert found.base.failed == ""

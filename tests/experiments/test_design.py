@@ -16,13 +16,14 @@ from small import TRUTH, TWO, draws_of, problem, record, row_values
 from lcopa_bayes.bench.command import quiet, step
 from lcopa_bayes.bench.device import Bench as VirtualBench
 from lcopa_bayes.bench.device import truth
+from lcopa_bayes.calibration.replica import device_of
 from lcopa_bayes.cli import main
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.record import load_record, save_record
 from lcopa_bayes.experiments.candidates import PLAIN, Candidate, candidates, template
 from lcopa_bayes.experiments.confirmation import confirm, confirmed
 from lcopa_bayes.experiments.design import checked, cramer_rao, design, promises, reached, within
-from lcopa_bayes.experiments.information import Bench, device_of, refit
+from lcopa_bayes.experiments.information import Bench, refit
 from lcopa_bayes.experiments.limits import Limits, bench_times, limits_of
 from lcopa_bayes.experiments.summary import as_json, next_measurement
 from lcopa_bayes.identifiability.curvature import sensitivities
@@ -151,7 +152,13 @@ def test_information_is_that_of_the_likelihood(one):
     values = row_values(one.posterior.table, TRUTH)
     bench = Bench(one, 24.0, 0.2)
     drive = candidates(limits_of(one), 24.0, np.random.default_rng(2), unit="ms")[-1].command
-    clean = truth(device_of(one, values), VirtualBench(camera=0.2), drive, duration=24.0, name="x")
+    clean = truth(
+        device_of(one.posterior.table, values, 0, time_unit="ms"),
+        VirtualBench(camera=0.2),
+        drive,
+        duration=24.0,
+        name="x",
+    )
     again = refit(one, clean, bench)
     found = sensitivities(Landscape(again.posterior), row_values(again.posterior.table, TRUTH))
     gram = found.matrix.T @ found.matrix
@@ -308,7 +315,7 @@ def test_a_filled_template_is_a_record(one, tmp_path):
     read = load_record(path)
     assert (read.drive_axes, read.response_axes) == (one.study.drive_axes, one.study.response_axes)
     clean = truth(
-        device_of(one, row_values(one.posterior.table, TRUTH)),
+        device_of(one.posterior.table, row_values(one.posterior.table, TRUTH), 0, time_unit="ms"),
         VirtualBench(camera=0.2),
         drive,
         duration=24.0,

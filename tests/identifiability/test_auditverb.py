@@ -154,7 +154,7 @@ OTHERWISE = {
 @pytest.mark.parametrize("claim", OTHERWISE)
 def test_another_audit_gives_another_verdict(claim):
     def verdict(audit: dict) -> str:
-        judged = {each.claim.id: each.verdict for each in judge(evidence=Evidence((audit,)))}
+        judged = judge(Evidence((audit,)))
         return judged[claim].kind.value
 
     assert verdict(told()) == "supported"
@@ -163,7 +163,7 @@ def test_another_audit_gives_another_verdict(claim):
 
 def test_the_first_audit_that_can_answer_decides():
     silent = told(delays={"paths": [], "separations": [], "sentence": "one path"}, study="one path")
-    judged = {each.claim.id: each.verdict for each in judge(evidence=Evidence((silent, told())))}
+    judged = judge(Evidence((silent, told())))
     assert judged["I6"].kind.value == "supported"
     assert judged["I1"].how.startswith("Audit of the study one path")
 

@@ -12,6 +12,7 @@ from scipy.special import ellipk
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.model.literature import PAPER
+from lcopa_bayes.optics import director
 from lcopa_bayes.optics.director import (
     Cell,
     Field,
@@ -32,6 +33,7 @@ from lcopa_bayes.optics.tiltlaw import (
     printed_law,
     tilt_law_check,
 )
+from lcopa_bayes.paper.staticoptics import OpticsPlan
 
 CELL = paper_cell()
 ONE = Cell(1e-11, 1e-11, 4e-11, 1e-10)
@@ -194,9 +196,11 @@ def test_equilibrium_does_not_depend_on_the_start(field):
 # Refusals
 
 
-def test_unfinished_iteration_raises_with_its_evidence():
-    with pytest.raises(NotConverged) as caught:
-        equilibrium(CELL, 2.0, iterations=2)
+def test_unfinished_iteration_raises_with_its_evidence(monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(director, "_ITERATIONS", 2)
+        with pytest.raises(NotConverged) as caught:
+            equilibrium(CELL, 2.0)
     assert caught.value.voltage == 2.0
     assert caught.value.iterations == 2
     assert caught.value.residual > 1e-6
@@ -207,22 +211,7 @@ def test_unfinished_iteration_raises_with_its_evidence():
 @pytest.mark.parametrize("volts", [-1.0, nan, inf])
 def test_impossible_voltages_are_refused(volts):
     with pytest.raises(InputError):
-        equilibrium(CELL, volts)
-    with pytest.raises(InputError):
-        quadrature(CELL, volts)
-
-
-def test_grids_and_starts_that_cannot_work_are_refused():
-    with pytest.raises(InputError, match="too few"):
-        equilibrium(CELL, 5.0, cells=50)
-    with pytest.raises(InputError, match="at least 8"):
-        equilibrium(CELL, 1.0, cells=4)
-    with pytest.raises(InputError, match="guess"):
-        equilibrium(CELL, 2.0, guess=np.zeros(801))
-    with pytest.raises(InputError, match="flat"):
-        quadrature(CELL, CELL.threshold)
-    with pytest.raises(InputError, match="tilts"):
-        quadrature(CELL, 2.0).positions(np.array([1.6]))
+        OpticsPlan(voltages=(1.0, volts))
 
 
 def test_impossible_cells_tell_every_problem_at_once():
@@ -234,12 +223,10 @@ def test_impossible_cells_tell_every_problem_at_once():
 # Tilt law
 
 
-def test_curve_rises_and_refuses_beyond_its_range():
+def test_curve_rises():
     curve = director_curve(CELL, np.linspace(0, 5, 26))
     assert curve.tilt.shape == (26, 801)
     assert (np.diff(curve.mean[curve.voltage > CELL.threshold]) > 0).all()
-    with pytest.raises(InputError, match="ascend"):
-        director_curve(CELL, [1.0, 1.0])
 
 
 def test_continuation_ends_where_a_fresh_start_does():
@@ -255,25 +242,19 @@ def test_laws_as_printed():
     assert continuous(3.0) == pytest.approx(1.2058)
     assert printed.jump == pytest.approx(3 * 0.095215 + 1.2058 - 3 * 0.4019, abs=1e-12)
     assert abs(continuous.jump) < 2e-4
-    with pytest.raises(InputError):
-        printed(5.01)
-    with pytest.raises(InputError):
-        printed(-0.01)
 
 
 def test_fit_quality_of_a_perfect_law_and_of_a_shifted_one():
     straight = replace(
         director_curve(CELL, np.linspace(0, 5, 51), cells=100), mean=np.linspace(0, 5, 51) * 0.2
     )
-    perfect = TiltLaw(0.2, 0.2, 0.0, 0.0, 3.0, 5.0)
+    perfect = TiltLaw(0.2, 0.2, 0.0, 0.0, 3.0)
     fit = fit_quality(straight, perfect, 0.0, 5.0)
     assert fit.r_squared == pytest.approx(1.0, abs=1e-12)
     assert fit.largest_relative_error < 1e-12
     tenth = fit_quality(straight, replace(perfect, low=0.22, high=0.22), 1.0, 5.0)
     assert tenth.largest_relative_error == pytest.approx(0.1, rel=1e-9)
     assert best_law(straight).low == pytest.approx(0.2, rel=1e-12)
-    with pytest.raises(InputError):
-        fit_quality(straight, perfect, 0.0, 6.0)
 
 
 @both
@@ -287,7 +268,7 @@ def test_tilt_law_check(field):
     worst = np.abs(continuous_law()(volts[::20]) / solved - 1).max()
     assert check.continuous[2].largest_relative_error == pytest.approx(worst, rel=2e-2)
     assert check.printed_jump > 100 * check.solved_change > 0
-    assert check.largest_printed_tilt > check.tilt_limit
+    assert check.largest_printed_tilt > pi / 2
 
 
 def test_tilt_law_check_follows_the_stated_numbers():

@@ -154,8 +154,6 @@ def test_no_wave_beyond_end_fire():
     with pytest.raises(InputError, match="no such wave propagates"):
         LinearArray(8, 0.25e-6, 1e-6).steering_angle(pi / 2 * 1.0001)
     assert LinearArray(8, 0.25e-6, 1e-6).steering_angle(pi / 2) == pytest.approx(pi / 2, abs=1e-7)
-    with pytest.raises(InputError, match="angle"):
-        ARRAY.phase_step(1.6)
 
 
 def test_impossible_arrays_tell_every_problem_at_once():
@@ -165,15 +163,6 @@ def test_impossible_arrays_tell_every_problem_at_once():
     for bad in (nan, np.inf):
         with pytest.raises(InputError):
             LinearArray(8, bad, 1e-6)
-
-
-def test_unusable_directions_are_refused():
-    with pytest.raises(InputError, match="`u`"):
-        intensity(ARRAY, [0.0, nan], 0.0)
-    with pytest.raises(InputError, match="`u`"):
-        array_factor(ARRAY, 1.1, 0.0)
-    with pytest.raises(InputError, match="must hold numbers"):
-        intensity(ARRAY, ["a"], 0.0)
 
 
 # Lobes
@@ -291,8 +280,6 @@ def test_linearisation_error_is_largest_at_an_end():
     at_limit = float(linearisation_error(ARRAY, pi / 2))
     assert at_limit == pytest.approx(np.arcsin(1 / (2.4 * pi)) * pi / 2 / exact - 1, rel=1e-10)
     assert linearised_angle(ARRAY, pi / 2) == pytest.approx(exact * (1 + at_limit), rel=1e-14)
-    with pytest.raises(InputError, match="phase_limit"):
-        largest_linearisation_error(ARRAY, nan)
 
 
 def test_implied_pitch_reproduces_the_measured_angle():

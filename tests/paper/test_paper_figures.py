@@ -195,7 +195,7 @@ def test_posterior_intervals_stand_beside(identified, tmp_path):
         (None, "cannot be read"),
         ("{", "cannot be read"),
         ("{}", "lacks step_metrics"),
-        ("[]", "lacks step_metrics"),
+        ("[]", "no JSON object"),
     ],
 )
 def test_a_folder_that_is_no_fit(identified, tmp_path, text, said):

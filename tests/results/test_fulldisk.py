@@ -13,15 +13,14 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-from small import record
+from small import record, study
 
-from lcopa_bayes.bench.campaignfile import write_campaign
 from lcopa_bayes.cli import main
 from lcopa_bayes.core import files
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.record import save_record
+from lcopa_bayes.data.studywriter import write_folder
 
 resource = pytest.importorskip("resource", reason="needs limits on the size of files")
 
@@ -185,7 +184,7 @@ def test_the_first_save_of_a_run_promises_nothing(tmp_path, monkeypatch, capsys)
 def test_a_campaign_that_does_not_fit_names_its_file_and_leaves_nothing(tmp_path, monkeypatch, at):
     monkeypatch.setattr(files.os, at, full)
     with pytest.raises(InputError) as caught:
-        write_campaign(tmp_path, [record(camera=0.8)], name="one", seed=1)
+        write_folder(tmp_path, study(record(camera=0.8)))
     assert str(tmp_path / "step.csv") + ": cannot be written (No space" in caught.value.problems[0]
     assert list(tmp_path.iterdir()) == []
 
@@ -193,7 +192,7 @@ def test_a_campaign_that_does_not_fit_names_its_file_and_leaves_nothing(tmp_path
 def test_a_campaign_in_a_folder_that_cannot_be_made_is_told(tmp_path, monkeypatch):
     monkeypatch.setattr(files.Path, "mkdir", full)
     with pytest.raises(InputError, match="cannot be written to"):
-        write_campaign(tmp_path / "new", [record(camera=0.8)], name="one", seed=1)
+        write_folder(tmp_path / "new", study(record(camera=0.8)))
 
 
 def test_figures_that_cannot_be_kept_are_told(tmp_path):
@@ -202,13 +201,3 @@ def test_figures_that_cannot_be_kept_are_told(tmp_path):
     (tmp_path / "figures").write_text("a file in the way")
     with pytest.raises(InputError, match="figures"):
         write_page(tmp_path, "claims.html", "it", {"verdict": "", "claims": []}, {"claims": []})
-
-
-def test_numbers_survive_the_enduring_file(tmp_path):
-    import h5py
-
-    values = np.random.default_rng(1).normal(size=(300, 7))
-    with files.enduring(tmp_path / "a.h5") as raw, h5py.File(raw, "w") as file:
-        file["x"] = values
-    with h5py.File(tmp_path / "a.h5") as file:
-        np.testing.assert_array_equal(file["x"][()], values)

@@ -22,7 +22,7 @@ from lcopa_bayes.sampling.importance import (
     importance,
 )
 from lcopa_bayes.sampling.sampler import sample
-from lcopa_bayes.sampling.weighted import Weighted, tail_smoothed
+from lcopa_bayes.sampling.weighted import Weighted, resampled, tail_smoothed
 
 WIDE = ("norm", {"loc": 0.0, "scale": 10.0})
 
@@ -189,14 +189,19 @@ def test_weights_without_a_tail():
 
 def test_resampling_takes_each_draw_as_often_as_its_weight(rng):
     weights = rng.dirichlet(np.ones(50))
-    zeros = np.zeros((50, 1)), np.zeros(50), np.zeros(50)
-    found = Weighted(*zeros, np.log(weights), 0.0, 50, 0.0, 0.0, np.zeros((50, 1)), (False,))
-    counts = np.bincount(found.resampled(1000, rng), minlength=50)
+    counts = np.bincount(resampled(np.log(weights), 1000, rng), minlength=50)
     assert np.abs(counts - 1000 * weights).max() < 1 + 1e-9
-    part = found.resampled(200, rng, part=slice(10, 20))
-    counts = np.bincount(part, minlength=50)
-    assert counts[:10].sum() == counts[20:].sum() == 0
-    assert np.abs(counts[10:20] - 200 * weights[10:20] / weights[10:20].sum()).max() < 1 + 1e-9
+
+
+def test_batches_are_resampled_from_parts_of_their_own(rng):
+    weights = rng.dirichlet(np.ones(52))
+    zeros = np.zeros((52, 1)), np.zeros(52), np.zeros(52)
+    weighted = Weighted(*zeros, np.log(weights), 0.0, 52, 0.0, 0.0, np.zeros((52, 1)), (False,))
+    for k, batch in enumerate(weighted.batches(200, rng)):
+        own = slice(13 * k, 13 * (k + 1))
+        counts = np.bincount(batch, minlength=52)
+        assert counts[own].sum() == 200
+        assert np.abs(counts[own] - 200 * weights[own] / weights[own].sum()).max() < 1 + 1e-9
 
 
 def test_the_same_randomness_gives_the_same_draws():

@@ -78,7 +78,7 @@ def test_a_longer_plan_begins_like_a_shorter_one(uninterrupted):
         assert_array_equal(one.chain, other.chain[: 2 * ROUND])
 
 
-@pytest.mark.parametrize("saves", [1, 2, 4])
+@pytest.mark.parametrize("saves", [2, *(pytest.param(saves, marks=pytest.mark.slow) for saves in (1, 4))])
 def test_a_killed_run_resumes_to_the_same_draws(tmp_path, monkeypatch, uninterrupted, saves):
     path, saved = tmp_path / "chain.h5", []
 
@@ -169,11 +169,11 @@ def test_steps_are_rounded_up_to_whole_rounds_and_at_least_two():
 
 
 def test_sampling_stops_once_the_target_is_reached():
-    run = sample(POSTERIOR, plan(ensembles=4, steps=5000, thin=3, walkers=16, target_ess=150))
+    run = sample(POSTERIOR, plan(ensembles=4, steps=5000, thin=3, walkers=16, target_ess=100))
     assert run.ensembles[0].steps < 5000
     assert finished(POSTERIOR, run)
     draws = gather(POSTERIOR, run)
-    assert draws.ess >= 150
+    assert draws.ess >= 100
     assert draws.grade.level == "reliable"
 
 
@@ -241,7 +241,7 @@ FOLLOWING = [
 ]
 
 
-@pytest.mark.parametrize("draws", [150, pytest.param(1500, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("draws", [60, pytest.param(1500, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("name", "following"), [*((name, False) for name in PRIORS), *FOLLOWING])
 def test_without_information_every_move_leaves_the_prior(name, following, draws):
     """Noise a million times the record: every parameter keeps its prior, or a proposal's volume is wrong.
@@ -300,7 +300,7 @@ def test_a_whole_run_samples_a_known_posterior(seed):
     fixed = {name: TRUTH[name] for name in ("time_1", "order_1", "delay", "offset")} | {"sigma": 0.3}
     posterior = problem(record(camera=0.6, noise_sd=0.3), priors=fixed | {"gain": GAIN}).posterior
     mean, sd = exact_gain(posterior)
-    run = sample(posterior, SamplePlan.of(1, seed=seed, walkers=16, thin=4, target_ess=1500))
+    run = sample(posterior, SamplePlan.of(1, seed=seed, walkers=16, thin=4, target_ess=500))
     draws = gather(posterior, run)
     assert draws.grade.level == "reliable"
     gain = draws.column("gain")

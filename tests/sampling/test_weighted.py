@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
+from scipy.special import logsumexp
 from small import Toy, problem, record
 
 from lcopa_bayes.sampling.draws import gather
 from lcopa_bayes.sampling.evidence import evidence_of
-from lcopa_bayes.sampling.sampler import Run, SamplePlan, sample
+from lcopa_bayes.sampling.sampler import SURPLUS, Run, SamplePlan, sample
 from lcopa_bayes.sampling.weighted import BATCHES, Weighted
 
 WIDE = ("norm", {"loc": 0.0, "scale": 10.0})
@@ -25,7 +26,7 @@ def test_an_error_that_hangs_on_few_draws_is_taken_larger(rng):
     raw = rng.exponential(1.2, 5_000)  # a tail of shape 1.2
     weighted = Weighted.of(TOY, z, np.zeros(5_000), raw, 5_000, smooth=False)
     by_weights = 1 / np.sum(np.exp(2 * weighted.log_weights))
-    assert weighted.smallest_ess(rng) < 0.5 * by_weights
+    assert weighted.smallest_ess < 0.5 * by_weights
 
 
 def test_effective_sizes_are_those_of_equal_weights():
@@ -37,6 +38,50 @@ def test_effective_sizes_are_those_of_equal_weights():
     assert_allclose(weighted.tail_ess, 4_000, rtol=0.25)
     assert weighted.log_evidence == pytest.approx(0.0)
     assert np.isnan(weighted.pareto_k)
+
+
+CENTRES, SHARES = np.array([0.0, 7.0, -8.0]), np.array([0.88, 0.09, 0.03])
+
+
+def three_modes(seed: int, count: int = 6_000) -> Weighted:
+    """Draws of a wide normal, weighted as of three narrow modes of `a` and one of `b`."""
+    rng, wide = np.random.default_rng(seed), stats.norm(0.0, [6.0, 1.5])
+    z = wide.rvs((count, 2), random_state=rng)
+    parts = stats.norm(CENTRES, 1.0).logpdf(z[:, :1]) + np.log(SHARES)
+    density = logsumexp(parts, axis=1) + stats.norm(0.0, 1.0).logpdf(z[:, 1])
+    return Weighted.of(TOY, z, density, density - wide.logpdf(z).sum(axis=1), count, smooth=False)
+
+
+def test_draws_that_suffice_a_search_are_graded_reliable():
+    """Modes and effective sizes are the same to the search that stops and to the grade, whichever draws are
+    taken for delivery and however their parts scatter."""
+    for seed in range(12):
+        weighted = three_modes(seed)
+        plan = SamplePlan.of(2, seed=seed, target_ess=weighted.smallest_ess / SURPLUS)
+        draws = gather(TOY, Run((), plan, weighted))
+        assert draws.sampling_grade.level == "reliable"
+        assert draws.ess == pytest.approx(1.007 * plan.target_ess, rel=1e-3)
+        assert [len(modes.boundaries) for modes in draws.modes] == [2]
+
+
+def test_shares_of_modes_scatter_as_their_errors_say():
+    found, errors, edges = [], [], (-4.0, 3.5)
+    for seed in range(120):
+        weighted = three_modes(seed)
+        vars(weighted)["boundaries"] = (edges, ())
+        draws = gather(TOY, Run((), SamplePlan.of(2, seed=seed), weighted))
+        (modes,) = draws.modes
+        assert modes.shares.shape == (1, 3)
+        delivered = np.searchsorted(edges, draws.column("a"))
+        found.append([np.mean(delivered == k) for k in range(3)])
+        errors.append(modes.pooled_errors)
+    exact = [SHARES[2], SHARES[0], SHARES[1]]
+    apart = (np.array(found) - exact) / np.array(errors)
+    assert np.abs(apart.mean(axis=0)).max() < 4 / np.sqrt(120)
+    low, high = stats.chi2(120).ppf([1e-4, 1 - 1e-4]) / 120
+    scatter = np.mean(apart**2, axis=0)
+    assert (scatter < high).all()
+    assert (scatter > 0.7 * low).all()  # errors that hang on few draws are taken a little larger
 
 
 @pytest.fixture(scope="module")

@@ -241,7 +241,7 @@ def test_a_plant_that_cannot_be_read_is_not_judged_further(tmp_path, capsys):
     assert main(["fit", str(tmp_path), "--out", str(tmp_path / "out"), "--quiet"]) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2  # whether there is a fourth term depends on what `terms` should have been
-    assert "`terms` must be a whole number from 1 to 6; got 9" in lines[0]
+    assert '`terms` must be a whole number from 1 to 6, or "auto"; got 9' in lines[0]
     assert "`kind` must be one of white, ar1, white+ar1, student; got 'ar'; did you mean 'ar1'?" in lines[1]
 
 

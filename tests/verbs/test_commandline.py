@@ -12,7 +12,7 @@ import pytest
 
 import lcopa_bayes as lb
 from lcopa_bayes.cli import VERBS, _parser, main
-from lcopa_bayes.verbs.commandline import EXAMPLES
+from lcopa_bayes.verbs.commandline import USAGES
 
 TERMS = tomllib.loads(files("lcopa_bayes.verbs").joinpath("glossary.toml").read_text(encoding="utf-8"))
 
@@ -57,9 +57,9 @@ def test_errors_are_json_where_json_is_asked_for(tmp_path, capsys):
 
 
 def test_the_example_of_every_verb_is_a_command_line():
-    assert EXAMPLES.keys() == VERBS.keys()
-    for verb, example in EXAMPLES.items():
-        given = [verb, *shlex.split(example)]
+    assert USAGES.keys() == VERBS.keys()
+    for verb, usage in USAGES.items():
+        given = [verb, *shlex.split(usage.example)]
         assert _parser(given).parse_args(given).verb == verb
 
 
@@ -67,7 +67,7 @@ def test_the_example_of_every_verb_is_a_command_line():
 def test_help_shows_the_example_and_the_exit_codes(verb, capsys):
     assert exit_code(verb, "--help") == 0
     said = capsys.readouterr().out
-    assert f"example: lcopa-bayes {verb} {EXAMPLES[verb]}" in said
+    assert f"example: lcopa-bayes {verb} {USAGES[verb].example}" in said
     assert "exit codes: 0 done, 2" in said
 
 

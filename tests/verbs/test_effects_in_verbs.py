@@ -19,7 +19,7 @@ from lcopa_bayes.comparison.candidates import candidates_of, derived, known_sett
 from lcopa_bayes.data.settings import EffectsSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studywriter import write_study
-from lcopa_bayes.experiments.information import Bench, EffectedDevice, device_of, refit
+from lcopa_bayes.experiments.information import Bench, refit, with_effects
 from lcopa_bayes.identifiability.curvature import sensitivities
 from lcopa_bayes.identifiability.profile import profile
 from lcopa_bayes.identifiability.symmetries import DIFFERENCED, structure
@@ -126,9 +126,7 @@ def test_information_of_a_new_drive_holds_the_effect(stiff: tuple[Problem, np.nd
     k = bench.columns[-1]
     up[k] += 1e-3
     down[k] -= 1e-3
-    devices = [device_of(problem, values) for values in (up, down)]
-    assert all(isinstance(one, EffectedDevice) for one in devices)
-    sides = [one.response(command, bench.sample_times)[:, 0] for one in devices]
+    sides = [with_effects(problem, values, command, bench.sample_times)[:, 0] for values in (up, down)]
     change = (sides[0] - sides[1]) / 2e-3 / TRUTH["sigma"]
     level = np.full(change.size, 1 / np.sqrt(change.size))
     assert_allclose(slopes[-1], change - (change @ level) * level, atol=2e-3 * np.abs(change).max())

@@ -288,7 +288,7 @@ def test_a_result_cut_short_is_refused(identified, tmp_path):
     folder = load_result(identified).save(tmp_path / "cut")
     (sample,) = (folder / "tables").iterdir()
     sample.unlink()
-    with pytest.raises(InputError, match="samples cannot be read"):
+    with pytest.raises(InputError, match="this file of the run folder is missing"):
         load_result(folder).report(folder)
     (folder / "identify.json").write_text('{"study": ')
     with pytest.raises(InputError, match="cannot be read"):

@@ -31,6 +31,8 @@ class OverdrivePulse(DriveEffect):
         source="Thalhammer et al. 2013, Opt. Express 21:1779 (about 1 ms with overdrive)",
         reveals="on/off, staircase",
         mistaken_for="a faster element, overshoot of an order above 1",
+        linear=True,
+        fields=("optical",),
     )
 
     @classmethod
@@ -123,6 +125,7 @@ class GreyQuantisation(DriveEffect):
         source="8 bit per 2 pi: 24.5 mrad per grey level",
         reveals="many different levels, small steps",
         mistaken_for="gain, noise of the gain",
+        fields=("optical",),
     )
 
     @classmethod
@@ -237,6 +240,7 @@ class SampledDrive(DriveEffect):
         source="midpoint rule for a band-limited drive; Ljung 1999, System Identification, ch. 13",
         reveals="a drive that changes with every sample, a delay near 0",
         mistaken_for="a shorter delay, exactly so where the delay can shrink",
+        linear=True,
     )
 
     lags = True

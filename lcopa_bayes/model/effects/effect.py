@@ -120,6 +120,12 @@ class Card:
     """Whether it belongs to the noise model and not to the plant."""
     resting: bool = False
     """Whether it goes on where nothing moves."""
+    linear: bool = False
+    """Whether it is a linear response to the drive that does not change with time."""
+    fields: tuple[str, ...] = ()
+    """optical, thermal, electrical, mechanical: where it can occur; anywhere by default."""
+    dynamics: bool = False
+    """Whether it stands for any such response that the plant may lack."""
 
 
 @final

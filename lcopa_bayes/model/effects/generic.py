@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, final
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import ClassVar, Self, final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.model.effects.effect import Card, Coefficient, ParallelEffect, Ranges, Scene, per_axis
+from lcopa_bayes.model.effects.effect import (
+    Card,
+    Coefficient,
+    ParallelEffect,
+    Ranges,
+    Scene,
+    per_axis,
+    single,
+)
 from lcopa_bayes.model.effects.parallel import falling, relaxing, summed
 
 _LAGS = 6
@@ -19,36 +29,77 @@ _PARTS = (0.3, 1.0, 3.0)
 
 @final
 class UnmodelledLinear(ParallelEffect):
-    """Any further linear response of an axis to its own drive."""
+    """Any further linear response of an axis to a drive."""
 
     card: ClassVar[Card] = Card(
         name="unmodelled_linear",
         place="generic",
-        formula="y += K sum_k c_k u / (1 + T_k s), T_k from an eighth of the response time to the span",
+        formula="y_i += (ymax_i / umax_j) sum_k c_ijk u_j / (1 + T_k s) for every drive j, T_k from an "
+        "eighth of the response time to the span",
         source="relaxation spectrum",
         reveals="any drive",
         mistaken_for="a named linear effect",
+        dynamics=True,
     )
 
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
-        """c_k [-] per axis."""
+        """c_ijk [-] by response axis, drive and lag."""
+        paths = [f"_{name}_{j + 1}" for name in ranges.names for j in range(ranges.drive.size)]
         return tuple(
-            Coefficient(f"c{k + 1}_{axis}" if ranges.axes > 1 else f"c{k + 1}", "-", 0.03)
-            for axis in ranges.names
+            Coefficient(f"c{k + 1}{path if len(paths) > 1 else ''}", "-", 0.03)
+            for path in paths
             for k in range(_LAGS)
         )
 
     def added(self, scene: Scene, psi: Vector) -> Matrix:
         """One exponential per change and lag."""
-        out = np.zeros((scene.times.size, scene.ranges.axes))
-        lags = np.geomspace(scene.ranges.speed / 8, scene.ranges.span, _LAGS)
-        for axis, mine in enumerate(psi.reshape(-1, _LAGS)):
-            drive, rest, gain, delay = scene.direct(axis)
-            for c, lag in zip(mine, lags, strict=True):
-                if c != 0.0:
-                    moved = summed(scene.times, drive, delay, drive.jumps, relaxing(float(lag)))
-                    out[:, axis] += c * gain * (rest + moved)
+        ranges = scene.ranges
+        out = np.zeros((scene.times.size, ranges.axes))
+        lags = np.geomspace(ranges.speed / 8, ranges.span, _LAGS)
+        for (i, j, k), c in np.ndenumerate(psi.reshape(ranges.axes, -1, _LAGS)):
+            if c != 0.0:
+                out[:, i] += c * ranges.response[i] / ranges.drive[j] * relaxed(scene, i, j, float(lags[k]))
         return out
+
+
+@final
+@dataclass(frozen=True)
+class UnmodelledLag(ParallelEffect):
+    """One more lag beside every path, or a zero of it: the least that a plant of too few terms lacks."""
+
+    time: float
+    """T [time unit]."""
+
+    units = MappingProxyType({"time": "time"})
+    estimated = single("c", 0.3)
+    card: ClassVar[Card] = Card(
+        name="unmodelled_lag",
+        place="generic",
+        formula="y_i += c K_ij u_j / (1 + T s) for every drive j, K the gains of the paths",
+        source="partial fractions",
+        reveals="any drive",
+        mistaken_for="a named linear effect",
+        dynamics=True,
+    )
+
+    @classmethod
+    def grid(cls, ranges: Ranges) -> tuple[Self, ...]:
+        """From a sampling period to a quarter of the longest record."""
+        return tuple(cls(float(time)) for time in np.geomspace(ranges.period, 0.25 * ranges.span, 6))
+
+    def added(self, scene: Scene, psi: Vector) -> Matrix:
+        """One exponential per change."""
+        out = np.zeros((scene.times.size, scene.ranges.axes))
+        for (i, j), gain in np.ndenumerate(scene.gains):
+            out[:, i] += psi[0] * gain * relaxed(scene, i, j, self.time)
+        return out
+
+
+def relaxed(scene: Scene, response: int, drive: int, lag: float) -> Vector:
+    """A drive after the delay of its path to a response and a lag [time unit], (samples,) [drive unit]."""
+    own, delay = scene.drives[drive], float(scene.delays[response, drive])
+    moved = summed(scene.times, own, delay, own.jumps, relaxing(lag))
+    return np.asarray(scene.rest[drive] + moved)
 
 
 @final

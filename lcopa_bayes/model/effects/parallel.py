@@ -123,6 +123,8 @@ class IonCreep(ParallelEffect):
         source="ionic double layers, 0.5 to 2 %",
         reveals="long holds",
         mistaken_for="fractional tail of a low order (84 % of it)",
+        linear=True,
+        fields=("optical",),
     )
 
     @classmethod
@@ -154,6 +156,7 @@ class Backflow(ParallelEffect):
         source="Ruan and Sambles; Appl. Phys. Lett. 75:3491 and 80:3721 (bounce on rise, overshoot)",
         reveals="on/off",
         mistaken_for="ringing of an order above 1",
+        fields=("optical",),
     )
 
     @classmethod
@@ -198,6 +201,8 @@ class ExtraMode(ParallelEffect):
         source="mechanical or elastic resonance",
         reveals="steps, pseudo-random drive",
         mistaken_for="ringing of an order above 1",
+        linear=True,
+        fields=("optical", "electrical", "mechanical"),
     )
 
     @classmethod
@@ -237,6 +242,7 @@ class MissingCrossPath(ParallelEffect):
         source="elastic or thermal coupling of the axes",
         reveals="single-axis records read on both axes",
         mistaken_for="cross gains; axis_rotation",
+        linear=True,
     )
 
     @classmethod

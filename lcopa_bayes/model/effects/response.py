@@ -93,6 +93,8 @@ class AxisRotation(ReadoutEffect):
         source="mounting, 5 to 50 mrad",
         reveals="single-axis and dual-axis records together, direct and cross elements that differ",
         mistaken_for="cross gains; exactly so with free output-side coupling",
+        linear=True,
+        fields=("optical", "mechanical"),
     )
 
     @classmethod
@@ -157,6 +159,7 @@ class CentroidLocking(ReadoutEffect):
         source="pixel locking of centroids, below 1/20 pixel",
         reveals="slow ramps, staircases of many levels",
         mistaken_for="noise",
+        fields=("optical",),
     )
 
     @classmethod
@@ -188,6 +191,7 @@ class CrossFade(ReadoutEffect):
         source="efficiencies of a re-written blaze, scalar diffraction",
         reveals="interrupted steps; not an amplitude series",
         mistaken_for="delay and order together",
+        fields=("optical",),
     )
 
     def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:

@@ -27,6 +27,7 @@ class SensorLag(SensorEffect):
         source="amplifier or read-out, 0.05 to 0.5 ms",
         reveals="pseudo-random drive; a test of the sensor with a fast source",
         mistaken_for="delay and order together (97 % of it)",
+        linear=True,
     )
 
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
@@ -74,6 +75,7 @@ class Exposure(SensorEffect):
         source="exposure of the camera, up to its period",
         reveals="pseudo-random drive near the sampling limit",
         mistaken_for="delay of Te/2, to second order",
+        linear=True,
     )
 
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:

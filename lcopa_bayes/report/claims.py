@@ -1,8 +1,10 @@
-"""Figures of the evidence for the verdicts: step response, crosstalk, delays, tilt, lobes, steering."""
+"""The page of `claims`: verdicts, and figures of their evidence: step response, crosstalk, delays, tilt,
+lobes, steering."""
 
 from __future__ import annotations
 
 from math import pi
+from pathlib import Path
 
 import numpy as np
 
@@ -27,6 +29,7 @@ from lcopa_bayes.paper.numericsclaims import delay_costs
 from lcopa_bayes.paper.opticsclaims import FAR_WEAKER, tilt_checks
 from lcopa_bayes.paper.paths import response_to
 from lcopa_bayes.report.formatting import figures
+from lcopa_bayes.report.page import write_graded
 from lcopa_bayes.report.theme import (
     BAND,
     CYCLE,
@@ -43,7 +46,17 @@ _SHOWN = 100.0
 """Time of the long panel [ms]."""
 
 
-def drawn(stated: Stated = PAPER) -> list[tuple[str, Drawing]]:
+def write_claims(folder: Path) -> Path:
+    """`claims.html` with every claim, its verdict and the figures behind them; returns its path.
+
+    InputError when `claims.json` cannot be used.
+    """
+    return write_graded(
+        folder, "claims", "Claims of the paper", lambda values: {"claims": _drawn(PAPER)}, box=None
+    )
+
+
+def _drawn(stated: Stated) -> list[tuple[str, Drawing]]:
     """A title and a figure for each family of claims."""
     rival, costs = integer_rival(stated), delay_costs(stated)
     shown = (

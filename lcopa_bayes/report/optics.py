@@ -1,14 +1,19 @@
-"""Static optics: far fields (Figs. 3, 5), the cell's tilt against Eq. 24 (Figs. 10, 11), volts to angle."""
+"""The page of `optics`: far fields (Figs. 3, 5), tilt against Eq. 24 (Figs. 10, 11), volts to angle."""
 
 from __future__ import annotations
+
+from math import log10
+from pathlib import Path
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix
+from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.optics.tiltlaw import continuous_law, printed_law
-from lcopa_bayes.paper.staticoptics import StaticOptics
-from lcopa_bayes.report.page import Drawings
+from lcopa_bayes.paper.staticoptics import OpticsPlan, StaticOptics, static_optics
+from lcopa_bayes.report.page import Drawings, write_graded
 from lcopa_bayes.report.theme import CYCLE, HELD_OUT, STEADY, Drawing, blank, extremes, grid, svg_of
+from lcopa_bayes.results.stored import stored_values
 
 _FLOOR = -50.0
 """Lowest intensity shown [dB]."""
@@ -16,7 +21,28 @@ _MOST = 1600
 """Points of a pattern that are drawn: its nulls are narrow."""
 
 
-def drawn(calculated: StaticOptics) -> Drawings:
+def write_optics(folder: Path) -> Path:
+    """`optics.html` with far fields, director, tilt law and chain; returns its path.
+
+    All is solved again for the plan in `optics.json`; InputError when that file cannot be used.
+    """
+    plan = stored_values(folder, "optics", ("plan",))["plan"]
+    try:
+        calculated = static_optics(OpticsPlan(**plan))
+    except TypeError as error:
+        raise InputError(f"{folder / 'optics.json'}: holds no plan ({error}); run `optics` again") from None
+    return write_graded(
+        folder,
+        "optics",
+        "Static optics of the array",
+        lambda values: _drawn(calculated),
+        box=None,
+        calculated=calculated,
+        decibel=lambda intensity: 10 * log10(intensity),
+    )
+
+
+def _drawn(calculated: StaticOptics) -> Drawings:
     """Far fields, director, tilt law and steering chain."""
     return {
         "far_field": [

@@ -63,13 +63,16 @@ def drawn(run: SavedRun) -> Drawings:
 
 def _metric(row: Mapping[str, Any]) -> dict[str, Any]:
     """A row of the table of step metrics."""
-    kind, path = _kind(row)
+    kind, _, path = str(row["name"]).partition("[")
+    never = NOT_REACHED if kind.startswith(_TIMES) else OPEN
+    lower, upper = row["lower"], row["upper"]
+    ends = interval(lower, upper, row["sd"], nothing=never)
     return {
         **{key: row[key] for key in ("unit", "sd", "grade")},
-        "path": path,
+        "path": path.rstrip("]"),
         "metric": _WORDS.get(kind, kind.replace("_", " ")),
-        "median": _median(row),
-        "ends": _interval(row),
+        "median": never if row["value"] is None else to_spread(row["value"], row["sd"]),
+        "ends": ends if (lower is None) == (upper is None) else ends.replace(OPEN, never),
         "note": row.get("note", ""),
     }
 
@@ -97,27 +100,6 @@ def _path(panel: Axes, rows: pd.DataFrame) -> None:
         level = float(rows[f"steady_{quantile}"].iloc[0])
         panel.axhline(level, color=STEADY, lw=width, ls=(0, (4, 3)), label=name or None)
     panel.axhline(0.0, color="#b0b0b0", lw=0.6, zorder=0)
-
-
-def _kind(metric: Mapping[str, Any]) -> tuple[str, str]:
-    """Kind and path of a metric."""
-    kind, _, where = str(metric["name"]).partition("[")
-    return kind, where.rstrip("]")
-
-
-def _open(metric: Mapping[str, Any]) -> str:
-    """Text of an end that no draw bounds."""
-    return NOT_REACHED if _kind(metric)[0].startswith(_TIMES) else OPEN
-
-
-def _median(metric: Mapping[str, Any]) -> str:
-    return _open(metric) if metric["value"] is None else to_spread(metric["value"], metric["sd"])
-
-
-def _interval(metric: Mapping[str, Any]) -> str:
-    lower, upper, never = metric["lower"], metric["upper"], _open(metric)
-    ends = interval(lower, upper, metric["sd"], nothing=never)
-    return ends if (lower is None) == (upper is None) else ends.replace(OPEN, never)
 
 
 def _bode(run: SavedRun, table: pd.DataFrame, paths: Sequence[str]) -> str:

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.integrate import quad
 
-from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.model.blockpulses import Circle, integration_matrix
 from lcopa_bayes.model.literature import PAPER
 from lcopa_bayes.model.path import TransferPath
@@ -143,9 +142,3 @@ def test_costs_and_differences_are_measured(n):
     assert cost.difference < 1e-11
     assert cost.largest_overlap == pytest.approx(2**-1.5, abs=1e-12)
     assert cost.ratio > 0
-
-
-@pytest.mark.parametrize("n", [0, 1, 3, 250, -4, True, 8.0])
-def test_other_sizes_than_powers_of_two_are_refused(n):
-    with pytest.raises(InputError, match="power of two"):
-        WaveletBasis(n)

@@ -1,0 +1,298 @@
+"""Whether the records of a campaign agree with each other, before any plant is assumed.
+
+What one record determines of a sum of lagged drives (`description`) predicts another one. By how much that
+prediction must be scaled, under noise correlated from sample to sample, shows records of one plant (1), of
+one plant in another unit (a thousand), with a connection reversed (negative), with axes exchanged (the
+prediction for another axis fits), or of two plants (none of these). A record whose response runs ahead of its
+drive is described better by the drive of later times.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+from typing import TypeAlias, final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.data.description import FOLLOWED, Described, LaggedSum
+from lcopa_bayes.data.record import Record
+
+_LAGS = 6
+"""Time constants of a description."""
+_PAIRED = 12
+"""Records up to which each is compared with each, and not with all others together only [-]."""
+_CLOSELY = 0.98
+"""Share of a response's variance that is followed where a difference in size is judged [-]."""
+_AHEAD = 2.0
+"""Residual variance with delays over that with advances from which a response runs ahead [-]."""
+_OTHER_UNIT = 30.0
+"""Ratio of two records from which they are in different units [-]."""
+_CONTRADICTION, _SLIGHT = 20.0, 0.05
+"""Difference of two records that is a contradiction [standard errors], and least such difference [-]."""
+_EXCHANGED = 5.0
+"""What a prediction misses of a record as it is, over what it misses with exchanged axes, from which they
+are exchanged [-]."""
+_SURE = 5.0
+"""Standard errors from zero from which a ratio has a sign and a size [-]."""
+
+_Order: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]
+"""Positions of drives and of responses."""
+
+
+@final
+@dataclass(frozen=True)
+class Disagreement:
+    """A record that runs ahead of its drive, or does not follow the plant of another record."""
+
+    records: tuple[str, ...]
+    reason: str
+    """What was seen, a clause without a full stop."""
+    remedy: str
+    """What to do, a clause without a full stop."""
+    gross: bool
+    """Whether no plant follows these records as they are."""
+    ratio: float = np.nan
+    """Of the first to what the others predict for it; NaN where they differ in another way [-]."""
+    misfit: float = 0.0
+    """Share of its variance that remains with that ratio, or the axes exchanged [-]."""
+
+    def __str__(self) -> str:
+        return f"{self.reason}: {self.remedy}"
+
+
+def disagreements(records: Sequence[Record]) -> tuple[Disagreement, ...]:
+    """What the records, all of equal axes, contradict: each record by itself, then in pairs.
+
+    A record that several others contradict is named once. Ratios are accurate to a tenth where a description
+    follows at least 70 % of the variance; records that it follows less are not judged.
+    """
+    if not records:
+        return ()
+    period = min(float(np.median(np.diff(record.time))) for record in records)
+    span = max(float(np.ptp(record.time)) for record in records)
+    lags = np.geomspace(period, span, _LAGS)
+    described = [one for one in (Described(record, lags) for record in records) if one.moving and one.best]
+    leads = [
+        max((-seen[0] for seen in one.best if _runs_ahead(*seen, period)), default=0.0) for one in described
+    ]
+    ahead = [_ahead(one.record, lead) for one, lead in zip(described, leads, strict=True) if lead > 0.0]
+    rest = [one for one, lead in zip(described, leads, strict=True) if lead <= 0.0]
+    if len(rest) < 2:
+        return tuple(ahead)
+    delay = float(np.median([max(delay, 0.0) for one in rest for delay, *_ in one.best]))
+    pairs: list[Disagreement] = []
+    joint: list[Disagreement] = []
+    for one in rest:
+        others = tuple(other for other in rest if other is not one)
+        single = others if len(rest) <= _PAIRED else ()
+        comparisons = [_Comparison(one, (other,), delay) for other in single]
+        if any(comparison.judged for comparison in comparisons):
+            pairs += [seen for comparison in comparisons for seen in comparison.disagreements()]
+        else:
+            joint += _Comparison(one, others, delay).disagreements()
+    # what one record contradicts in all others together, these contradict in it
+    return (*ahead, *_once(sorted(pairs, key=_severity)), *sorted(joint, key=_severity)[:1])
+
+
+def _severity(one: Disagreement) -> tuple[bool, bool, float]:
+    """Sorts the gross ones first, those of all axes before those of one, then by what explains most."""
+    return not one.gross, np.isfinite(one.ratio), one.misfit
+
+
+def _runs_ahead(delay: float, misfit: float, causal: float, period: float) -> bool:
+    """Whether a response is described so well by the drive of later times alone."""
+    return -delay > period and causal > max(1 - _CLOSELY, _AHEAD * misfit)
+
+
+def _ahead(record: Record, lead: float) -> Disagreement:
+    return Disagreement(
+        (record.name,),
+        f"the response of record {record.name!r} runs about {lead:.3g} {record.time_unit} ahead of its drive",
+        "no plant responds to a drive of later times; align the clocks of its drive and response columns",
+        gross=True,
+    )
+
+
+def _once(pairs: Sequence[Disagreement]) -> Iterator[Disagreement]:
+    """One pair, of those in their order of severity, for each record that disagrees with others: records in
+    most pairs first."""
+    remaining = list(pairs)
+    while remaining:
+        counts = Counter(name for one in remaining for name in one.records)
+        odd = counts.most_common(1)[0][0]
+        yield next(one for one in remaining if odd in one.records)
+        remaining = [one for one in remaining if odd not in one.records]
+
+
+@final
+@dataclass(frozen=True)
+class _Ratio:
+    """One axis of a record over what another record predicts for it."""
+
+    axis: int
+    value: float
+    """[-]."""
+    sd: float
+    """[-]."""
+    misfit: float
+    """Residual variance of the scaled prediction over that of the response [-]."""
+    size: float
+    """Variance of the response over the square of the other record's range [-]."""
+    missed: float
+    """The same of response less unscaled prediction [-]."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Comparison:
+    """A record beside what others, together, predict for it."""
+
+    one: Described
+    others: tuple[Described, ...]
+    delay: float
+    """Of the whole campaign [time unit]."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the record, and of the other where it is one."""
+        own = (self.one.record.name,)
+        return (*own, self.others[0].record.name) if len(self.others) == 1 else own
+
+    @property
+    def _them(self) -> str:
+        return f"record {self.names[1]!r}" if len(self.names) > 1 else "the other records"
+
+    @cached_property
+    def _known(self) -> tuple[LaggedSum | None, ...]:
+        """Description of every response axis of the others; None where it follows too little of it."""
+        columns = [one.columns(self.delay) for one in self.others]
+        flat = [each.reshape(len(each), -1) for each in columns]
+        known: list[LaggedSum | None] = []
+        for axis in range(len(self.one.record.response_axes)):
+            parts = [
+                _centred(x, one.response[:, axis])
+                for x, one in zip(flat, self.others, strict=True)
+                if one.sampled(axis)
+            ]
+            if not parts:
+                known.append(None)
+                continue
+            joined = LaggedSum.of(
+                np.concatenate([x for x, _ in parts]), np.concatenate([y for _, y in parts])
+            )
+            known.append(joined if joined.misfit <= 1 - FOLLOWED else None)
+        return tuple(known)
+
+    @cached_property
+    def ratios(self) -> list[_Ratio]:
+        """Of all response axes that are followed, as they are."""
+        drives, responses = range(len(self.one.drives)), range(len(self.one.record.response_axes))
+        return self._ratios((tuple(drives), tuple(responses)))
+
+    @property
+    def judged(self) -> bool:
+        """Whether a ratio is known well enough to show a contradiction."""
+        return any(one.sd <= _SLIGHT * abs(one.value) for one in self.ratios)
+
+    def _ratios(self, order: _Order) -> list[_Ratio]:
+        """With its drives and responses taken in an order; empty where a drive moves in this record alone."""
+        drives, responses = order
+        if not {drives.index(j) for j in self.one.moving} <= {j for one in self.others for j in one.moving}:
+            return []
+        columns = self.one.columns(self.delay)[:, drives]
+        target, out = columns.reshape(len(columns), -1), []
+        for axis, k in enumerate(responses):
+            known = self._known[axis]
+            if known is None or not self.one.sampled(k):
+                continue
+            predicted, seen = target @ known.coefficients, self.one.response[:, k]
+            if not np.ptp(predicted) > 0.0:
+                continue
+            scaled = LaggedSum.of(predicted[:, None], seen)
+            lever = (predicted - predicted.mean()) @ target / float(np.var(predicted) * predicted.size)
+            ratio = float(scaled.coefficients[0])
+            variance = float(scaled.covariance[0, 0] + ratio**2 * lever @ known.covariance @ lever)
+            size, missed = (float(np.nanvar(each) / known.span**2) for each in (seen, seen - predicted))
+            out.append(_Ratio(k, ratio, float(np.sqrt(variance)), scaled.misfit, size, missed))
+        return out
+
+    def _exchanges(self) -> Iterator[_Order]:
+        """Orders in which two responses or two drives have changed places."""
+        drives, responses = len(self.one.drives), len(self.one.record.response_axes)
+        for i, j in combinations(range(responses), 2):
+            yield tuple(range(drives)), _with_exchanged(responses, i, j)
+        for i, j in combinations(range(drives), 2):
+            yield _with_exchanged(drives, i, j), tuple(range(responses))
+
+    def disagreements(self) -> Iterator[Disagreement]:
+        """At most one, the most severe."""
+        record = self.one.record
+        orders = {order: _missed(self._ratios(order)) for order in self._exchanges()}
+        order = min(orders, key=lambda order: orders[order], default=None)
+        as_is = _missed(self.ratios)
+        if order and as_is > 1 - FOLLOWED > orders[order] and as_is > _EXCHANGED * orders[order]:
+            which = _exchanged(record, order)
+            seen = f"record {record.name!r} follows {self._them} with its {which} exchanged, not as it is"
+            remedy = "exchange the columns, or their names, in one of the two"
+            yield Disagreement(self.names, seen, remedy, gross=True, misfit=orders[order])
+            return
+        for ratio in self.ratios:
+            if ratio.misfit > 1 - FOLLOWED or abs(ratio.value) < _SURE * ratio.sd:
+                continue
+            axis, by = record.response_axes[ratio.axis], f"{ratio.value:.3g} times"
+            seen = (
+                f"response {axis.name!r} of record {record.name!r} is {by} what is predicted for it from "
+                f"{self._them} (standard error {ratio.sd:.1g})"
+            )
+            if not 1 / _OTHER_UNIT < abs(ratio.value) < _OTHER_UNIT:
+                remedy = (
+                    "one of them is in another unit than it states; correct the unit, or convert the values"
+                )
+            elif ratio.value < 0.0:
+                remedy = "check the signs of drive and response in both"
+            elif ratio.misfit <= 1 - _CLOSELY and abs(ratio.value - 1) > max(
+                _CONTRADICTION * ratio.sd, _SLIGHT
+            ):
+                remedy = (
+                    "no linear plant follows both; leave one out, or let `loop` trace what changed between "
+                    "them or depends on the size of the drive"
+                )
+                yield Disagreement(
+                    self.names, seen, remedy, gross=False, ratio=ratio.value, misfit=ratio.misfit
+                )
+                return
+            else:
+                continue
+            yield Disagreement(self.names, seen, remedy, gross=True, ratio=ratio.value, misfit=ratio.misfit)
+            return
+
+
+def _centred(columns: Matrix, response: Vector) -> tuple[Matrix, Vector]:
+    """Columns and response where this was sampled, each less its mean."""
+    seen = np.isfinite(response)
+    return columns[seen] - columns[seen].mean(axis=0), response[seen] - response[seen].mean()
+
+
+def _missed(ratios: Sequence[_Ratio]) -> float:
+    """Share of the variance of all responses that unscaled predictions miss [-]; 1 of no responses."""
+    return sum(one.missed for one in ratios) / sum(one.size for one in ratios) if ratios else 1.0
+
+
+def _with_exchanged(count: int, i: int, j: int) -> tuple[int, ...]:
+    return tuple({i: j, j: i}.get(k, k) for k in range(count))
+
+
+def _exchanged(record: Record, order: _Order) -> str:
+    """The two axes that have changed places, in words."""
+    for role, axes, places in zip(
+        ("drives", "responses"), (record.drive_axes, record.response_axes), order, strict=True
+    ):
+        moved = [axes[k].name for k, place in enumerate(places) if k != place]
+        if moved:
+            return f"{role} {moved[0]!r} and {moved[1]!r}"
+    return "axes"

@@ -1,0 +1,168 @@
+"""How many terms a plant has and what its paths share, where a study leaves that to its records.
+
+Structures are looked at by least squares: the fewest terms per element, then one more, until a further one is
+not worth its parameters; then an element, and a delay, of its own for every path. The best by BIC is fitted
+(Schwarz 1978, Ann. Statist. 6): Laplace's approximation of the evidence needs a mode that is close to a
+normal distribution, which that of a plant with a term too many is not. What other structures leave open of a
+number is a question for `compare`, which samples them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import log
+from typing import Any, final
+
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import attributes, plain
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.inference.assembly import Problem, table_of
+from lcopa_bayes.inference.defaultpriors import Scales
+from lcopa_bayes.inference.optimum import Optimum
+from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.model.layout import Layout
+from lcopa_bayes.results.firstlook import FirstLook, look_at, searched
+
+_MOST = 4
+"""Most terms that are looked at."""
+_SHARING: tuple[Mapping[str, str], ...] = ({"share": "none"}, {"delay": "path"})
+"""What is asked of a plant with several paths: an element for each of them, a delay for each of them."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Looked:
+    """One structure, by least squares."""
+
+    problem: Problem
+    optima: tuple[Optimum, ...]
+    """Best first."""
+
+    @property
+    def study(self) -> Study:
+        """With that structure."""
+        return self.problem.study
+
+    @property
+    def name(self) -> str:
+        """In words."""
+        layout, terms = self.problem.posterior.table.layout, self.study.model.most_terms
+        parts = [f"{terms} term{'s' * (terms > 1)}"]
+        if len(layout.drives) * len(layout.responses) > 1:
+            parts += [f"elements: {len(layout.elements)}", f"delays: {len(layout.delays)}"]
+        return ", ".join(parts)
+
+    @cached_property
+    def max_log_likelihood(self) -> float:
+        """At the best optimum [nat]."""
+        posterior = self.problem.posterior
+        best = posterior.table.canonical(self.optima[0].values[None])
+        return float(posterior.joint_log_likelihood(best)[0])
+
+    @cached_property
+    def parameters(self) -> int:
+        """Free parameters, noise and offsets included [-]."""
+        return sum(row.free for row in self.problem.posterior.table.rows)
+
+    @property
+    def bic(self) -> float:
+        """``k log n - 2 log L`` [-]; n counts samples as if they were independent."""
+        return self.parameters * log(self.problem.posterior.size) - 2 * self.max_log_likelihood
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """The structure that the records chose, and those they chose from."""
+
+    looked: tuple[Looked, ...]
+    """In the order they were looked at."""
+
+    @property
+    def chosen(self) -> Looked:
+        """The one of the least BIC."""
+        return min(self.looked, key=lambda one: one.bic)
+
+    @property
+    def look(self) -> FirstLook:
+        """Of that structure."""
+        return look_at(self.chosen.problem, self.chosen.optima)
+
+    @property
+    def sentence(self) -> str:
+        """What was chosen of what."""
+        others = "; ".join(one.name for one in self.looked if one is not self.chosen)
+        return (
+            f"The records chose a structure by BIC: {self.chosen.name}; looked at beside it: {others}. "
+            "`compare` shows what the others leave open."
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        rows = [attributes(one, "name", "parameters", "max_log_likelihood", "bic") for one in self.looked]
+        return plain({"chosen": self.chosen.name, "candidates": rows, "sentence": self.sentence})
+
+
+def structure_of(study: Study) -> Structure | None:
+    """The structure of a study whose terms are "auto"; None where it states them.
+
+    InputError as `first_look` of the fewest terms, and for priors that no number of terms has a use for.
+    """
+    if study.model.terms != "auto":
+        return None
+    least = with_least_terms(study)
+    looked = [Looked(*searched(least))]
+    for terms in range(least.model.most_terms + 1, _MOST + 1):
+        more = _if_possible(least, terms=terms)
+        if more is None:
+            break
+        looked.append(more)
+        if Structure(tuple(looked)).chosen is not more:
+            break
+    for variant in _SHARING if len(study.drive_axes) * len(study.response_axes) > 1 else ():
+        best = Structure(tuple(looked)).chosen.study
+        more = _if_possible(best, **variant)
+        if more is not None and more.study.model != best.model:
+            looked.append(more)
+    return Structure(tuple(looked))
+
+
+def settled(study: Study) -> Study:
+    """The study itself, or where its terms are "auto" with the structure that its records chose."""
+    structure = structure_of(study)
+    return study if structure is None else structure.chosen.study
+
+
+def with_least_terms(study: Study) -> Study:
+    """The study with the fewest terms that its priors need where its terms are "auto", else as it is.
+
+    InputError for priors that no number of terms has a use for.
+    """
+    if study.model.terms != "auto":
+        return study
+    for terms in range(1, _MOST):
+        least = replace(study, model=replace(study.model, terms=terms))
+        try:
+            _table(least)
+        except InputError:
+            continue
+        return least
+    most = replace(study, model=replace(study.model, terms=_MOST))
+    _table(most)
+    return most
+
+
+def _table(study: Study) -> ParameterTable:
+    """InputError where its priors are not of its parameters."""
+    layout = Layout.of(study.drive_axes, study.response_axes, study.model)
+    return table_of(study, layout, Scales.of(study.fit))[2]
+
+
+def _if_possible(study: Study, **model: Any) -> Looked | None:
+    """None where the records cannot determine so many parameters, or priors are of other parameters."""
+    try:
+        return Looked(*searched(replace(study, model=replace(study.model, **model))))
+    except InputError:
+        return None

@@ -1,0 +1,124 @@
+"""A study that leaves its structure to its records gets the one that made them, where they can show it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from math import log
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small import ONE, TWO, U, Y, path, record, study
+
+from lcopa_bayes.bench.command import on_off, step
+from lcopa_bayes.bench.device import Device
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.data.record import Axis
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.results.fit import fit as sampled
+from lcopa_bayes.results.structure import settled, structure_of, with_least_terms
+from lcopa_bayes.verbs.check import check
+from lcopa_bayes.verbs.fit import fit
+from lcopa_bayes.verbs.look import look
+
+LAGS = Device(((path(2.0, 0.4, (1.2, 2.5), (1.6, 0.7)),),), (U,), (Y,), (0.0,))
+"""Two terms that steps of 12 ms tell apart."""
+QUICK = {"ensembles": 2, "walkers": 8, "steps": 40, "thin": 1, "target_ess": 10}
+
+
+def steps(device: Device, noise_sd: float = 0.01) -> Study:
+    on, half = (
+        record(k, device=device, command=step(height, at=0.35), name=f"r{k}", noise_sd=noise_sd)
+        for k, height in ((1, 1.0), (2, -0.5))
+    )
+    return study(on, half, terms="auto")
+
+
+@pytest.mark.parametrize(("device", "terms"), [(ONE, 1), (LAGS, 2)])
+def test_the_terms_that_made_the_records_are_chosen(device: Device, terms: int) -> None:
+    chosen = settled(steps(device))
+    assert chosen.model.terms == terms
+
+
+def test_a_structure_that_is_stated_stays() -> None:
+    stated = study(record(), terms=3)
+    assert structure_of(stated) is None
+    assert settled(stated) is stated
+    assert with_least_terms(stated) is stated
+
+
+def test_bic_is_that_of_its_definition_and_the_least_one_is_chosen() -> None:
+    structure = structure_of(steps(ONE))
+    assert structure is not None
+    for one in structure.looked:
+        samples = sum(int(np.isfinite(r.response).sum()) for r in one.study.fit)
+        table = one.problem.posterior.table
+        free = [row.name for row in table.rows if row.prior is not None]
+        assert one.parameters == len(free)
+        assert one.bic == pytest.approx(len(free) * log(samples) - 2 * one.max_log_likelihood)
+    values = [one.bic for one in structure.looked]
+    assert structure.chosen is structure.looked[int(np.argmin(values))]
+    assert values[-1] > min(values)  # looking stops at the first that is not worth its parameters
+
+
+def test_paths_that_share_no_delay_are_recognised() -> None:
+    apart = Device(
+        (
+            (path(1.0, 0.3, (1.2,), (0.9,)), path(0.3, 1.5, (1.2,), (0.9,))),
+            (path(0.3, 1.5, (1.2,), (0.9,)), path(1.5, 0.3, (1.2,), (0.9,))),
+        ),
+        (Axis("x", "V"), Axis("y", "V")),
+        (Axis("x", "rad"), Axis("y", "rad")),
+        (0.0, 0.0),
+    )
+    campaign = study(
+        *(
+            record(k, device=apart, command=on_off(to, hold=5.0, at=0.35, rest=(0.0, 0.0)), name=f"r{k}")
+            for k, to in ((1, (1.0, 0.0)), (2, (0.0, 1.0)))
+        ),
+        terms="auto",
+    )
+    assert settled(campaign).model.delay == "path"
+    alike = study(
+        *(
+            record(k, device=TWO, command=on_off(to, hold=5.0, at=0.35, rest=(0.0, 0.2)), name=f"r{k}")
+            for k, to in ((1, (1.0, 0.2)), (2, (0.0, 1.0)))
+        ),
+        terms="auto",
+    )
+    assert settled(alike).model.delay == "shared"
+
+
+def test_priors_need_terms_and_unknown_ones_are_refused() -> None:
+    made = steps(ONE)
+    both = replace(made, priors=study(record(), terms=2, priors={"order_2": 0.5}).priors)
+    assert with_least_terms(both).model.terms == 2
+    structure = structure_of(both)
+    assert structure is not None
+    assert all(one.study.model.most_terms >= 2 for one in structure.looked)
+    unknown = study(record(), terms="auto", priors={"delya": 0.5})
+    for verb in (structure_of, check, look):
+        with pytest.raises(InputError, match="delya"):
+            verb(unknown)
+
+
+def test_fixed_orders_leave_nothing_to_choose() -> None:
+    with pytest.raises(InputError, match="needs free orders"):
+        study(record(), terms="auto", orders=[1.0])
+    assert study(record(), orders=[2.0, 1.0], terms=2).model.most_terms == 2
+    assert Study(fit=[record()], model={"orders": [2.0, 1.0]}).model.terms == 2
+
+
+def test_a_fit_says_what_was_chosen_of_what(tmp_path: Path) -> None:
+    campaign = replace(steps(LAGS), sampler=study(record(), sampler=QUICK).sampler)
+    fitted = fit(campaign, folder=tmp_path)
+    assert fitted.study.model.terms == 2
+    assert fitted.structure is not None
+    values = json.loads((tmp_path / "results.json").read_text())["structure"]
+    assert values["chosen"] == "2 terms"
+    assert [row["name"] for row in values["candidates"]] == ["1 term", "2 terms", "3 terms"]
+    assert "The records chose a structure by BIC: 2 terms" in fitted.verdict
+    assert 'id="structure"' in fitted.report(tmp_path).read_text()
+    with pytest.raises(ValueError, match="not settled"):
+        sampled(campaign)
