@@ -32,8 +32,8 @@ from lcopa_bayes.sampling.convergence import TENTATIVE_RHAT, Grade, Level
 from lcopa_bayes.sampling.evidence import known_to
 from lcopa_bayes.sampling.importanceweights import FEWEST_EFFECTIVE, effective, smoothed, usable_k
 
-_DRAWS = 600
-"""Draws behind a predictive density."""
+_DRAWS, _EFFECT_DRAWS = 600, 200
+"""Draws behind a predictive density, and with effects, which take a simulation each."""
 _BEYOND = 3.0
 """Standard errors by which a density of what was left out may exceed that of what was fitted [-]."""
 
@@ -111,6 +111,7 @@ def predictions(fit: Fit, *, held_out_only: bool = False) -> tuple[Predicted, ..
     their Pareto k is at most 0.7 and 100 draws or more stay effective, else by a refit (`bridge`).
     """
     posterior, study = fit.near, fit.study
+    count = _DRAWS if posterior.simulation is None else _EFFECT_DRAWS
     positions = _walkers(fit)
     out: list[Predicted] = []
     source = posterior
@@ -118,13 +119,13 @@ def predictions(fit: Fit, *, held_out_only: bool = False) -> tuple[Predicted, ..
         if part.kind == "held-out record":
             samples, model = fit.problem.simulated(study.held_out)
             scored = _Scored(fit, part, samples[part.record], _one(model, part.record))
-            out.append(scored(fit.draws.thinned(_DRAWS), None, "exact", known=posterior))
+            out.append(scored(fit.draws.thinned(count), None, "exact", known=posterior))
             continue
         if held_out_only:
             continue
         scored = _Scored(fit, part, posterior.samples[part.record], _one(posterior.model, part.record))
-        seen = scored(fit.draws.thinned(_DRAWS), None, "exact")
-        values = fit.draws.thinned(2 * _DRAWS)
+        seen = scored(fit.draws.thinned(count), None, "exact")
+        values = fit.draws.thinned(2 * count)
         target = without(posterior, part)
         weights, k = left_out_weights(posterior, target, values, fit.draws.ess / len(fit.draws.flat))
         rng = np.random.default_rng([fit.run.plan.seed, 5, len(out)])
@@ -138,7 +139,7 @@ def predictions(fit: Fit, *, held_out_only: bool = False) -> tuple[Predicted, ..
             if part.kind == "future of the record":  # the next part knows still less
                 source, positions = target, moved.coordinates[:, :, -1]
             flat = moved.coordinates.reshape(-1, posterior.dimension)
-            chosen = np.linspace(0, len(flat) - 1, min(_DRAWS, len(flat))).astype(int)
+            chosen = np.linspace(0, len(flat) - 1, min(count, len(flat))).astype(int)
             values = target.complete(flat[chosen], rng)
             result = scored(values, None, "refit", k=k, ess=moved.ess, rhat=moved.rhat, known=target)
         total = float(seen.log_density.sum())

@@ -258,7 +258,7 @@ def _columns(
         r = len(known.samples)
         posterior = replace(known, model=known.model.joined(model), samples=(*known.samples, samples))
     observed = samples.axes[axis]
-    units = replace(posterior, model=model).responses(values)[0]
+    units = replace(posterior, model=model, surrogate=None).responses(values)[0]
     mean, sd = known.scaled[axis]
     block = known.blocks[axis]
     centre = values.copy()

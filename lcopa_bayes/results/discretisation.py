@@ -142,10 +142,14 @@ def optima_of(problem: Problem, *, starts: int = _STARTS) -> tuple[Optimum, ...]
 
 
 def resolved_optima(problem: Problem, optima: Sequence[Optimum]) -> tuple[Problem, tuple[Optimum, ...]]:
-    """`resolved`, and the optima there."""
+    """`resolved`, and the optima there; with effects until these ask for no narrower blocks: where the error
+    of wide ones passes for noise, they seem narrow enough."""
     narrow = resolved(problem, optima)
+    if narrow is problem:
+        return problem, tuple(optima)
     with threadpool_limits(1):
-        return narrow, tuple(optima) if narrow is problem else again(narrow.posterior, optima)
+        found = again(narrow.posterior, optima)
+    return (narrow, found) if problem.ranges is None or not found else resolved_optima(narrow, found)
 
 
 def narrowed(problem: Problem, shift: Callable[[Problem], float]) -> Problem:

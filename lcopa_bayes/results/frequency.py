@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector, frozen
+from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector, frozen
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import Estimate, plain
 from lcopa_bayes.inference.parameters import ParameterTable
@@ -30,6 +30,8 @@ _SEARCHED = (1e-6, 1e2)
 """A bandwidth is searched from this share of the lowest to this multiple of the highest frequency that the
 fit records resolve [-]."""
 _SEARCH_POINTS = 300
+_SHOWN = 24
+"""Most frequencies of which a summary shows all [-]."""
 _SIGN = 0.05
 """Share of draws with a gain of the other sign from which the phase has two values [-]."""
 
@@ -86,25 +88,30 @@ class FrequencyResponse:
         return pd.concat(frames, ignore_index=True)
 
     def summary(self) -> pd.DataFrame:
-        """One row per path: gain at the lowest frequency and bandwidth, with 90 % intervals."""
-        return pd.DataFrame(
-            [
-                {
-                    "path": one.path,
-                    "unit": one.unit,
-                    "frequency": float(self.frequency[0]),
-                    "gain": float(one.gain.pointwise[2, 0]),
-                    "gain_lower": float(one.gain.pointwise[0, 0]),
-                    "gain_upper": float(one.gain.pointwise[4, 0]),
-                    "bandwidth": one.bandwidth.value,
-                    "bandwidth_lower": one.bandwidth.lower,
-                    "bandwidth_upper": one.bandwidth.upper,
-                    "grade": one.bandwidth.grade,
-                    "note": one.note,
-                }
-                for one in self.paths
-            ]
-        )
+        """One row per path and frequency, of many a few per decade: gain [`unit`] and phase [deg], and the
+        bandwidth of the path [cycles / time unit], with 90 % intervals."""
+        frames = []
+        for one in self.paths:
+            columns: dict[str, Any] = {"path": one.path, "unit": one.unit, "frequency": self.frequency}
+            for name, band in (("gain", one.gain), ("phase", one.phase)):
+                ends = {"": 2, "_lower": 0, "_upper": 4}
+                columns |= {f"{name}{end}": band.pointwise[k] for end, k in ends.items()}
+            width = one.bandwidth
+            columns |= {"bandwidth": width.value, "bandwidth_lower": width.lower}
+            columns |= {"bandwidth_upper": width.upper, "grade": width.grade, "note": one.note}
+            frames.append(pd.DataFrame(columns).iloc[self._shown])
+        return pd.concat(frames, ignore_index=True)
+
+    @property
+    def _shown(self) -> Index:
+        """Frequencies of the summary: all where they are few, else those nearest to 1, 2 and 5 a decade."""
+        known = np.log10(np.maximum(self.frequency, np.finfo(float).tiny))
+        if known.size <= _SHOWN:
+            return np.arange(known.size)
+        decades = np.arange(np.floor(known.min()), np.ceil(known.max()) + 1)
+        wanted = (decades[:, None] + np.log10([1.0, 2.0, 5.0])).ravel()
+        wanted = wanted[(wanted >= known.min()) & (wanted <= known.max())]
+        return np.unique(np.abs(known[:, None] - wanted).argmin(axis=0))
 
     def to_json(self) -> dict[str, Any]:
         """Frequencies, bands and bandwidths as plain values."""

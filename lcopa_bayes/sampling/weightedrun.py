@@ -125,7 +125,7 @@ def _by_surrogate(
     near = replace(posterior, surrogate=surrogate)
     enough = replace(plan, wanted=_SURPLUS * plan.wanted, efficient=False)  # walkers show what it misses
     first = importance(near, [optimum], rng, enough, mapped).weighted
-    if not usable(first):
+    if first.ess < _FEWEST:
         return posterior, None, 0.0
     tried = first.batches(_TRIED // BATCHES, rng).ravel()
     held = _efficiency(posterior, first.coordinates[tried], first.log_density[tried], mapped)
@@ -134,10 +134,12 @@ def _by_surrogate(
     count, share = int(max(_SURPLUS * plan.wanted, _LEAST) / held), first.ess / first.count
     drawn = first.batches(max(1, int(min(count, first.ess)) // BATCHES), rng).ravel()
     z, about = first.coordinates[drawn], first.log_density[drawn]
-    if share < LEAST_EFFICIENCY:
+    if share < LEAST_EFFICIENCY or not usable(first):
         walk = _walked(near, first, rng, mapped)
+        if not (walk.agree or usable(first)):
+            return posterior, None, 0.0
         share = 1.0 if walk.agree else share
-        if walk.moved > _MOVED:
+        if walk.moved > _MOVED or not usable(first):
             z, about = walk.draws(count, rng)
     exact = spread(posterior, z, mapped)
     inside = np.isfinite(exact)

@@ -10,6 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 from small import record, study, with_effect
 
+import lcopa_bayes as lb
 from lcopa_bayes.bench.command import Command, staircase
 from lcopa_bayes.calibration.replica import exact_responses, model_gap
 from lcopa_bayes.calibration.truths import Truths
@@ -191,3 +192,26 @@ def test_effects_that_cannot_be_used_end_with_code_2_and_nothing_written(
     assert "'axis_rotation' has no place" in said
     assert "'ion_creep' is not used" in said
     assert not out.exists()
+
+
+@pytest.mark.slow
+def test_verbs_on_a_finished_fit_with_effects_take_few_simulations(
+    stiff: tuple[Problem, np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Audit, comparison and prediction rest on the draws of the fit, and the effect is preferred."""
+    explained = stiff[0].study
+    plain = replace(explained, name="plain", effects=EffectsSettings(), priors={})
+    lb.fit(explained, quick=True, folder=tmp_path / "fit")
+    simulated, called = [], Simulation.__call__
+    monkeypatch.setattr(Simulation, "__call__", lambda self, v: simulated.append(len(v)) or called(self, v))
+    verdicts = lb.audit(tmp_path / "fit").summary().set_index("parameter")["verdict"]
+    assert verdicts["cubic_stiffness.c"] == "identified"
+    assert sum(simulated) < 1_500
+    simulated.clear()
+    compared = lb.compare([plain, tmp_path / "fit"], quick=True)
+    assert sum(simulated) < 6_000
+    assert compared.preferred == explained.name
+    simulated.clear()
+    drive = lb.Drive.steps(u=[(0, 0.5), (4.0, 0.0)])
+    lb.load_result(tmp_path / "fit").predict(drive)
+    assert 0 < sum(simulated) <= 400
