@@ -51,6 +51,10 @@ class AxisDrive:
         at, where = np.unique(times, return_inverse=True)
         return cls(at, np.cumsum(np.bincount(where, weights=jumps, minlength=at.size)))
 
+    def later(self, by: Vector | float) -> AxisDrive:
+        """With every change later by a time [time unit], one or (changes,); they may change places."""
+        return AxisDrive.of_jumps(self.times + by, self.jumps)
+
     @property
     def jumps(self) -> Vector:
         """Change of the drive at each instant [drive unit], (changes,)."""

@@ -61,7 +61,7 @@ def records(seed, curvature=0.0, quiet=8.0):
 def study(seed, curvature=0.0, held_out=1, **changes):
     made = records(seed, curvature, **changes)
     fit, apart = made[: len(made) - held_out], made[len(made) - held_out :]
-    return Study("small", None, "ms", seed, tuple(fit), tuple(apart), ModelSettings(offset="shared"))
+    return Study("small", None, "ms", seed, tuple(fit), tuple(apart), ModelSettings(terms=1, offset="shared"))
 
 
 @pytest.fixture(scope="module")

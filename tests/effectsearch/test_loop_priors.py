@@ -88,7 +88,7 @@ def test_what_a_narrow_prior_takes_away_is_no_further_effect(seed, monkeypatch):
         seed,
         fit,
         (lag("held", 1.0, rng),),
-        ModelSettings(orders=(1.0,), offset="none"),
+        ModelSettings(terms=1, orders=(1.0,), offset="none"),
         priors={"delay": PriorSettings("delay", fixed=0.0)},
     )
     found = loop(made, sample=False, quick=True, as_stated=True)

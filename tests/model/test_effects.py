@@ -519,3 +519,18 @@ def test_a_sampled_drive_is_a_delay_that_coefficients_move():
         assert_allclose(
             moved[0].deflection, alone[0].deflection, atol=2e-5 * np.abs(alone[0].deflection).max()
         )
+
+
+def test_a_drive_sampled_while_it_moved_acts_before_it_was_written():
+    """The whole delay below 0 as changes that come earlier, on narrow blocks: the linear plant with the drive
+    moved by hand, to the force's own share."""
+    whole, values = fractional_plant(staircase([1.0, -1.0, 0.6], hold=4.0, start=0.35))
+    values = np.where(np.array(whole.posterior.table.names) == "delay", 0.01, values)
+    narrow = whole.refined(16).posterior
+    made = effected(narrow, values, [SampledDrive(), CubicStiffness()])
+    psi, tiny = np.array([0.7, 0.0]), np.array([0.7, 1e-9])
+    plants = [made.plant(values) for _ in range(2)]
+    for moved in made.simulator.moved_together([(plant, tiny) for plant in plants]):
+        alone = made.simulator.moved(plants[0], psi)
+        reach = np.abs(alone[0].deflection).max()
+        assert_allclose(moved[0].deflection, alone[0].deflection, atol=1e-7 * reach)

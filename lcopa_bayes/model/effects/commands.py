@@ -90,12 +90,7 @@ class RefreshHold(DriveEffect):
     ) -> tuple[AxisDrive, float]:
         """Of several changes that fall to one refresh the sum acts."""
         ticks = np.ceil(drive.times / self.refresh - self.phase - 1e-9) + self.phase
-        return _shifted(drive, psi[0] * (self.refresh * ticks - drive.times)), rest
-
-
-def _shifted(drive: AxisDrive, by: Vector | float) -> AxisDrive:
-    """The drive with every change later by a time [time unit], one or (changes,); any order."""
-    return AxisDrive.of_jumps(drive.times + by, drive.jumps)
+        return drive.later(psi[0] * (self.refresh * ticks - drive.times)), rest
 
 
 def _mapped(drive: AxisDrive, levels: Vector) -> tuple[AxisDrive, float]:
@@ -225,7 +220,7 @@ class FieldDependentDelay(DriveEffect):
         own = np.flatnonzero(scene.ranges.direct == axis)
         delay = float(scene.delays[own[0] if own.size else 0, axis])
         levels = np.abs(_levels(drive, rest)[1:]) / scene.ranges.drive[axis]
-        return _shifted(drive, psi[0] * delay * (0.5 - levels)), rest
+        return drive.later(psi[0] * delay * (0.5 - levels)), rest
 
 
 @final
@@ -253,4 +248,4 @@ class SampledDrive(DriveEffect):
         self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
     ) -> tuple[AxisDrive, float]:
         """All changes by the same time."""
-        return _shifted(drive, float(self.lag(scene.ranges, psi))), rest
+        return drive.later(float(self.lag(scene.ranges, psi))), rest

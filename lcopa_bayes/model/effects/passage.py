@@ -87,7 +87,19 @@ def forced(
     model: ForwardModel, scenes: Sequence[Scene], gains: Array, dynamics: Dynamics, forces: Forces
 ) -> Iterator[tuple[Array, dict[int, str]]]:
     """Of every record, deflections of many plants under forces, (axes, batch, samples) [response unit], and
-    why some of the plants, by number, have no bounded response."""
+    why some of the plants, by number, have no bounded response.
+
+    Delays below 0, of drives that were sampled while they moved, become changes that come whole sampling
+    periods earlier: the forward model takes no response before its cause.
+    """
+    early = min(0.0, float(dynamics.delays.min()))
+    if early < 0.0:
+        period = scenes[0].ranges.period
+        ahead = period * float(np.ceil(-early / period))
+        scenes = [replace(s, drives=tuple(drive.later(-ahead) for drive in s.drives)) for s in scenes]
+        pairs = zip(model.experiments, scenes, strict=True)
+        model = replace(model, experiments=tuple(replace(each, drives=s.drives) for each, s in pairs))
+        dynamics = dynamics.later(np.full(dynamics.batch, ahead))
     kernels: Kernels = {}
     for experiment, scene, units in zip(
         model.experiments, scenes, model.unit_responses(dynamics), strict=True
