@@ -88,14 +88,14 @@ def _fitted(fit: Fit) -> str:
     for axis, response in enumerate(fit.draws.table.layout.responses):
         own = [band for band in fit.bands if band.axis == response.name and not band.held_out]
         residual = np.concatenate([band.observed - band.plant[2] for band in own])
-        said = f"the residual of {response.name} is {np.sqrt(np.mean(residual**2)):.3g} {response.unit} rms"
+        said = f"The residual of {response.name} is {np.sqrt(np.mean(residual**2)):.3g} {response.unit} rms"
         still = [one.quiet(axis).values for one in fit.problem.posterior.samples]
         free = sum(max(0, values.size - 1) for values in still)
         if free >= _AT_REST:
             squares = sum(float(np.sum((values - values.mean()) ** 2)) for values in still if values.size)
             said += f", where samples at rest scatter by {np.sqrt(squares / free):.3g} {response.unit}"
         parts.append(said)
-    return "; ".join(parts) + "."
+    return ". ".join(parts) + "."
 
 
 def _predicted(fit: Fit) -> str:

@@ -70,7 +70,7 @@ def test_answers_follow_the_fit():
     fitted = fit(study(late, held_out=[off], priors={"delay": 0.73, "order_1": 0.8}, sampler=tiny))
     answers = {one["question"]: one["answer"] for one in overview(fitted)["answers"]}
     (band,) = (one for one in fitted.bands if not one.held_out)
-    assert f"the residual of y is {band.rmse:.3g} rad rms" in answers["How good is the fit?"]
+    assert f"The residual of y is {band.rmse:.3g} rad rms" in answers["How good is the fit?"]
     (held,) = (one for one in fitted.bands if one.held_out)
     said = answers["Does it predict?"]
     assert f"off/y, has {100 * held.coverage(0.9):.0f} %" in said
