@@ -17,7 +17,7 @@ from lcopa_bayes.effectsearch.basefit import BaseFit
 from lcopa_bayes.effectsearch.explained import coordinates_of, declarable, explained_draws, explained_study
 from lcopa_bayes.effectsearch.heldouteffects import missed, unseen_share
 from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
-from lcopa_bayes.effectsearch.outliers import Outlying, outlying
+from lcopa_bayes.effectsearch.outliers import Outlying, outlying, without_outliers
 from lcopa_bayes.effectsearch.rounds import CLEAR, SINGLE, Round, search
 from lcopa_bayes.effectsearch.scores import (
     WIDTH,
@@ -211,6 +211,10 @@ def _looped(
     added = searched.state.model.effects
     names = tuple(effect.name for effect in added if not effect.card.dynamics)
     apart = bool(added) and all(effect.card.per_record for effect in added)
+    # a model of the rest is not judged by samples that the noise throws anywhere
+    was, now = (
+        without_outliers(side.unseen) if outliers is not None else side.unseen for side in (before, reached)
+    )
     verdict = decide(
         Findings(
             failed="",
@@ -232,12 +236,10 @@ def _looped(
             excess=start.whitening.excess(start.optimum.residual),
             enough=ALONE if alone else EXPLAINED,
             scatter=first.scatter,
-            missed=missed(study, before.fit, before.unseen, start) if study.held_out else np.nan,
-            unseen=unseen_share(study, before.unseen, reached.unseen, searched.state)
-            if study.held_out
-            else np.nan,
-            risen=risen(before.unseen, reached.unseen) if study.held_out else np.nan,
-            reached=np.nan if apart else over_noise(reached.fit, reached.unseen, clear=not last.alarmed),
+            missed=missed(study, before.fit, was, start) if study.held_out else np.nan,
+            unseen=unseen_share(study, was, now, searched.state) if study.held_out else np.nan,
+            risen=risen(was, now) if study.held_out else np.nan,
+            reached=np.nan if apart else over_noise(reached.fit, now, clear=not last.alarmed),
         )
     )
     if outliers is not None:

@@ -7,7 +7,7 @@ moves, or it is taken for a misfit and left alone.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -19,6 +19,7 @@ from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basefit import BaseFit
 from lcopa_bayes.effectsearch.noise import quiet_samples, scatter_evidence
+from lcopa_bayes.effectsearch.scores import Score
 from lcopa_bayes.effectsearch.whitening import parts
 from lcopa_bayes.inference.observations import Samples
 
@@ -103,6 +104,17 @@ def outlying(study: Study, fit: BaseFit) -> Outlying | None:
         float(np.sqrt(np.mean(widths**2))),
         scatter_evidence(fit.optimum.white),
     )
+
+
+def without_outliers(scores: Sequence[Score]) -> list[Score]:
+    """Scores where the noise has outliers, without the samples that lie as far from their neighbours."""
+    out = []
+    for one in scores:
+        distance = np.abs(_apart(one.observed - one.predicted))
+        near = distance <= _FAR * np.median(distance) / _NORMAL
+        arrays = {name: getattr(one, name)[near] for name in ("time", "observed", "predicted", "variance")}
+        out.append(replace(one, **arrays))
+    return out
 
 
 def _apart(residual: Vector) -> Vector:

@@ -21,12 +21,14 @@ from lcopa_bayes.model.effects.catalogue import catalogue
 SHARE = 0.03
 
 
-def struck(made: Study, seed: int, *, at_rest: bool = True) -> tuple[Study, list[np.ndarray]]:
+def struck(
+    made: Study, seed: int, *, share: float = SHARE, at_rest: bool = True
+) -> tuple[Study, list[np.ndarray]]:
     """The study with a share of its samples ten times the noise away, and which ones."""
     rng = np.random.default_rng(seed)
     out, where = [], []
     for record in made.fit:
-        hit = rng.random(record.time.size) < SHARE
+        hit = rng.random(record.time.size) < share
         if not at_rest:
             hit &= record.time > record.time[np.flatnonzero(np.diff(record.drive[:, 0]))[0]]
         y = record.response.copy()
@@ -84,3 +86,13 @@ def test_outliers_alone_are_a_disturbance():
     said = beside(Verdict("clean", "firm", "Nothing."), "Two samples.")
     assert (said.kind, said.sentence) == ("disturbance", "Two samples. Nothing.")
     assert beside(Verdict("unexplained", "firm", "x"), "y").kind == "unexplained"
+
+
+def test_outliers_of_held_out_records_are_no_error_of_the_model():
+    """Struck on every record, as a sensor does; before, the held-out ones counted against every name."""
+    made, _ = struck(study(1), 5)
+    apart, _ = struck(replace(made, fit=made.held_out, held_out=()), 6, share=0.05)
+    found = loop(replace(made, held_out=apart.fit), library=LIBRARY, sample=False, quick=True, as_stated=True)
+    assert found.outliers is not None
+    assert found.verdict.kind == "disturbance"
+    assert found.names == ("outliers",)
