@@ -61,8 +61,9 @@ def play(folder: Path, task: Task) -> dict[str, Any]:
         except Exception as error:  # a crash is a result too, and must not end the others
             row = asdict(task) | {"crashed": f"{type(error).__name__}: {error}"}
     row |= {"seconds": time.perf_counter() - begun, "cpu_seconds": time.process_time() - cpu}
-    write_text(path, json.dumps(row, indent=1))
-    return row
+    text = json.dumps(row, indent=1)
+    write_text(path, text)
+    return json.loads(text)  # as it is read back when the sheet goes on
 
 
 def measured(task: Task) -> Campaign:
