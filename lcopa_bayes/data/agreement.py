@@ -125,7 +125,9 @@ def _once(pairs: Sequence[Disagreement]) -> Iterator[Disagreement]:
     while remaining:
         counts = Counter(name for one in remaining for name in one.records)
         odd = counts.most_common(1)[0][0]
-        yield next(one for one in remaining if odd in one.records)
+        about = [one for one in remaining if odd in one.records]
+        alike = (one for one in about if one.records[0] == odd and one.gross == about[0].gross)
+        yield next(alike, about[0])
         remaining = [one for one in remaining if odd not in one.records]
 
 
