@@ -18,7 +18,7 @@ from lcopa_bayes.effectsearch.summary import drawn, results, words
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.results.runfolder import opened, provenance
 from lcopa_bayes.results.stored import StoredResult
-from lcopa_bayes.results.structure import settled
+from lcopa_bayes.results.structure import with_least_terms
 from lcopa_bayes.verbs.sources import FitLike, study_of
 
 CURVES = "loop_curves.json"
@@ -93,7 +93,7 @@ def loop(
     `jobs`, processes to use; `folder`, a run folder to write into; `quick`, fewer chance residuals and
     shorter ensembles. InputError as `fit`.
     """
-    wanted = settled(study_of(study))
+    wanted = with_least_terms(study_of(study))  # the search chooses its structure itself
     problem_of(wanted)  # what is wrong with the study is said before anything is written
     origin = plain(provenance(wanted, "loop"))
     with opened(folder, origin):
