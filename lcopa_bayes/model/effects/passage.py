@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import NamedTuple, TypeAlias, final
 
 import numpy as np
@@ -96,9 +96,9 @@ def forced(
     if early < 0.0:
         period = scenes[0].ranges.period
         ahead = period * float(np.ceil(-early / period))
-        scenes = [replace(s, drives=tuple(drive.later(-ahead) for drive in s.drives)) for s in scenes]
-        pairs = zip(model.experiments, scenes, strict=True)
-        model = replace(model, experiments=tuple(replace(each, drives=s.drives) for each, s in pairs))
+        model = _earlier(model, ahead)
+        pairs = zip(scenes, model.experiments, strict=True)
+        scenes = [replace(scene, drives=experiment.drives) for scene, experiment in pairs]
         dynamics = dynamics.later(np.full(dynamics.batch, ahead))
     kernels: Kernels = {}
     for experiment, scene, units in zip(
@@ -107,6 +107,15 @@ def forced(
         passage = Passage(model.layout, experiment, scene, gains, dynamics, forces, kernels)
         change, failures = passage.change()
         yield deflections(model.layout, scene.rest, gains, units) + change, failures
+
+
+@lru_cache(maxsize=1)
+def _earlier(model: ForwardModel, by: float) -> ForwardModel:
+    """The model with all changes of its drives earlier by a time [time unit]; the latest one is kept, with
+    what it knows of its drives."""
+    shifted = (tuple(drive.later(-by) for drive in each.drives) for each in model.experiments)
+    pairs = zip(model.experiments, shifted, strict=True)
+    return replace(model, experiments=tuple(replace(each, drives=drives) for each, drives in pairs))
 
 
 def passed(
