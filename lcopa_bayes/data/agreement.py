@@ -39,6 +39,12 @@ _EXCHANGED = 5.0
 are exchanged [-]."""
 _SURE = 5.0
 """Standard errors from zero from which a ratio has a sign and a size [-]."""
+_UNIT = "one of them is in another unit than it states; correct the unit, or convert the values"
+_SIGN = "check the signs of drive and response in both"
+_PLANT = (
+    "no linear plant follows both; leave one out, or let `loop` trace what changed between them or depends "
+    "on the size of the drive"
+)
 
 _Order: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]
 """Positions of drives and of responses."""
@@ -92,9 +98,9 @@ def disagreements(records: Sequence[Record]) -> tuple[Disagreement, ...]:
         single = others if len(rest) <= _PAIRED else ()
         comparisons = [_Comparison(one, (other,), delay) for other in single]
         if any(comparison.judged for comparison in comparisons):
-            pairs += [seen for comparison in comparisons for seen in comparison.disagreements()]
-        else:
-            joint += _Comparison(one, others, delay).disagreements()
+            pairs += [seen for each in comparisons if (seen := each.disagreement()) is not None]
+        elif (seen := _Comparison(one, others, delay).disagreement()) is not None:
+            joint.append(seen)
     # what one record contradicts in all others together, these contradict in it
     return (*ahead, *_once(sorted(pairs, key=_severity)), *sorted(joint, key=_severity)[:1])
 
@@ -147,6 +153,18 @@ class _Ratio:
     """Variance of the response over the square of the other record's range [-]."""
     missed: float
     """The same of response less unscaled prediction [-]."""
+
+    @property
+    def remedy(self) -> str:
+        """What to do about a record of that size; empty where it is one of the same plant, or not known."""
+        if self.misfit > 1 - FOLLOWED or abs(self.value) < _SURE * self.sd:
+            return ""
+        if not 1 / _OTHER_UNIT < abs(self.value) < _OTHER_UNIT:
+            return _UNIT
+        if self.value < 0.0:
+            return _SIGN
+        apart = abs(self.value - 1) > max(_CONTRADICTION * self.sd, _SLIGHT)
+        return _PLANT if apart and self.misfit <= 1 - _CLOSELY else ""
 
 
 @final
@@ -231,47 +249,27 @@ class _Comparison:
         for i, j in combinations(range(drives), 2):
             yield _with_exchanged(drives, i, j), tuple(range(responses))
 
-    def disagreements(self) -> Iterator[Disagreement]:
-        """At most one, the most severe."""
-        record = self.one.record
+    def disagreement(self) -> Disagreement | None:
+        """The most severe one; None where the record agrees or cannot be judged."""
         orders = {order: _missed(self._ratios(order)) for order in self._exchanges()}
         order = min(orders, key=lambda order: orders[order], default=None)
         as_is = _missed(self.ratios)
         if order and as_is > 1 - FOLLOWED > orders[order] and as_is > _EXCHANGED * orders[order]:
-            which = _exchanged(record, order)
-            seen = f"record {record.name!r} follows {self._them} with its {which} exchanged, not as it is"
+            which, name = _exchanged(self.one.record, order), self.one.record.name
+            seen = f"record {name!r} follows {self._them} with its {which} exchanged, not as it is"
             remedy = "exchange the columns, or their names, in one of the two"
-            yield Disagreement(self.names, seen, remedy, gross=True, misfit=orders[order])
-            return
-        for ratio in self.ratios:
-            if ratio.misfit > 1 - FOLLOWED or abs(ratio.value) < _SURE * ratio.sd:
-                continue
-            axis, by = record.response_axes[ratio.axis], f"{ratio.value:.3g} times"
-            seen = (
-                f"response {axis.name!r} of record {record.name!r} is {by} what is predicted for it from "
-                f"{self._them} (standard error {ratio.sd:.1g})"
-            )
-            if not 1 / _OTHER_UNIT < abs(ratio.value) < _OTHER_UNIT:
-                remedy = (
-                    "one of them is in another unit than it states; correct the unit, or convert the values"
-                )
-            elif ratio.value < 0.0:
-                remedy = "check the signs of drive and response in both"
-            elif ratio.misfit <= 1 - _CLOSELY and abs(ratio.value - 1) > max(
-                _CONTRADICTION * ratio.sd, _SLIGHT
-            ):
-                remedy = (
-                    "no linear plant follows both; leave one out, or let `loop` trace what changed between "
-                    "them or depends on the size of the drive"
-                )
-                yield Disagreement(
-                    self.names, seen, remedy, gross=False, ratio=ratio.value, misfit=ratio.misfit
-                )
-                return
-            else:
-                continue
-            yield Disagreement(self.names, seen, remedy, gross=True, ratio=ratio.value, misfit=ratio.misfit)
-            return
+            return Disagreement(self.names, seen, remedy, gross=True, misfit=orders[order])
+        return next((self._in_size(ratio) for ratio in self.ratios if ratio.remedy), None)
+
+    def _in_size(self, ratio: _Ratio) -> Disagreement:
+        record = self.one.record
+        seen = (
+            f"response {record.response_axes[ratio.axis].name!r} of record {record.name!r} is "
+            f"{ratio.value:.3g} times what is predicted for it from {self._them} (standard error "
+            f"{ratio.sd:.1g})"
+        )
+        gross = ratio.remedy in (_UNIT, _SIGN)
+        return Disagreement(self.names, seen, ratio.remedy, gross, ratio.value, ratio.misfit)
 
 
 def _centred(columns: Matrix, response: Vector) -> tuple[Matrix, Vector]:
