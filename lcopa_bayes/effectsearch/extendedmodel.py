@@ -159,14 +159,12 @@ class ExtendedModel:
         out[np.searchsorted(self.columns, source[self.columns])] = x
         return out
 
-    def supported(self, x: Matrix, *, every: bool = True) -> Flags:
-        """Whether orders decrease and terms are resolved, of coordinates (batch, k), (batch,).
-
-        Unless `every`, terms that can be exchanged may be in any sequence.
-        """
+    def supported(self, x: Matrix) -> Flags:
+        """Whether orders decrease and terms are resolved, of coordinates (batch, k), (batch,); terms that can
+        be exchanged may be in any sequence."""
         values = np.array([self._least.values(each, self.template) for each in x])
         table = self.posterior.table
-        return table.supported(values if every else table.canonical(values))
+        return table.supported(table.canonical(values))
 
     @property
     def log_support(self) -> float:
@@ -185,6 +183,21 @@ class ExtendedModel:
         """Shortest delay at coordinates [time unit]."""
         table, values = self.posterior.table, self.values(x)
         return min(float(values[table.at("delay", k)]) for k in range(len(table.layout.delays)))
+
+    @property
+    def delays(self) -> list[int]:
+        """Positions of the delays among the coordinates."""
+        rows = self.posterior.table.rows
+        return [position for position, k in enumerate(self.columns) if rows[k].kind == "delay"]
+
+    def delayed(self, x: Vector, share: float) -> Vector:
+        """Coordinates, perhaps with those of further effects behind, with every delay longer by a share of it
+        [-]."""
+        out, rows = x.copy(), self.posterior.table.rows
+        for position in self.delays:
+            log = rows[self.columns[position]].log_scale
+            out[position] += np.log1p(share) if log else share * x[position]
+        return out
 
     def held(self, x: Vector) -> tuple[ExtendedModel, Vector]:
         """The model with its `loose` constants held at those of coordinates, and the other coordinates."""

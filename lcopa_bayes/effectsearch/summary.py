@@ -130,7 +130,7 @@ def _nearest(result: Loop, name: str) -> list[dict[str, Any]]:
     assert result.trace is not None
     own = result.trace.of(name)
     others = [one for one in result.trace.traced if one.signatures and one.name != name]
-    angles = {one.name: own.signatures[own.best].cosine(one.signatures[one.best]) for one in others}
+    angles = {one.name: own.signature.cosine(one.signature) for one in others}
     ranked = sorted(angles, key=lambda other: -angles[other])[:_NEAREST]
     return [{"name": other, "cosine": angles[other]} for other in ranked]
 

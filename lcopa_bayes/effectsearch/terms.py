@@ -166,7 +166,7 @@ def _fit(problem: Problem, key: Sequence[int], contained: Base | None) -> BaseFi
 
 def _state(study: Study, fit: BaseFit) -> State:
     model = fit.model.at_scales(fit.optimum.x, campaign_places(study))
-    return State(model, fit.optimum, fit.regression.whitening, fit.optimum.covariance)
+    return State(model, fit.optimum, fit.regression.whitening)
 
 
 def _shift(fit: BaseFit, problem: Problem) -> float:
