@@ -78,7 +78,8 @@ class ExtendedModel:
     @cached_property
     def template(self) -> Vector:
         """Fixed values, (rows,); those of the noise do not count."""
-        return _template(self.posterior)
+        unit = self.posterior.noise.nearly_white(1.0)
+        return np.array([unit.get(row.kind, row.value) for row in self.posterior.table.rows])
 
     def having(self, *effects: Effect) -> ExtendedModel:
         """The same plant and scales with these effects."""
@@ -109,11 +110,6 @@ class ExtendedModel:
     def names(self) -> tuple[str, ...]:
         """Names of the coordinates, as in the table."""
         return tuple(self.posterior.table.names[k] for k in self.columns)
-
-    @property
-    def time_unit(self) -> str:
-        """Unit of all times."""
-        return self.plant.samples[0].record.time_unit
 
     @cached_property
     def _priors(self) -> tuple[Vector, Vector]:
@@ -165,11 +161,6 @@ class ExtendedModel:
         values = np.array([self._least.values(each, self.template) for each in x])
         table = self.posterior.table
         return table.supported(table.canonical(values))
-
-    @property
-    def log_support(self) -> float:
-        """What the support of terms adds to the log of a prior density of terms in any sequence [nat]."""
-        return self.plant.table.log_support
 
     def values(self, x: Vector) -> Vector:
         """Table values of coordinates, (rows,), terms in canonical order."""
@@ -241,8 +232,3 @@ class ExtendedModel:
         slopes = [np.moveaxis(one, 2, 0) for one in more.signature(values, psi)]
         raw = stacked(self.plant.samples, slopes)[len(own) :].T
         return raw * scale, more.coefficients[-new:]
-
-
-def _template(posterior: Posterior) -> Vector:
-    unit = posterior.noise.nearly_white(1.0)
-    return np.array([unit.get(row.kind, row.value) for row in posterior.table.rows])

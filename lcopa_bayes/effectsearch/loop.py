@@ -296,5 +296,5 @@ def _alone(study: Study) -> tuple[str, ...]:
 
 def _side(problem: Problem, state: State) -> Side:
     unseen = held_out_scores(state, problem) if problem.study.held_out else left_out_scores(state)
-    log_evidence = state.optimum.log_evidence + state.model.log_support
+    log_evidence = state.optimum.log_evidence + state.model.plant.table.log_support
     return Side(state, tuple(fit_scores(state)), tuple(unseen), log_evidence)
