@@ -20,7 +20,7 @@ from lcopa_bayes.comparison.sequentialdensity import (
     predicted,
     without,
 )
-from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.inference.observations import Observed, Samples
 from lcopa_bayes.inference.posterior import Posterior
@@ -112,18 +112,18 @@ def predictions(fit: Fit, *, held_out_only: bool = False) -> tuple[Predicted, ..
     """
     posterior, study = fit.near, fit.study
     count = _DRAWS if posterior.simulation is None else _EFFECT_DRAWS
-    positions = _walkers(fit)
+    positions = fit.run.kept()[0][:, :, -1]
     out: list[Predicted] = []
     source = posterior
     for part in parts_of(posterior, [record.name for record in study.held_out]):
         if part.kind == "held-out record":
             samples, model = fit.problem.simulated(study.held_out)
-            scored = _Scored(fit, part, samples[part.record], _one(model, part.record))
+            scored = _Scored(fit, part, samples[part.record], model.only(part.record))
             out.append(scored(fit.draws.thinned(count), None, "exact", known=posterior))
             continue
         if held_out_only:
             continue
-        scored = _Scored(fit, part, posterior.samples[part.record], _one(posterior.model, part.record))
+        scored = _Scored(fit, part, posterior.samples[part.record], posterior.model.only(part.record))
         seen = scored(fit.draws.thinned(count), None, "exact")
         values = fit.draws.thinned(2 * count)
         target = without(posterior, part)
@@ -156,15 +156,6 @@ def left_out_weights(
     Gains and levels that are integrated out do not count: the weights are those of the sampled coordinates.
     """
     return smoothed(target.log_likelihood(values) - posterior.log_likelihood(values), r_eff=r_eff)
-
-
-def _one(model: ForwardModel, number: int) -> ForwardModel:
-    return model.only(number)
-
-
-def _walkers(fit: Fit) -> Array:
-    """Walkers of every ensemble, at their last kept draw, (ensembles, walkers, dimension)."""
-    return fit.run.kept()[0][:, :, -1]
 
 
 @final

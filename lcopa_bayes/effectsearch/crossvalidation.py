@@ -8,8 +8,6 @@ Closed form of the linearised model. With whitened residual r and tangents J at 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import final
 
 import numpy as np
 
@@ -23,41 +21,20 @@ _STRETCHES = 10
 """Stretches of successive samples in each part [-]."""
 
 
-@final
-@dataclass(frozen=True)
-class Group:
-    """Samples that are left out together."""
-
-    name: str
-    rows: Index
-    """Positions in the stack."""
-
-
-def groups(whitening: Whitening) -> tuple[Group, ...]:
-    """One per record; of a single record every fifth of 50 stretches of successive samples, all axes alike.
+def groups(whitening: Whitening) -> list[Index]:
+    """Positions in the stack: of each record; of a single one every fifth of 50 stretches of successive
+    samples, all axes alike.
 
     One fifth in one piece would take away the only step of a record, and nothing predicts a step not seen.
     """
-    records = {part.record for part in whitening.parts if part.rows.stop > part.rows.start}
+    records: dict[int, list[Index]] = {}
+    for part in whitening.parts:
+        records.setdefault(part.record, []).append(np.arange(part.rows.start, part.rows.stop))
     if len(records) > 1:
-        return tuple(
-            Group(
-                whitening.samples[r].record.name,
-                np.concatenate(
-                    [np.arange(p.rows.start, p.rows.stop) for p in whitening.parts if p.record == r]
-                ),
-            )
-            for r in sorted(records)
-        )
-    blocks = []
-    for k in range(PARTS):
-        rows = [
-            stretch
-            for p in whitening.parts
-            for stretch in np.array_split(np.arange(p.rows.start, p.rows.stop), PARTS * _STRETCHES)[k::PARTS]
-        ]
-        blocks.append(Group(f"part {k + 1} of {PARTS}", np.concatenate(rows)))
-    return tuple(blocks)
+        return [np.concatenate(axes) for axes in records.values()]
+    (axes,) = records.values()
+    cut = [np.array_split(rows, PARTS * _STRETCHES) for rows in axes]
+    return [np.concatenate([stretch for each in cut for stretch in each[k::PARTS]]) for k in range(PARTS)]
 
 
 def in_turn(records: int) -> str:
@@ -67,12 +44,12 @@ def in_turn(records: int) -> str:
     return f"leaving each of {PARTS} parts of the only record out in turn"
 
 
-def log_scores(optimum: Optimum, chosen: Sequence[Group]) -> Vector:
+def log_scores(optimum: Optimum, chosen: Sequence[Index]) -> Vector:
     """Log predictive density of each group given the others, without the constant of the noise [nat]."""
     whole = np.linalg.slogdet(optimum.information)[1]
     out = []
-    for group in chosen:
-        tangents, residual = optimum.jacobian[group.rows], optimum.settled[group.rows]
+    for rows in chosen:
+        tangents, residual = optimum.jacobian[rows], optimum.settled[rows]
         rest = optimum.information - tangents.T @ tangents
         pull = tangents.T @ residual
         power = residual @ residual + pull @ np.linalg.solve(rest, pull)
@@ -80,11 +57,11 @@ def log_scores(optimum: Optimum, chosen: Sequence[Group]) -> Vector:
     return np.array(out)
 
 
-def shifts(optimum: Optimum, chosen: Sequence[Group]) -> list[tuple[Vector, Matrix]]:
+def shifts(optimum: Optimum, chosen: Sequence[Index]) -> list[tuple[Vector, Matrix]]:
     """For each group, how far the optimum moves when it is left out, and the covariance there."""
     out = []
-    for group in chosen:
-        tangents, residual = optimum.jacobian[group.rows], optimum.settled[group.rows]
+    for rows in chosen:
+        tangents, residual = optimum.jacobian[rows], optimum.settled[rows]
         covariance: Matrix = np.linalg.inv(optimum.information - tangents.T @ tangents).astype(float)
         out.append((-covariance @ (tangents.T @ residual), covariance))
     return out

@@ -49,48 +49,40 @@ class View:
 @final
 @dataclass(frozen=True, eq=False)
 class _Axis:
-    """Pooled samples of one axis."""
+    """Samples of one axis."""
 
     name: str
+    parts: list[Part]
     white: Vector
-    record: Vector
     since: Vector
     predicted: Vector
     growing: Flags
+
+    @classmethod
+    def of(cls, state: State, axis: int) -> _Axis:
+        """Of all records."""
+        parts, columns = [part for part in state.whitening.parts if part.axis == axis], []
+        for part in parts:
+            predicted = state.fitted[part.rows] - state.fitted[part.rows][0]
+            growing = np.gradient(np.abs(predicted)) > 0 if predicted.size > 1 else np.array([False])
+            since = since_command(part.samples)[part.observed.index]
+            columns.append((state.optimum.settled[part.rows], since, predicted, growing))
+        name = parts[0].samples.record.response_axes[axis].name
+        return cls(name, parts, *(np.concatenate(each) for each in zip(*columns, strict=True)))
 
 
 def views(state: State, time_unit: str) -> list[View]:
     """All views of every axis' whitened residual."""
     out: list[View] = []
-    whitening = state.whitening
-    for axis, response in enumerate(whitening.samples[0].record.response_axes):
-        parts = [p for p in whitening.parts if p.axis == axis and p.rows.stop > p.rows.start]
-        pooled = _pooled(state, parts, response.name)
-        names = [whitening.samples[part.record].record.name for part in parts]
-        out.append(_by_record(pooled, names))
+    for axis, response in enumerate(state.whitening.samples[0].record.response_axes):
+        pooled = _Axis.of(state, axis)
+        out.append(_by_record(pooled, [state.optimum.settled[part.rows] for part in pooled.parts]))
         out.append(_by_time(pooled, time_unit))
         out += _by_amplitude(pooled, response.unit)
         out.append(_by_direction(pooled))
-        out.append(_spectrum(state, parts, response.name, time_unit))
-        out.append(_drive(state, parts, response.name))
+        out.append(_spectrum(state, pooled.parts, response.name, time_unit))
+        out.append(_drive(state, pooled.parts, response.name))
     return out
-
-
-def _pooled(state: State, parts: list[Part], name: str) -> _Axis:
-    white, record, since, predicted, growing = [], [], [], [], []
-    whitening = state.whitening
-    for number, part in enumerate(parts):
-        samples = whitening.samples[part.record]
-        fitted = whitening.observed[part.rows] - state.optimum.residual[part.rows]
-        deflection = fitted - fitted[0]
-        white.append(state.optimum.settled[part.rows])
-        record.append(np.full(fitted.size, float(number)))
-        since.append(since_command(samples)[samples.axes[part.axis].index])
-        predicted.append(deflection)
-        growing.append(np.gradient(np.abs(deflection)) > 0 if deflection.size > 1 else np.array([False]))
-    pooled = (np.concatenate(each) for each in (white, record, since, predicted))
-    first, second, third, fourth = pooled
-    return _Axis(name, first, second, third, fourth, np.concatenate(growing))
 
 
 def _binned(x: Vector, y: Vector, statistic: Callable[[Vector], float]) -> tuple[Vector, Vector, Vector]:
@@ -108,12 +100,11 @@ def _power(values: Vector) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _by_record(pooled: _Axis, names: list[str]) -> View:
-    rms = np.array([_power(pooled.white[pooled.record == k]) for k in range(len(names))])
-    count = np.array([float((pooled.record == k).sum()) for k in range(len(names))])
+def _by_record(pooled: _Axis, white: list[Vector]) -> View:
+    rms, names = np.array([_power(one) for one in white]), [part.samples.record.name for part in pooled.parts]
     worst = int(np.argmax(rms))
     said = f"largest on {names[worst]}, {rms[worst]:.2f} times the noise, smallest {rms.min():.2f} times"
-    error = np.sqrt(0.5 / count)
+    error = np.sqrt(0.5 / np.array([one.size for one in white]))
     across = "record: " + ", ".join(f"{k} {name}" for k, name in enumerate(names))
     x = np.arange(len(names), dtype=float)
     return View("by record", pooled.name, across, "rms over noise [-]", x, rms, error, said)
@@ -162,11 +153,9 @@ def _spectrum(state: State, parts: list[Part], name: str, unit: str) -> View:
     """Mean periodogram of the records over that of white noise, in bands of equal logarithmic width."""
     frequencies, powers = [], []
     for part in parts:
-        samples = state.whitening.samples[part.record]
-        times = samples.times[samples.axes[part.axis].index]
-        if times.size < 8:
+        if part.times.size < 8:
             continue
-        rate = 1.0 / float(np.median(np.diff(times)))
+        rate = 1.0 / float(np.median(np.diff(part.times)))
         f, p = signal.periodogram(state.optimum.settled[part.rows], fs=rate, detrend=False)
         frequencies.append(f[1:])
         powers.append(p[1:] * rate / 2)
@@ -195,10 +184,8 @@ def _drive(state: State, parts: list[Part], name: str) -> View:
     lags = np.arange(_LAGS + 1)
     total, norm = np.zeros(lags.size), 0.0
     for part in parts:
-        samples = state.whitening.samples[part.record]
-        times = samples.times[samples.axes[part.axis].index]
-        record = samples.record
-        held = np.searchsorted(record.time, times, side="right") - 1
+        record = part.samples.record
+        held = np.searchsorted(record.time, part.times, side="right") - 1
         drive = np.abs(np.diff(record.drive[np.clip(held, 0, None)], axis=0, prepend=record.drive[:1]))
         jumps = drive.sum(axis=1)
         power = state.optimum.settled[part.rows] ** 2

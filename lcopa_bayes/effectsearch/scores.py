@@ -105,31 +105,39 @@ class State:
     model: ExtendedModel
     optimum: Optimum
     whitening: Whitening
-    covariance: Matrix
-    """Of the coordinates, (k, k)."""
     widening: Widening | None = None
     sampled: tuple[Draws, Noise] | None = None
     """Draws of the explained study and its noise; None where only the optimum is known."""
+    spread: Matrix | None = None
+    """Covariance of the coordinates in these draws, (k, k)."""
+
+    @property
+    def covariance(self) -> Matrix:
+        """Of the coordinates, (k, k)."""
+        return self.optimum.covariance if self.spread is None else self.spread
+
+    @property
+    def fitted(self) -> Vector:
+        """Responses at the samples, stacked [response unit]."""
+        return self.whitening.observed - self.optimum.residual
 
 
 def fit_scores(state: State) -> list[Score]:
     """On the records that were fitted."""
     tangents = state.optimum.tangents
     variance = np.einsum("nk,kl,nl->n", tangents, state.covariance, tangents, optimize=True)
-    return _scores(
-        state, state.whitening.observed - state.optimum.residual, variance, "the fit", own_levels=False
-    )
+    return _scores(state, state.fitted, variance, "the fit", own_levels=False)
 
 
 def left_out_scores(state: State) -> list[Score]:
     """On the fit records, each left out in turn (one Gauss-Newton step away from the fit of all)."""
     chosen = groups(state.whitening)
-    mean = state.whitening.observed - state.optimum.residual
+    mean = state.fitted
     variance = np.zeros_like(mean)
-    for group, (shift, covariance) in zip(chosen, shifts(state.optimum, chosen), strict=True):
-        tangents = state.optimum.tangents[group.rows]
-        mean[group.rows] += tangents @ shift
-        variance[group.rows] = np.einsum("nk,kl,nl->n", tangents, covariance, tangents, optimize=True)
+    for rows, (shift, covariance) in zip(chosen, shifts(state.optimum, chosen), strict=True):
+        tangents = state.optimum.tangents[rows]
+        mean[rows] += tangents @ shift
+        variance[rows] = np.einsum("nk,kl,nl->n", tangents, covariance, tangents, optimize=True)
     own = len(state.whitening.samples) > 1 and _own_levels(state)
     return _scores(state, mean, variance, "the other records", own_levels=own)
 
@@ -171,11 +179,10 @@ def held_out_scores(state: State, problem: Problem) -> list[Score]:
             level, source, _ = offset_draws(
                 table, values, axis, r, record, seen, noise, held_out=True, rng=rng
             )
-            law = state.whitening.noise[axis]
             # what differs from record to record is 0 on average
             mean = plant[axis][:, observed.index].mean(axis=0) + level.mean()
             variance = (seen + level[:, None]).var(axis=0)
-            out.append(_score(state, record, axis, (mean, variance), law.sd, source, held_out=True))
+            out.append(_score(state, record, axis, (mean, variance), source, held_out=True))
     return out
 
 
@@ -189,7 +196,7 @@ def _laplace(state: State, seed: int) -> tuple[Draws, Noise]:
     x[:, free] += rng.standard_normal((len(x), free.size)) @ root_of(covariance).T
     low, high = model.bounds
     inside = ((x >= low) & (x <= high))[:, free].all(axis=1)
-    inside &= model.supported(x, every=False)
+    inside &= model.supported(x)
     x = np.concatenate([x[inside][:_DRAWS], optimum.x[None]])
     table = model.posterior.table
     rows = [k for k, row in enumerate(table.rows) if not row.noise]
@@ -214,20 +221,16 @@ def _scores(
     state: State, mean: Vector, variance: Vector, level_from: str, *, own_levels: bool
 ) -> list[Score]:
     """One score per record and axis; with `own_levels` each record's level is taken from its samples."""
-    whitening, out = state.whitening, []
-    for part in whitening.parts:
-        record = whitening.samples[part.record]
-        observed = record.axes[part.axis]
-        if not observed.values.size:
-            continue
-        noise = whitening.noise[part.axis]
+    out = []
+    for part in state.whitening.parts:
         centre, spread, source = mean[part.rows], variance[part.rows], level_from
         if own_levels:
-            level, doubt, source = _level(record, part.axis, observed.values - centre, noise)
+            misfit, noise = part.observed.values - centre, state.whitening.noise[part.axis]
+            level, doubt, source = _level(part.samples, part.axis, misfit, noise)
             # what the fit did not know about the level is known now
             centre, spread = centre + level, _without_level(spread, doubt)
         held_out = level_from != "the fit"
-        out.append(_score(state, record, part.axis, (centre, spread), noise.sd, source, held_out=held_out))
+        out.append(_score(state, part.samples, part.axis, (centre, spread), source, held_out=held_out))
     return out
 
 
@@ -236,7 +239,6 @@ def _score(
     record: Samples,
     axis: int,
     predicted: tuple[Vector, Vector],
-    noise_sd: float,
     level_from: str,
     *,
     held_out: bool,
@@ -246,17 +248,16 @@ def _score(
     mean, variance = predicted
     if state.widening is not None:
         variance = variance + state.widening.variance(record, axis)
-    times = record.times[observed.index]
     return Score(
         record.record.name,
         named.name,
         named.unit,
         held_out,
-        times,
+        record.times[observed.index],
         observed.values,
         mean,
         variance,
-        noise_sd,
+        state.whitening.noise[axis].sd,
         level_from,
     )
 

@@ -166,7 +166,7 @@ def _fit(problem: Problem, key: Sequence[int], contained: Base | None) -> BaseFi
 
 def _state(study: Study, fit: BaseFit) -> State:
     model = fit.model.at_scales(fit.optimum.x, campaign_places(study))
-    return State(model, fit.optimum, fit.regression.whitening, fit.optimum.covariance)
+    return State(model, fit.optimum, fit.regression.whitening)
 
 
 def _shift(fit: BaseFit, problem: Problem) -> float:
@@ -182,7 +182,7 @@ def _gain(base: Base, wider: Base) -> float:
     """Log evidence of the wider model over the other under the wider one's noise [nat]."""
     quiet = float(sum(wider.fit.noise_samples))
     same = Regression(base.fit.model, wider.fit.regression.whitening).descend(base.fit.optimum.x)
-    ordering = wider.fit.model.log_support - base.fit.model.log_support
+    ordering = wider.fit.model.plant.table.log_support - base.fit.model.plant.table.log_support
     return log_bayes_factor(same, wider.fit.optimum, quiet) + ordering
 
 
@@ -207,7 +207,7 @@ def _later(study: Study, fit: BaseFit) -> Mended | None:
         name: PriorSettings(name, dist="uniform", parameters={"loc": 0.0, "scale": _LONGER * end})
         for name, end in stuck
     }
-    names = ", ".join(f"{name} (ends at {end:.4g} {model.time_unit})" for name, end in stuck)
+    names = ", ".join(f"{name} (ends at {end:.4g} {study.time_unit})" for name, end in stuck)
     return Mended(
         replace(study, priors={**study.priors, **longer}),
         f"The default prior of {names} is too short for these records and was doubled.",

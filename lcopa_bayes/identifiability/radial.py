@@ -10,6 +10,7 @@ from scipy.optimize import least_squares
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.inference.leastsquares import apart
 from lcopa_bayes.inference.likelihood import Landscape, Peak
 
 _MOVED = 0.2
@@ -58,19 +59,10 @@ def radial(landscape: Landscape, peak: Peak, prior_sd: Vector, direction: Vector
         pull = _WEIGHT * (distance - radius) / radius
         return np.append(residual, pull), np.vstack([jacobian, _WEIGHT * slope / radius])
 
-    def residual_of(x: Vector) -> Vector:
-        return pulled(x)[0]
-
-    def jacobian_of(x: Vector) -> Matrix:
-        return pulled(x)[1]
-
     candidates = []
     for sign in (-1.0, 1.0):
         start = np.clip(centre + 0.1 * sign * radius * scale * direction, *ends)
-        solved = least_squares(
-            residual_of, start, jacobian_of, bounds=(ends[0], ends[1]), x_scale="jac",
-            max_nfev=100,
-        )  # fmt: skip
+        solved = least_squares(*apart(pulled, start), bounds=(ends[0], ends[1]), x_scale="jac", max_nfev=100)
         residual = landscape.rows(solved.x, peak.values, moving)[0]
         away = np.abs(solved.x - centre) / scale
         order = [p for p in np.argsort(-away) if away[p] > _MOVED * radius]

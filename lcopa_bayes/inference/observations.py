@@ -37,6 +37,10 @@ class Observed:
     gaps: Vector
     """Time since the previous sample, in sampling periods; 1 for the first."""
 
+    def first(self, count: int) -> Observed:
+        """The first samples."""
+        return Observed(self.index[:count], self.values[:count], self.gaps[:count])
+
     @cached_property
     def chosen(self) -> Index | slice:
         """`index`, as a slice where it is one: taking a slice copies nothing."""
@@ -82,9 +86,8 @@ class Samples:
 
     def quiet(self, axis: int) -> Observed:
         """Samples of an axis taken before any drive change can have acted, that at the change included."""
-        observed = self.axes[axis]
-        n = int(np.searchsorted(self.times[observed.index], self.first_change, side="right"))
-        return Observed(observed.index[:n], observed.values[:n], observed.gaps[:n])
+        times = self.times[self.axes[axis].index]
+        return self.axes[axis].first(int(np.searchsorted(times, self.first_change, side="right")))
 
     def level_samples(self, axis: int) -> tuple[Flags, str]:
         """Samples of an axis that give the offset of a record that was not fitted, and what they are."""

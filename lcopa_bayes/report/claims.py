@@ -3,8 +3,10 @@ lobes, steering."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import pi
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +19,6 @@ from lcopa_bayes.optics.array import (
     paper_array,
     strongest_grating_lobe,
 )
-from lcopa_bayes.optics.tiltlaw import continuous_law, printed_law
 from lcopa_bayes.paper.modelclaims import (
     RECORD_LENGTH,
     SETTLING_BANDS,
@@ -29,7 +30,8 @@ from lcopa_bayes.paper.numericsclaims import delay_costs
 from lcopa_bayes.paper.opticsclaims import FAR_WEAKER, tilt_checks
 from lcopa_bayes.paper.paths import response_to
 from lcopa_bayes.report.formatting import figures
-from lcopa_bayes.report.page import write_graded
+from lcopa_bayes.report.optics import draw_laws
+from lcopa_bayes.report.page import Drawings
 from lcopa_bayes.report.theme import (
     BAND,
     CYCLE,
@@ -46,18 +48,9 @@ _SHOWN = 100.0
 """Time of the long panel [ms]."""
 
 
-def write_claims(folder: Path) -> Path:
-    """`claims.html` with every claim, its verdict and the figures behind them; returns its path.
-
-    InputError when `claims.json` cannot be used.
-    """
-    return write_graded(
-        folder, "claims", "Claims of the paper", lambda values: {"claims": _drawn(PAPER)}, box=None
-    )
-
-
-def _drawn(stated: Stated) -> list[tuple[str, Drawing]]:
+def drawn(folder: Path, values: Mapping[str, Any]) -> Drawings:
     """A title and a figure for each family of claims."""
+    stated = PAPER
     rival, costs = integer_rival(stated), delay_costs(stated)
     shown = (
         (
@@ -99,7 +92,8 @@ def _drawn(stated: Stated) -> list[tuple[str, Drawing]]:
             "Section 2 and for the pitch that the measured step implies.",
         ),
     )
-    return [(title, Drawing(f"claim_{stem}", draw(stated), caption)) for title, stem, draw, caption in shown]
+    families = [(title, Drawing(f"claim_{stem}", draw(stated), said)) for title, stem, draw, said in shown]
+    return {"verdict": None, "claims": families}
 
 
 def _steady(stated: Stated) -> str:
@@ -186,14 +180,7 @@ def _tilt(stated: Stated) -> str:
             panel.plot(
                 check.curve.voltage, check.curve.mean, color=colour, label=f"{check.curve.field.value} field"
             )
-        for law, shade, name, dashes in (
-            (printed_law(optics), STEADY, "Eq. 24 as printed", "-"),
-            (continuous_law(optics), CYCLE[2], "Eq. 24, continuous", (0, (4, 2))),
-        ):
-            below = np.array([0.0, np.nextafter(optics.knee_voltage, 0)])
-            above = np.array([optics.knee_voltage, optics.largest_voltage])
-            panel.plot(below, law(below), color=shade, ls=dashes, label=name)
-            panel.plot(above, law(above), color=shade, ls=dashes)
+        draw_laws(panel, optics)
         panel.axhline(pi / 2, color=NOISE, lw=0.7, label="pi/2")
         panel.set_xlabel("voltage [V]")
     whole.set(ylabel="mean tilt [rad]", ylim=(0, 1.8))

@@ -20,7 +20,7 @@ from lcopa_bayes.data.record import save_record
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.paper.claims import judge
 from lcopa_bayes.paper.verdict import Evidence
-from lcopa_bayes.report.compare import write_comparison
+from lcopa_bayes.report.pages import write_page_of
 from lcopa_bayes.results.fit import plan_of
 
 FEW = {"ensembles": 2, "walkers": 16, "steps": 600, "thin": 2, "target_ess": 100}
@@ -199,7 +199,7 @@ def test_a_comparison_of_an_earlier_version_is_refused_by_the_page(folder, told,
     old = told | {"models": [{k: v for k, v in row.items() if k != "containment"} for row in told["models"]]}
     (tmp_path / "compare.json").write_text(json.dumps(old))
     with pytest.raises(InputError, match="run `compare` again"):
-        write_comparison(tmp_path)
+        write_page_of("compare", tmp_path)
 
 
 def test_a_comparison_samples_as_a_fit_does():
