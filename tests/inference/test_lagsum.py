@@ -13,6 +13,7 @@ from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.lagsum import WEIGHT, LagTable, lag_fits, lag_problem, lag_table
 
 SD = 0.01
@@ -122,3 +123,11 @@ def test_a_record_whose_drive_is_still_tells_nothing_of_the_lags() -> None:
     places = np.array([[np.log(time), delay] for time in (0.4, 1.0, 3.0) for delay in (0.3, 0.5)])
     levels = [tabulated(problem).log_density(places) for problem in (both, alone)]
     assert np.ptp(levels[0] - levels[1]) < 1e-3 * np.ptp(levels[1])
+
+
+def test_a_record_whose_drive_is_still_has_no_span() -> None:
+    moved = made().fit[0]
+    still = replace(moved, name="still", drive=np.zeros_like(moved.drive))
+    end = moved.time[-1] - moved.time[np.flatnonzero(moved.drive[:, 0])[0]]
+    assert Scales.of([moved, still]).span == pytest.approx(end)
+    assert Scales.of([still]).span == pytest.approx(moved.time[-1] - moved.time[0])
