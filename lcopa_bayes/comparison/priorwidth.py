@@ -111,7 +111,7 @@ def _refit(
         return Width(factor, None, None, "undefined", 0.0, k_hat, names)
     seed = fit.run.plan.seed + round(9_000 * factor)
     result = transferred(posterior, target, coordinates[:, :, -1], seed, jump=True)
-    again = evidence(target, result.coordinates, result.ess, seed)
+    again = result.evidence or evidence(target, result.coordinates, result.ess, seed)
     assert again is not None
     return Width(factor, again.value, again.sd, "refit", result.ess, k_hat, names)
 

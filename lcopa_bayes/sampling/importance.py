@@ -100,15 +100,16 @@ def importance(
     plan: ImportancePlan = ImportancePlan(),
     mapped: Mapped = map,
     late: Callable[[], bool] = lambda: False,
+    begin: Mixture | None = None,
 ) -> Importance:
-    """Importance sampling around given optima, one or more; `mapped` spreads the density over processes. Once
-    it is `late` no further attempt is made.
+    """Importance sampling around given optima, one or more, or from a proposal to `begin` with, in the chart;
+    `mapped` spreads the density over processes. Once it is `late` no further attempt is made.
 
     FloatingPointError where the density is NaN.
     """
     chart = Chart.of(posterior)
     chosen = weighty(optima)
-    proposal = core = around(posterior, chart, chosen, rng)
+    proposal = core = begin or around(posterior, chart, chosen, rng)
     seen = Seen()
     for effort in plan.efforts:
         if seen.proposals and len(core.means) < _MOST:
