@@ -5,7 +5,7 @@ Radial test: a fit far from the maximum, whose likelihood shows whether a direct
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, final
 
@@ -26,7 +26,6 @@ from lcopa_bayes.identifiability.contraction import (
 )
 from lcopa_bayes.identifiability.curvature import (
     Curvature,
-    Delays,
     Sensitivities,
     curvature,
     delays,
@@ -143,7 +142,8 @@ class Audit:
     """None when only noise parameters are free."""
     radial: Radial | None
     known: tuple[Known, ...]
-    delays: Delays
+    delays: Mapping[str, Any]
+    """As `curvature.delays` gives them."""
     peak: Peak
 
     @property
@@ -180,7 +180,7 @@ class Audit:
                 "local": None if self.curvature is None else self.curvature.as_json(),
                 "radial": None if self.radial is None else self.radial.as_json(),
                 "functions": [known.as_json() for known in self.known],
-                "delays": self.delays.as_json(),
+                "delays": self.delays,
                 "log_likelihood": self.peak.log_likelihood,
                 "next_measurement": None,
             }
