@@ -14,6 +14,7 @@ from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.basefit import BaseFit
+from lcopa_bayes.effectsearch.basemodel import fitted_base
 from lcopa_bayes.effectsearch.explained import coordinates_of, declarable, explained_draws, explained_study
 from lcopa_bayes.effectsearch.heldouteffects import missed, unseen_share
 from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
@@ -29,7 +30,6 @@ from lcopa_bayes.effectsearch.scores import (
     over_noise,
     risen,
 )
-from lcopa_bayes.effectsearch.terms import fitted_base
 from lcopa_bayes.effectsearch.trace import Trace
 from lcopa_bayes.effectsearch.verdict import (
     ALONE,
@@ -191,8 +191,7 @@ def _looped(
     before = _side(problem, start)
     cautions = (*base.caution, *_alone(study))
     if base.failed:
-        failure = Findings(base.failed, cautions, False, np.nan, np.nan, (), (), 0, 0, "", 0, 0, "", np.nan)
-        verdict = decide(failure)
+        verdict = Verdict("unexplained", "tentative", f"No effect is named, because {base.failed}.")
         return Loop(
             *(problem, base, enlarged, (), (), (), verdict, before, before, not study.held_out, cautions),
             outliers=outliers,
@@ -216,7 +215,6 @@ def _looped(
     )
     verdict = decide(
         Findings(
-            failed="",
             cautions=cautions,
             alarmed=first.alarmed or bool(added),
             largest=first.largest,

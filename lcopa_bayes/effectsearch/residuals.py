@@ -42,8 +42,7 @@ class View:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        labels = {"name": self.name, "axis": self.axis, "across": self.across, "along": self.along}
-        return labels | {"x": self.x, "y": self.y, "error": self.error, "sentence": self.sentence}
+        return dict(vars(self))
 
 
 @final

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 
 from lcopa_bayes.core.estimate import attributes, plain
-from lcopa_bayes.effectsearch.crossvalidation import in_turn
 from lcopa_bayes.effectsearch.loop import Loop, Side
 from lcopa_bayes.effectsearch.residuals import View, views
 from lcopa_bayes.effectsearch.rounds import Round
-from lcopa_bayes.effectsearch.scores import Score, pooled_coverage, pooled_rmse
+from lcopa_bayes.effectsearch.scores import Score, in_turn, pooled_coverage, pooled_rmse
 from lcopa_bayes.effectsearch.trace import SEEN
 from lcopa_bayes.model.effects.effect import Card
 

@@ -15,9 +15,8 @@ import numpy as np
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import Estimate, quantile
-from lcopa_bayes.experiments.candidates import PLAIN, Candidate, candidates
+from lcopa_bayes.experiments.candidates import PLAIN, Candidate, Limits, bench_times, candidates, limits_of
 from lcopa_bayes.experiments.information import Bench
-from lcopa_bayes.experiments.limits import Limits, bench_times, limits_of
 from lcopa_bayes.identifiability.contraction import prior_draws, prior_spread
 from lcopa_bayes.identifiability.symmetries import DIFFERENCED, Structure, structure
 from lcopa_bayes.inference.assembly import Problem

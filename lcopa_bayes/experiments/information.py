@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from lcopa_bayes.bench.command import Command
+from lcopa_bayes.calibration.replica import measured
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Record
@@ -23,6 +24,7 @@ from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.effects import effect_slopes
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.noise import GaussianNoise, Student
+from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.simulation import Simulation
 from lcopa_bayes.model.forward import Experiment, ForwardModel, StepResponses
@@ -189,20 +191,10 @@ class Trial:
     def __call__(self) -> tuple[Vector, Flags]:
         """Relative errors, and which estimates lean on a bound."""
         problem, values, rng = self.bench.problem, self.truth, np.random.default_rng(self.seed)
-        again = refit(problem, _noisy(problem, self.clean, values, rng), self.bench)
+        samples = Samples.of(self.clean, self.bench.period)
+        again = refit(problem, measured(problem, values, samples, samples.matrix(), rng), self.bench)
         result = _solve(again, _moved(problem, again, values))
         return _errors(problem, again, result, values, self.names), _leaning(again, result, self.names)
-
-
-def _noisy(problem: Problem, clean: Record, values: Vector, rng: np.random.Generator) -> Record:
-    """The record with the study's noise at these values."""
-    posterior, response = problem.posterior, clean.response.copy()
-    sampled = ~np.isnan(response[:, 0])
-    gaps = np.ones(int(sampled.sum()))
-    for axis in range(response.shape[1]):
-        parameters = posterior.noise_parameters(values[None], axis)
-        response[sampled, axis] += posterior.noise.draw(parameters, gaps, rng)[0]
-    return replace(clean, response=response)
 
 
 def refit(problem: Problem, record: Record, bench: Bench) -> Problem:

@@ -126,7 +126,7 @@ class Samples:
 
 def sampling_period(records: Sequence[Record]) -> float:
     """Median time between samples over the records [time unit]; the unit in which noise correlates."""
-    steps = [np.diff(record.time[~np.isnan(record.response).all(axis=1)]) for record in records]
+    steps = [np.diff(record.sampled) for record in records]
     return float(np.median(np.concatenate(steps)))
 
 

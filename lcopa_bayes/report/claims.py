@@ -13,8 +13,7 @@ import numpy as np
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.literature import PAPER, Stated
 from lcopa_bayes.optics.array import (
-    LinearArray,
-    geometry_check,
+    implied_array,
     linearisation_error,
     paper_array,
     strongest_grating_lobe,
@@ -190,7 +189,7 @@ def _tilt(stated: Stated) -> str:
 
 
 def _steering(stated: Stated) -> str:
-    optics, check = stated.optics, geometry_check(stated)
+    optics, records, implied = stated.optics, stated.records, implied_array(stated)
     figure = blank(2.9)
     lobes, error, angle = figure.subplots(1, 3)
     targets = np.linspace(0.0, max(optics.targets_1d_deg), 81)
@@ -200,18 +199,16 @@ def _steering(stated: Stated) -> str:
     lobes.axhline(FAR_WEAKER, color=NOISE, lw=0.8, ls=(0, (4, 3)), label="far weaker")
     lobes.set(xlabel="steering angle [deg]", ylabel="grating lobe over main lobe [-]", ylim=(0, 1.45))
     phases = np.linspace(0.0, pi, 400)
-    implied = LinearArray(optics.elements, check.implied_pitch, optics.wavelength)
     pitches = (
         (paper_array(optics), HELD_OUT, f"d = {optics.pitch_in_wavelengths:g} wavelengths"),
-        (implied, BAND, f"d = {check.implied_pitch_in_wavelengths:.2f} wavelengths"),
+        (implied, BAND, f"d = {implied.pitch / optics.wavelength:.2f} wavelengths"),
     )
     for array, colour, name in pitches:
         error.semilogy(phases, np.abs(linearisation_error(array, phases)), color=colour, label=name)
         angle.plot(phases, array.steering_angle(phases), color=colour, label=name)
-    limit = stated.records.steady_state_error
-    error.axhline(limit, color=NOISE, lw=0.8, ls=(0, (4, 3)), label="claimed error")
+    error.axhline(records.steady_state_error, color=NOISE, lw=0.8, ls=(0, (4, 3)), label="claimed error")
     error.set(ylabel="error of Eq. 26 [-]", ylim=(1e-6, 2.0))
-    angle.plot(check.step, check.measured_angle, "o", ms=4, color=STEADY, label="measured")
+    angle.plot(records.step_drive, records.measured.steady, "o", ms=4, color=STEADY, label="measured")
     angle.set(ylabel="angle [rad]", ylim=(0, 0.65))
     for panel in (error, angle):
         panel.set_xlabel("phase step [rad]")

@@ -20,11 +20,18 @@ from lcopa_bayes.calibration.replica import device_of
 from lcopa_bayes.cli import main
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.record import load_record, save_record
-from lcopa_bayes.experiments.candidates import PLAIN, Candidate, candidates, template
+from lcopa_bayes.experiments.candidates import (
+    PLAIN,
+    Candidate,
+    Limits,
+    bench_times,
+    candidates,
+    limits_of,
+    template,
+)
 from lcopa_bayes.experiments.confirmation import confirm, confirmed
 from lcopa_bayes.experiments.design import checked, cramer_rao, design, promises, reached, within
 from lcopa_bayes.experiments.information import Bench, refit
-from lcopa_bayes.experiments.limits import Limits, bench_times, limits_of
 from lcopa_bayes.experiments.summary import as_json, next_measurement
 from lcopa_bayes.identifiability.curvature import sensitivities
 from lcopa_bayes.inference.assembly import Problem
