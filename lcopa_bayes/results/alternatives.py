@@ -330,8 +330,11 @@ def _averaged(plant: Metric, lags: Metric, weight: float, ess: float, grade: str
         one.values[np.linspace(0, one.values.size - 1, count).astype(int)] for one in (plant, lags)
     )
     pooled = theirs if weight == 1.0 else np.concatenate([ours, theirs])
-    note = "of sums of lags" if weight == 1.0 else "over the fitted plant and sums of lags"
-    joined = "; ".join(part for part in (plant.note, note) if part)
+    own = f"of the fitted plant {plant.note}" if plant.note else ""
+    notes = (
+        ("of sums of lags", lags.note) if weight == 1.0 else ("over the fitted plant and sums of lags", own)
+    )
+    joined = "; ".join(note for note in notes if note)
     here = Estimate.of(plant.name, plant.unit, pooled, ess=ess, grade=grade, note=joined)
     return Averaged(here, plant.values, lags.values, weight)
 
