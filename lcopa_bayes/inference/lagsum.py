@@ -27,6 +27,7 @@ from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.noise import GaussianNoise
+from lcopa_bayes.inference.posterior import Posterior
 
 MOST = 4
 """Most lags of a path."""
@@ -39,8 +40,10 @@ WEIGHT = 1.0
 """Prior standard deviation of a weight, in ranges of response over ranges of drive [-]."""
 _VISIBLE = 1e-4
 """Squared whitened response below which a direction is left out [-]."""
-_PORTION = 256
-"""Lags simulated at once."""
+_SAMPLES = 4_000
+"""Most samples of a response axis: of more one in so many is used, which widens intervals."""
+_VALUES = 4_000_000
+"""Most values simulated at once."""
 _APART = 0.7
 """Least distance of the time constants a search starts from [-, natural logarithm]."""
 _STARTS = 3
@@ -230,7 +233,19 @@ def lag_problem(study: Study) -> Problem:
     as in the study; InputError as `problem_of`."""
     model = replace(study.model, terms=1, orders=(1.0,), share="none", delay="path")
     priors = {name: prior for name, prior in study.priors.items() if name.startswith("offset")}
-    return problem_of(replace(study, model=model, priors=priors))
+    problem = problem_of(replace(study, model=model, priors=priors))
+    return replace(problem, posterior=thinned(problem.posterior))
+
+
+def thinned(posterior: Posterior) -> Posterior:
+    """A posterior of no more samples than lags are held against."""
+    most = max(
+        sum(samples.axes[axis].values.size for samples in posterior.samples)
+        for axis in range(len(posterior.table.layout.responses))
+    )
+    step = -(-most // _SAMPLES)
+    kept = [replace(one, axes=tuple(axis.every(step) for axis in one.axes)) for one in posterior.samples]
+    return replace(posterior, samples=tuple(kept)) if step > 1 else posterior
 
 
 def lag_table(problem: Problem, axis: int, drives: Sequence[int], noise: Vector, delays: Matrix) -> LagTable:
@@ -243,41 +258,52 @@ def lag_table(problem: Problem, axis: int, drives: Sequence[int], noise: Vector,
     assert isinstance(posterior.noise, GaussianNoise)
     first, last = np.log(_SHORTEST * scales.period), np.log(_LONGEST * scales.span)
     log_times = np.linspace(first, last, max(8, round(_PER_DECADE * (last - first) / np.log(10)) + 1))
+    offsets = [k for k in posterior.table.of_kind("offset") if posterior.table.rows[k].response == axis]
+    offsets = [k for k in offsets if posterior.table.rows[k].free]
     values = _values(problem, axis, drives, np.exp(log_times), delays)
-    table = posterior.table
-    gains = [table.at("gain", axis, drive) for drive in drives]
-    units = [scales.amplitude[axis] / scales.excursion[drive] for drive in drives]
-    offsets = [k for k in table.of_kind("offset") if table.rows[k].response == axis and table.rows[k].free]
-    count = len(gains) * len(values)
-    whole = []
-    for r, samples in enumerate(posterior.samples):
+    count = len(drives) * len(values)
+    stacked = _columns(problem, axis, drives, values)
+    white = []
+    for r, (samples, columns) in enumerate(zip(posterior.samples, stacked, strict=True)):
         observed = samples.axes[axis]
-        if observed.values.size == 0:
-            continue
-        stacked = np.zeros((count + len(offsets) + 1, observed.values.size))
-        for first in range(0, len(values), _PORTION):
-            portion = posterior.model.unit_responses(table.dynamics(values[first : first + _PORTION]))[r]
-            for p, (k, unit) in enumerate(zip(gains, units, strict=True)):
-                column = posterior.column(k, axis, r, observed, portion)
-                if column is not None:
-                    start = p * len(values) + first
-                    stacked[start : start + portion.shape[1]] = unit * column
         none = np.zeros((0, 1, observed.values.size))  # offsets need no response
-        for p, k in enumerate(offsets):
-            column = posterior.column(k, axis, r, observed, none)
-            stacked[count + p] = 0.0 if column is None else column[0]
+        acting = [posterior.column(k, axis, r, observed, none) for k in offsets]
+        own = [np.zeros(observed.values.size) if column is None else column[0] for column in acting]
         held = values[:1].copy()
-        held[:, [*gains, *offsets]] = 0.0
-        stacked[-1] = posterior.residual(axis, r, observed, held, none)[0]
-        whole.append(posterior.noise.whiten(stacked[None], noise[None], observed.gaps)[0][0])
-    white = np.concatenate(whole, axis=1)
+        held[:, [*posterior.table.of_kind("gain"), *offsets]] = 0.0
+        target = posterior.residual(axis, r, observed, held, none)
+        whole = np.concatenate([columns, np.reshape(own, (len(offsets), -1)), target])
+        if observed.values.size:
+            white.append(posterior.noise.whiten(whole[None], noise[None], observed.gaps)[0][0])
+    joined = np.concatenate(white, axis=1)
     if offsets:
-        basis = orth(white[count:-1].T)
-        white = white - (white @ basis) @ basis.T
-    shape = (len(gains), log_times.size, delays.shape[1], -1)
-    reduced, target = _reduced(white[:count], white[-1])
-    remainder = max(0.0, float(white[-1] @ white[-1] - target @ target))
-    return LagTable(log_times, delays, reduced.reshape(shape), target, remainder, white.shape[1])
+        basis = orth(joined[count:-1].T)
+        joined = joined - (joined @ basis) @ basis.T
+    reduced, target = _reduced(joined[:count], joined[-1])
+    remainder = max(0.0, float(joined[-1] @ joined[-1] - target @ target))
+    shape = (len(drives), log_times.size, delays.shape[1], -1)
+    return LagTable(log_times, delays, reduced.reshape(shape), target, remainder, joined.shape[1])
+
+
+def _columns(problem: Problem, axis: int, drives: Sequence[int], values: Matrix) -> list[Matrix]:
+    """Responses to each drive at table values (batch, rows), of every record (drives * batch, samples)
+    [response unit per unit weight]."""
+    posterior, scales = problem.posterior, problem.scales
+    table, units = posterior.table, scales.amplitude[axis] / scales.excursion
+    sizes = [samples.axes[axis].values.size for samples in posterior.samples]
+    out = [np.zeros((len(drives), len(values), size)) for size in sizes]
+    simulated = sum(samples.times.size for samples in posterior.samples) * len(table.layout.units)
+    size = max(1, _VALUES // simulated)
+    for first in range(0, len(values), size):
+        portion = slice(first, first + size)
+        read = posterior.model.unit_responses(table.dynamics(values[portion]))
+        for r, samples in enumerate(posterior.samples):
+            for p, drive in enumerate(drives):
+                gain = table.at("gain", axis, drive)
+                column = posterior.column(gain, axis, r, samples.axes[axis], read[r])
+                if column is not None:
+                    out[r][p, portion] = units[drive] * column
+    return [one.reshape(len(drives) * len(values), -1) for one in out]
 
 
 def _values(problem: Problem, axis: int, drives: Sequence[int], times: Vector, delays: Matrix) -> Matrix:

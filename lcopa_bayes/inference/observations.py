@@ -41,6 +41,11 @@ class Observed:
         """The first samples."""
         return Observed(self.index[:count], self.values[:count], self.gaps[:count])
 
+    def every(self, step: int) -> Observed:
+        """One sample of so many, the first included."""
+        since = np.cumsum(self.gaps)[::step]
+        return Observed(self.index[::step], self.values[::step], np.diff(since, prepend=since[:1] - 1.0))
+
     @cached_property
     def chosen(self) -> Index | slice:
         """`index`, as a slice where it is one: taking a slice copies nothing."""

@@ -21,7 +21,7 @@ from lcopa_bayes.core.arrays import Array, Vector
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import Estimate, plain
 from lcopa_bayes.inference.assembly import Problem
-from lcopa_bayes.inference.lagsum import lag_problem
+from lcopa_bayes.inference.lagsum import lag_problem, thinned
 from lcopa_bayes.inference.noise import GaussianNoise
 from lcopa_bayes.model.layout import PathSlot
 from lcopa_bayes.results.fit import Fit
@@ -259,7 +259,7 @@ def _open(fitted: Fit, axis: int) -> tuple[PathSlot, ...]:
 
 
 def _alternative(fitted: Fit, problem: Problem, axis: int, paths: tuple[PathSlot, ...]) -> Alternative:
-    posterior, draws = fitted.problem.posterior, fitted.draws
+    posterior, draws = thinned(fitted.problem.posterior), fitted.draws
     best = draws.flat[[int(draws.log_density.argmax())]]
     best = posterior.complete(posterior.coordinates(best), None)
     noise = posterior.noise_parameters(best, axis)
@@ -292,12 +292,11 @@ def _ends(fitted: Fit, path: PathSlot) -> tuple[float, float]:
     row = table.rows[table.at("delay", table.layout.delay_of[path.response][path.drive])]
     if not row.free:
         return row.value, row.value + 1e-6 * fitted.problem.scales.period
-    low, high = row.domain
+    low, high = (max(float(end), 0.0) for end in row.domain)
     curve = np.median(curves.normalised[curves.curve_of[path.response][path.drive]], axis=0)
-    risen = np.flatnonzero(curve >= _RISEN * curve[-1])
-    later = float(curves.time[risen[0]]) if risen.size else np.inf
-    wide = max(float(low), 0.0) + 2 * fitted.problem.scales.period
-    return max(float(low), 0.0), min(float(high), 0.4 * fitted.problem.scales.span, max(later, wide))
+    begun = float(curves.time[(curve >= _RISEN * curve[-1]).argmax()])
+    period = fitted.problem.scales.period
+    return low, max(min(high, max(begun, low + 2 * period)), low + 1e-6 * period)
 
 
 def _numbers(fitted: Fit, problem: Problem, found: Sequence[Alternative]) -> list[Averaged]:

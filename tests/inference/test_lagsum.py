@@ -131,3 +131,21 @@ def test_a_record_whose_drive_is_still_has_no_span() -> None:
     end = moved.time[-1] - moved.time[np.flatnonzero(moved.drive[:, 0])[0]]
     assert Scales.of([moved, still]).span == pytest.approx(end)
     assert Scales.of([still]).span == pytest.approx(moved.time[-1] - moved.time[0])
+
+
+def test_every_other_sample_keeps_the_time_between_samples() -> None:
+    whole = lag_problem(made()).posterior.samples[0].axes[0]
+    gaps = np.arange(1.0, whole.values.size + 1)
+    half = replace(whole, gaps=gaps).every(2)
+    assert (half.values == whole.values[::2]).all()
+    assert half.gaps[0] == 1.0
+    assert half.gaps[1:] == pytest.approx(gaps[1:-1:2] + gaps[2::2])
+
+
+def test_of_many_samples_some_are_used_and_the_answer_stays() -> None:
+    few, many = (lag_problem(made(count=count)) for count in (1_500, 6_000))
+    assert few.posterior.size == 3_000
+    assert 1_500 < many.posterior.size <= 4_000
+    times = [np.sort(np.exp(lag_fits(tabulated(one))[1].coordinates[:-1])) for one in (few, many)]
+    assert times[0] == pytest.approx(TIMES, rel=0.1)
+    assert times[1] == pytest.approx(TIMES, rel=0.1)
