@@ -100,16 +100,18 @@ def importance(
     plan: ImportancePlan = ImportancePlan(),
     mapped: Mapped = map,
     late: Callable[[], bool] = lambda: False,
-) -> Importance:
+) -> Importance | None:
     """Importance sampling around given optima, one or more; `mapped` spreads the density over processes. Once
-    it is `late` no further attempt is made.
+    it is `late` no further attempt is made. None where no optimum has a surrounding inside the prior.
 
     FloatingPointError where the density is NaN.
     """
     chart = Chart.of(posterior)
     chosen = weighty(optima)
-    proposal = core = around(posterior, chart, chosen, rng)
-    seen = Seen()
+    core = around(posterior, chart, chosen, rng)
+    if core is None:
+        return None
+    proposal, seen = core, Seen()
     for effort in plan.efforts:
         if seen.proposals and len(core.means) < _MOST:
             core = split(core, rng)
