@@ -108,7 +108,7 @@ def _refit(target: Posterior, fit: Fit, undefined: Width) -> Width:
         return undefined
     seed = fit.run.plan.seed + round(9_000 * undefined.factor)
     result = transferred(fit.near, target, coordinates[:, :, -1], seed, jump=True)
-    again = evidence(target, result.coordinates, result.ess, seed)
+    again = result.evidence or evidence(target, result.coordinates, result.ess, seed)
     assert again is not None
     return replace(undefined, log_evidence=again.value, sd=again.sd, method="refit", ess=result.ess)
 

@@ -35,8 +35,12 @@ _RISEN = 0.3
 """Share of its value at the end of the record that a response has reached before which its delay ends [-]."""
 _MOVED = 0.5
 """Shift of a median over its standard deviation that is told [-]."""
+_NORMAL = 3.29
+"""Standard deviations that 90 % of a normal distribution take [-]."""
 _WIDER = 1.5
 """Width of an interval over that of the fitted plant that is told [-]."""
+_SHOWN = 4
+"""Most numbers named in a sentence."""
 _STREAM = 17
 """Marks the randomness of these draws."""
 
@@ -90,14 +94,14 @@ class Averaged:
     @cached_property
     def moved(self) -> bool:
         """Whether the number is elsewhere, or open farther, than the fitted plant by itself says."""
-        middle, here = np.median(self.plant), self.estimate
-        alone = np.quantile(self.plant, (0.05, 0.95), method="nearest")
-        if not np.isfinite(alone).all():
+        low, middle, high = np.quantile(self.plant, (0.05, 0.5, 0.95), method="nearest")
+        here = self.estimate
+        if not np.isfinite([low, high]).all():
             return False
         if not np.isfinite([here.lower, here.value, here.upper]).all():
             return True
-        shifted = abs(here.value - middle) > _MOVED * float(np.std(self.plant))
-        return bool(shifted or here.upper - here.lower > _WIDER * (alone[1] - alone[0]))
+        shifted = abs(here.value - middle) > _MOVED * (high - low) / _NORMAL
+        return bool(shifted or here.upper - here.lower > _WIDER * (high - low))
 
     def as_json(self) -> dict[str, Any]:
         """Plain values: the estimate, its parts, and what each plant says by itself."""
@@ -131,7 +135,8 @@ class Alternatives:
         return " ".join(
             f"Sums of {one.lags.best.lags} to {one.lags.times.shape[2]} lags"
             f"{f' for {_listed([path.name for path in one.paths])}' if len(self.alternatives) > 1 else ''} "
-            f"{said[one.support]} (AIC {one.advantage:+.1f})."
+            f"{said[one.support]} (AIC {'lower' if one.advantage > 0 else 'higher'} by "
+            f"{abs(one.advantage):.1f})."
             for one in self.alternatives
         )
 
@@ -151,19 +156,20 @@ class Alternatives:
                         "weigh other structures",
                     )
                 )
-        for number in self.numbers:
-            concerned = names.get(number.estimate.name, ())
-            if concerned and number.moved and number.weight == 0.5:
-                here = number.estimate
-                out.append(
-                    Limitation(
-                        "tentative",
-                        f"a sum of lags follows the records as well and leaves {here.name} at "
-                        f"{here.lower:.4g} to {here.upper:.4g} {here.unit}",
-                        "record until the response settles, and sample its onset",
-                        concerned,
-                    )
+        moved = [one.estimate for one in self.numbers if one.weight == 0.5 and one.moved]
+        moved = [one for one in moved if one.name in names]
+        if moved:
+            said = [f"{one.name} at {one.lower:.4g} to {one.upper:.4g} {one.unit}" for one in moved]
+            more = f" and {len(said) - _SHOWN} more open" if len(said) > _SHOWN else ""
+            concerned = dict.fromkeys(parameter for one in moved for parameter in names[one.name])
+            out.append(
+                Limitation(
+                    "tentative",
+                    f"sums of lags follow the records as well and leave {_listed(said[:_SHOWN])}{more}",
+                    "record until the response settles, and sample its onset",
+                    tuple(concerned),
                 )
+            )
         return out
 
     def as_json(self) -> dict[str, Any]:

@@ -100,15 +100,17 @@ def importance(
     plan: ImportancePlan = ImportancePlan(),
     mapped: Mapped = map,
     late: Callable[[], bool] = lambda: False,
+    begin: Mixture | None = None,
 ) -> Importance | None:
-    """Importance sampling around given optima, one or more; `mapped` spreads the density over processes. Once
-    it is `late` no further attempt is made. None where no optimum has a surrounding inside the prior.
+    """Importance sampling around given optima, one or more, or from a proposal to `begin` with, in the chart;
+    `mapped` spreads the density over processes. Once it is `late` no further attempt is made. None where no
+    optimum has a surrounding inside the prior.
 
     FloatingPointError where the density is NaN.
     """
     chart = Chart.of(posterior)
     chosen = weighty(optima)
-    core = around(posterior, chart, chosen, rng)
+    core = begin or around(posterior, chart, chosen, rng)
     if core is None:
         return None
     proposal, seen = core, Seen()
