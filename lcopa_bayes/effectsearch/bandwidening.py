@@ -52,7 +52,7 @@ class Widening:
             edges = np.array([edges[0], edges[0] + max(abs(edges[0]), 1e-9)])
         excess = []
         for axis, process in enumerate(noise):
-            own = [part for part in parts(samples) if part.axis == axis]
+            own = parts(samples, axis)
             at = np.concatenate([times[part.record][part.observed.index] for part in own])
             squares = np.concatenate([residual[part.rows] ** 2 for part in own])
             known = np.isfinite(at)

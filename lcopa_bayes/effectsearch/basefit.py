@@ -127,11 +127,8 @@ def renewed(model: ExtendedModel, optimum: Optimum, known: Whitening) -> Whiteni
 
 def axis_pieces(posterior: Posterior, stacked: Vector, axis: int) -> list[Observed]:
     """Stacked values of one axis, record by record."""
-    return [
-        replace(part.observed, values=stacked[part.rows])
-        for part in parts(posterior.samples)
-        if part.axis == axis
-    ]
+    own = parts(posterior.samples, axis)
+    return [replace(part.observed, values=stacked[part.rows]) for part in own]
 
 
 def _alike(one: AxisNoise, other: AxisNoise) -> bool:
@@ -148,7 +145,7 @@ def _failure(model: ExtendedModel, optimum: Optimum) -> str:
         )
     responses = model.plant.table.layout.responses
     for axis, response in enumerate(responses):
-        own = [part.rows for part in parts(model.plant.samples) if part.axis == axis]
+        own = [part.rows for part in parts(model.plant.samples, axis)]
         seen = [model.observed[rows] for rows in own]
         spread = sum(float(((values - values.mean()) ** 2).sum()) for values in seen)
         missed = sum(float((optimum.residual[rows] ** 2).sum()) for rows in own)

@@ -82,7 +82,7 @@ def outlying(study: Study, fit: BaseFit) -> Outlying | None:
     sizes: list[Vector] = []
     counts = np.zeros((2, 2))  # rows: at rest, moving; columns: samples, outliers
     for axis in range(len(samples[0].axes)):
-        own = [part for part in parts(samples) if part.axis == axis]
+        own = parts(samples, axis)
         apart = [_apart(residual[part.rows]) for part in own]
         core = float(np.median(np.abs(np.concatenate(apart)))) / _NORMAL
         for part, distance in zip(own, apart, strict=True):

@@ -12,7 +12,7 @@ from scipy import signal, stats
 from lcopa_bayes.core.arrays import Flags, Vector
 from lcopa_bayes.effectsearch.bandwidening import since_command
 from lcopa_bayes.effectsearch.scores import State
-from lcopa_bayes.effectsearch.whitening import Part
+from lcopa_bayes.effectsearch.whitening import Part, parts
 
 _BINS = 12
 _LAGS = 60
@@ -51,7 +51,7 @@ class _Axis:
     """Samples of one axis."""
 
     name: str
-    parts: list[Part]
+    parts: tuple[Part, ...]
     white: Vector
     since: Vector
     predicted: Vector
@@ -60,14 +60,14 @@ class _Axis:
     @classmethod
     def of(cls, state: State, axis: int) -> _Axis:
         """Of all records."""
-        parts, columns = [part for part in state.whitening.parts if part.axis == axis], []
-        for part in parts:
+        own, columns = parts(state.whitening.samples, axis), []
+        for part in own:
             predicted = state.fitted[part.rows] - state.fitted[part.rows][0]
             growing = np.gradient(np.abs(predicted)) > 0 if predicted.size > 1 else np.array([False])
             since = since_command(part.samples)[part.observed.index]
             columns.append((state.optimum.settled[part.rows], since, predicted, growing))
-        name = parts[0].samples.record.response_axes[axis].name
-        return cls(name, parts, *(np.concatenate(each) for each in zip(*columns, strict=True)))
+        name = own[0].samples.record.response_axes[axis].name
+        return cls(name, own, *(np.concatenate(each) for each in zip(*columns, strict=True)))
 
 
 def views(state: State, time_unit: str) -> list[View]:
@@ -79,8 +79,8 @@ def views(state: State, time_unit: str) -> list[View]:
         out.append(_by_time(pooled, time_unit))
         out += _by_amplitude(pooled, response.unit)
         out.append(_by_direction(pooled))
-        out.append(_spectrum(state, pooled.parts, response.name, time_unit))
-        out.append(_drive(state, pooled.parts, response.name))
+        out.append(_spectrum(state, pooled, time_unit))
+        out.append(_drive(state, pooled))
     return out
 
 
@@ -148,10 +148,10 @@ def _by_direction(pooled: _Axis) -> View:
     return View("by direction", pooled.name, across, "rms over noise [-]", np.arange(2.0), rms, error, said)
 
 
-def _spectrum(state: State, parts: list[Part], name: str, unit: str) -> View:
+def _spectrum(state: State, pooled: _Axis, unit: str) -> View:
     """Mean periodogram of the records over that of white noise, in bands of equal logarithmic width."""
     frequencies, powers = [], []
-    for part in parts:
+    for part in pooled.parts:
         if part.times.size < 8:
             continue
         rate = 1.0 / float(np.median(np.diff(part.times)))
@@ -162,7 +162,7 @@ def _spectrum(state: State, parts: list[Part], name: str, unit: str) -> View:
     if not frequencies:
         empty = np.zeros(0)
         return View(
-            "spectrum", name, across, "power over noise [-]", empty, empty, empty, "records too short"
+            "spectrum", pooled.name, across, "power over noise [-]", empty, empty, empty, "records too short"
         )
     f, p = np.concatenate(frequencies), np.concatenate(powers)
     edges = np.geomspace(f.min(), f.max() * (1 + 1e-12), _BANDS + 1)
@@ -174,15 +174,15 @@ def _spectrum(state: State, parts: list[Part], name: str, unit: str) -> View:
     top = int(np.argmax(mean))
     said = f"largest at {centre[top]:.3g} cycles per {unit}, {mean[top]:.2f} times white noise"
     return View(
-        "spectrum", name, across, "power over noise [-]", centre, mean, 1 / np.sqrt(count[kept]), said
+        "spectrum", pooled.name, across, "power over noise [-]", centre, mean, 1 / np.sqrt(count[kept]), said
     )
 
 
-def _drive(state: State, parts: list[Part], name: str) -> View:
+def _drive(state: State, pooled: _Axis) -> View:
     """Largest correlation of the residual with commands up to `_LAGS` samples earlier, over all drives."""
     lags = np.arange(_LAGS + 1)
     total, norm = np.zeros(lags.size), 0.0
-    for part in parts:
+    for part in pooled.parts:
         record = part.samples.record
         held = np.searchsorted(record.time, part.times, side="right") - 1
         drive = np.abs(np.diff(record.drive[np.clip(held, 0, None)], axis=0, prepend=record.drive[:1]))
@@ -202,7 +202,7 @@ def _drive(state: State, parts: list[Part], name: str) -> View:
     )
     return View(
         "independence from the drive",
-        name,
+        pooled.name,
         "samples after a command [-]",
         "correlation of power over its sd [-]",
         lags.astype(float),

@@ -30,7 +30,7 @@ from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.model.effects.declared import Declared
 from lcopa_bayes.model.effects.effect import UnstableError
-from lcopa_bayes.results.prediction import disturbances, named_rng, offset_draws, plant_draws
+from lcopa_bayes.results.prediction import axis_draws
 from lcopa_bayes.sampling.draws import Draws
 
 PARTS = 5
@@ -217,29 +217,17 @@ def held_out_scores(state: State, problem: Problem) -> list[Score]:
         )
         model = replace(model, effects=own)
     draws, noise = state.sampled or _laplace(state, study.seed)
-    draws = replace(draws, values=draws.thinned(_MOST)[None])
-    table, out = draws.table, []
-    for r, record in enumerate(samples):
-        rng, alone = named_rng(study.seed, record.record.name), model.only(r)
-        values, plant = plant_draws(draws, alone)
-        apart = disturbances(table, alone, values, plant, rng)
-        whole = plant if apart is None else plant + apart
-        bounded = np.isfinite(whole).all(axis=(0, 2))
+    draws, out = replace(draws, values=draws.thinned(_MOST)[None]), []
+    drawn = axis_draws(draws, model, samples, noise, held_out=True, seed=study.seed)
+    for record, axis, _, plant, seen, (level, source, _), _ in drawn:
+        bounded = np.isfinite(seen).all(axis=1)
         if not bounded.any():
             names = tuple(effect.name for effect in state.model.effects)
             raise UnstableError(names, record.record.name, "no draw has a bounded response")
-        values, plant, whole = values[bounded], plant[:, bounded], whole[:, bounded]
-        for axis, observed in enumerate(record.axes):
-            if not observed.values.size:
-                continue
-            seen = whole[axis][:, observed.index]
-            level, source, _ = offset_draws(
-                table, values, axis, r, record, seen, noise, held_out=True, rng=rng
-            )
-            # what differs from record to record is 0 on average
-            mean = plant[axis][:, observed.index].mean(axis=0) + level.mean()
-            variance = (seen + level[:, None]).var(axis=0)
-            out.append(_score(state, record, axis, (mean, variance), source, held_out=True))
+        # what differs from record to record is 0 on average
+        mean = plant[bounded].mean(axis=0) + level[bounded].mean()
+        variance = (seen + level[:, None])[bounded].var(axis=0)
+        out.append(_score(state, record, axis, (mean, variance), source, held_out=True))
     return out
 
 

@@ -43,13 +43,14 @@ class Part:
         return self.samples.times[self.observed.index]
 
 
-def parts(samples: Sequence[Samples]) -> tuple[Part, ...]:
-    """Where each record's axes are in the stack, those with samples: records in their order, axes within."""
+def parts(samples: Sequence[Samples], only: int | None = None) -> tuple[Part, ...]:
+    """Where each record's axes are in the stack, those with samples: records in their order, axes within; of
+    one axis where `only` names it."""
     out, start = [], 0
     for r, record in enumerate(samples):
         for axis, observed in enumerate(record.axes):
             stop = start + observed.values.size
-            if stop > start:
+            if stop > start and only in (None, axis):
                 out.append(Part(r, axis, slice(start, stop), record))
             start = stop
     return tuple(out)
@@ -107,20 +108,16 @@ class Whitening:
         """Whitened columns (..., n), same shape [-]."""
         out = np.empty_like(columns, dtype=float)
         for part in self.parts:
-            gaps = part.observed.gaps
-            out[..., part.rows] = self.noise[part.axis].whiten(columns[..., part.rows], gaps)
-            if self.dependence:
-                out[..., part.rows] /= np.sqrt(self.dependence[part.axis])
+            law = Law(*self.held[part.axis].tolist())
+            out[..., part.rows] = law.whiten(columns[..., part.rows], part.observed.gaps)
         return out
 
     def adjoint(self, columns: Matrix) -> Matrix:
         """Adjoint of whitening of columns (k, n), same shape [1 / response unit]."""
         out = np.empty_like(columns, dtype=float)
         for part in self.parts:
-            law, gaps = self.noise[part.axis].parameters, part.observed.gaps
-            out[:, part.rows] = WhiteAR1().adjoint(columns[:, part.rows], law, gaps)
-            if self.dependence:
-                out[:, part.rows] /= np.sqrt(self.dependence[part.axis])
+            law = self.held[part.axis]
+            out[:, part.rows] = WhiteAR1().adjoint(columns[:, part.rows], law, part.observed.gaps)
         return out
 
     def covariances(self, columns: Matrix, count: int) -> Array:
@@ -137,10 +134,9 @@ class Whitening:
             drawn = self._plausible(axis, count, rng)
             rho, which = np.unique(drawn[:, 2], return_inverse=True)
             white, correlated = np.zeros((k, k)), np.zeros((rho.size, k, k))
-            for part in self.parts:
-                if part.axis == axis:
-                    white += back[:, part.rows] @ back[:, part.rows].T
-                    correlated += _correlated_products(back[:, part.rows], rho, part.observed.gaps)
+            for part in parts(self.samples, axis):
+                white += back[:, part.rows] @ back[:, part.rows].T
+                correlated += _correlated_products(back[:, part.rows], rho, part.observed.gaps)
             out += drawn[:, 0, None, None] ** 2 * white
             out += drawn[:, 1, None, None] ** 2 * correlated[which]
         return out
@@ -186,9 +182,8 @@ class Whitening:
         several = -(-count // _PER_LAW)
         for axis in range(len(self.posterior)):
             drawn = np.repeat(self._plausible(axis, several, rng), _PER_LAW, axis=0)[:count]
-            for part in self.parts:
-                if part.axis == axis:
-                    raw[:, part.rows] = WhiteAR1().draw(drawn, part.observed.gaps, rng)
+            for part in parts(self.samples, axis):
+                raw[:, part.rows] = WhiteAR1().draw(drawn, part.observed.gaps, rng)
         return np.ascontiguousarray(self(raw).T)
 
 
