@@ -25,6 +25,10 @@ from lcopa_bayes.model.effects.effect import Effect, Ranges, ScatterEffect
 from lcopa_bayes.model.forward import ForwardModel, forward_model
 from lcopa_bayes.model.layout import Layout
 
+_WIDER = 4
+"""Most by which the blocks of a search are wider [-]: draws of a dryer's posterior on blocks four times wider
+are worth 0.96 of as many of its own, on blocks eight times wider 0.2."""
+
 
 @final
 @dataclass(frozen=True, eq=False)
@@ -78,6 +82,15 @@ class Problem:
         problem = replace(self, refinement=self.refinement * factor)
         _, model = problem.simulated(self.study.fit)
         return replace(problem, posterior=replace(self.posterior, model=model))
+
+    @cached_property
+    def rough(self) -> Posterior:
+        """The posterior on blocks up to four times wider, if those in use are narrower than the study's
+        settings make them: to search in, where what is found is weighted by the posterior itself."""
+        wider = max(1, self.refinement // _WIDER)
+        if wider == self.refinement:
+            return self.posterior
+        return replace(self, refinement=wider).refined(1).posterior
 
     @cached_property
     def thrifty(self) -> Problem:

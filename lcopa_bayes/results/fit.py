@@ -182,6 +182,7 @@ def fit(
             quiet=quiet,
             starts=starts,
             optima=optima,
+            rough=problem.rough,
         )
         draws = gather(problem.posterior, run)
         draws = draws.limited(shortfall(run, draws))

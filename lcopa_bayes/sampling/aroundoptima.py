@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.parallel import Workers
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.sampling.coordinates import Chart
+from lcopa_bayes.sampling.coordinates import Chart, charted_density
 from lcopa_bayes.sampling.importance import Effort, ImportancePlan, importance
 from lcopa_bayes.sampling.weighted import Weighted
 
@@ -25,7 +26,7 @@ _PLAN = ImportancePlan(
     (Effort(3_000, 1_000, 6), Effort(4_000, 2_000, 6), Effort(8_000, 3_000, 4)), promising=0.05
 )
 _ATTEMPTS, _STRAY = 2, 3
-"""Attempts, and points that the second one begins at, at most [-]."""
+"""Attempts, and points that the second one begins at, the heaviest that the first does not cover [-]."""
 _SPARSE, _NEGLIGIBLE = 30.0, 0.01
 """Posterior density over that of a proposal from which it does not cover a point, and posterior mass of such
 points that may be missed [-]."""
@@ -34,6 +35,7 @@ points that may be missed [-]."""
 def around_optima(
     posterior: Posterior,
     crew: Workers[Posterior],
+    scouts: Workers[Posterior],
     optima: Sequence[Optimum],
     hunted: tuple[Matrix, Vector, Vector],
     rng: np.random.Generator,
@@ -42,13 +44,14 @@ def around_optima(
 ) -> tuple[bool, Weighted | None]:
     """Draws of a proposal around optima, and whether they will do: not where the proposal does not come
     close to the posterior, nor where it does not cover what points of the whole prior show; none where no
-    optimum has a surrounding inside the prior.
+    optimum has a surrounding inside the prior. It is fitted by `scouts`, whose posterior may differ a little.
 
     `hunted` are coordinates of such points, (points, dimension), log densities there and log weights, whose
     sum estimates the evidence [nat]. A few may be far out in a tail, heavy by chance: a second attempt
     begins there too, and would find a mode.
     """
     chart, (z, density, log_weights) = Chart.of(posterior), hunted
+    weighing, learning = (lambda _, portions, own=own: own.each(_density, portions) for own in (crew, scouts))
     drawn = np.isfinite(log_weights)
     z, density, log_weights = z[drawn], density[drawn], log_weights[drawn]
     y, log_volume = chart.charted(z)
@@ -59,8 +62,9 @@ def around_optima(
             optima,
             rng,
             replace(_PLAN, wanted=wanted),
-            lambda _, portions: crew.each(_density, portions),
+            weighing,
             late,
+            partial(charted_density, posterior, chart, mapped=learning),
         )
         if tried is None:
             return False, None
@@ -68,10 +72,12 @@ def around_optima(
         if not tried.good(wanted):
             break
         log_ratio = density + posterior.table.log_permutations - log_volume - weighted.log_evidence
-        missed = (log_ratio - tried.proposal.log_density(y) > np.log(_SPARSE)) & ~explored
-        if np.exp(log_weights[missed] - weighted.log_evidence).sum() < _NEGLIGIBLE:
+        sparse = (log_ratio - tried.proposal.log_density(y) > np.log(_SPARSE)) & ~explored
+        mass = np.where(sparse, np.exp(log_weights - weighted.log_evidence), 0.0)
+        if mass.sum() < _NEGLIGIBLE:
             return True, weighted
-        if missed.sum() > _STRAY:
+        missed = np.isin(np.arange(mass.size), np.argsort(-mass)[:_STRAY]) & sparse
+        if mass[~missed].sum() > _NEGLIGIBLE:
             break
         explored |= missed
         places = zip(posterior.values(z[missed]), density[missed], strict=True)

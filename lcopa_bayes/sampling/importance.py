@@ -15,17 +15,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from math import ceil
 from typing import final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Index, Matrix, Vector
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.coordinates import Chart, Mapped, charted_density
 from lcopa_bayes.sampling.importanceweights import effective, usable_k
 from lcopa_bayes.sampling.mixture import Mixture
-from lcopa_bayes.sampling.proposal import Seen, around, fitted, split, weighty
+from lcopa_bayes.sampling.proposal import Blend, Product, Proposal, Seen, around, fitted, split, weighty
 from lcopa_bayes.sampling.weighted import Weighted, tail_smoothed
 
 LEAST_EFFICIENCY = 0.4
@@ -33,11 +35,17 @@ LEAST_EFFICIENCY = 0.4
 k = 0.4 at an efficiency of 0.2 while a third of its mass was not covered."""
 _MOST = 12
 """Components beyond which a further attempt takes more draws alone [-]."""
+_JOINT = 0.3
+"""Share of a proposal in which plant and noise are not apart [-]."""
 _SURPLUS = 1.25
 """Effective draws for every centre, tail and share of a mode over those wanted [-]: resampling costs the
 rest."""
-_LIGHT = 0.2
-"""Pareto k at which the proposal is fitted no further, if it is efficient [-]."""
+_CALM, _LONGER, _SPARE = 0.5, 3.0, 1.1
+"""Pareto k up to which a proposal that gave too few draws gives more, how many times as many at most, and
+factor on the number that is estimated to be lacking [-]."""
+_LIGHT, _HEAVY = 0.2, 0.6
+"""Pareto k at which the proposal is fitted no further, if it is efficient, and from which a third attempt has
+little hope [-]."""
 
 
 @final
@@ -68,7 +76,7 @@ class ImportancePlan:
     """Whether a good attempt is close to the posterior."""
     promising: float = 0.0
     """Effective draws per draw of the last proposal that was learned from, below which no further attempt is
-    made [-]."""
+    made [-]; above 0 a third one is made only after one with a Pareto k below `_HEAVY`."""
 
 
 @final
@@ -77,7 +85,7 @@ class Importance:
     """Weighted draws of a posterior around its optima."""
 
     weighted: Weighted
-    proposal: Mixture
+    proposal: Proposal
     """That they are drawn from, in the chart of the posterior."""
     modes: int
     """Optima the proposal started from."""
@@ -100,45 +108,85 @@ def importance(
     plan: ImportancePlan = ImportancePlan(),
     mapped: Mapped = map,
     late: Callable[[], bool] = lambda: False,
+    rough: Callable[[Matrix], Vector] | None = None,
     begin: Mixture | None = None,
 ) -> Importance | None:
     """Importance sampling around given optima, one or more, or from a proposal to `begin` with, in the chart;
-    `mapped` spreads the density over processes. Once it is `late` no further attempt is made. None where no
-    optimum has a surrounding inside the prior.
+    `mapped` spreads the density over processes. Once it is `late` no further attempt is made. The proposal is
+    fitted to a `rough` density of charted coordinates, where there is a cheaper one; its draws are weighted by
+    the posterior itself. None where no optimum has a surrounding inside the prior.
 
     FloatingPointError where the density is NaN.
     """
     chart = Chart.of(posterior)
     chosen = weighty(optima)
-    core = begin or around(posterior, chart, chosen, rng)
-    if core is None:
+    first, groups = begin or around(posterior, chart, chosen, rng), _apart(posterior)
+    if first is None:
         return None
-    proposal, seen = core, Seen()
-    for effort in plan.efforts:
-        if seen.proposals and len(core.means) < _MOST:
-            core = split(core, rng)
+    cores = [first, *(first.marginal(own) for own in groups if len(groups) > 1)]
+    proposal: Proposal = first
+    rough = rough or partial(charted_density, posterior, chart, mapped=mapped)
+    seen = Seen()
+    for number, effort in enumerate(plan.efforts, start=1):
+        if seen.proposals and len(cores[0].means) < _MOST:
+            cores = [split(core, rng) for core in cores]
         worth = np.inf
         for _ in range(effort.rounds):
             y = proposal.draw(effort.learning, rng)
-            seen = seen.joined(proposal, len(y), y, charted_density(posterior, chart, y, mapped))
+            seen = seen.joined(proposal, len(y), y, rough(y))
             log_weights = seen.log_weights()
             if np.isneginf(log_weights).all():
                 break
             own, k = tail_smoothed(seen.last_weights())
             worth = effective(own) / len(y)
-            core, proposal = fitted(core, np.concatenate(seen.points), log_weights)
+            cores, proposal = _learned(cores, groups, np.concatenate(seen.points), log_weights)
             if (k <= _LIGHT and worth > LEAST_EFFICIENCY) or late():
                 break
         last = worth < plan.promising or late()
-        y = proposal.draw(effort.learning if last else effort.draws, rng)
-        density = charted_density(posterior, chart, y, mapped)
-        weighted = _weighted(posterior, chart, y, density, density - proposal.log_density(y))
+        y, density = np.empty((0, posterior.dimension)), np.empty(0)
+        count = effort.learning if last else effort.draws
+        while count:
+            more = proposal.draw(count, rng)
+            y = np.concatenate([y, more])
+            density = np.append(density, charted_density(posterior, chart, more, mapped))
+            weighted = _weighted(posterior, chart, y, density, density - proposal.log_density(y))
+            count = 0 if last else _lacking(weighted, plan.wanted, _LONGER * effort.draws)
         spent = sum(map(len, seen.points)) + len(y)
         result = Importance(weighted, proposal, len(chosen), spent)
+        last |= number == 2 and plan.promising > 0 and weighted.pareto_k > _HEAVY
         if last or result.good(plan.wanted, efficient=plan.efficient):
             break
         seen = seen.joined(proposal, len(y), y, density)
     return result
+
+
+def _lacking(weighted: Weighted, wanted: float, most: float) -> int:
+    """Further draws of a proposal that is good and has given too few: none where it would be `most`."""
+    if weighted.pareto_k > _CALM or weighted.ess < LEAST_EFFICIENCY * weighted.count:
+        return 0
+    needed = _SURPLUS * wanted / weighted.smallest_ess
+    return ceil(_SPARE * (needed - 1.0) * weighted.count) if 1.0 < needed < most / weighted.count else 0
+
+
+def _learned(
+    cores: Sequence[Mixture], groups: Sequence[Index], y: Matrix, log_weights: Vector
+) -> tuple[list[Mixture], Proposal]:
+    """Mixtures of all coordinates, and of each group where there are several, fitted further; and the
+    proposal they make: groups hardly depend on each other, and jointly they need as many components as there
+    are pairs."""
+    joint, whole = fitted(cores[0], y, log_weights)
+    pairs = [fitted(core, y[:, own], log_weights) for core, own in zip(cores[1:], groups, strict=False)]
+    if not pairs:
+        return [joint], whole
+    product = Product(tuple(groups), tuple(proposal for _, proposal in pairs))
+    return [joint, *(core for core, _ in pairs)], Blend(product, whole, _JOINT)
+
+
+def _apart(posterior: Posterior) -> tuple[Index, ...]:
+    """Sampled coordinates of the plant, and of the noise of each axis."""
+    rows = [posterior.table.rows[k] for k in posterior.sampled]
+    keys = [row.place.first if row.noise else -1 for row in rows]
+    return tuple(np.flatnonzero([key == one for key in keys]) for one in dict.fromkeys(keys))
 
 
 def _weighted(posterior: Posterior, chart: Chart, y: Matrix, charted: Vector, raw: Vector) -> Weighted:

@@ -120,8 +120,9 @@ class Search:
     """Points, proposals and weights of a search; deterministic given its arguments and what it is asked.
 
     `bar` counts points and names what is being done; `optima` are least-squares optima to begin with, by
-    default those of a few searches. Once no time is `left` [s], or less than half of what the next round
-    takes, a search ends with the draws it has.
+    default those of a few searches. Where the posterior stands for an `exact` one that hardly differs, draws
+    are those of the latter, and one round decides whether there are any. Once no time is `left` [s], or less
+    than half of what the next round takes, a search ends with the draws it has.
     """
 
     def __init__(
@@ -132,8 +133,9 @@ class Search:
         bar: Progress,
         optima: Sequence[Optimum] = (),
         left: Callable[[], float] = lambda: inf,
+        exact: tuple[Posterior, Workers[Posterior]] | None = None,
     ) -> None:
-        self.posterior = posterior
+        self.posterior, self._exact = posterior, exact
         self._left, self._pace = left, 0.0
         self.unfinished = False
         """Whether time ended it."""
@@ -146,12 +148,13 @@ class Search:
         self._points: list[_Point] = []
         self._log_weights: Vector = np.empty(0)
 
-    def run(self, wanted: float) -> Weighted | None:
+    def run(self, wanted: float, *, direct: bool = True) -> Weighted | None:
         """Weighted draws equivalent to `wanted` independent ones for the centre, the tails and the shares of
         modes of every sampled parameter, from a search of the whole prior; None where no number of draws in
-        reach gives them: ensembles may then start from the `population`."""
+        reach gives them: ensembles may then start from the `population`. Not of optima alone unless
+        `direct`."""
         first, starts, optima = first_proposal(self.outer, self._rng, self._done, self._optima)
-        return self._improved(first, starts, wanted, optima)
+        return self._improved(first, starts, wanted, optima if direct else ())
 
     def around(self, z: Matrix, wanted: float) -> Weighted | None:
         """The same from points (n, dimension) of the sampled coordinates where ensembles have been."""
@@ -194,7 +197,7 @@ class Search:
                 return None
             if number == 0 and optima:
                 direct = self._direct(optima, seen, wanted)
-                if direct is not None:
+                if direct is not None or self._exact is not None:
                     return direct
             if number % _WALKING == _WALKING - 1:
                 walked = self._walked()
@@ -214,8 +217,9 @@ class Search:
         (point,) = self._points
         raw = seen.log_weights() - np.log(sum(seen.counts))
         hunted = point.coordinates, point.log_density, raw
+        posterior, crew = self._exact or (self.posterior, self._crew)
         enough, weighted = around_optima(
-            self.posterior, self._crew, optima, hunted, self._rng, wanted, self._late
+            posterior, crew, self._crew, optima, hunted, self._rng, wanted, self._late
         )
         self.unfinished = not enough and self._late()
         if weighted is None or enough:

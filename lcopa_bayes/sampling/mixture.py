@@ -76,6 +76,12 @@ class Mixture:
         """Of some columns alone, those of a diagonal mixture."""
         return Mixture(self.weights, self.means[:, columns], self.factors[:, columns[:, None], columns])
 
+    def marginal(self, columns: Index) -> Mixture:
+        """Of some columns alone."""
+        rows = self.factors[:, columns]
+        factors = np.linalg.cholesky(rows @ rows.swapaxes(1, 2)).astype(float)
+        return Mixture(self.weights, self.means[:, columns], factors)
+
     @property
     def dimension(self) -> int:
         """Number of coordinates."""

@@ -165,6 +165,7 @@ def sample(
     quiet: bool = True,
     starts: Matrix | None = None,
     optima: Sequence[Optimum] = (),
+    rough: Posterior | None = None,
 ) -> Run:
     """Sample a posterior, as the plan allows by importance draws from a search over orders, delays and noise
     (`marginal`). Where their weights do not converge, rounds of emcee go on from the points of the search;
@@ -177,7 +178,7 @@ def sample(
     rows), are modes known from elsewhere, which moves propose too (`knownmodes`); InputError when none lies
     inside the prior. With a budget of `plan.seconds` they depend on the speed of the machine too, and
     sampling goes on, resumed, for as long again. `optima` are least-squares optima that a search begins with,
-    by default its own.
+    by default its own; it tries `rough` first, a cheaper posterior that hardly differs.
     """
     begin = monotonic()
 
@@ -202,8 +203,14 @@ def sample(
         seeds = np.random.SeedSequence(plan.seed).spawn(plan.ensembles)
         if not ensembles and searched and known is None:
             with _points(quiet) as bar:
-                search = Search(posterior, plan.seed, crew, bar, optima, left)
-                weighted = search.run(wanted)
+                weighted, scouted = None, rough is not None and rough is not posterior
+                if rough is not None and scouted:
+                    with workers(rough, jobs=jobs) as scouts:
+                        search = Search(rough, plan.seed, scouts, bar, optima, left, (posterior, crew))
+                        weighted = search.run(wanted)
+                if weighted is None:
+                    search = Search(posterior, plan.seed, crew, bar, optima, left)
+                    weighted = search.run(wanted, direct=not scouted)
             if weighted is not None:
                 stopped = monotonic() - begin if search.unfinished else None
                 if stopped is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from small import Toy, problem, record, same_quantiles
 
 from lcopa_bayes.inference.optimum import Optimum, find_optima
 from lcopa_bayes.results.fit import plan_of
+from lcopa_bayes.sampling.coordinates import Chart, charted_density
 from lcopa_bayes.sampling.draws import gather, weighted_draws
 from lcopa_bayes.sampling.evidence import evidence
 from lcopa_bayes.sampling.importance import (
@@ -68,6 +70,34 @@ def test_a_gaussian_has_its_moments_and_its_evidence(rng, start):
     assert_allclose(covariance, exact, atol=6 * np.sqrt(np.diag(exact).max() / found.weighted.ess), rtol=0.15)
     marginal = stats.multivariate_normal(np.zeros(3), likelihood + 100 * np.eye(3)).logpdf(centre)
     assert abs(found.weighted.log_evidence - marginal) < 4 * found.weighted.log_evidence_sd < 0.1
+
+
+def normal_toy(centre: float) -> Toy:
+    """A normal likelihood of standard deviation 0.5 about a point of two dimensions."""
+    return Toy(lambda z: stats.norm(centre, 0.5).logpdf(z).sum(axis=1), {"a": WIDE, "b": WIDE})
+
+
+def test_a_proposal_learned_from_a_rough_density_gives_draws_of_the_posterior(rng):
+    """One that is off by half a standard deviation: the moments are not."""
+    toy, off = normal_toy(1.0), normal_toy(1.25)
+    rough = partial(charted_density, off, Chart.of(toy))
+    found = importance(toy, [optimum([1.0, 1.0], 0.5)], rng, rough=rough)
+    mean, error, _ = moments(found)
+    assert found.good(400)
+    assert np.abs((mean - 100 / 100.25) / error).max() < 4
+    assert (np.abs(mean - 125 / 100.25) > 8 * error).all()
+    evidence_there = 2 * stats.norm(0.0, np.sqrt(100.25)).logpdf(1.0)
+    assert abs(found.weighted.log_evidence - evidence_there) < 4 * found.weighted.log_evidence_sd < 0.1
+
+
+def test_a_good_proposal_gives_as_many_draws_as_are_wanted(rng):
+    """Also where an attempt asks for fewer; one that is not good gives no more."""
+    plan = ImportancePlan((Effort(500, 1_000, 6),))
+    found = importance(normal_toy(1.0), [optimum([1.0, 1.0], 0.5)], rng, plan)
+    assert found.good(400)
+    assert 500 < found.weighted.count <= 1_500
+    far = importance(two_modes(7.0), [optimum([-3.5, 0], 1.0)], rng, ImportancePlan((Effort(300, 1, 0),)))
+    assert far.weighted.count == 300
 
 
 def test_a_bent_posterior_agrees_with_quadrature(rng):

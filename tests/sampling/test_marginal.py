@@ -122,6 +122,7 @@ def search_of(log_density, seed: int, groups=BOTH) -> Search:
     search = Search.__new__(Search)
     search.posterior, search._rng = toy, np.random.default_rng(seed)
     search._points, search._bar, search._pace = [], Progress(quiet=True), 0.0
+    search._exact = None
     search._log_weights = np.empty(0)
     search._seeds, search._left = np.random.SeedSequence(seed), lambda: np.inf
     search._crew = SimpleNamespace(each=lambda task, inputs: [task(toy, one) for one in inputs])
@@ -202,6 +203,30 @@ def test_an_easy_posterior_is_drawn_from_directly_and_a_mode_elsewhere_is_not_mi
     assert share > 0.0 or len(search._points) == 1
     assert abs(weighted.log_evidence) < 4 * weighted.log_evidence_sd
     assert abs(np.exp(weighted.log_weights) @ (weighted.coordinates[:, 0] > 3) - share) < 0.3 * share + 1e-6
+
+
+def test_a_search_of_a_rough_posterior_gives_draws_of_the_exact_one():
+    """Whose mode is a third of a standard deviation away, or six: draws that count teach the proposal too."""
+
+    def toy(centre):
+        return Toy(lambda z: stats.norm(centre, 0.5).logpdf(z).sum(axis=1), {"a": WIDE, "b": WIDE})
+
+    def crew(own):
+        return SimpleNamespace(each=lambda task, inputs: [task(own, one) for one in inputs])
+
+    first = whole(Mixture(np.ones(1), np.zeros((1, 2)), 5.0 * np.eye(2)[None]))
+    for shift in (0.17, 3.0):
+        exact, rough = toy(shift), toy(0.0)
+        search = search_of(rough.log_density, 3)
+        search.posterior, search._crew, search._exact = rough, crew(rough), (exact, crew(exact))
+        optimum = Optimum(np.zeros(2), 0.25 * np.eye(2), float(rough.log_density(np.zeros((1, 2)))[0]))
+        weighted = search._improved(first, np.empty((0, 2)), 400, [optimum])
+        assert len(search._points) == 1
+        assert weighted is not None
+        weights = np.exp(weighted.log_weights)
+        errors = np.sqrt(weights**2 @ (weighted.coordinates - shift) ** 2)
+        assert (np.abs(weights @ weighted.coordinates - 100 / 100.25 * shift) < 4 * errors).all()
+        assert (errors < 0.028).all()
 
 
 def test_a_search_ends_with_what_it_has_when_its_time_is_over():

@@ -39,6 +39,16 @@ def test_the_density_is_that_of_scipy(three, rng):
     assert_allclose(three.log_shares(points), parts - logsumexp(parts, axis=0), atol=1e-9)
 
 
+def test_the_marginal_of_some_columns_has_their_means_and_scales(three, rng):
+    columns, points = np.array([2, 0]), rng.normal(scale=5.0, size=(50, 2))
+    own = [
+        stats.multivariate_t(mean[columns], (factor @ factor.T)[np.ix_(columns, columns)], df=FREEDOM)
+        for mean, factor in zip(three.means, three.factors, strict=True)
+    ]
+    exact = logsumexp([one.logpdf(points) for one in own], axis=0, b=three.weights[:, None])
+    assert_allclose(three.marginal(columns).log_density(points), exact, rtol=1e-9)
+
+
 def test_the_density_is_normalised():
     one = Mixture(np.array([0.3, 0.7]), np.array([[-2.0], [1.0]]), np.array([[[0.5]], [[1.5]]]))
     total, _ = quad(lambda x: float(np.exp(one.log_density(np.array([[x]]))[0])), -np.inf, np.inf)
