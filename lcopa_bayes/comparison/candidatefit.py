@@ -1,7 +1,4 @@
-"""One candidate fitted and scored, as plain values that its folder keeps.
-
-Is this order an integer? Savage-Dickey ratios of the posterior's free orders.
-"""
+"""One candidate fitted and scored, as plain values that its folder keeps."""
 
 from __future__ import annotations
 
@@ -9,142 +6,36 @@ import hashlib
 import json
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from math import log, sqrt
+from dataclasses import dataclass, replace
+from math import log
 from pathlib import Path
-from typing import Any, Literal, final
+from typing import Any, final
 
 import numpy as np
 import pandas as pd
+from scipy.special import logsumexp
 from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.comparison.averaging import quantiles
 from lcopa_bayes.comparison.candidates import Candidate
+from lcopa_bayes.comparison.integerorder import integer_orders
 from lcopa_bayes.comparison.predictivedensity import Predicted, predictions
 from lcopa_bayes.comparison.priorwidth import widths
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.core.estimate import Estimate, attributes, plain
+from lcopa_bayes.core.estimate import attributes, plain
 from lcopa_bayes.core.files import save_json, save_table, writable_folder
 from lcopa_bayes.data.settings import SamplerSettings
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.likelihood import Landscape, Peak
 from lcopa_bayes.results.alternatives import alternatives_of
 from lcopa_bayes.results.bands import POINTWISE
+from lcopa_bayes.results.discretisation import optima_of
 from lcopa_bayes.results.fit import Fit, fit, plan_of, whole
 from lcopa_bayes.results.runfolder import digest, fingerprint, settings_of
 from lcopa_bayes.results.summary import residual_rms, scores
-from lcopa_bayes.sampling.convergence import Grade
-
-DECISIVE = 3.0
-"""Bayes factor from which it counts as more than worth a bare mention [-] (Jeffreys 1961, App. B)."""
-_WIDEST = 0.1
-"""Widest distance from the integer that counts as at it [-]: no record tells the two apart."""
-_SHARE = 0.25
-"""Half width of the window in posterior standard deviations [-]: 3 of them off, the mean density in it is
-8 % above that at the integer."""
-_PRIOR_NARROWEST = 0.005
-"""Narrowest window in which prior draws are counted [-]: no prior of an order varies within it."""
-_FEWEST = 10.0
-"""Effective draws at the integer below which the tail is extrapolated [-]."""
-_PRIOR_DRAWS = 200_000
-
-Answer = Literal["integer", "not an integer", "undecided"]
-Method = Literal["draws at the integer", "normal tail", "undefined"]
-
-
-@final
-@dataclass(frozen=True)
-class IntegerOrder:
-    """What the draws say of one order."""
-
-    parameter: str
-    nearest: int
-    """Integer next to the median, 1 or 2."""
-    log_bayes_factor: float
-    """Of the integer against a free order [nat]; above 0 favours the integer."""
-    log_sd: float
-    """Its Monte Carlo standard error [nat]."""
-    method: Method
-    window: float
-    """Distance from the integer within which draws are counted [-]."""
-    estimate: Estimate
-
-    @property
-    def bayes_factor(self) -> float:
-        """Of the integer against a free order [-]."""
-        return float(np.exp(self.log_bayes_factor))
-
-    @property
-    def answer(self) -> Answer:
-        """By two standard errors about a Bayes factor of 3, or of a third."""
-        low, high = (self.log_bayes_factor + side * 2 * self.log_sd for side in (-1, 1))
-        if self.estimate.grade == "unusable" or np.isnan(low):
-            return "undecided"
-        return (
-            "integer" if low > log(DECISIVE) else "not an integer" if high < -log(DECISIVE) else "undecided"
-        )
-
-    def as_json(self) -> dict[str, Any]:
-        """Plain values."""
-        return plain(
-            {key: value for key, value in asdict(self).items() if key != "estimate"}
-            | {
-                "bayes_factor": self.bayes_factor,
-                "answer": self.answer,
-                "grade": self.estimate.grade,
-                "estimate": self.estimate.as_json(),
-            }
-        )
-
-
-def integer_orders(fit: Fit) -> tuple[IntegerOrder, ...]:
-    """Every free order of a fit."""
-    table, rng = fit.draws.table, np.random.default_rng([fit.run.plan.seed, 8])
-    free = [k for k, row in enumerate(table.rows) if row.kind == "order" and row.free]
-    if not free:
-        return ()
-    prior = table.draw(_PRIOR_DRAWS, rng)
-    estimates = {one.name: one for one in fit.draws.estimates()}
-    return tuple(savage_dickey(fit.draws.flat[:, k], prior[:, k], estimates[table.names[k]]) for k in free)
-
-
-def savage_dickey(posterior: Vector, prior: Vector, estimate: Estimate) -> IntegerOrder:
-    """Ratio of posterior to prior density at the integer nearest to the median.
-
-    ``B = p(order | y) / p(order)`` there (Dickey 1971, Ann. Math. Statist. 42). Densities are shares of
-    draws within a window per width of the window: a quarter of a posterior standard deviation, 0.1 at most,
-    for the posterior, and 0.005 at least for the prior. Where fewer than ten effective draws lie in it, the
-    posterior density is that of a normal distribution of the draws' mean and standard deviation: good
-    enough to say that the integer lies far out, and its error grows with the distance as that of both
-    moments does. `prior` draws are independent; those of the posterior are worth the effective sample size
-    of `estimate`. Draws that do not vary leave the ratio undefined.
-    """
-    nearest = max(1, round(float(np.median(posterior))))
-    mean, sd, ess = float(posterior.mean()), float(posterior.std()), max(float(estimate.ess), 2.0)
-    window = min(_SHARE * sd, _WIDEST)
-    wide = max(window, _PRIOR_NARROWEST)
-    after = float(np.mean(np.abs(posterior - nearest) <= window))
-    before = float(np.mean(np.abs(prior - nearest) <= wide))
-    if before == 0.0 or sd == 0.0:
-        return IntegerOrder(estimate.name, nearest, np.nan, np.nan, "undefined", window, estimate)
-    prior_error = (1 - before) / (before * prior.size)
-    log_prior = log(before / _width(nearest, wide))
-    if after * ess >= _FEWEST:
-        error = sqrt((1 - after) / (after * ess) + prior_error)
-        value = log(after / _width(nearest, window)) - log_prior
-        return IntegerOrder(estimate.name, nearest, value, error, "draws at the integer", window, estimate)
-    beyond = (nearest - mean) / sd
-    density = -0.5 * beyond**2 - log(sd * sqrt(2 * np.pi))
-    error = sqrt(beyond**2 / ess + (beyond**2 - 1) ** 2 / (2 * ess) + prior_error)
-    return IntegerOrder(estimate.name, nearest, density - log_prior, error, "normal tail", window, estimate)
-
-
-def _width(nearest: int, window: float) -> float:
-    """Width of a window about an integer, of which nothing lies beyond an order of 2 [-]."""
-    return min(nearest + window, 2.0) - (nearest - window)
-
+from lcopa_bayes.sampling.convergence import Grade, Limitation
 
 _CLIMBED = 4
 """Draws the maximum is sought from."""
@@ -213,6 +104,11 @@ _STARTS = 64
 """Draws kept as starts of richer models [-]."""
 _VERSION = 5
 """Raised when what a card holds changes."""
+REJECTED = 100.0
+"""Log evidence that the optima of a candidate may lack of another's before it is sampled around these alone
+[nat]: Laplace's approximation errs by a few."""
+_REJECTED_ESS = 100
+"""Effective draws of such a candidate: its evidence is then known to a tenth of a nat [-]."""
 
 
 @final
@@ -227,6 +123,18 @@ class Contender:
     folder: Path | None
     quick: bool
     resume: bool
+    rejected: bool = False
+    """Whether its optima lie so far below another candidate's that no more than these is sampled."""
+
+    @property
+    def rough(self) -> float | None:
+        """Log evidence before any sampling: that of the finished fit, else by Laplace's approximation at the
+        optima [nat]; None with effects, whose sampling hardly takes longer."""
+        if self.candidate.fit is not None:
+            value: float | None = self.candidate.fit.to_json()["log_evidence"]
+            return value
+        problem = problem_of(self.candidate.study)
+        return None if problem.posterior.simulation is not None else laplace(problem)
 
     @property
     def fingerprint(self) -> str:
@@ -236,6 +144,7 @@ class Contender:
             fingerprint(study, plan_of(problem_of(study), quick=self.quick)),
             self.candidate.improper,
             _VERSION,
+            self.rejected,
             "" if self.candidate.fit is None else self.candidate.fit.draws.sha256,
             [digest(record) for record in study.held_out],
         )
@@ -273,6 +182,11 @@ class Contender:
         usable."""
         if self.candidate.fit is not None:
             return whole(self.candidate.fit)
+        if self.rejected:
+            sampler = replace(self.candidate.study.sampler, target_ess=_REJECTED_ESS)
+            study = replace(self.candidate.study, sampler=sampler)
+            fitted = fit(study, quick=self.quick, around_optima=True)
+            return replace(fitted, draws=fitted.draws.limited((_ROUGHLY,)))
         fitted = self._fitted(self.candidate.study, self.folder)
         if fitted.draws.grade.level == "unusable" and self.patient != self.candidate.study.sampler:
             longer = replace(self.candidate.study, sampler=self.patient)
@@ -305,6 +219,24 @@ class Contender:
 
     def _fitted(self, study: Study, folder: Path | None, starts: Matrix | None = None) -> Fit:
         return fit(study, folder=folder, resume=self.resume, quick=self.quick, quiet=True, starts=starts)
+
+
+_ROUGHLY = Limitation(
+    "tentative",
+    f"its optima lie more than {REJECTED:.0f} nat of log evidence below another candidate, so that it was "
+    f"sampled around them alone, {_REJECTED_ESS} effective draws or more: other modes were not sought",
+    "fit it by itself and compare its run folder",
+)
+
+
+def laplace(problem: Problem) -> float:
+    """Log evidence by Laplace's approximation at the optima of a least-squares search [nat]; -inf without
+    any."""
+    levels = [
+        one.log_density + 0.5 * float(np.linalg.slogdet(2 * np.pi * one.covariance)[1])
+        for one in optima_of(problem)
+    ]
+    return float(logsumexp(levels)) + problem.posterior.table.log_permutations if levels else -np.inf
 
 
 def contender(candidate: Candidate, folder: Path | None, *, quick: bool, resume: bool) -> Contender:

@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.special import logsumexp
+from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.comparison.averaging import averaged, stretches, total_sd
-from lcopa_bayes.comparison.candidatefit import Contender, contender
+from lcopa_bayes.comparison.candidatefit import REJECTED, Contender, contender
 from lcopa_bayes.comparison.candidates import Candidate
 from lcopa_bayes.comparison.containment import Check
 from lcopa_bayes.comparison.decision import decided
@@ -156,8 +158,9 @@ def compare(
 ) -> dict[str, Any]:
     """Fit every candidate, score it, and say which is warranted; plain values as `compare.json` holds them.
 
-    A candidate that contains another is held against it, and sampled again where it has missed a mode that
-    the smaller one has found (`containment`).
+    A candidate whose optima lie far below another's evidence is sampled around these alone
+    (`candidatefit.REJECTED`). A candidate that contains another is held against it, and sampled again where
+    it has missed a mode that the smaller one has found (`containment`).
 
     Candidates are fitted in `jobs` processes; what they give is the same. With `folder` each has a folder
     of its own under `candidates/`, and `resume` goes on from what is there. InputError for fewer than two
@@ -173,9 +176,21 @@ def compare(
         tasks.append(contender(one, own, quick=quick, resume=resume))
     cards: dict[str, Mapping[str, Any]] = {}
     with Progress(total=len(tasks), unit="candidate", quiet=quiet, desc="comparing") as bar:
-        for values in _performed(tasks, jobs):
-            cards[str(values["name"])] = values
-            bar.update()
+        with workers(None, jobs=min(jobs, len(tasks))) as crew:
+            levels = list(crew.each(_rough, tasks))
+        for known in (True, False):  # with effects first: their evidence tells whom to sample how
+            chosen = [k for k, level in enumerate(levels) if (level is None) == known]
+            if not chosen:
+                continue
+            reached = [one["log_evidence"] for one in cards.values()]
+            best = max([level for level in (*levels, *reached) if level is not None], default=-np.inf)
+            for k in chosen:
+                level = levels[k]
+                behind = level is not None and level < best - REJECTED and tasks[k].candidate.fit is None
+                tasks[k] = replace(tasks[k], rejected=behind)
+            for values in _performed([tasks[k] for k in chosen], jobs):
+                cards[str(values["name"])] = values
+                bar.update()
         bar.set_description("holding against contained models")
         for wave in _by_size(tasks, cards):
             smaller = [task for task in tasks if _size(cards, task) < _size(cards, wave[0])]
@@ -248,6 +263,11 @@ def _performed(tasks: Sequence[Contender | Check], jobs: int) -> Iterator[Mappin
     ranked = sorted(tasks, key=lambda task: -problem_of(task.candidate.study).posterior.dimension)
     with workers(None, jobs=min(jobs, len(tasks))) as crew:
         yield from crew.finished(_perform, ranked)
+
+
+def _rough(_: None, task: Contender) -> float | None:
+    with threadpool_limits(1):
+        return task.rough
 
 
 def _perform(_: None, task: Contender | Check) -> Mapping[str, Any]:

@@ -34,7 +34,9 @@ from lcopa_bayes.sampling.importanceweights import FEWEST_EFFECTIVE, effective, 
 from lcopa_bayes.sampling.weighted import resampled
 
 _DRAWS, _EFFECT_DRAWS = 600, 200
-"""Draws behind a predictive density, and with effects, which take a simulation each."""
+"""Draws behind a predictive density, and with effects, which take a simulation each ..."""
+_PER_WANTED = 1.5
+"""... and over the effective draws that the fit was asked for, at most [-]."""
 _BEYOND = 3.0
 """Standard errors by which a density of what was left out may exceed that of what was fitted [-]."""
 
@@ -113,8 +115,8 @@ def predictions(fit: Fit, *, held_out_only: bool = False) -> tuple[Predicted, ..
     """
     posterior, study = fit.near, fit.study
     simulated = posterior.simulation is not None
-    count = _EFFECT_DRAWS if simulated else _DRAWS
-    tried = count if simulated and posterior.surrogate is None else _DRAWS
+    count = min(_EFFECT_DRAWS if simulated else _DRAWS, int(_PER_WANTED * fit.draws.target_ess))
+    tried = count if posterior.surrogate is None else _DRAWS
     positions = fit.run.kept()[0][:, :, -1]
     out: list[Predicted] = []
     source = posterior
@@ -136,9 +138,10 @@ def predictions(fit: Fit, *, held_out_only: bool = False) -> tuple[Predicted, ..
             # gains and levels are drawn anew: those of the draws have seen what is to be predicted
             values = target.complete(posterior.coordinates(values), rng)
             worth = effective(weights)
-            if simulated:  # each density takes a simulation
+            fewer = len(values) > 2 * count  # more weights than densities are worth
+            if fewer:
                 values = values[resampled(weights, count, rng)]
-            own = None if simulated else weights
+            own = None if fewer else weights
             result = scored(values, own, "importance weights", k=k, ess=worth, known=target)
         else:
             seed = fit.run.plan.seed + 7_000 + len(out)

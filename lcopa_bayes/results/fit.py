@@ -142,12 +142,14 @@ def fit(
     quiet: bool = True,
     starts: Matrix | None = None,
     look: FirstLook | None = None,
+    around_optima: bool = False,
 ) -> Fit:
     """Sample the posterior of a study and derive what it predicts.
 
     `starts`, table values (starts, rows), are modes known from elsewhere that sampling proposes too. A plant
-    with effects is sampled by importance around its optima (`weightedrun`) where the method is "auto" and its
-    weights hold. A first `look` of the study spares the search for optima, and changes no number.
+    with effects where the method is "auto", and any `around_optima`, is sampled by importance around its
+    optima (`weightedrun`), which searches for no other modes, where its weights hold. A first `look` of the
+    study spares the search for optima, and changes no number.
 
     With `folder`, sampling is stored there in `chain.h5` and `resume` goes on from it; the result is
     the same as without interruption. With `cross_check` the posterior is also sampled by nested sampling,
@@ -165,7 +167,7 @@ def fit(
     if folder:
         writable_folder(folder)
     plan, weighted_result, optima = plan_of(problem, quick=quick), None, tuple[Optimum, ...]()
-    if problem.posterior.simulation is not None and plan.method == "auto":
+    if around_optima or (problem.posterior.simulation is not None and plan.method == "auto"):
         problem, weighted_result = weighted_fit(problem, plan, jobs=jobs, quick=quick)
     else:
         problem, optima = resolved_optima(problem, look.optima if look else optima_of(problem))

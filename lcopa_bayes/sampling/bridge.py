@@ -1,11 +1,11 @@
 """Draws transferred from one posterior to another of the same coordinates, without starting from the prior.
 
-A mixture fitted to draws of one posterior proposes draws of the other, which are weighted (`importance`).
-Where their weights do not converge populations follow ``source^(1-b) target^b`` while b rises from 0 to 1,
-resampled and moved at every rise (Del Moral, Doucet and Jasra 2006, J. R. Statist. Soc. B 68), and then
-sample the target. This refits a model to fewer samples, or under other priors, at a fraction of the cost.
-Modes that no walker of the source was in, such as one excluded by the omitted data, are reached by tails of
-the mixture and by moves alone.
+A mixture fitted to draws of one posterior proposes draws of the other, which are weighted and improve it
+(`importance`). Where their weights do not converge populations follow
+``source^(1-b) target^b`` while b rises from 0 to 1, resampled and moved at every rise (Del Moral, Doucet and
+Jasra 2006, J. R. Statist. Soc. B 68), and then sample the target. This refits a model to fewer samples, or
+under other priors, at a fraction of the cost. Modes that no walker of the source was in, such as one excluded
+by the omitted data, are reached by tails of the mixture and by moves alone.
 """
 
 from __future__ import annotations
@@ -28,8 +28,9 @@ from lcopa_bayes.sampling.tempering import largest_rise, survivors
 from lcopa_bayes.sampling.weighted import BATCHES, CHAIN
 from lcopa_bayes.sampling.weightedrun import usable
 
-_PLAN = ImportancePlan((Effort(3_000, 1_000, 4),))
-"""Effort of importance sampling."""
+_PLAN = ImportancePlan((Effort(1_500, 500, 4), Effort(3_000, 1_000, 3)), wanted=20.0, efficient=False)
+"""Efforts of importance sampling, the second where averages over weights do not converge, or some parameter's
+tail has hardly a draw; draws of the source show what a proposal near them would miss."""
 _DELIVERED = 400
 """Draws of each of its batches that are delivered."""
 _MOVES = 15

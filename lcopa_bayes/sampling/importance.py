@@ -113,8 +113,8 @@ def importance(
 ) -> Importance | None:
     """Importance sampling around given optima, one or more, or from a proposal to `begin` with, in the chart;
     `mapped` spreads the density over processes. Once it is `late` no further attempt is made. The proposal is
-    fitted to a `rough` density of charted coordinates, where there is a cheaper one; its draws are weighted by
-    the posterior itself. None where no optimum has a surrounding inside the prior.
+    fitted to a `rough` density of charted coordinates, where there is a cheaper one; its draws are weighted
+    by the posterior itself. None where no optimum has a surrounding inside the prior.
 
     FloatingPointError where the density is NaN.
     """

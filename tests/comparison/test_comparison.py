@@ -13,9 +13,9 @@ from scipy.stats import norm
 from small import Toy, problem, record
 
 from lcopa_bayes.comparison.averaging import stretches, total_sd
-from lcopa_bayes.comparison.candidatefit import savage_dickey
 from lcopa_bayes.comparison.compare import judged, probabilities, stacking_weights
 from lcopa_bayes.comparison.decision import decided
+from lcopa_bayes.comparison.integerorder import savage_dickey
 from lcopa_bayes.comparison.priorwidth import _scaled
 from lcopa_bayes.comparison.sequentialdensity import CUTS, parts_of, predicted, without
 from lcopa_bayes.core.estimate import Estimate

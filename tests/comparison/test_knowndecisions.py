@@ -16,9 +16,9 @@ from test_comparison import card, outcome, prior_widths
 
 from lcopa_bayes.bench.device import Device
 from lcopa_bayes.comparison.averaging import Gain, by_prediction
-from lcopa_bayes.comparison.candidatefit import DECISIVE, savage_dickey
 from lcopa_bayes.comparison.candidates import candidates_of
 from lcopa_bayes.comparison.compare import compare
+from lcopa_bayes.comparison.integerorder import DECISIVE, savage_dickey
 from lcopa_bayes.comparison.sequentialdensity import log_densities
 from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.inference.noise import AR1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from scipy import fft
@@ -103,11 +103,11 @@ def marched(kernel: Matrix, force: Force, scale: Matrix, plants: int) -> tuple[A
     block, each one equation. Accuracy: 1e-12 of the scale.
     """
     rows, n = kernel.shape
-    length, window = fft.next_fast_len(2 * n, real=True), min(n, _STRETCH)
-    spectrum = fft.rfft(kernel, length)
+    window = min(n, _STRETCH)
     lags = np.subtract.outer(np.arange(window), np.arange(window))
     operator = np.where(lags >= 0, kernel[:, np.maximum(lags, 0)], 0.0)
     y, history, lost = np.zeros((rows, n + 2)), np.zeros((rows, n)), np.zeros(rows, dtype=bool)
+    pushes, spectra = np.zeros((rows, n)), dict[int, Any]()
     for first in range(0, n, window):
         own = slice(first, min(first + window, n))
         size = own.stop - first
@@ -120,8 +120,17 @@ def marched(kernel: Matrix, force: Force, scale: Matrix, plants: int) -> tuple[A
         with np.errstate(invalid="ignore"):
             lost |= ~(np.abs(now) < RUNAWAY * scale).all(axis=1)
         y[:, first + 2 : own.stop + 2] = np.where(lost[:, None], 0.0, now)
-        product = spectrum * fft.rfft(np.where(lost[:, None], 0.0, v), length)
-        history[:, own.stop :] += fft.irfft(product, length)[:, size : n - first]
+        pushes[:, own] = np.where(lost[:, None], 0.0, v)
+        # as many stretches ahead as divide those that are done: each pair of stretches meets once, in one of
+        # few long transforms (van der Hoeven 2002, J. Symb. Comput. 34)
+        done = own.stop // window
+        reach = window * (done & -done)
+        if own.stop < n:
+            if reach not in spectra:
+                spectra[reach] = fft.rfft(kernel[:, : 2 * reach], 2 * reach)
+            acted = spectra[reach] * fft.rfft(pushes[:, own.stop - reach : own.stop], 2 * reach)
+            ahead = history[:, own.stop : own.stop + reach]
+            ahead += fft.irfft(acted, 2 * reach)[:, reach : reach + ahead.shape[1]]
     away: Flags = np.asarray(lost.reshape(plants, -1).any(axis=1))
     return y[:, 2:].reshape(plants, -1, n), away
 
