@@ -45,6 +45,7 @@ from lcopa_bayes.sampling.weighted import Weighted
 from lcopa_bayes.sampling.weightedrun import QUICK_STARTS, STARTS, weighted_run
 
 if TYPE_CHECKING:
+    from lcopa_bayes.results.alternatives import Alternatives
     from lcopa_bayes.results.integerrival import Rival
     from lcopa_bayes.results.structure import Structure
 
@@ -81,6 +82,8 @@ class Fit(Predictive):
     """The same study with integer orders, and how it predicts; None when none was fitted."""
     structure: Structure | None = None
     """What other structures the records allow; None where the study states its terms."""
+    alternatives: Alternatives | None = None
+    """Sums of lags that follow the records too, and the numbers over both; None likewise."""
 
     @property
     def near(self) -> Posterior:

@@ -39,9 +39,10 @@ def around_optima(
     rng: np.random.Generator,
     wanted: float,
     late: Callable[[], bool],
-) -> tuple[bool, Weighted]:
+) -> tuple[bool, Weighted | None]:
     """Draws of a proposal around optima, and whether they will do: not where the proposal does not come
-    close to the posterior, nor where it does not cover what points of the whole prior show.
+    close to the posterior, nor where it does not cover what points of the whole prior show; none where no
+    optimum has a surrounding inside the prior.
 
     `hunted` are coordinates of such points, (points, dimension), log densities there and log weights, whose
     sum estimates the evidence [nat]. A few may be far out in a tail, heavy by chance: a second attempt
@@ -61,6 +62,8 @@ def around_optima(
             lambda _, portions: crew.each(_density, portions),
             late,
         )
+        if tried is None:
+            return False, None
         weighted = tried.weighted
         if not tried.good(wanted):
             break

@@ -101,16 +101,19 @@ def importance(
     mapped: Mapped = map,
     late: Callable[[], bool] = lambda: False,
     begin: Mixture | None = None,
-) -> Importance:
+) -> Importance | None:
     """Importance sampling around given optima, one or more, or from a proposal to `begin` with, in the chart;
-    `mapped` spreads the density over processes. Once it is `late` no further attempt is made.
+    `mapped` spreads the density over processes. Once it is `late` no further attempt is made. None where no
+    optimum has a surrounding inside the prior.
 
     FloatingPointError where the density is NaN.
     """
     chart = Chart.of(posterior)
     chosen = weighty(optima)
-    proposal = core = begin or around(posterior, chart, chosen, rng)
-    seen = Seen()
+    core = begin or around(posterior, chart, chosen, rng)
+    if core is None:
+        return None
+    proposal, seen = core, Seen()
     for effort in plan.efforts:
         if seen.proposals and len(core.means) < _MOST:
             core = split(core, rng)

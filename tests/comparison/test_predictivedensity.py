@@ -203,7 +203,7 @@ def exact_elpd(fitted, part) -> float:
 
 
 def _model(posterior, part):
-    return predictivedensity._one(posterior.model, part.record)
+    return posterior.model.only(part.record)
 
 
 @pytest.mark.parametrize("way", ["importance weights", "refit"])
