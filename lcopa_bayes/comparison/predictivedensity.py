@@ -111,13 +111,15 @@ def predictions(fit: Fit, *, held_out_only: bool = False) -> tuple[Predicted, ..
     ``sum_i log E[p(y_i | y_1 .. y_i-1, theta) | known]``, i over the samples of a part: the log density of
     one forecast of the record by the posterior of its shared parameters given what is known. Held-out
     records come from the draws as they are. What was fitted is taken away again by importance weights when
-    their Pareto k is at most 0.7 and 100 draws or more stay effective, else by a refit (`bridge`).
+    their Pareto k is at most 0.7 and 100 draws or more stay effective, else by a refit (`bridge`); by a rough
+    one where the fit was asked for no more draws than that.
     """
     posterior, study = fit.near, fit.study
     simulated = posterior.simulation is not None
     count = min(_EFFECT_DRAWS if simulated else _DRAWS, int(_PER_WANTED * fit.draws.target_ess))
     tried = count if posterior.surrogate is None else _DRAWS
     positions = fit.run.kept()[0][:, :, -1]
+    roughly = fit.draws.target_ess <= FEWEST_EFFECTIVE
     out: list[Predicted] = []
     source = posterior
     for part in parts_of(posterior, [record.name for record in study.held_out]):
@@ -145,7 +147,7 @@ def predictions(fit: Fit, *, held_out_only: bool = False) -> tuple[Predicted, ..
             result = scored(values, own, "importance weights", k=k, ess=worth, known=target)
         else:
             seed = fit.run.plan.seed + 7_000 + len(out)
-            moved = transferred(source, target, positions, seed, jump=False)
+            moved = transferred(source, target, positions, seed, jump=False, roughly=roughly)
             if part.kind == "future of the record":  # the next part knows still less
                 source, positions = target, moved.coordinates[:, :, -1]
             flat = moved.coordinates.reshape(-1, posterior.dimension)

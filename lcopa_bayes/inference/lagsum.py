@@ -272,7 +272,7 @@ def lag_table(problem: Problem, axis: int, drives: Sequence[int], noise: Vector,
         held = values[:1].copy()
         held[:, [*posterior.table.of_kind("gain"), *offsets]] = 0.0
         target = posterior.residual(axis, r, observed, held, none)
-        whole = np.concatenate([columns, np.reshape(own, (len(offsets), -1)), target])
+        whole = np.concatenate([columns, np.reshape(own, (len(offsets), observed.values.size)), target])
         if observed.values.size:
             white.append(posterior.noise.whiten(whole[None], noise[None], observed.gaps)[0][0])
     joined = np.concatenate(white, axis=1)

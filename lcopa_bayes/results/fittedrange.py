@@ -128,14 +128,16 @@ class FittedRange:
                         since,
                         f"Drive {axis.name} runs from {column.min():.4g} to {column.max():.4g} {axis.unit}, "
                         f"in the fit records from {self.low[k]:.4g} to {self.high[k]:.4g} {axis.unit}: from "
-                        f"{since:.4g} {self.time_unit} on the bands rest on a linear plant.",
+                        f"{since:.4g} {self.time_unit} on the bands rest on the form of the model.",
                     )
                 )
         return out
 
     def _rests(self, driven: Driven) -> list[Outside]:
         return [
-            Outside("rest", "", None, f"{clause[0].upper()}{clause[1:]}: the bands rest on a linear plant.")
+            Outside(
+                "rest", "", None, f"{clause[0].upper()}{clause[1:]}: the bands rest on the form of the model."
+            )
             for clause in self.other_rest(driven.drive[0])
         ]
 

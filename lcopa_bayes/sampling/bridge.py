@@ -59,15 +59,22 @@ class Transferred:
 
 
 def transferred(
-    source: Posterior, target: Posterior, positions: Array, seed: int, *, jump: bool
+    source: Posterior,
+    target: Posterior,
+    positions: Array,
+    seed: int,
+    *,
+    jump: bool,
+    roughly: bool = False,
 ) -> Transferred:
     """Draws of `target` from walkers (ensembles, walkers, dimension) of `source`.
 
-    With `jump` in one rise: for posteriors whose supports differ, but little else. Deterministic given
-    `seed`.
+    With `jump` in one rise: for posteriors whose supports differ, but little else. To know the target
+    `roughly`, importance draws are enough whose averages may not converge, if 20 are effective; their R-hat
+    is then NaN. Deterministic given `seed`.
     """
     mixture = learned(target, list(positions), seed)
-    weighed = _weighed(target, mixture, np.random.default_rng([seed, 3_001]))
+    weighed = _weighed(target, mixture, np.random.default_rng([seed, 3_001]), roughly=roughly)
     if weighed is not None:
         return weighed
     chains = []
@@ -94,16 +101,21 @@ def transferred(
     return _judged(np.stack(chains))
 
 
-def _weighed(target: Posterior, mixture: Mixture, rng: np.random.Generator) -> Transferred | None:
+def _weighed(
+    target: Posterior, mixture: Mixture, rng: np.random.Generator, *, roughly: bool
+) -> Transferred | None:
     """Importance draws of the target that begin with a mixture in its chart; None where they will not do."""
     tried = importance(target, (), rng, _PLAN, begin=mixture)
-    if tried is None or not usable(tried.weighted):
+    if tried is None:
         return None
-    weighted = tried.weighted
+    weighted, good = tried.weighted, usable(tried.weighted)
+    if not (good or (roughly and weighted.ess >= _PLAN.wanted)):
+        return None
     drawn = weighted.coordinates[weighted.batches(_DELIVERED, rng)]
     judged = _judged(drawn.reshape(BATCHES, -1, CHAIN, target.dimension))
     level = Evidence(weighted.log_evidence, weighted.log_evidence_sd, ())
-    return replace(judged, ess=weighted.ess, evidence=level)
+    rhat = judged.rhat if good else np.nan
+    return replace(judged, ess=weighted.ess, rhat=rhat, evidence=level)
 
 
 @final

@@ -22,6 +22,7 @@ from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.inference.priors import Prior
+from lcopa_bayes.sampling import bridge
 from lcopa_bayes.sampling.bridge import transferred
 
 
@@ -194,7 +195,7 @@ def gauss(data: np.ndarray) -> Toy:
     return Toy(log_likelihood, {"a": ("norm", {"loc": 0.0, "scale": 2.0}), "b": ("norm", {"scale": 2.0})})
 
 
-def test_draws_carried_to_fewer_data_are_those_of_the_smaller_posterior(rng):
+def test_draws_carried_to_fewer_data_are_those_of_the_smaller_posterior(rng, monkeypatch):
     data = np.concatenate([rng.normal(1.0, 0.5, 3), rng.normal(-1.5, 0.5, 12)])
     source, target = gauss(data), gauss(data[:3])
 
@@ -213,6 +214,15 @@ def test_draws_carried_to_fewer_data_are_those_of_the_smaller_posterior(rng):
     assert found.rhat < 1.1
     again = transferred(source, target, positions, 5, jump=False)
     np.testing.assert_array_equal(found.coordinates, again.coordinates)
+    monkeypatch.setattr(bridge, "usable", lambda weighted: False)
+    walked, rough = (
+        transferred(source, target, positions, 5, jump=False, roughly=roughly) for roughly in (False, True)
+    )
+    np.testing.assert_array_equal(rough.coordinates, found.coordinates)
+    assert np.isnan(rough.rhat)  # averages over the weights are not known to converge
+    assert walked.evidence is None
+    draws = walked.coordinates.reshape(-1, 2)
+    np.testing.assert_allclose(draws.mean(axis=0), wanted, atol=4 * spread / np.sqrt(walked.ess))
 
 
 # -- widths of priors ------------------------------------------------------------------------------
