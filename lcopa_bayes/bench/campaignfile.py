@@ -34,7 +34,7 @@ from typing import Any, ClassVar, final
 
 import numpy as np
 
-from lcopa_bayes.bench.command import Command, on_off, prbs, quiet, staircase, step
+from lcopa_bayes.bench.command import Command, joint, on_off, prbs, quiet, staircase, step
 from lcopa_bayes.bench.device import PAPER_BENCH, PAPER_DEVICE, Bench, Device, simulate
 from lcopa_bayes.bench.inversion import unsuited
 from lcopa_bayes.bench.undeclared import UndeclaredPlan
@@ -207,10 +207,7 @@ def _device(path: Path, entries: list[Mapping[str, Any]]) -> Device:
 
 def _command(record: Mapping[str, Any], device: Device, rng: np.random.Generator) -> Command:
     """Joint command of all drive axes of a record."""
-    commands = [_axis_command(record.get(axis.name), record, rng) for axis in device.drive_axes]
-    times = np.unique(np.concatenate([command.times for command in commands]))
-    values = np.hstack([command.at(times) for command in commands])
-    return Command(times, values, np.hstack([command.rest for command in commands]))
+    return joint(*(_axis_command(record.get(axis.name), record, rng) for axis in device.drive_axes))
 
 
 def _axis_command(

@@ -112,7 +112,8 @@ def prbs(
     return Command((start + hold * np.arange(len(values)))[moved], values[moved], before)
 
 
-def two_axis(x: Command, y: Command) -> Command:
-    """Both commands at once, the drives of `x` before those of `y`."""
-    times = np.union1d(x.times, y.times)
-    return Command(times, np.hstack([x.at(times), y.at(times)]), np.hstack([x.rest, y.rest]))
+def joint(*commands: Command) -> Command:
+    """All commands at once, the drives of the first before those of the next."""
+    times = np.unique(np.concatenate([each.times for each in commands]))
+    rest = np.hstack([each.rest for each in commands])
+    return Command(times, np.hstack([each.at(times) for each in commands]), rest)

@@ -221,8 +221,7 @@ def bent(
     elements = tuple(path.normalised(Normalisation.STIFFNESS) for path in paths)
     force = rest[:, None] + gains[:, None] * np.stack(means)
     y = marched(elements, force, balance, level, step)
-    nodes = np.concatenate((edges[:1], edges[1:]))
-    table = CubicSpline(nodes, np.concatenate((level[:, None], y), axis=1), axis=1)
+    table = CubicSpline(edges, np.concatenate((level[:, None], y), axis=1), axis=1)
     out = np.where(times[:, None] <= start, level, table(np.maximum(times, start)).T)
     return np.asarray(out)
 

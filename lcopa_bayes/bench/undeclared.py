@@ -12,7 +12,7 @@ from typing import ClassVar, Literal, final
 import numpy as np
 
 from lcopa_bayes.bench import driveeffects, planteffects, readingeffects, unnamedeffects
-from lcopa_bayes.bench.command import Command, quiet, two_axis
+from lcopa_bayes.bench.command import Command, joint, quiet
 from lcopa_bayes.bench.device import Bench, Device, truth
 from lcopa_bayes.bench.driveeffects import joined
 from lcopa_bayes.bench.hiddeneffects import STEPS, Hidden, HiddenDevice, Shot
@@ -89,7 +89,7 @@ def rich_schedules(rng: np.random.Generator) -> list[Schedule]:
         (_random_signs(start(), 8, rng), _random_signs(start(), 8, rng), 60.0, True),
         (full, still, 50.0, False),
     ]
-    return [Schedule(two_axis(x, y), duration, held) for x, y, duration, held in entries]
+    return [Schedule(joint(x, y), duration, held) for x, y, duration, held in entries]
 
 
 def plain_schedules(rng: np.random.Generator) -> list[Schedule]:
@@ -101,7 +101,7 @@ def plain_schedules(rng: np.random.Generator) -> list[Schedule]:
     for number, (x, y) in enumerate(heights):
         start, duration = float(rng.uniform(3.0, 6.0)), float(rng.uniform(30.0, 50.0))
         commands = [_levels([level], start, []) if level else quiet() for level in (x, y)]
-        out.append(Schedule(two_axis(*commands), duration, number in held))
+        out.append(Schedule(joint(*commands), duration, number in held))
     return out
 
 

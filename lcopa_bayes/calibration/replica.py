@@ -87,23 +87,17 @@ def _simulated(problem: Problem, truth: Vector) -> list[Matrix]:
 
 
 def measured(
-    problem: Problem, truth: Vector, exact: Sequence[Matrix], rng: np.random.Generator
-) -> tuple[Record, ...]:
-    """The fit records with the `exact` responses and noise of the study's noise model at the truth.
-
-    Drives, times and missing cells are those of the study.
-    """
-    posterior, values = problem.posterior, truth[None]
-    out = []
-    for samples, clean in zip(posterior.samples, exact, strict=True):
-        record = samples.record
-        rows = np.searchsorted(record.time, samples.times)
-        response = np.full(record.response.shape, np.nan)
-        for axis, observed in enumerate(samples.axes):
-            noise = posterior.noise.draw(posterior.noise_parameters(values, axis), observed.gaps, rng)[0]
-            response[rows[observed.index], axis] = clean[observed.index, axis] + noise
-        out.append(replace(record, response=response))
-    return tuple(out)
+    problem: Problem, truth: Vector, samples: Samples, exact: Matrix, rng: np.random.Generator
+) -> Record:
+    """A record with the `exact` responses at its sample times, (samples, axes), and noise of the study's
+    noise model at the truth; drives, times and missing cells are its own."""
+    posterior, record = problem.posterior, samples.record
+    rows, response = np.searchsorted(record.time, samples.times), np.full(record.response.shape, np.nan)
+    for axis, observed in enumerate(samples.axes):
+        parameters = posterior.noise_parameters(truth[None], axis)
+        noise = posterior.noise.draw(parameters, observed.gaps, rng)[0]
+        response[rows[observed.index], axis] = exact[observed.index, axis] + noise
+    return replace(record, response=response)
 
 
 def model_gap(problem: Problem, truth: Vector, exact: Sequence[Matrix]) -> float:
@@ -248,7 +242,8 @@ class Replication:
         streams = np.random.SeedSequence([seed, _STREAM]).spawn(4)
         drawing, noise, ranking, looking = map(np.random.default_rng, streams)
         truth, exact = self._bounded(drawing)
-        records = measured(self.problem, truth, exact, noise)
+        pairs = zip(self.problem.posterior.samples, exact, strict=True)
+        records = tuple(measured(self.problem, truth, one, clean, noise) for one, clean in pairs)
         problem, draws, engine, pareto_k = self._inferred(self._measured_again(records), seed, looking)
         posterior = problem.posterior
         width = discretisation(problem, draws)

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import TypeAlias, final
 
 import numpy as np
-import xarray as xr
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.errors import InputError, nearest, refuse_if
 from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.results.savedfit import load_fit
 
 Stated: TypeAlias = float | tuple[float, float]
 """A true value, or the ends between which it is drawn evenly."""
@@ -96,48 +96,29 @@ def truths_stated(stated: Mapping[str, Stated], table: ParameterTable) -> Truths
 def truths_around(folder: Path, table: ParameterTable) -> Truths:
     """Truths from the draws in the run folder of a fit with the parameters and priors of `table`.
 
-    InputError when there is no posterior, its parameters or their units are others, or it has draws
-    that the priors exclude.
+    InputError as `load_fit`, when the parameters or their units are others, or the draws are such that the
+    priors exclude them.
     """
-    path = folder / "posterior.nc"
-    advice = "give the run folder that `fit` wrote for this study"
-    if not path.is_file():
-        raise InputError(f"{folder}: holds no posterior.nc; {advice}")
-    try:
-        with xr.open_dataset(path, group="posterior", engine="h5netcdf") as posterior:
-            draws = {
-                str(held.attrs.get("parameter", name)): (
-                    str(held.attrs.get("units", "")),
-                    held.to_numpy().ravel(),
-                )
-                for name, held in posterior.data_vars.items()
-            }
-        with xr.open_dataset(path, engine="h5netcdf") as root:
-            grade = str(root.attrs.get("grade", ""))
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"{path}: cannot be read as draws ({error}); {advice}") from None
-    pool = np.tile(
-        [row.value for row in table.rows], (max((v.size for _, v in draws.values()), default=0), 1)
-    )
+    draws = load_fit(folder).draws
     free = {row.name: k for k, row in enumerate(table.rows) if row.free}
-    problems = [
-        f"{path}: has the parameter {name!r}, which this study does not infer" for name in draws.keys() - free
-    ]
-    problems += [f"{path}: has no draws of {name!r}, which this study infers" for name in free.keys() - draws]
-    for name in free.keys() & draws:
-        row, (unit, values) = table.rows[free[name]], draws[name]
-        if unit != row.unit:
-            problems.append(f"{path}: {name!r} is in {unit}, in this study in {row.unit}")
-        elif values.size != pool.shape[0] or not values.size or np.isneginf(row.log_prior(values)).any():
-            problems.append(f"{path}: {name!r} has no draws, or draws that the prior of this study excludes")
-        else:
-            pool[:, free[name]] = values
+    units = {row.name: row.unit for row in draws.table.rows if row.free}
+    pool = np.tile([row.value for row in table.rows], (len(draws.flat), 1))
+    foreign, absent = units.keys() - free, free.keys() - units
+    problems = [f"has the parameter {name!r}, which this study does not infer" for name in foreign]
+    problems += [f"has no draws of {name!r}, which this study infers" for name in absent]
+    for name in free.keys() & units:
+        row, pool[:, free[name]] = table.rows[free[name]], draws.column(name)
+        if units[name] != row.unit:
+            problems.append(f"{name!r} is in {units[name]}, in this study in {row.unit}")
+        elif np.isneginf(row.log_prior(draws.column(name))).any():
+            problems.append(f"{name!r} has draws that the prior of this study excludes")
     if not problems and not table.supported(pool).all():
-        problems.append(f"{path}: has draws whose orders do not decrease, as they must in this study")
+        problems.append("has draws whose orders do not decrease, as they must in this study")
     if problems:
-        raise InputError([*sorted(problems), f"{folder}: {advice}"])
+        advice = f"{folder}: give the run folder that `fit` wrote for this study"
+        raise InputError([*(f"{folder}: {one}" for one in sorted(problems)), advice])
     pool.setflags(write=False)
-    return Truths(table, pool, str(folder), grade)
+    return Truths(table, pool, str(folder), draws.grade.level)
 
 
 def stated_values(words: Sequence[str]) -> dict[str, Stated]:

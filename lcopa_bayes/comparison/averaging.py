@@ -20,6 +20,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
 from lcopa_bayes.core.estimate import EQUAL_TAILED, LEVEL
+from lcopa_bayes.results.alternatives import parts_of_sd
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.steps import metrics_of
 from lcopa_bayes.sampling.convergence import Grade
@@ -91,7 +92,7 @@ def _number(name: str, usable: Sequence[Row], best: Row, kept: Sequence[Row]) ->
     for k in raised:
         alone = mixture_quantiles(values[[k]], np.ones(1), at)
         lower, upper = min(lower, alone[0]), max(upper, alone[2])
-    noise, structure = parts_of_sd(values, weights)
+    noise, structure = parts_of_sd(list(values), weights)
     shown = [k for k in range(len(usable)) if weights[k] >= _SHOWN]
     return {
         "name": name,
@@ -136,19 +137,6 @@ def mixture_quantiles(values: Matrix, weights: Vector, probabilities: Vector) ->
     reached = np.cumsum(each[order]) - 0.5 * each[order]
     at = np.searchsorted(reached, probabilities * each.sum(), side="left")
     return np.asarray(flat[order][np.minimum(at, flat.size - 1)])
-
-
-def parts_of_sd(values: Matrix, weights: Vector) -> tuple[float, float]:
-    """Standard deviation within and between the components of a mixture; NaN where a component is open.
-
-    Their squares add up to the variance of the mixture.
-    """
-    if not np.isfinite(values).all():
-        return np.nan, np.nan
-    means = values.mean(axis=1)
-    within = float(weights @ values.var(axis=1))
-    between = float(weights @ (means - weights @ means) ** 2)
-    return float(np.sqrt(within)), float(np.sqrt(between))
 
 
 BLOCKS = 10

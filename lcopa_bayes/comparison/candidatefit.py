@@ -30,6 +30,7 @@ from lcopa_bayes.data.settings import SamplerSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.likelihood import Landscape, Peak
+from lcopa_bayes.results.alternatives import alternatives_of
 from lcopa_bayes.results.bands import POINTWISE
 from lcopa_bayes.results.fit import Fit, fit, plan_of, whole
 from lcopa_bayes.results.runfolder import digest, fingerprint, settings_of
@@ -210,7 +211,7 @@ WALKERS = 32
 [-]. Ensembles and effective draws are those of a fit, so that a grade means the same."""
 _STARTS = 64
 """Draws kept as starts of richer models [-]."""
-_VERSION = 4
+_VERSION = 5
 """Raised when what a card holds changes."""
 
 
@@ -328,6 +329,7 @@ def card(
     weighed = None if candidate.improper else fitted.evidence
     parts = predictions(fitted) if usable else ()
     result = criteria(fitted, also)
+    lags = alternatives_of(fitted) if usable and not candidate.integer else None
     entries: dict[str, Any] = plain(
         {
             **attributes(candidate, "name", "about", "notes", "integer", "terms"),
@@ -351,6 +353,7 @@ def card(
             "held_out": scores(fitted, held_out=True),
             "predictions": [one.as_json() | {"grade": one.grade(grade.level)} for one in parts],
             "order_is_integer": [one.as_json() for one in integer_orders(fitted)],
+            "sums_of_lags": [one.as_json() for one in lags.alternatives] if lags else [],
             "estimates": [one.as_json() for one in fitted.draws.estimates()],
             "step_metrics": [one.as_json() for one in fitted.metrics],
             "residual_tests": [

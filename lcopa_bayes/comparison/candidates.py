@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import final
 
 from lcopa_bayes.core.errors import InputError, nearest, refuse_if
-from lcopa_bayes.data.settings import CandidateSettings, ModelSettings, PriorSettings
+from lcopa_bayes.data.settings import CandidateSettings, ModelSettings, NoiseSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import table_of
 from lcopa_bayes.inference.defaultpriors import Scales
@@ -97,8 +97,8 @@ def derived(study: Study, settings: CandidateSettings) -> Candidate:
     candidate = replace(
         study,
         model=model,
-        noise=settings.noise_settings(study.noise),
-        effects=settings.effects_settings(study.effects),
+        noise=study.noise if settings.noise is None else NoiseSettings(settings.noise),
+        effects=study.effects if settings.effects is None else replace(study.effects, use=settings.effects),
         priors={},
     )
     names = _names(candidate)
@@ -145,8 +145,7 @@ def candidates_of(
     refuse_if(problems)
     distinct: list[Candidate] = []
     for one in candidates:
-        alike = [other for other in distinct if _same(one, other)]
-        if not alike:
+        if not any(_same(one, other) for other in distinct):
             distinct.append(one)
     if len(distinct) < 2:
         raise InputError(
@@ -185,13 +184,12 @@ def _short_list(study: Study) -> list[str]:
 
 def _same(one: Candidate, other: Candidate) -> bool:
     """Whether two candidates are one model."""
-    return (one.study.model, one.study.noise, one.study.effects, dict(one.study.priors), one.improper) == (
-        other.study.model,
-        other.study.noise,
-        other.study.effects,
-        dict(other.study.priors),
-        other.improper,
-    )
+
+    def key(candidate: Candidate) -> tuple[object, ...]:
+        study = candidate.study
+        return study.model, study.noise, study.effects, dict(study.priors), candidate.improper
+
+    return key(one) == key(other)
 
 
 def _names(study: Study) -> tuple[str, ...]:

@@ -178,18 +178,9 @@ def compare(
             bar.update()
         bar.set_description("holding against contained models")
         for wave in _by_size(tasks, cards):
-            checks = [
-                Check(
-                    task,
-                    cards[task.candidate.name],
-                    tuple(
-                        (other.candidate, cards[other.candidate.name])
-                        for other in tasks
-                        if _size(cards, other) < _size(cards, task)
-                    ),
-                )
-                for task in wave
-            ]
+            smaller = [task for task in tasks if _size(cards, task) < _size(cards, wave[0])]
+            others = tuple((task.candidate, cards[task.candidate.name]) for task in smaller)
+            checks = [Check(task, cards[task.candidate.name], others) for task in wave]
             for values in _performed(checks, jobs):
                 cards[str(values["name"])] = values
     return judged([cards[one.name] for one in candidates], candidates[0].study)

@@ -20,7 +20,8 @@ from lcopa_bayes.comparison.priorwidth import FACTORS
 
 
 def fractional(usable: Sequence[Row]) -> dict[str, Any]:
-    """Whether the best fractional candidate is warranted against the best integer one.
+    """Whether the best fractional candidate is warranted against the best integer one, and against sums of
+    lags (`results.alternatives`), which are integer models too.
 
     The best is the simplest that none of its kind beats beyond chance.
     """
@@ -51,17 +52,23 @@ def fractional(usable: Sequence[Row]) -> dict[str, Any]:
     said = f"{free['name']} against {whole['name']}: log evidence {gain}"
     if predicted is not None:
         said += f", log predictive density {predicted}"
+    lags = [one for one in free["sums_of_lags"] if one["support"] != "plant"]
+    rivals = f"{whole['name']} and sums of lags" if free["sums_of_lags"] else whole["name"]
     strong = least.nats - ERRORS * least.sd > STRONG
     denied = predicted is not None and -predicted.nats > max(TIE, ERRORS * predicted.sd)
     shown = predicted is None or predicted.nats > predicted.sd  # the evidence is strong by itself
-    if strong and shown and not unknown:
+    if strong and shown and not unknown and not lags:
         return values | {
             "verdict": "warranted",
             "sentence": (
-                f"Fractional orders are warranted. {said}; least over priors half and twice as wide {least}."
+                f"Fractional orders are warranted, against {rivals}. {said}; least over priors half and "
+                f"twice as wide {least}."
             ),
         }
-    if denied or most.nats + ERRORS * most.sd < 0:
+    preferred = [one for one in lags if one["support"] == "lags"]
+    if denied or preferred or most.nats + ERRORS * most.sd < 0:
+        if preferred:
+            said = f"{_lags(free, preferred)} better. {said}"
         return values | {
             "verdict": "not warranted",
             "sentence": f"Fractional orders are not warranted. {said}.",
@@ -69,6 +76,8 @@ def fractional(usable: Sequence[Row]) -> dict[str, Any]:
     lacking = (
         "the evidence, or its prior's part, does not suffice"
         if not strong
+        else f"{_lags(free, lags)} as well"
+        if lags
         else "what was left out is predicted no better by more than a standard error"
         if not shown
         else f"whether the evidence hangs on the width of the priors is not known: {'; '.join(unknown)}"
@@ -77,6 +86,16 @@ def fractional(usable: Sequence[Row]) -> dict[str, Any]:
         "verdict": "not shown",
         "sentence": f"No win of fractional orders is claimed: {lacking}. {said}.",
     }
+
+
+def _lags(free: Row, lags: Sequence[Row]) -> str:
+    """Which sums of lags follow the records, without how well."""
+    parts = [
+        f"sums of {one['lags']} lags for {', '.join(one['paths'])} (AIC "
+        f"{'lower' if one['aic_advantage'] > 0 else 'higher'} by {abs(one['aic_advantage']):.1f})"
+        for one in lags
+    ]
+    return f"beside {free['name']}, {' and '.join(parts)} follow the records"
 
 
 def _other_widths(free: Row, whole: Row) -> tuple[list[Gain], list[str]]:

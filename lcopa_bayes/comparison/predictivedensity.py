@@ -20,9 +20,9 @@ from lcopa_bayes.comparison.sequentialdensity import (
     predicted,
     without,
 )
-from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.estimate import attributes, plain
-from lcopa_bayes.inference.observations import Observed, Samples
+from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.forward import ForwardModel
 from lcopa_bayes.results.fit import Fit
@@ -31,6 +31,7 @@ from lcopa_bayes.sampling.bridge import transferred
 from lcopa_bayes.sampling.convergence import TENTATIVE_RHAT, Grade, Level
 from lcopa_bayes.sampling.evidence import known_to
 from lcopa_bayes.sampling.importanceweights import FEWEST_EFFECTIVE, effective, smoothed, usable_k
+from lcopa_bayes.sampling.weighted import resampled
 
 _DRAWS, _EFFECT_DRAWS = 600, 200
 """Draws behind a predictive density, and with effects, which take a simulation each."""
@@ -111,28 +112,34 @@ def predictions(fit: Fit, *, held_out_only: bool = False) -> tuple[Predicted, ..
     their Pareto k is at most 0.7 and 100 draws or more stay effective, else by a refit (`bridge`).
     """
     posterior, study = fit.near, fit.study
-    count = _DRAWS if posterior.simulation is None else _EFFECT_DRAWS
-    positions = _walkers(fit)
+    simulated = posterior.simulation is not None
+    count = _EFFECT_DRAWS if simulated else _DRAWS
+    tried = count if simulated and posterior.surrogate is None else _DRAWS
+    positions = fit.run.kept()[0][:, :, -1]
     out: list[Predicted] = []
     source = posterior
     for part in parts_of(posterior, [record.name for record in study.held_out]):
         if part.kind == "held-out record":
             samples, model = fit.problem.simulated(study.held_out)
-            scored = _Scored(fit, part, samples[part.record], _one(model, part.record))
+            scored = _Scored(fit, part, samples[part.record], model.only(part.record))
             out.append(scored(fit.draws.thinned(count), None, "exact", known=posterior))
             continue
         if held_out_only:
             continue
-        scored = _Scored(fit, part, posterior.samples[part.record], _one(posterior.model, part.record))
+        scored = _Scored(fit, part, posterior.samples[part.record], posterior.model.only(part.record))
         seen = scored(fit.draws.thinned(count), None, "exact")
-        values = fit.draws.thinned(2 * count)
+        values = fit.draws.thinned(2 * tried)
         target = without(posterior, part)
         weights, k = left_out_weights(posterior, target, values, fit.draws.ess / len(fit.draws.flat))
         rng = np.random.default_rng([fit.run.plan.seed, 5, len(out)])
         if k <= usable_k(len(values)) and effective(weights) >= FEWEST_EFFECTIVE:
             # gains and levels are drawn anew: those of the draws have seen what is to be predicted
             values = target.complete(posterior.coordinates(values), rng)
-            result = scored(values, weights, "importance weights", k=k, known=target)
+            worth = effective(weights)
+            if simulated:  # each density takes a simulation
+                values = values[resampled(weights, count, rng)]
+            own = None if simulated else weights
+            result = scored(values, own, "importance weights", k=k, ess=worth, known=target)
         else:
             seed = fit.run.plan.seed + 7_000 + len(out)
             moved = transferred(source, target, positions, seed, jump=False)
@@ -158,15 +165,6 @@ def left_out_weights(
     return smoothed(target.log_likelihood(values) - posterior.log_likelihood(values), r_eff=r_eff)
 
 
-def _one(model: ForwardModel, number: int) -> ForwardModel:
-    return model.only(number)
-
-
-def _walkers(fit: Fit) -> Array:
-    """Walkers of every ensemble, at their last kept draw, (ensembles, walkers, dimension)."""
-    return fit.run.kept()[0][:, :, -1]
-
-
 @final
 @dataclass(frozen=True, eq=False)
 class _Scored:
@@ -188,18 +186,17 @@ class _Scored:
         rhat: float = np.nan,
         known: Posterior | None = None,
     ) -> Predicted:
-        table, pieces = self.fit.draws.table, np.array_split(values, max(1, len(values) // 64))
-        plant = np.concatenate([responses(table, self.model, piece)[0] for piece in pieces], axis=1)
-        axes: list[str] = []
-        times: list[Vector] = []
-        densities: list[Matrix] = []
-        sources: list[LevelFrom] = []
-        for axis, observed in enumerate(self.samples.axes):
-            if not predicted(observed, self.part).size:
-                continue
-            each, source, index = self._axis(axis, observed, values, plant[axis], known)
-            densities.append(each)
-            sources.append(source)
+        scored = [k for k, one in enumerate(self.samples.axes) if predicted(one, self.part).size]
+        pieces = np.array_split(values, max(1, len(values) // 64))
+        each = self._linear if known is not None and applies(known) else self._drawn
+        parts = [each(piece, known) for piece in pieces]
+        densities = [np.concatenate([part[axis] for part in parts]) for axis in scored]
+        table, axes, times, sources = self.fit.draws.table, list[str](), list[Vector](), list[LevelFrom]()
+        for axis in scored:
+            observed = self.samples.axes[axis]
+            last = int(np.count_nonzero(observed.index < self.part.until))
+            index = observed.index[:last][known_before(self.samples, axis, self.part) :]
+            sources.append(level_of(table, values, axis, self.part, self.samples).source)
             axes += [self.samples.record.response_axes[axis].name] * index.size
             times.append(self.samples.times[index])
         every = np.concatenate(densities, axis=1) if densities else np.empty((len(values), 0))
@@ -217,26 +214,24 @@ class _Scored:
             level_from=tuple(sources),
         )
 
-    def _axis(
-        self, axis: int, observed: Observed, values: Matrix, plant: Matrix, known: Posterior | None
-    ) -> tuple[Matrix, LevelFrom, np.ndarray[tuple[int], np.dtype[np.intp]]]:
-        """Densities (draws, predicted), where the level comes from, and the predicted samples' places."""
+    def _linear(self, values: Matrix, known: Posterior | None) -> list[Matrix]:
+        """Densities (draws, predicted) of every axis, gains and levels integrated out."""
+        assert known is not None
+        first = [known_before(self.samples, axis, self.part) for axis in range(len(self.samples.axes))]
+        return linear_densities(known, self.part, self.samples, self.model, values, first)
+
+    def _drawn(self, values: Matrix, _: Posterior | None) -> list[Matrix]:
+        """The same at the gains and levels of the draws."""
         table, noise = self.fit.draws.table, self.fit.problem.posterior.noise
-        last = int(np.count_nonzero(observed.index < self.part.until))
-        first = known_before(self.samples, axis, self.part)
-        index = observed.index[:last]
-        residual = observed.values[:last] - plant[:, index]
-        parameters = values[:, [table.at(name, axis) for name in noise.names]]
-        level = level_of(table, values, axis, self.part, self.samples)
-        if known is not None and applies(known):
-            pieces = np.array_split(values, max(1, len(values) // 64))
-            parts = [
-                linear_densities(known, self.part, self.samples, self.model, piece, axis, first)
-                for piece in pieces
-            ]
-            return np.concatenate(parts), level.source, index[first:]
-        each = log_densities(noise, residual, parameters, observed.gaps[:last], level.value, first)
-        return each, level.source, index[first:]
+        plant, out = responses(table, self.model, values)[0], []
+        for axis, observed in enumerate(self.samples.axes):
+            last = int(np.count_nonzero(observed.index < self.part.until))
+            residual = observed.values[:last] - plant[axis][:, observed.index[:last]]
+            parameters = values[:, [table.at(name, axis) for name in noise.names]]
+            level = level_of(table, values, axis, self.part, self.samples).value
+            first = known_before(self.samples, axis, self.part)
+            out.append(log_densities(noise, residual, parameters, observed.gaps[:last], level, first))
+        return out
 
 
 def _error(every: Matrix, level: Vector) -> float:

@@ -94,26 +94,23 @@ def _width(fit: Fit, factor: float) -> Width:
     else:
         k_hat = np.nan
     target = replace(posterior, table=replace(posterior.table, rows=rows))
-    positions = fit.run.kept()[0][:, :, -1]
-    if not np.isfinite(target.log_density(positions.reshape(-1, posterior.dimension))).any():
-        return Width(factor, None, None, "undefined", 0.0, k_hat, names)
-    return _refit(posterior=posterior, target=target, fit=fit, factor=factor, k_hat=k_hat, names=names)
+    undefined = Width(factor, None, None, "undefined", 0.0, k_hat, names)
+    return _refit(target, fit, undefined)
 
 
-def _refit(
-    posterior: Posterior, target: Posterior, fit: Fit, factor: float, k_hat: float, names: tuple[str, ...]
-) -> Width:
-    """From walkers moved to the new posterior: all draws that the new priors allow take part."""
+def _refit(target: Posterior, fit: Fit, undefined: Width) -> Width:
+    """From walkers moved to the new posterior: all draws that the new priors allow take part; `undefined`
+    where those of an ensemble allow none."""
     coordinates = fit.run.kept()[0]
     shape = coordinates.shape
     allowed = np.isfinite(target.log_density(coordinates[:, :, -1].reshape(-1, shape[-1])))
     if not allowed.reshape(shape[:2]).any(axis=1).all():
-        return Width(factor, None, None, "undefined", 0.0, k_hat, names)
-    seed = fit.run.plan.seed + round(9_000 * factor)
-    result = transferred(posterior, target, coordinates[:, :, -1], seed, jump=True)
-    again = evidence(target, result.coordinates, result.ess, seed)
+        return undefined
+    seed = fit.run.plan.seed + round(9_000 * undefined.factor)
+    result = transferred(fit.near, target, coordinates[:, :, -1], seed, jump=True)
+    again = result.evidence or evidence(target, result.coordinates, result.ess, seed)
     assert again is not None
-    return Width(factor, again.value, again.sd, "refit", result.ess, k_hat, names)
+    return replace(undefined, log_evidence=again.value, sd=again.sd, method="refit", ess=result.ess)
 
 
 def _contains(old: Parameter, new: Parameter) -> bool:

@@ -29,7 +29,7 @@ from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.inference.noise import LOG_2PI, GaussianNoise, Noise
 from lcopa_bayes.inference.observations import Observed, Samples
 from lcopa_bayes.inference.parameters import ParameterTable
-from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.posterior import NormalEquations, Posterior, Units
 from lcopa_bayes.model.forward import ForwardModel
 
 Kind = Literal["held-out record", "record left out", "future of the record"]
@@ -212,32 +212,58 @@ def applies(posterior: Posterior) -> bool:
 
 
 def linear_densities(
-    known: Posterior, part: Part, samples: Samples, model: ForwardModel, values: Matrix, axis: int, first: int
-) -> Matrix:
-    """Log density of each predicted sample of an axis given all before it, (draws, predicted) [nat].
+    known: Posterior, part: Part, samples: Samples, model: ForwardModel, values: Matrix, first: Sequence[int]
+) -> list[Matrix]:
+    """Log density of each predicted sample of every axis given all before it, (draws, predicted) [nat].
 
     `known` is the posterior without what is predicted; of `values` (draws, rows) linear parameters do not
-    count. `model` simulates the record of `samples` alone; `first` is the first sample predicted. A level
-    that no known record shares has the prior of the others'.
+    count. `model` simulates the record of `samples` alone, each axis from its `first` sample predicted. A
+    level that no known record shares has the prior of the others'.
     """
-    noise = known.noise
-    assert isinstance(noise, GaussianNoise)
-    observed = samples.axes[axis]
-    last = int(np.count_nonzero(observed.index < part.until))
     units = known.responses(values)
-    equations, _, _ = known.equations(axis, values, units)
-    stacked, extra = _columns(known, part, samples, model, values, axis)
-    white, _ = noise.whiten(stacked[..., :last], known.noise_parameters(values, axis), observed.gaps[:last])
-    scales = np.broadcast_to(
-        noise.log_scales(known.noise_parameters(values, axis), observed.gaps[:last]), (len(values), last)
-    )
-    size = equations.gram.shape[1]
-    covariance = np.tile(np.eye(size + extra), (len(values), 1, 1))
+    own = replace(known, model=model, surrogate=None).responses(values)[0]
+    r, joined = part.record, known
+    if part.kind == "held-out record":
+        r = len(known.samples)
+        joined = replace(known, model=known.model.joined(model), samples=(*known.samples, samples))
+    out = []
+    for axis, start in enumerate(first):
+        equations, _, _ = known.equations(axis, values, units)
+        level = _prior_level(known, part, axis)
+        stacked = _columns(joined, samples, values, own, axis=axis, record=r)
+        if level is not None:
+            column = np.full_like(stacked[:, :1], level[1])
+            stacked = np.concatenate([stacked[:, :-1], column, stacked[:, -1:] - level[0]], axis=1)
+        out.append(_sequential(known, part, samples, values, equations, stacked, axis=axis)[:, start:])
+    return out
+
+
+def _sequential(
+    known: Posterior,
+    part: Part,
+    samples: Samples,
+    values: Matrix,
+    equations: NormalEquations,
+    stacked: Array,
+    *,
+    axis: int,
+) -> Matrix:
+    """Recursive least squares of the linear parameters over the samples of a record, `stacked` their columns
+    and last what is predicted; NaN for what is known (draws, n)."""
+    noise, observed = known.noise, samples.axes[axis]
+    assert isinstance(noise, GaussianNoise)
+    last = int(np.count_nonzero(observed.index < part.until))
+    parameters = known.noise_parameters(values, axis)
+    white, _ = noise.whiten(stacked[..., :last], parameters, observed.gaps[:last])
+    scales = np.broadcast_to(noise.log_scales(parameters, observed.gaps[:last]), (len(values), last))
+    size, wide = equations.gram.shape[1], stacked.shape[1] - 1
+    covariance = np.tile(np.eye(wide), (len(values), 1, 1))
     covariance[:, :size, :size] = np.linalg.inv(equations.gram)
-    mean = np.zeros((len(values), size + extra))
+    mean = np.zeros((len(values), wide))
     mean[:, :size] = equations.mean()
     out = np.full((len(values), last), np.nan)
-    for k in range(first if part.known else 0, last):  # what is known of the record is in the equations
+    # what is known of the record is in the equations
+    for k in range(known_before(samples, axis, part) if part.known else 0, last):
         slope = white[:, :-1, k]
         bent = np.einsum("bij,bj->bi", covariance, slope)
         variance = 1 + np.einsum("bi,bi->b", slope, bent)
@@ -245,36 +271,26 @@ def linear_densities(
         out[:, k] = -0.5 * (apart**2 / variance + np.log(variance) + LOG_2PI) - scales[:, k]
         mean = mean + bent * (apart / variance)[:, None]
         covariance = covariance - bent[:, :, None] * (bent / variance[:, None])[:, None, :]
-    return out[:, first:]
+    return out
 
 
 def _columns(
-    known: Posterior, part: Part, samples: Samples, model: ForwardModel, values: Matrix, axis: int
-) -> tuple[Array, int]:
-    """What a prior standard deviation of every linear parameter adds to the record, and last what it leaves
-    at their prior means, (draws, parameters + 1, n); and how many columns are no parameter of `known`."""
-    r, posterior = part.record, known
-    if part.kind == "held-out record":
-        r = len(known.samples)
-        posterior = replace(known, model=known.model.joined(model), samples=(*known.samples, samples))
+    posterior: Posterior, samples: Samples, values: Matrix, units: Units, *, axis: int, record: int
+) -> Array:
+    """What a prior standard deviation of every linear parameter adds to a record of the posterior, and last
+    what it leaves at their prior means, (draws, parameters + 1, n)."""
     observed = samples.axes[axis]
-    units = replace(posterior, model=model, surrogate=None).responses(values)[0]
-    mean, sd = known.scaled[axis]
-    block = known.blocks[axis]
+    mean, sd = posterior.scaled[axis]
+    block = posterior.blocks[axis]
     centre = values.copy()
     centre[:, block] = mean
-    acting = [posterior.column(k, axis, r, observed, units) for k in block]
+    acting = [posterior.column(k, axis, record, observed, units) for k in block]
     shape = (len(values), observed.values.size)
     columns = [
         np.zeros(shape) if column is None else np.broadcast_to(sd[p] * column, shape)
         for p, column in enumerate(acting)
     ]
-    left = posterior.residual(axis, r, observed, centre, units)
-    level = _prior_level(known, part, axis)
-    if level is not None:
-        columns.append(np.full(shape, level[1]))
-        left = left - level[0]
-    return np.stack([*columns, left], axis=1), int(level is not None)
+    return np.stack([*columns, posterior.residual(axis, record, observed, centre, units)], axis=1)
 
 
 def _prior_level(known: Posterior, part: Part, axis: int) -> tuple[float, float] | None:

@@ -99,6 +99,11 @@ class Record:
         if any(is_so for is_so, _ in wrong):
             raise InputError([f"record {self.name!r}: {what}" for is_so, what in wrong if is_so])
 
+    @property
+    def sampled(self) -> Vector:
+        """Times of rows in which some response was sampled, (n,) [time_unit]."""
+        return self.time[np.isfinite(self.response).any(axis=1)]
+
     def __repr__(self) -> str:
         """What it holds, without the numbers."""
         axes = ", ".join(

@@ -165,14 +165,9 @@ def unmet_apart_from_rest(study: Study) -> list[str]:
     problems = [*_drives(study), *_responses(study)]
     for record in (*study.fit, *study.held_out):
         problems += _exposure(record, study.exposure) + _twins(record)
-    if not any(_sampled(record).size > 1 for record in study.fit):
+    if not any(record.sampled.size > 1 for record in study.fit):
         problems.append("no fit record has more than one response sample; give records with two or more")
     return problems
-
-
-def _sampled(record: Record) -> Vector:
-    """Times of rows in which some response was sampled, (n,) [time unit]."""
-    return record.time[np.isfinite(record.response).any(axis=1)]
 
 
 def _scaled(role: str, axis: Axis, span: float) -> list[str]:
@@ -215,7 +210,7 @@ def _responses(study: Study) -> list[str]:
 
 def _exposure(record: Record, exposure: float) -> list[str]:
     """A sample cannot be a mean over a time in which the sample before it was still taken."""
-    times = _sampled(record)
+    times = record.sampled
     if exposure == 0.0 or times.size < 2:
         return []
     period = float(np.median(np.diff(times)))

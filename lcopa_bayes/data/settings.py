@@ -314,11 +314,3 @@ class CandidateSettings(Ruled):
             delay=self.delay or own.delay,
             offset=self.offset or own.offset,
         )
-
-    def effects_settings(self, own: EffectsSettings) -> EffectsSettings:
-        """Settings of the effects."""
-        return own if self.effects is None else replace(own, use=self.effects)
-
-    def noise_settings(self, own: NoiseSettings) -> NoiseSettings:
-        """Settings of the noise."""
-        return own if self.noise is None else NoiseSettings(self.noise)

@@ -52,23 +52,17 @@ class Widening:
             edges = np.array([edges[0], edges[0] + max(abs(edges[0]), 1e-9)])
         excess = []
         for axis, process in enumerate(noise):
-            total, count = np.zeros(edges.size - 1), np.zeros(edges.size - 1)
-            for part in parts(samples):
-                if part.axis == axis:
-                    at = times[part.record][samples[part.record].axes[axis].index]
-                    known = np.isfinite(at)
-                    bins = np.clip(np.searchsorted(edges, at[known], side="right") - 1, 0, edges.size - 2)
-                    np.add.at(total, bins, residual[part.rows][known] ** 2)
-                    np.add.at(count, bins, 1.0)
+            own = parts(samples, axis)
+            at = np.concatenate([times[part.record][part.observed.index] for part in own])
+            squares = np.concatenate([residual[part.rows] ** 2 for part in own])
+            known = np.isfinite(at)
+            bins = np.clip(np.searchsorted(edges, at[known], side="right") - 1, 0, edges.size - 2)
+            total, count = (np.bincount(bins, one, edges.size - 1) for one in (squares[known], None))
             mean = np.divide(total, count, out=np.zeros_like(total), where=count > 0)
             beyond = mean - process.sd**2
             excess.append(_INFLATION * np.where(beyond > 0, beyond, 0.0))
-        drive = [record.record.drive for record in samples]
-        low, high = (
-            np.min([d.min(axis=0) for d in drive], axis=0),
-            np.max([d.max(axis=0) for d in drive], axis=0),
-        )
-        return cls(edges, tuple(excess), np.stack([low, high], axis=1))
+        drive = np.concatenate([record.record.drive for record in samples])
+        return cls(edges, tuple(excess), np.stack([drive.min(axis=0), drive.max(axis=0)], axis=1))
 
     def variance(self, record: Samples, axis: int) -> Vector:
         """Excess variance at an axis' samples, (n,) [response unit^2]; NaN outside the excited range."""

@@ -21,8 +21,8 @@ from lcopa_bayes.inference.posterior import Posterior
 
 _STARTS = 4
 """Starts of the search for the optimum [-]."""
-_DELAYS = (0.7, 0.85, 1.15, 1.3)
-"""Factors on the fitted delays from which the descent is started again: delays can jump [-]."""
+_DELAYS = tuple(factor - 1.0 for factor in (0.7, 0.85, 1.15, 1.3))
+"""Shares of the fitted delays by which the descent is started again later: delays can jump [-]."""
 _EXPLAINED = 0.5
 """Share of the response variance that a usable base fit explains at least [-]."""
 _ROUNDS = 3
@@ -57,9 +57,7 @@ class BaseFit:
         return all(one.known for one in self.noise)
 
 
-def base_fit(
-    model: ExtendedModel, rng: np.random.Generator, *, starts: int = _STARTS, near: Sequence[Vector] = ()
-) -> BaseFit:
+def base_fit(model: ExtendedModel, rng: np.random.Generator, *, near: Sequence[Vector] = ()) -> BaseFit:
     """The optimum of a fit's own search, then noise, and the optimum under it; `near` are further coordinates
     to start from.
 
@@ -67,13 +65,12 @@ def base_fit(
     """
     posterior = model.plant
     seeds = [model.values(x) for x in near]
-    optima = find_optima(replace(posterior, noise=White()), rng, starts=starts, near=seeds)
+    optima = find_optima(replace(posterior, noise=White()), rng, starts=_STARTS, near=seeds)
     # where no search ends inside the priors a draw of them is as good a start as any
     first = optima[0].values if optima else posterior.table.draw(1, rng)[0]
     x = model.coordinates(first)
-    optimum = Regression(model, Whitening(posterior.samples, _guessed(posterior))).best(
-        [x, *_other_delays(model, x)]
-    )
+    others = [model.delayed(x, share) for share in _DELAYS] if model.delays else []
+    optimum = Regression(model, Whitening(posterior.samples, _guessed(posterior))).best([x, *others])
     noise: tuple[AxisNoise, ...] = ()
     for _ in range(_ROUNDS):
         delay = model.dead_time(optimum.x)
@@ -130,24 +127,8 @@ def renewed(model: ExtendedModel, optimum: Optimum, known: Whitening) -> Whiteni
 
 def axis_pieces(posterior: Posterior, stacked: Vector, axis: int) -> list[Observed]:
     """Stacked values of one axis, record by record."""
-    return [
-        replace(posterior.samples[part.record].axes[axis], values=stacked[part.rows])
-        for part in parts(posterior.samples)
-        if part.axis == axis and part.rows.stop > part.rows.start
-    ]
-
-
-def _other_delays(model: ExtendedModel, x: Vector) -> list[Vector]:
-    """The same coordinates with every free delay scaled."""
-    rows = [model.plant.table.rows[k] for k in model.columns]
-    where = [k for k, row in enumerate(rows) if row.kind == "delay"]
-    out = []
-    for factor in _DELAYS if where else ():
-        other = x.copy()
-        for k in where:
-            other[k] += np.log(factor) if rows[k].log_scale else (factor - 1) * x[k]
-        out.append(other)
-    return out
+    own = parts(posterior.samples, axis)
+    return [replace(part.observed, values=stacked[part.rows]) for part in own]
 
 
 def _alike(one: AxisNoise, other: AxisNoise) -> bool:
@@ -164,8 +145,8 @@ def _failure(model: ExtendedModel, optimum: Optimum) -> str:
         )
     responses = model.plant.table.layout.responses
     for axis, response in enumerate(responses):
-        own = [part.rows for part in parts(model.plant.samples) if part.axis == axis]
-        seen = [model.observed[rows] for rows in own if rows.stop > rows.start]
+        own = [part.rows for part in parts(model.plant.samples, axis)]
+        seen = [model.observed[rows] for rows in own]
         spread = sum(float(((values - values.mean()) ** 2).sum()) for values in seen)
         missed = sum(float((optimum.residual[rows] ** 2).sum()) for rows in own)
         if missed > (1 - _EXPLAINED) * spread > 0 and len(responses) == 1:

@@ -44,7 +44,7 @@ def refitted(state: State, seen: Trace) -> tuple[list[Refit], list[str]]:
     from the size of their prior. So are the classes of linear dynamics, which a name must beat.
     """
     named = [one for one in seen.traced if one.card.place != "generic" and one.signatures][:_NAMED]
-    worth = {one.name: one.signatures[one.best] for one in named if one.log_bayes_factor > 0}
+    worth = {one.name: one.signature for one in named if one.log_bayes_factor > 0}
     reached = {name: seen.alone(signature) for name, signature in worth.items()}
     ranked = sorted(reached, key=lambda name: -reached[name])
     # noise fitted jointly holds the misfit too: only a refit shows what an effect is worth
@@ -55,12 +55,12 @@ def refitted(state: State, seen: Trace) -> tuple[list[Refit], list[str]]:
     sizes = {name: worth[name].amplitude(seen.residual) for name in near}
     if seen.alarmed and near:
         blind = [one for one in _blind(seen) if one.name not in near]
-        worth |= {one.name: one.signatures[one.best] for one in blind}
+        worth |= {one.name: one.signature for one in blind}
         sizes |= {one.name: np.ones(worth[one.name].columns.shape[1]) for one in blind}
     worthy = _RIVAL * max(reached.values(), default=0.0)
     for one in seen.traced if sizes or seen.alarmed else ():
         if one.card.dynamics and one.signatures and one.log_bayes_factor >= worthy:
-            worth[one.name] = one.signatures[one.best]
+            worth[one.name] = one.signature
             sizes[one.name] = worth[one.name].amplitude(seen.residual)
     done: list[Refit] = []
     failures: list[str] = []

@@ -78,7 +78,8 @@ class ExtendedModel:
     @cached_property
     def template(self) -> Vector:
         """Fixed values, (rows,); those of the noise do not count."""
-        return _template(self.posterior)
+        unit = self.posterior.noise.nearly_white(1.0)
+        return np.array([unit.get(row.kind, row.value) for row in self.posterior.table.rows])
 
     def having(self, *effects: Effect) -> ExtendedModel:
         """The same plant and scales with these effects."""
@@ -109,11 +110,6 @@ class ExtendedModel:
     def names(self) -> tuple[str, ...]:
         """Names of the coordinates, as in the table."""
         return tuple(self.posterior.table.names[k] for k in self.columns)
-
-    @property
-    def time_unit(self) -> str:
-        """Unit of all times."""
-        return self.plant.samples[0].record.time_unit
 
     @cached_property
     def _priors(self) -> tuple[Vector, Vector]:
@@ -159,19 +155,12 @@ class ExtendedModel:
         out[np.searchsorted(self.columns, source[self.columns])] = x
         return out
 
-    def supported(self, x: Matrix, *, every: bool = True) -> Flags:
-        """Whether orders decrease and terms are resolved, of coordinates (batch, k), (batch,).
-
-        Unless `every`, terms that can be exchanged may be in any sequence.
-        """
+    def supported(self, x: Matrix) -> Flags:
+        """Whether orders decrease and terms are resolved, of coordinates (batch, k), (batch,); terms that can
+        be exchanged may be in any sequence."""
         values = np.array([self._least.values(each, self.template) for each in x])
         table = self.posterior.table
-        return table.supported(values if every else table.canonical(values))
-
-    @property
-    def log_support(self) -> float:
-        """What the support of terms adds to the log of a prior density of terms in any sequence [nat]."""
-        return self.plant.table.log_support
+        return table.supported(table.canonical(values))
 
     def values(self, x: Vector) -> Vector:
         """Table values of coordinates, (rows,), terms in canonical order."""
@@ -185,6 +174,21 @@ class ExtendedModel:
         """Shortest delay at coordinates [time unit]."""
         table, values = self.posterior.table, self.values(x)
         return min(float(values[table.at("delay", k)]) for k in range(len(table.layout.delays)))
+
+    @property
+    def delays(self) -> list[int]:
+        """Positions of the delays among the coordinates."""
+        rows = self.posterior.table.rows
+        return [position for position, k in enumerate(self.columns) if rows[k].kind == "delay"]
+
+    def delayed(self, x: Vector, share: float) -> Vector:
+        """Coordinates, perhaps with those of further effects behind, with every delay longer by a share of it
+        [-]."""
+        out, rows = x.copy(), self.posterior.table.rows
+        for position in self.delays:
+            log = rows[self.columns[position]].log_scale
+            out[position] += np.log1p(share) if log else share * x[position]
+        return out
 
     def held(self, x: Vector) -> tuple[ExtendedModel, Vector]:
         """The model with its `loose` constants held at those of coordinates, and the other coordinates."""
@@ -228,8 +232,3 @@ class ExtendedModel:
         slopes = [np.moveaxis(one, 2, 0) for one in more.signature(values, psi)]
         raw = stacked(self.plant.samples, slopes)[len(own) :].T
         return raw * scale, more.coefficients[-new:]
-
-
-def _template(posterior: Posterior) -> Vector:
-    unit = posterior.noise.nearly_white(1.0)
-    return np.array([unit.get(row.kind, row.value) for row in posterior.table.rows])

@@ -10,10 +10,11 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.core.estimate import LEVEL
+from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.basefit import BaseFit
+from lcopa_bayes.effectsearch.basemodel import fitted_base
 from lcopa_bayes.effectsearch.explained import coordinates_of, declarable, explained_draws, explained_study
 from lcopa_bayes.effectsearch.heldouteffects import missed, unseen_share
 from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
@@ -29,7 +30,6 @@ from lcopa_bayes.effectsearch.scores import (
     over_noise,
     risen,
 )
-from lcopa_bayes.effectsearch.terms import fitted_base
 from lcopa_bayes.effectsearch.trace import Trace
 from lcopa_bayes.effectsearch.verdict import (
     ALONE,
@@ -119,19 +119,18 @@ class Loop:
         row = state.model.posterior.table.rows[state.model.columns[k]]
         x, sd = float(state.optimum.x[k]), float(np.sqrt(state.covariance[k, k]))
         lower, middle, upper = row.value_at(x + sd * WIDTH * np.array([-1.0, 0.0, 1.0])).tolist()
-        return {
-            "name": row.name,
-            "value": middle,
-            "unit": row.unit,
-            "mean": middle,
-            "sd": sd * (middle if row.log_scale else 1.0),
-            "lower": lower,
-            "upper": upper,
-            "level": LEVEL,
-            "interval": "Laplace",
-            "ess": None,
-            "grade": "tentative",
-        }
+        return Estimate(
+            name=row.name,
+            value=middle,
+            unit=row.unit,
+            lower=lower,
+            upper=upper,
+            ess=np.nan,
+            grade="tentative",
+            mean=middle,
+            sd=sd * (middle if row.log_scale else 1.0),
+            interval="Laplace",
+        ).as_json()
 
     @property
     def study(self) -> Study:
@@ -192,8 +191,7 @@ def _looped(
     before = _side(problem, start)
     cautions = (*base.caution, *_alone(study))
     if base.failed:
-        failure = Findings(base.failed, cautions, False, np.nan, np.nan, (), (), 0, 0, "", 0, 0, "", np.nan)
-        verdict = decide(failure)
+        verdict = Verdict("unexplained", "tentative", f"No effect is named, because {base.failed}.")
         return Loop(
             *(problem, base, enlarged, (), (), (), verdict, before, before, not study.held_out, cautions),
             outliers=outliers,
@@ -217,7 +215,6 @@ def _looped(
     )
     verdict = decide(
         Findings(
-            failed="",
             cautions=cautions,
             alarmed=first.alarmed or bool(added),
             largest=first.largest,
@@ -259,7 +256,7 @@ def _looped(
         after = _side(problem, last_state)
     if sampled is not None:
         covariance = np.asarray(np.cov(coordinates_of(last_state.model, sampled[0]).T))
-        drawn = _side(problem, replace(last_state, covariance=covariance, sampled=sampled))
+        drawn = _side(problem, replace(last_state, spread=covariance, sampled=sampled))
         if study.held_out and risen(after.unseen, drawn.unseen) > RISEN:
             cautions, sampled = (*cautions, _ASTRAY), None
             after = _side(problem, last_state)
@@ -297,5 +294,5 @@ def _alone(study: Study) -> tuple[str, ...]:
 
 def _side(problem: Problem, state: State) -> Side:
     unseen = held_out_scores(state, problem) if problem.study.held_out else left_out_scores(state)
-    log_evidence = state.optimum.log_evidence + state.model.log_support
+    log_evidence = state.optimum.log_evidence + state.model.plant.table.log_support
     return Side(state, tuple(fit_scores(state)), tuple(unseen), log_evidence)

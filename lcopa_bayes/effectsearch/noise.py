@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations, product
 from typing import final
 
 import numpy as np
@@ -171,21 +172,14 @@ def quiet_pieces(samples: Sequence[Samples], axis: int, delay: float) -> list[Ob
     `delay` is the shortest fitted delay [time unit]; 0.8 of it counts as dead time.
     """
     counts = [quiet_samples(record, axis, delay) for record in samples]
-    return [_first(one.axes[axis], count) for one, count in zip(samples, counts, strict=True) if count > 1]
-
-
-def _first(observed: Observed, count: int) -> Observed:
-    return Observed(observed.index[:count], observed.values[:count], observed.gaps[:count])
+    return [one.axes[axis].first(count) for one, count in zip(samples, counts, strict=True) if count > 1]
 
 
 def repeat_pieces(samples: Sequence[Samples], axis: int) -> list[Observed]:
     """Differences over sqrt(2) of records with the same drive and sample times [response unit]."""
-    out, taken = [], set()
-    for k, one in enumerate(samples):
-        for j in range(k + 1, len(samples)):
-            other = samples[j]
-            if k in taken or j in taken or not _repeats(one, other, axis):
-                continue
+    out, taken = [], set[int]()
+    for (k, one), (j, other) in combinations(enumerate(samples), 2):
+        if not taken & {k, j} and _repeats(one, other, axis):
             taken |= {k, j}
             difference = (one.axes[axis].values - other.axes[axis].values) / np.sqrt(2)
             out.append(replace(one.axes[axis], values=difference))
@@ -322,9 +316,8 @@ def _mixture(apart: Vector) -> float:
     plain = -0.5 * (apart / scale) ** 2 - np.log(scale)
     z2 = (apart / core) ** 2
     evidence = []
-    for share in _SHARES:
-        for width in _WIDTHS:
-            inner = np.log1p(-share) - 0.5 * z2
-            outer = np.log(share / width) - 0.5 * z2 / width**2
-            evidence.append(float((np.logaddexp(inner, outer) - np.log(core) - plain).sum()))
+    for share, width in product(_SHARES, _WIDTHS):
+        inner = np.log1p(-share) - 0.5 * z2
+        outer = np.log(share / width) - 0.5 * z2 / width**2
+        evidence.append(float((np.logaddexp(inner, outer) - np.log(core) - plain).sum()))
     return float(logsumexp(evidence) - np.log(len(evidence)))

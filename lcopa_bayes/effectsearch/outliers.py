@@ -82,12 +82,12 @@ def outlying(study: Study, fit: BaseFit) -> Outlying | None:
     sizes: list[Vector] = []
     counts = np.zeros((2, 2))  # rows: at rest, moving; columns: samples, outliers
     for axis in range(len(samples[0].axes)):
-        own = [part for part in parts(samples) if part.axis == axis and part.rows.stop > part.rows.start]
+        own = parts(samples, axis)
         apart = [_apart(residual[part.rows]) for part in own]
         core = float(np.median(np.abs(np.concatenate(apart)))) / _NORMAL
         for part, distance in zip(own, apart, strict=True):
             flags = np.abs(distance) > _FAR * core
-            rest = quiet_samples(samples[part.record], axis, delay)
+            rest = quiet_samples(part.samples, axis, delay)
             counts[0] += rest, flags[:rest].sum()
             counts[1] += flags.size - rest, flags[rest:].sum()
             far[part.record, axis] = flags

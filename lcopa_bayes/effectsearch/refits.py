@@ -13,10 +13,10 @@ from scipy.stats import chi2
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.effectsearch.basefit import renewed
-from lcopa_bayes.effectsearch.crossvalidation import groups, log_scores
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.noise import quiet_samples
 from lcopa_bayes.effectsearch.regression import Optimum, Regression
+from lcopa_bayes.effectsearch.scores import State, groups, log_scores
 from lcopa_bayes.effectsearch.signature import Scale
 from lcopa_bayes.effectsearch.trace import LEVEL
 from lcopa_bayes.effectsearch.whitening import Whitening
@@ -80,6 +80,11 @@ class Refit:
         return float(log_scores(self.optimum, apart).sum() - log_scores(self.before, apart).sum())
 
     @property
+    def state(self) -> State:
+        """The model at its optimum."""
+        return State(self.model, self.optimum, self.whitening)
+
+    @property
     def dynamics(self) -> bool:
         """Whether it adds linear dynamics without a name."""
         return any(e.card.dynamics for e in self.model.effects if e.name in self.added)
@@ -124,7 +129,7 @@ class Refit:
         bare = self.whitening(self.whitening.observed - model.predict(x))
         drop = 0.0
         for part in self.whitening.parts:
-            count = quiet_samples(self.whitening.samples[part.record], part.axis, delay)
+            count = quiet_samples(part.samples, part.axis, delay)
             rows = slice(part.rows.start, part.rows.start + count)
             drop += float((bare[rows] ** 2 - self.optimum.white[rows] ** 2).sum())
         return drop >= 0.0
@@ -227,7 +232,7 @@ def refit(
     low, high = extended.bounds
     starts = [np.concatenate([before.x, factor * linear]) for factor in (1.0, 0.3, 0.0)]
     if any(effect.card.place == "drive" for effect, _ in added):
-        starts += [_earlier(model, starts[0], share) for share in _DELAYS]
+        starts += [model.delayed(starts[0], share) for share in _DELAYS]
     starts += [near] if near is not None else []
     starts = [np.clip(start, low, high) for start in starts]  # starts only
     quick, _ = Regression(replace(extended, exact=False), whitening).lowest(starts, gain=_NEAR)
@@ -374,13 +379,3 @@ def log_bayes_factor(before: Optimum, after: Optimum, quiet: float) -> float:
     volume = (after.log_evidence + after.cost) - (before.log_evidence + before.cost)
     known = Scale(quiet, after.effective - after.x.size, np.array([2 * before.cost]))
     return float(volume + known.gain(np.array([before.cost - after.cost]))[0])
-
-
-def _earlier(model: ExtendedModel, start: Vector, share: float) -> Vector:
-    """The start with every free delay changed by a share of it."""
-    out = start.copy()
-    rows = model.plant.table.rows
-    for position, k in enumerate(model.columns):
-        if k < len(rows) and rows[k].kind == "delay":
-            out[position] += np.log1p(share) if rows[k].log_scale else share * start[position]
-    return out

@@ -168,9 +168,7 @@ class Regression:
             stuck,
         )
 
-    def lowest(
-        self, starts: Sequence[Vector], *, glance: int = _GLANCE, gain: float = GAIN
-    ) -> tuple[Vector, bool]:
+    def lowest(self, starts: Sequence[Vector], *, gain: float = GAIN) -> tuple[Vector, bool]:
         """`reached` from the best of several starts: a few evaluations from each, the best two taken to the
         end.
 
@@ -179,7 +177,7 @@ class Regression:
         looked: list[tuple[float, Vector]] = []
         for start in starts:
             try:
-                x, _ = self.reached(start, most=glance if len(starts) > 1 else _EVALUATIONS, gain=gain)
+                x, _ = self.reached(start, most=_GLANCE if len(starts) > 1 else _EVALUATIONS, gain=gain)
             except ArithmeticError:
                 continue
             looked.append((self.cost(x), x))
@@ -189,9 +187,9 @@ class Regression:
         ends = [self.reached(x, gain=gain) for _, x in looked[:2]]
         return min(ends, key=lambda one: self.cost(one[0])) if len(ends) > 1 else ends[0]
 
-    def best(self, starts: Sequence[Vector], *, gain: float = GAIN) -> Optimum:
+    def best(self, starts: Sequence[Vector]) -> Optimum:
         """The optimum of `lowest`, described."""
-        x, converged = self.lowest(starts, gain=gain)
+        x, converged = self.lowest(starts)
         return self.at(x, converged=converged)
 
 

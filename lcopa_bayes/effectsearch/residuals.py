@@ -12,7 +12,7 @@ from scipy import signal, stats
 from lcopa_bayes.core.arrays import Flags, Vector
 from lcopa_bayes.effectsearch.bandwidening import since_command
 from lcopa_bayes.effectsearch.scores import State
-from lcopa_bayes.effectsearch.whitening import Part
+from lcopa_bayes.effectsearch.whitening import Part, parts
 
 _BINS = 12
 _LAGS = 60
@@ -42,55 +42,46 @@ class View:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values."""
-        labels = {"name": self.name, "axis": self.axis, "across": self.across, "along": self.along}
-        return labels | {"x": self.x, "y": self.y, "error": self.error, "sentence": self.sentence}
+        return dict(vars(self))
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class _Axis:
-    """Pooled samples of one axis."""
+    """Samples of one axis."""
 
     name: str
+    parts: tuple[Part, ...]
     white: Vector
-    record: Vector
     since: Vector
     predicted: Vector
     growing: Flags
+
+    @classmethod
+    def of(cls, state: State, axis: int) -> _Axis:
+        """Of all records."""
+        own, columns = parts(state.whitening.samples, axis), []
+        for part in own:
+            predicted = state.fitted[part.rows] - state.fitted[part.rows][0]
+            growing = np.gradient(np.abs(predicted)) > 0 if predicted.size > 1 else np.array([False])
+            since = since_command(part.samples)[part.observed.index]
+            columns.append((state.optimum.settled[part.rows], since, predicted, growing))
+        name = own[0].samples.record.response_axes[axis].name
+        return cls(name, own, *(np.concatenate(each) for each in zip(*columns, strict=True)))
 
 
 def views(state: State, time_unit: str) -> list[View]:
     """All views of every axis' whitened residual."""
     out: list[View] = []
-    whitening = state.whitening
-    for axis, response in enumerate(whitening.samples[0].record.response_axes):
-        parts = [p for p in whitening.parts if p.axis == axis and p.rows.stop > p.rows.start]
-        pooled = _pooled(state, parts, response.name)
-        names = [whitening.samples[part.record].record.name for part in parts]
-        out.append(_by_record(pooled, names))
+    for axis, response in enumerate(state.whitening.samples[0].record.response_axes):
+        pooled = _Axis.of(state, axis)
+        out.append(_by_record(pooled, [state.optimum.settled[part.rows] for part in pooled.parts]))
         out.append(_by_time(pooled, time_unit))
         out += _by_amplitude(pooled, response.unit)
         out.append(_by_direction(pooled))
-        out.append(_spectrum(state, parts, response.name, time_unit))
-        out.append(_drive(state, parts, response.name))
+        out.append(_spectrum(state, pooled, time_unit))
+        out.append(_drive(state, pooled))
     return out
-
-
-def _pooled(state: State, parts: list[Part], name: str) -> _Axis:
-    white, record, since, predicted, growing = [], [], [], [], []
-    whitening = state.whitening
-    for number, part in enumerate(parts):
-        samples = whitening.samples[part.record]
-        fitted = whitening.observed[part.rows] - state.optimum.residual[part.rows]
-        deflection = fitted - fitted[0]
-        white.append(state.optimum.settled[part.rows])
-        record.append(np.full(fitted.size, float(number)))
-        since.append(since_command(samples)[samples.axes[part.axis].index])
-        predicted.append(deflection)
-        growing.append(np.gradient(np.abs(deflection)) > 0 if deflection.size > 1 else np.array([False]))
-    pooled = (np.concatenate(each) for each in (white, record, since, predicted))
-    first, second, third, fourth = pooled
-    return _Axis(name, first, second, third, fourth, np.concatenate(growing))
 
 
 def _binned(x: Vector, y: Vector, statistic: Callable[[Vector], float]) -> tuple[Vector, Vector, Vector]:
@@ -108,12 +99,11 @@ def _power(values: Vector) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _by_record(pooled: _Axis, names: list[str]) -> View:
-    rms = np.array([_power(pooled.white[pooled.record == k]) for k in range(len(names))])
-    count = np.array([float((pooled.record == k).sum()) for k in range(len(names))])
+def _by_record(pooled: _Axis, white: list[Vector]) -> View:
+    rms, names = np.array([_power(one) for one in white]), [part.samples.record.name for part in pooled.parts]
     worst = int(np.argmax(rms))
     said = f"largest on {names[worst]}, {rms[worst]:.2f} times the noise, smallest {rms.min():.2f} times"
-    error = np.sqrt(0.5 / count)
+    error = np.sqrt(0.5 / np.array([one.size for one in white]))
     across = "record: " + ", ".join(f"{k} {name}" for k, name in enumerate(names))
     x = np.arange(len(names), dtype=float)
     return View("by record", pooled.name, across, "rms over noise [-]", x, rms, error, said)
@@ -158,15 +148,13 @@ def _by_direction(pooled: _Axis) -> View:
     return View("by direction", pooled.name, across, "rms over noise [-]", np.arange(2.0), rms, error, said)
 
 
-def _spectrum(state: State, parts: list[Part], name: str, unit: str) -> View:
+def _spectrum(state: State, pooled: _Axis, unit: str) -> View:
     """Mean periodogram of the records over that of white noise, in bands of equal logarithmic width."""
     frequencies, powers = [], []
-    for part in parts:
-        samples = state.whitening.samples[part.record]
-        times = samples.times[samples.axes[part.axis].index]
-        if times.size < 8:
+    for part in pooled.parts:
+        if part.times.size < 8:
             continue
-        rate = 1.0 / float(np.median(np.diff(times)))
+        rate = 1.0 / float(np.median(np.diff(part.times)))
         f, p = signal.periodogram(state.optimum.settled[part.rows], fs=rate, detrend=False)
         frequencies.append(f[1:])
         powers.append(p[1:] * rate / 2)
@@ -174,7 +162,7 @@ def _spectrum(state: State, parts: list[Part], name: str, unit: str) -> View:
     if not frequencies:
         empty = np.zeros(0)
         return View(
-            "spectrum", name, across, "power over noise [-]", empty, empty, empty, "records too short"
+            "spectrum", pooled.name, across, "power over noise [-]", empty, empty, empty, "records too short"
         )
     f, p = np.concatenate(frequencies), np.concatenate(powers)
     edges = np.geomspace(f.min(), f.max() * (1 + 1e-12), _BANDS + 1)
@@ -186,19 +174,17 @@ def _spectrum(state: State, parts: list[Part], name: str, unit: str) -> View:
     top = int(np.argmax(mean))
     said = f"largest at {centre[top]:.3g} cycles per {unit}, {mean[top]:.2f} times white noise"
     return View(
-        "spectrum", name, across, "power over noise [-]", centre, mean, 1 / np.sqrt(count[kept]), said
+        "spectrum", pooled.name, across, "power over noise [-]", centre, mean, 1 / np.sqrt(count[kept]), said
     )
 
 
-def _drive(state: State, parts: list[Part], name: str) -> View:
+def _drive(state: State, pooled: _Axis) -> View:
     """Largest correlation of the residual with commands up to `_LAGS` samples earlier, over all drives."""
     lags = np.arange(_LAGS + 1)
     total, norm = np.zeros(lags.size), 0.0
-    for part in parts:
-        samples = state.whitening.samples[part.record]
-        times = samples.times[samples.axes[part.axis].index]
-        record = samples.record
-        held = np.searchsorted(record.time, times, side="right") - 1
+    for part in pooled.parts:
+        record = part.samples.record
+        held = np.searchsorted(record.time, part.times, side="right") - 1
         drive = np.abs(np.diff(record.drive[np.clip(held, 0, None)], axis=0, prepend=record.drive[:1]))
         jumps = drive.sum(axis=1)
         power = state.optimum.settled[part.rows] ** 2
@@ -216,7 +202,7 @@ def _drive(state: State, parts: list[Part], name: str) -> View:
     )
     return View(
         "independence from the drive",
-        name,
+        pooled.name,
         "samples after a command [-]",
         "correlation of power over its sd [-]",
         lags.astype(float),

@@ -15,12 +15,11 @@ from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.signature import (
     Projection,
-    Signature,
     expected_margin,
     pair_evidence,
     signature_of,
 )
-from lcopa_bayes.effectsearch.trace import Trace, Traced, trace
+from lcopa_bayes.effectsearch.trace import Trace, trace
 from lcopa_bayes.effectsearch.verdict import FIRM, MARGIN
 from lcopa_bayes.model.effects.effect import Effect
 
@@ -108,7 +107,7 @@ def search(
     if rounds[-1].trace.alarmed and rounds[0].trace.alarmed and not (alone or unnamed):
         paired = _paired(start, state, rounds[0].trace)
         if paired is not None:
-            state = _state(paired)
+            state = paired.state
             seen = trace(state, library, rng, noise_samples=noise_samples, draws=draws)
             rounds += [Round(rounds[0].trace, (paired,), (), paired), Round(seen, (), (), None)]
     names = [effect.name for effect in state.model.effects]
@@ -212,10 +211,6 @@ def _leader(accepted: Sequence[Refit]) -> Refit | None:
     return next(shared, accepted[0] if accepted else None)
 
 
-def _state(candidate: Refit) -> State:
-    return State(candidate.model, candidate.optimum, candidate.whitening, candidate.optimum.covariance)
-
-
 def _kept(candidate: Refit) -> State:
     """Without effects that are no longer significant beside the new one, and not missed when they go."""
     idle = [
@@ -224,12 +219,12 @@ def _kept(candidate: Refit) -> State:
         if effect.name not in candidate.added and candidate.wald(effect.name) > SIGNIFICANT
     ]
     if not idle:
-        return _state(candidate)
+        return candidate.state
     model, x = candidate.without(idle)
     optimum = Regression(model, candidate.whitening).descend(x, most=12, gain=0.02)
     if log_bayes_factor(optimum, candidate.optimum, candidate.quiet) > MARGIN:
-        return _state(candidate)
-    return State(model, optimum, candidate.whitening, optimum.covariance)
+        return candidate.state
+    return State(model, optimum, candidate.whitening)
 
 
 def _paired(start: State, state: State, seen: Trace) -> Refit | None:
@@ -239,7 +234,8 @@ def _paired(start: State, state: State, seen: Trace) -> Refit | None:
     """
     named = [one for one in seen.traced if one.card.place != "generic" and one.signatures][:_PAIRED]
     ranked = sorted(
-        combinations(named, 2), key=lambda pair: -pair_evidence(_best(pair[0]), _best(pair[1]), seen.residual)
+        combinations(named, 2),
+        key=lambda pair: -pair_evidence(pair[0].signature, pair[1].signature, seen.residual),
     )
     have = {effect.name for effect in state.model.effects}
     choice = float(np.log(max(len(ranked), 1)))
@@ -248,10 +244,10 @@ def _paired(start: State, state: State, seen: Trace) -> Refit | None:
     for pair in ranked[:_PAIRS]:
         if {one.name for one in pair} <= have:
             continue
-        columns = np.concatenate([_best(one).columns for one in pair], axis=1)
+        columns = np.concatenate([one.signature.columns for one in pair], axis=1)
         inner = np.linalg.solve(np.eye(columns.shape[1]) + columns.T @ columns, columns.T @ seen.residual)
-        size = _best(pair[0]).columns.shape[1]
-        added = [(_best(pair[0]).effect, inner[:size]), (_best(pair[1]).effect, inner[size:])]
+        sizes = np.split(inner, [pair[0].signature.columns.shape[1]])
+        added = [(one.signature.effect, size) for one, size in zip(pair, sizes, strict=True)]
         try:
             candidate = refit(start.model, start.optimum, start.whitening, added, seen.scale.quiet)
         except ArithmeticError:
@@ -260,10 +256,6 @@ def _paired(start: State, state: State, seen: Trace) -> Refit | None:
         if candidate.log_bayes_factor > bar and _accepted(candidate, seen, seen.threshold):
             bar, best = candidate.log_bayes_factor, candidate
     return best
-
-
-def _best(one: Traced) -> Signature:
-    return one.signatures[one.best]
 
 
 def group(state: State, chosen: Refit, refits: Sequence[Refit], seen: Trace) -> tuple[str, ...]:

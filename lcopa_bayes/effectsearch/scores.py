@@ -1,4 +1,10 @@
-"""Errors of a model on records it was fitted to and on records it never saw, per axis and record."""
+"""Errors of a model on records it was fitted to and on records it never saw, per axis and record.
+
+What a fit says of samples it is not shown: each record, or each fifth of a single one, left out in turn, in
+closed form of the linearised model. With whitened residual r and tangents J at the optimum, information
+``H = J' J + prior`` and group k, the optimum without the group is one Gauss-Newton step away,
+``x - (H - J_k' J_k)^-1 J_k' r_k``, and its predictive density follows without a refit.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +15,10 @@ from typing import Any, final
 import numpy as np
 from scipy.stats import norm
 
-from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Index, Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of, root_of
 from lcopa_bayes.core.estimate import LEVEL, attributes
 from lcopa_bayes.effectsearch.bandwidening import Widening
-from lcopa_bayes.effectsearch.crossvalidation import groups, shifts
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.noise import Law
 from lcopa_bayes.effectsearch.regression import Optimum
@@ -25,8 +30,60 @@ from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.parameter import Parameter, Place
 from lcopa_bayes.model.effects.declared import Declared
 from lcopa_bayes.model.effects.effect import UnstableError
-from lcopa_bayes.results.prediction import disturbances, named_rng, offset_draws, plant_draws
+from lcopa_bayes.results.prediction import axis_draws
 from lcopa_bayes.sampling.draws import Draws
+
+PARTS = 5
+"""Parts of a single record that are left out in turn [-]."""
+_STRETCHES = 10
+"""Stretches of successive samples in each part [-]."""
+
+
+def groups(whitening: Whitening) -> list[Index]:
+    """Positions in the stack: of each record; of a single one every fifth of 50 stretches of successive
+    samples, all axes alike.
+
+    One fifth in one piece would take away the only step of a record, and nothing predicts a step not seen.
+    """
+    records: dict[int, list[Index]] = {}
+    for part in whitening.parts:
+        records.setdefault(part.record, []).append(np.arange(part.rows.start, part.rows.stop))
+    if len(records) > 1:
+        return [np.concatenate(axes) for axes in records.values()]
+    (axes,) = records.values()
+    cut = [np.array_split(rows, PARTS * _STRETCHES) for rows in axes]
+    return [np.concatenate([stretch for each in cut for stretch in each[k::PARTS]]) for k in range(PARTS)]
+
+
+def in_turn(records: int) -> str:
+    """In words, what is left out of that many records."""
+    if records > 1:
+        return "leaving records out in turn"
+    return f"leaving each of {PARTS} parts of the only record out in turn"
+
+
+def log_scores(optimum: Optimum, chosen: Sequence[Index]) -> Vector:
+    """Log predictive density of each group given the others, without the constant of the noise [nat]."""
+    whole = np.linalg.slogdet(optimum.information)[1]
+    out = []
+    for rows in chosen:
+        tangents, residual = optimum.jacobian[rows], optimum.settled[rows]
+        rest = optimum.information - tangents.T @ tangents
+        pull = tangents.T @ residual
+        power = residual @ residual + pull @ np.linalg.solve(rest, pull)
+        out.append(-0.5 * power + 0.5 * (np.linalg.slogdet(rest)[1] - whole))
+    return np.array(out)
+
+
+def shifts(optimum: Optimum, chosen: Sequence[Index]) -> list[tuple[Vector, Matrix]]:
+    """For each group, how far the optimum moves when it is left out, and the covariance there."""
+    out = []
+    for rows in chosen:
+        tangents, residual = optimum.jacobian[rows], optimum.settled[rows]
+        covariance: Matrix = np.linalg.inv(optimum.information - tangents.T @ tangents).astype(float)
+        out.append((-covariance @ (tangents.T @ residual), covariance))
+    return out
+
 
 _DRAWS = 100
 """Draws about an optimum behind the prediction of a held-out record [-]."""
@@ -105,31 +162,39 @@ class State:
     model: ExtendedModel
     optimum: Optimum
     whitening: Whitening
-    covariance: Matrix
-    """Of the coordinates, (k, k)."""
     widening: Widening | None = None
     sampled: tuple[Draws, Noise] | None = None
     """Draws of the explained study and its noise; None where only the optimum is known."""
+    spread: Matrix | None = None
+    """Covariance of the coordinates in these draws, (k, k)."""
+
+    @property
+    def covariance(self) -> Matrix:
+        """Of the coordinates, (k, k)."""
+        return self.optimum.covariance if self.spread is None else self.spread
+
+    @property
+    def fitted(self) -> Vector:
+        """Responses at the samples, stacked [response unit]."""
+        return self.whitening.observed - self.optimum.residual
 
 
 def fit_scores(state: State) -> list[Score]:
     """On the records that were fitted."""
     tangents = state.optimum.tangents
     variance = np.einsum("nk,kl,nl->n", tangents, state.covariance, tangents, optimize=True)
-    return _scores(
-        state, state.whitening.observed - state.optimum.residual, variance, "the fit", own_levels=False
-    )
+    return _scores(state, state.fitted, variance, "the fit", own_levels=False)
 
 
 def left_out_scores(state: State) -> list[Score]:
     """On the fit records, each left out in turn (one Gauss-Newton step away from the fit of all)."""
     chosen = groups(state.whitening)
-    mean = state.whitening.observed - state.optimum.residual
+    mean = state.fitted
     variance = np.zeros_like(mean)
-    for group, (shift, covariance) in zip(chosen, shifts(state.optimum, chosen), strict=True):
-        tangents = state.optimum.tangents[group.rows]
-        mean[group.rows] += tangents @ shift
-        variance[group.rows] = np.einsum("nk,kl,nl->n", tangents, covariance, tangents, optimize=True)
+    for rows, (shift, covariance) in zip(chosen, shifts(state.optimum, chosen), strict=True):
+        tangents = state.optimum.tangents[rows]
+        mean[rows] += tangents @ shift
+        variance[rows] = np.einsum("nk,kl,nl->n", tangents, covariance, tangents, optimize=True)
     own = len(state.whitening.samples) > 1 and _own_levels(state)
     return _scores(state, mean, variance, "the other records", own_levels=own)
 
@@ -152,30 +217,17 @@ def held_out_scores(state: State, problem: Problem) -> list[Score]:
         )
         model = replace(model, effects=own)
     draws, noise = state.sampled or _laplace(state, study.seed)
-    draws = replace(draws, values=draws.thinned(_MOST)[None])
-    table, out = draws.table, []
-    for r, record in enumerate(samples):
-        rng, alone = named_rng(study.seed, record.record.name), model.only(r)
-        values, plant = plant_draws(draws, alone)
-        apart = disturbances(table, alone, values, plant, rng)
-        whole = plant if apart is None else plant + apart
-        bounded = np.isfinite(whole).all(axis=(0, 2))
+    draws, out = replace(draws, values=draws.thinned(_MOST)[None]), []
+    drawn = axis_draws(draws, model, samples, noise, held_out=True, seed=study.seed)
+    for record, axis, _, plant, seen, (level, source, _), _ in drawn:
+        bounded = np.isfinite(seen).all(axis=1)
         if not bounded.any():
             names = tuple(effect.name for effect in state.model.effects)
             raise UnstableError(names, record.record.name, "no draw has a bounded response")
-        values, plant, whole = values[bounded], plant[:, bounded], whole[:, bounded]
-        for axis, observed in enumerate(record.axes):
-            if not observed.values.size:
-                continue
-            seen = whole[axis][:, observed.index]
-            level, source, _ = offset_draws(
-                table, values, axis, r, record, seen, noise, held_out=True, rng=rng
-            )
-            law = state.whitening.noise[axis]
-            # what differs from record to record is 0 on average
-            mean = plant[axis][:, observed.index].mean(axis=0) + level.mean()
-            variance = (seen + level[:, None]).var(axis=0)
-            out.append(_score(state, record, axis, (mean, variance), law.sd, source, held_out=True))
+        # what differs from record to record is 0 on average
+        mean = plant[bounded].mean(axis=0) + level[bounded].mean()
+        variance = (seen + level[:, None])[bounded].var(axis=0)
+        out.append(_score(state, record, axis, (mean, variance), source, held_out=True))
     return out
 
 
@@ -189,7 +241,7 @@ def _laplace(state: State, seed: int) -> tuple[Draws, Noise]:
     x[:, free] += rng.standard_normal((len(x), free.size)) @ root_of(covariance).T
     low, high = model.bounds
     inside = ((x >= low) & (x <= high))[:, free].all(axis=1)
-    inside &= model.supported(x, every=False)
+    inside &= model.supported(x)
     x = np.concatenate([x[inside][:_DRAWS], optimum.x[None]])
     table = model.posterior.table
     rows = [k for k, row in enumerate(table.rows) if not row.noise]
@@ -214,20 +266,16 @@ def _scores(
     state: State, mean: Vector, variance: Vector, level_from: str, *, own_levels: bool
 ) -> list[Score]:
     """One score per record and axis; with `own_levels` each record's level is taken from its samples."""
-    whitening, out = state.whitening, []
-    for part in whitening.parts:
-        record = whitening.samples[part.record]
-        observed = record.axes[part.axis]
-        if not observed.values.size:
-            continue
-        noise = whitening.noise[part.axis]
+    out = []
+    for part in state.whitening.parts:
         centre, spread, source = mean[part.rows], variance[part.rows], level_from
         if own_levels:
-            level, doubt, source = _level(record, part.axis, observed.values - centre, noise)
+            misfit, noise = part.observed.values - centre, state.whitening.noise[part.axis]
+            level, doubt, source = _level(part.samples, part.axis, misfit, noise)
             # what the fit did not know about the level is known now
             centre, spread = centre + level, _without_level(spread, doubt)
         held_out = level_from != "the fit"
-        out.append(_score(state, record, part.axis, (centre, spread), noise.sd, source, held_out=held_out))
+        out.append(_score(state, part.samples, part.axis, (centre, spread), source, held_out=held_out))
     return out
 
 
@@ -236,7 +284,6 @@ def _score(
     record: Samples,
     axis: int,
     predicted: tuple[Vector, Vector],
-    noise_sd: float,
     level_from: str,
     *,
     held_out: bool,
@@ -246,17 +293,16 @@ def _score(
     mean, variance = predicted
     if state.widening is not None:
         variance = variance + state.widening.variance(record, axis)
-    times = record.times[observed.index]
     return Score(
         record.record.name,
         named.name,
         named.unit,
         held_out,
-        times,
+        record.times[observed.index],
         observed.values,
         mean,
         variance,
-        noise_sd,
+        state.whitening.noise[axis].sd,
         level_from,
     )
 

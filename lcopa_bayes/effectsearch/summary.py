@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 
 from lcopa_bayes.core.estimate import attributes, plain
-from lcopa_bayes.effectsearch.crossvalidation import in_turn
 from lcopa_bayes.effectsearch.loop import Loop, Side
 from lcopa_bayes.effectsearch.residuals import View, views
 from lcopa_bayes.effectsearch.rounds import Round
-from lcopa_bayes.effectsearch.scores import Score, pooled_coverage, pooled_rmse
+from lcopa_bayes.effectsearch.scores import Score, in_turn, pooled_coverage, pooled_rmse
 from lcopa_bayes.effectsearch.trace import SEEN
 from lcopa_bayes.model.effects.effect import Card
 
@@ -30,8 +29,7 @@ def results(result: Loop) -> dict[str, Any]:
     numbers: dict[str, Any] = {
         "study": result.problem.study.name,
         "verdict": result.verdict.kind,
-        "confidence": result.verdict.confidence,
-        "sentence": result.verdict.sentence,
+        **attributes(result.verdict, "confidence", "sentence"),
         "cautions": result.cautions,
         "base_failed": result.base.failed,
         "base_enlarged": result.enlarged,
@@ -48,7 +46,8 @@ def results(result: Loop) -> dict[str, Any]:
             for axis, one in zip(result.problem.study.response_axes, result.base.noise, strict=True)
         ],
         "effects": _effects(result, chances),
-        "outliers": _outliers(result),
+        "outliers": result.outliers
+        and attributes(result.outliers, "count", "share", "width", "log_bayes_factor", "sentence"),
         "before": side(result.before, result),
         "after": side(result.after, result),
         "unseen_by": in_turn(len(result.problem.study.fit)) if result.left_out else "held-out records",
@@ -130,16 +129,9 @@ def _nearest(result: Loop, name: str) -> list[dict[str, Any]]:
     assert result.trace is not None
     own = result.trace.of(name)
     others = [one for one in result.trace.traced if one.signatures and one.name != name]
-    angles = {one.name: own.signatures[own.best].cosine(one.signatures[one.best]) for one in others}
+    angles = {one.name: own.signature.cosine(one.signature) for one in others}
     ranked = sorted(angles, key=lambda other: -angles[other])[:_NEAREST]
     return [{"name": other, "cosine": angles[other]} for other in ranked]
-
-
-def _outliers(result: Loop) -> dict[str, Any] | None:
-    if result.outliers is None:
-        return None
-    keys = ("count", "share", "width", "log_bayes_factor", "sentence")
-    return {key: getattr(result.outliers, key) for key in keys}
 
 
 def _evidence(result: Loop) -> dict[str, Any]:
@@ -157,15 +149,10 @@ def _evidence(result: Loop) -> dict[str, Any]:
         "none": chances["none"],
         "classes": [
             {
-                "name": one.name,
-                "place": one.card.place,
-                "log_bayes_factor": one.log_bayes_factor,
+                **attributes(one, "name", "log_bayes_factor", "survival", "failed"),
+                **attributes(one.card, "place", "reveals", "mistaken_for"),
                 "probability": chances[one.name],
-                "survival": one.survival,
                 "instances": len(one.signatures),
-                "reveals": one.card.reveals,
-                "mistaken_for": one.card.mistaken_for,
-                "failed": one.failed,
             }
             for one in trace.traced
         ],
@@ -175,15 +162,11 @@ def _evidence(result: Loop) -> dict[str, Any]:
 def _round(one: Round) -> dict[str, Any]:
     return {
         **attributes(one.trace, "largest", "threshold", "p_value"),
-        "leading": [
-            {"name": each.name, "log_bayes_factor": each.log_bayes_factor} for each in one.trace.traced[:6]
-        ],
+        "leading": [attributes(each, "name", "log_bayes_factor") for each in one.trace.traced[:6]],
         "refits": [
             {
-                "added": list(candidate.added),
-                "log_bayes_factor": candidate.log_bayes_factor,
+                **attributes(candidate, "added", "log_bayes_factor", "significant"),
                 "left_out_gain": candidate.left_out,
-                "significant": candidate.significant,
                 "converged": candidate.optimum.converged,
             }
             for candidate in one.refits
@@ -254,15 +237,9 @@ def moved(result: Loop) -> list[dict[str, Any]]:
     for position, k in enumerate(base.columns):
         shift = (after.optimum.x[position] - before.optimum.x[position]) / sds[position]
         if abs(shift) > FAR:
-            row = rows[k]
             out.append(
-                {
-                    "name": row.name,
-                    "unit": row.unit,
-                    "before": first[k],
-                    "after": last[k],
-                    "shift_in_sd": shift,
-                }
+                attributes(rows[k], "name", "unit")
+                | {"before": first[k], "after": last[k], "shift_in_sd": shift}
             )
     return sorted(out, key=lambda row: -abs(row["shift_in_sd"]))
 

@@ -59,6 +59,11 @@ class Traced:
         return self.card.name
 
     @property
+    def signature(self) -> Signature:
+        """That of its best instance."""
+        return self.signatures[self.best]
+
+    @property
     def scatters(self) -> bool:
         """Whether it changes the distribution of the noise alone."""
         return not self.signatures and not self.failed
@@ -124,10 +129,7 @@ class Trace:
 
     def of(self, name: str) -> Traced:
         """The effect of that name; KeyError when it was not traced."""
-        for one in self.traced:
-            if one.name == name:
-                return one
-        raise KeyError(name)
+        return {one.name: one for one in self.traced}[name]
 
 
 def trace(

@@ -42,8 +42,6 @@ class Verdict:
 class Findings:
     """What a loop found, as far as the verdict depends on it."""
 
-    failed: str
-    """Why the base fit cannot be used; empty when it can."""
     cautions: tuple[str, ...]
     alarmed: bool
     """Whether any class of effect was above the threshold in the first residual."""
@@ -92,10 +90,8 @@ class Findings:
 
 
 def decide(given: Findings) -> Verdict:
-    """The verdict; an effect is never named from a base fit that failed."""
-    confidence: Confidence = "tentative" if given.cautions or given.failed else "firm"
-    if given.failed:
-        return Verdict("unexplained", "tentative", f"No effect is named, because {given.failed}.")
+    """The verdict from a base fit that can be used."""
+    confidence: Confidence = "tentative" if given.cautions else "firm"
     if not given.alarmed:
         return _quiet(given, confidence)
     refused = _refused(given)

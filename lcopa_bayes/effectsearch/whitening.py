@@ -12,7 +12,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.effectsearch.noise import Law
 from lcopa_bayes.inference.noise import WhiteAR1
-from lcopa_bayes.inference.observations import PlausibleNoise, Samples
+from lcopa_bayes.inference.observations import Observed, PlausibleNoise, Samples
 
 _PER_LAW = 4
 """Draws of noise from each plausible law [-]."""
@@ -22,22 +22,37 @@ _SHORTER = 0.5
 
 
 @final
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Part:
     """Samples of one response axis of one record inside the stacked samples of all."""
 
     record: int
     axis: int
     rows: slice
+    samples: Samples
+    """Of the record."""
+
+    @property
+    def observed(self) -> Observed:
+        """Those of the axis."""
+        return self.samples.axes[self.axis]
+
+    @property
+    def times(self) -> Vector:
+        """Times of those [time unit]."""
+        return self.samples.times[self.observed.index]
 
 
-def parts(samples: Sequence[Samples]) -> tuple[Part, ...]:
-    """Where each record's axes are in the stack: records in their order, axes within."""
+def parts(samples: Sequence[Samples], only: int | None = None) -> tuple[Part, ...]:
+    """Where each record's axes are in the stack, those with samples: records in their order, axes within; of
+    one axis where `only` names it."""
     out, start = [], 0
     for r, record in enumerate(samples):
         for axis, observed in enumerate(record.axes):
-            out.append(Part(r, axis, slice(start, start + observed.values.size)))
-            start = out[-1].rows.stop
+            stop = start + observed.values.size
+            if stop > start and only in (None, axis):
+                out.append(Part(r, axis, slice(start, stop), record))
+            start = stop
     return tuple(out)
 
 
@@ -81,12 +96,6 @@ class Whitening:
         """Observed samples, stacked [response unit]."""
         return np.concatenate([one.values for record in self.samples for one in record.axes])
 
-    @cached_property
-    def _filled(self) -> list[tuple[Part, Vector]]:
-        """Parts that hold samples, with their gaps [sampling periods]."""
-        gaps = [self.samples[part.record].axes[part.axis].gaps for part in self.parts]
-        return [(part, gap) for part, gap in zip(self.parts, gaps, strict=True) if gap.size]
-
     @property
     def held(self) -> tuple[Vector, ...]:
         """Noise of each axis as it weights the samples: as `WhiteAR1` takes it, (3,), a sample that counts as
@@ -98,20 +107,17 @@ class Whitening:
     def __call__(self, columns: Array) -> Array:
         """Whitened columns (..., n), same shape [-]."""
         out = np.empty_like(columns, dtype=float)
-        for part, gaps in self._filled:
-            out[..., part.rows] = self.noise[part.axis].whiten(columns[..., part.rows], gaps)
-            if self.dependence:
-                out[..., part.rows] /= np.sqrt(self.dependence[part.axis])
+        for part in self.parts:
+            law = Law(*self.held[part.axis].tolist())
+            out[..., part.rows] = law.whiten(columns[..., part.rows], part.observed.gaps)
         return out
 
     def adjoint(self, columns: Matrix) -> Matrix:
         """Adjoint of whitening of columns (k, n), same shape [1 / response unit]."""
         out = np.empty_like(columns, dtype=float)
-        for part, gaps in self._filled:
-            parameters = self.noise[part.axis].parameters
-            out[:, part.rows] = WhiteAR1().adjoint(columns[:, part.rows], parameters, gaps)
-            if self.dependence:
-                out[:, part.rows] /= np.sqrt(self.dependence[part.axis])
+        for part in self.parts:
+            law = self.held[part.axis]
+            out[:, part.rows] = WhiteAR1().adjoint(columns[:, part.rows], law, part.observed.gaps)
         return out
 
     def covariances(self, columns: Matrix, count: int) -> Array:
@@ -128,10 +134,9 @@ class Whitening:
             drawn = self._plausible(axis, count, rng)
             rho, which = np.unique(drawn[:, 2], return_inverse=True)
             white, correlated = np.zeros((k, k)), np.zeros((rho.size, k, k))
-            for part, gaps in self._filled:
-                if part.axis == axis:
-                    white += back[:, part.rows] @ back[:, part.rows].T
-                    correlated += _correlated_products(back[:, part.rows], rho, gaps)
+            for part in parts(self.samples, axis):
+                white += back[:, part.rows] @ back[:, part.rows].T
+                correlated += _correlated_products(back[:, part.rows], rho, part.observed.gaps)
             out += drawn[:, 0, None, None] ** 2 * white
             out += drawn[:, 1, None, None] ** 2 * correlated[which]
         return out
@@ -158,7 +163,7 @@ class Whitening:
     @cached_property
     def log_scale(self) -> float:
         """Sum over samples of log sd of the prediction errors [nat]."""
-        laws = [(self.noise[part.axis].parameters[None], gaps) for part, gaps in self._filled]
+        laws = [(self.noise[part.axis].parameters[None], part.observed.gaps) for part in self.parts]
         return float(sum(WhiteAR1().log_scales(law, gaps).sum() for law, gaps in laws))
 
     def excess(self, residual: Vector) -> float:
@@ -177,9 +182,8 @@ class Whitening:
         several = -(-count // _PER_LAW)
         for axis in range(len(self.posterior)):
             drawn = np.repeat(self._plausible(axis, several, rng), _PER_LAW, axis=0)[:count]
-            for part, gaps in self._filled:
-                if part.axis == axis:
-                    raw[:, part.rows] = WhiteAR1().draw(drawn, gaps, rng)
+            for part in parts(self.samples, axis):
+                raw[:, part.rows] = WhiteAR1().draw(drawn, part.observed.gaps, rng)
         return np.ascontiguousarray(self(raw).T)
 
 

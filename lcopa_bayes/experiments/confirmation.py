@@ -18,7 +18,7 @@ from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.core.estimate import LEVEL, attributes, plain
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.experiments.design import LINEAR, Design
-from lcopa_bayes.experiments.information import Bench, Trial, with_effects
+from lcopa_bayes.experiments.information import Bench, Trial
 
 REPLICAS = 12
 """Records simulated and fitted per drive."""
@@ -189,13 +189,13 @@ def _confirmed(design: Design, chosen: int, where: str, replicas: int, jobs: int
     problem, period = design.fit.problem, design.limits.period
     values, table = design.draws[chosen], problem.posterior.table
     device = device_of(table, values, 0, time_unit=problem.study.time_unit)
-    responding = None if table.effects is None else partial(with_effects, problem, values)
     camera = VirtualBench(camera=period, exposure=problem.study.exposure)
     tasks = []
     for which, each in enumerate((design.winner, design.step)):
         drive, name = each.candidate.command, "simulated"
-        clean = truth(device, camera, drive, duration=each.time, name=name, responding=responding)
         bench = Bench(problem, each.time, period)
+        responding = table.effects and partial(bench.responses, values)
+        clean = truth(device, camera, drive, duration=each.time, name=name, responding=responding)
         tasks += [
             Trial(bench, clean, values, design.names, (problem.study.seed, 9, chosen, which, k))
             for k in range(replicas)

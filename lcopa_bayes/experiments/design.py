@@ -15,13 +15,13 @@ import numpy as np
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import Estimate, quantile
-from lcopa_bayes.experiments.candidates import PLAIN, Candidate, candidates
+from lcopa_bayes.experiments.candidates import PLAIN, Candidate, Limits, bench_times, candidates, limits_of
 from lcopa_bayes.experiments.information import Bench
-from lcopa_bayes.experiments.limits import Limits, bench_times, limits_of
 from lcopa_bayes.identifiability.contraction import prior_draws, prior_spread
 from lcopa_bayes.identifiability.symmetries import DIFFERENCED, Structure, structure
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.likelihood import Landscape
+from lcopa_bayes.model.forward import StepResponses
 from lcopa_bayes.results.predictive import Predictive
 
 _SINGULAR = 1e-13
@@ -89,9 +89,9 @@ def promises(
     """
     result: list[list[Matrix]] = [[] for _ in drives]
     for values in draws:
-        elements, sizes = bench.elements(values), bench.sizes(values)
+        known, sizes = StepResponses(), bench.sizes(values)
         for place, drive in enumerate(drives):
-            gram = repeats * bench.gram(values, elements, drive.command)
+            gram = repeats * bench.gram(values, drive.command, known)
             if prior is not None:
                 gram[np.diag_indices_from(gram)] += prior**-2.0
             result[place].append(cramer_rao(gram * np.outer(sizes, sizes)))
@@ -347,10 +347,10 @@ def _symmetries(bench: Bench, limits: Limits, points: Matrix) -> Structure:
     drives = candidates(limits, bench.time, np.random.default_rng(0), unit=unit)
     slopes, values = [], []
     for point in points:
-        elements, sizes = bench.elements(point), bench.sizes(point)
+        known, sizes = StepResponses(), bench.sizes(point)
         if not (sizes > 0).all():  # a size of zero has no relative change
             continue
-        stacked = [s for drive in drives for s in bench.slopes(point, elements, drive.command)]
+        stacked = [s for drive in drives for s in bench.slopes(point, drive.command, known)]
         slopes.append((np.concatenate(stacked, axis=1) * sizes[:, None]).T)
         values.append(point[list(bench.columns)])
     if not slopes:

@@ -5,17 +5,17 @@ A record of the virtual bench under a drive, and the study fitted to it by least
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import ceil
-from typing import NamedTuple, final
+from typing import final
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from lcopa_bayes.bench.command import Command
+from lcopa_bayes.calibration.replica import measured
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.data.record import Record
@@ -24,28 +24,14 @@ from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.effects import effect_slopes
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.noise import GaussianNoise, Student
+from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.simulation import Simulation
-from lcopa_bayes.model.blockpulses import Circle
-from lcopa_bayes.model.effects.declared import Declared
-from lcopa_bayes.model.forward import Experiment, ForwardModel
+from lcopa_bayes.model.forward import Experiment, ForwardModel, StepResponses
 from lcopa_bayes.model.grid import Mesh
-from lcopa_bayes.model.layout import Layout
-from lcopa_bayes.model.stepresponse import StepResponse, step_response
-from lcopa_bayes.model.superposition import Superposition, blocks_of, phases
 
 _NOTHING = 1e-11
 """Share of a slope that is not constant below which a resting response makes up for all of it [-]."""
-
-
-@final
-class Prepared(NamedTuple):
-    """An element at one set of values."""
-
-    response: StepResponse
-    """With its derivatives."""
-    superposition: Superposition
-    """Its readings, shared by all drives."""
 
 
 @final
@@ -101,82 +87,60 @@ class Bench:
         exposure = self.problem.study.exposure
         return Mesh.of_samples(self.sample_times, 0.0, blocks=self.blocks, exposure=exposure)
 
-    @cached_property
-    def circle(self) -> Circle:
-        """Where series are evaluated."""
-        return Circle(blocks_of(self.mesh.lattice, 0.0))
-
     def sizes(self, values: Vector) -> Vector:
         """What a slope is multiplied by to be relative to the parameter's size, (parameters,)."""
         rows = self.problem.posterior.table.rows
         return np.array([1.0 if rows[k].kind == "time" else abs(values[k]) for k in self.columns])
 
-    def elements(self, values: Vector) -> list[Prepared]:
-        """Step responses of the elements at table values, with their slopes; shared by all drives."""
-        dynamics = self.problem.posterior.table.dynamics(values[None])
-        step = self.mesh.lattice.step
-        return [
-            Prepared(
-                step_response(times, orders, self.circle, step, slopes="all"), Superposition(self.circle)
-            )
-            for times, orders in zip(dynamics.times, dynamics.orders, strict=True)
-        ]
-
-    def gram(self, values: Vector, elements: Sequence[Prepared], command: Command) -> Matrix:
+    def gram(self, values: Vector, command: Command, known: StepResponses) -> Matrix:
         """Fisher information of one record under `command`, (parameters, parameters)."""
         out = np.zeros((len(self.columns), len(self.columns)))
-        for slopes in self.slopes(values, elements, command):
+        for slopes in self.slopes(values, command, known):
             out += slopes @ slopes.T
         return out
 
-    def slopes(self, values: Vector, elements: Sequence[Prepared], command: Command) -> list[Matrix]:
+    def slopes(self, values: Vector, command: Command, known: StepResponses) -> list[Matrix]:
         """White derivatives of every response axis, each (parameters, samples).
 
-        With effects by `inference.effects`; what differs from record to record is left out.
-        UnstableError where there is no bounded response.
+        `known` are step responses at these values under other commands; those that lack are added. With
+        effects by `inference.effects`; what differs from record to record is left out. UnstableError where
+        there is no bounded response.
         """
         table = self.problem.posterior.table
-        if table.effects is not None:
-            return self._with_effects(table.effects, values, command)
-        units = [
-            self._unit(values, elements[unit.element], unit.delay, _drive(command, unit.drive))
-            for unit in table.layout.units
-        ]
-        out = []
-        for axis in range(len(table.layout.responses)):
-            rows = np.zeros((len(table.rows), self.sample_times.size))
-            for drive, number in enumerate(table.layout.unit_of[axis]):
-                at, (unit, *slopes) = table.at("gain", axis, drive), units[number]
-                rows[at] += unit + command.rest[drive]
-                for k, slope in zip(table.shaping(number), slopes, strict=True):
-                    rows[k] += values[at] * slope
-            out.append(self._whitened(rows[list(self.columns)], values, axis))
-        return out
+        model = self.model(self.mesh, self.sample_times, command)
+        if model.effects is None:
+            [(units, unit_slopes)] = model.unit_slopes(table.dynamics(values[None]), known)
+            rows = np.zeros((len(table.layout.responses), len(table.rows), self.sample_times.size))
+            for axis, own in enumerate(rows):
+                for drive, unit in enumerate(table.layout.unit_of[axis]):
+                    at = table.at("gain", axis, drive)
+                    own[at] += units[unit, 0] + command.rest[drive]
+                    for k, slope in zip(table.shaping(unit), unit_slopes[unit][:, 0], strict=True):
+                        own[k] += values[at] * slope
+        else:
+            rows = effect_slopes(Simulation(table, model), values)[0].transpose(1, 2, 0)
+            logs = table.of_kind("time")
+            rows[:, logs] *= values[logs, None]
+        return [self._whitened(own[list(self.columns)], values, axis) for axis, own in enumerate(rows)]
 
-    def _with_effects(self, effects: Declared, values: Vector, command: Command) -> list[Matrix]:
+    def model(self, mesh: Mesh, times: Vector, command: Command) -> ForwardModel:
+        """What simulates a record under a command, read at `times`, without what differs from record to
+        record."""
         table = self.problem.posterior.table
-        model = effected_model(table.layout, effects, command, self.mesh, self.sample_times)
-        slopes = effect_slopes(Simulation(table, model), values)[0]
-        logs = table.of_kind("time")
-        slopes[..., logs] *= values[logs]
-        return [
-            self._whitened(slopes[:, axis, list(self.columns)].T, values, axis)
-            for axis in range(slopes.shape[1])
-        ]
+        drives = tuple(_drive(command, axis) for axis in range(len(table.layout.drives)))
+        over = table.effects and replace(table.effects, epochs=np.zeros(1), times=(times,), fitted=(None,))
+        return ForwardModel(table.layout, (Experiment("next", mesh, drives, command.rest),), over)
 
-    def _unit(self, values: Vector, element: Prepared, slot: int, drive: AxisDrive) -> Matrix:
-        """A unit response and its slopes in log times, orders and delay, (2 terms + 2, samples)."""
-        response, superposition = element
-        out = np.zeros((response.coarse.shape[0] + 1, self.sample_times.size))
-        if not drive.moves:
-            return out
-        lattice, later = self.mesh.lattice, slice(self.mesh.reading.first, None)
-        delays = values[None, self.problem.posterior.table.at("delay", slot)]
-        changes = phases(drive, lattice.step)
-        out[:-1, later] = superposition(response, changes, lattice, delays, (0, slot))[:, 0]
-        by_block = superposition(response.alone, changes, lattice, delays, (0, slot), "slope")
-        out[-1, later] = -by_block[0, 0] / lattice.step
-        return out
+    def responses(
+        self, values: Vector, command: Command, time: ArrayLike, *, exposure: float = 0.0
+    ) -> Matrix:
+        """Responses at `time` of a plant with effects, (times, axes) [response unit], by the model itself on
+        blocks as narrow as those of the fit: no device of the virtual bench has its effects."""
+        times: Vector = np.asarray(time, dtype=float)
+        table, blocks = self.problem.posterior.table, max(2, round(float(times[-1]) / self.step))
+        mesh = Mesh.of_samples(times, 0.0, blocks=blocks, exposure=exposure)
+        moved = Simulation(table, self.model(mesh, times, command)).responses(values[None])[0][:, 0].T
+        return np.asarray(moved + [table.offset(values[None], i, 0)[0] for i in range(moved.shape[1])])
 
     def _whitened(self, rows: Matrix, values: Vector, axis: int) -> Matrix:
         """Rows in noise standard deviations, without what a resting response can make up for."""
@@ -197,16 +161,6 @@ class Bench:
         before, after = (np.linalg.norm(part, axis=1) for part in (white[:-1], varying))
         varying[after <= _NOTHING * before] = 0.0  # what remains of a constant is rounding
         return np.asarray(varying)
-
-
-def effected_model(
-    layout: Layout, effects: Declared, command: Command, mesh: Mesh, times: Vector
-) -> ForwardModel:
-    """Model of one record under a command, with effects and without what differs from record to record."""
-    drives = tuple(_drive(command, axis) for axis in range(len(layout.drives)))
-    experiment = Experiment("next", mesh, drives, command.rest)
-    over = replace(effects, epochs=np.zeros(1), times=(times,), fitted=(None,))
-    return ForwardModel(layout, (experiment,), over)
 
 
 def _drive(command: Command, axis: int) -> AxisDrive:
@@ -237,36 +191,10 @@ class Trial:
     def __call__(self) -> tuple[Vector, Flags]:
         """Relative errors, and which estimates lean on a bound."""
         problem, values, rng = self.bench.problem, self.truth, np.random.default_rng(self.seed)
-        again = refit(problem, _noisy(problem, self.clean, values, rng), self.bench)
+        samples = Samples.of(self.clean, self.bench.period)
+        again = refit(problem, measured(problem, values, samples, samples.matrix(), rng), self.bench)
         result = _solve(again, _moved(problem, again, values))
         return _errors(problem, again, result, values, self.names), _leaning(again, result, self.names)
-
-
-def with_effects(
-    problem: Problem, values: Vector, command: Command, time: ArrayLike, *, exposure: float = 0.0
-) -> Matrix:
-    """Responses at `time` of a plant with effects, (times, axes) [response unit], by the model itself on
-    blocks as narrow as those of the fit: no device of the virtual bench has its effects."""
-    times: Vector = np.asarray(time, dtype=float)
-    table, posterior = problem.posterior.table, problem.posterior
-    assert table.effects is not None
-    step = min(one.mesh.lattice.step for one in posterior.model.experiments)
-    blocks = max(2, round(float(times[-1]) / step))
-    mesh = Mesh.of_samples(times, 0.0, blocks=blocks, exposure=exposure)
-    model = effected_model(table.layout, table.effects, command, mesh, times)
-    moved = Simulation(table, model).responses(values[None])[0][:, 0].T
-    return np.asarray(moved + [table.offset(values[None], i, 0)[0] for i in range(moved.shape[1])])
-
-
-def _noisy(problem: Problem, clean: Record, values: Vector, rng: np.random.Generator) -> Record:
-    """The record with the study's noise at these values."""
-    posterior, response = problem.posterior, clean.response.copy()
-    sampled = ~np.isnan(response[:, 0])
-    gaps = np.ones(int(sampled.sum()))
-    for axis in range(response.shape[1]):
-        parameters = posterior.noise_parameters(values[None], axis)
-        response[sampled, axis] += posterior.noise.draw(parameters, gaps, rng)[0]
-    return replace(clean, response=response)
 
 
 def refit(problem: Problem, record: Record, bench: Bench) -> Problem:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any, final
 
 import numpy as np
-from scipy.stats import rankdata
+import pandas as pd
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.estimate import Estimate, attributes, plain
@@ -157,10 +157,7 @@ def beliefs(
     """Of every free parameter, in table order."""
     flat, names = draws.flat, [landscape.posterior.table.names[k] for k in landscape.free]
     columns = np.stack([landscape.column(k, flat) for k in landscape.free], axis=1)
-    ranks = np.apply_along_axis(rankdata, 0, columns)
-    spread = ranks.std(axis=0)
-    centred = (ranks - ranks.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
-    spearman = centred.T @ centred / ranks.shape[0]
+    spearman = pd.DataFrame(columns).corr("spearman").fillna(0.0).to_numpy()
     by_name = {sensitivity.parameter: sensitivity for sensitivity in moved}
     estimates = {estimate.name: estimate for estimate in draws.estimates()}
     modes = {mode.parameter: len(mode.boundaries) + 1 for mode in draws.modes}

@@ -201,56 +201,21 @@ def _spectral(matrix: Matrix) -> tuple[Vector, Matrix]:
     return whole, rows
 
 
-@final
-@dataclass(frozen=True)
-class Separation:
-    """Smallest difference of the delays of two paths that the records resolve."""
+def delays(study: Study, table: ParameterTable, values: Vector) -> dict[str, Any]:
+    """Delay separation at the maximum of the likelihood, every path given a delay of its own, which it has
+    from its slot and may leave; linearised at table values.
 
-    pair: tuple[str, str]
-    """Names of the paths."""
-    smallest: float
-    """Smallest difference that a two-sided interval at `LEVEL` keeps apart from 0 [time unit]; infinite
-    where the records have no information about one of the two."""
-
-
-@final
-@dataclass(frozen=True)
-class Delays:
-    """Delay separation at the maximum of the likelihood, every path given a delay of its own."""
-
-    paths: tuple[str, ...]
-    sd: tuple[float, ...]
-    """Cramer-Rao standard deviation of the delay of each path [time unit]; infinite when unbounded."""
-    separations: tuple[Separation, ...]
-    time_unit: str
-    sentence: str
-
-    def as_json(self) -> dict[str, Any]:
-        """Plain values; what is infinite is None."""
-        return plain(
-            {
-                "paths": [
-                    {"path": path, "sd": sd, "unit": self.time_unit}
-                    for path, sd in zip(self.paths, self.sd, strict=True)
-                ],
-                "separations": [
-                    {"pair": separation.pair, "smallest_difference": separation.smallest, "level": LEVEL}
-                    for separation in self.separations
-                ],
-                "sentence": self.sentence,
-            }
-        )
-
-
-def delays(study: Study, table: ParameterTable, values: Vector) -> Delays:
-    """Linearised at table values; every path has the delay its slot has there and may leave it."""
+    Returns: Cramer-Rao standard deviation of each path's delay, and the smallest difference of two delays
+    that a two-sided interval at `LEVEL` keeps apart from 0 [time unit]; infinite without information.
+    """
     paths = [
         table.layout.path_name(i, j) or "the path"
         for i in range(len(table.layout.responses))
         for j in range(len(table.layout.drives))
     ]
     if len(paths) == 1:
-        return Delays((), (), (), study.time_unit, "one path: there are no delays to compare")
+        said = "one path: there are no delays to compare"
+        return {"paths": (), "separations": (), "sentence": said}
     priors = {name: prior for name, prior in study.priors.items() if name.split("_")[0] != "delay"}
     apart = replace(study, model=replace(study.model, delay="path"), priors=priors)
     landscape = Landscape(problem_of(apart).posterior)
@@ -271,25 +236,28 @@ def delays(study: Study, table: ParameterTable, values: Vector) -> Delays:
         both = np.isfinite(curved.sd[[p, q]]).all()
         mixed = 2 * curved.correlations[p, q] * curved.sd[p] * curved.sd[q] if both else 0.0
         spread = np.sqrt(max(curved.sd[p] ** 2 + curved.sd[q] ** 2 - mixed, 0.0)) if both else np.inf
-        separations.append(Separation((paths[a], paths[b]), float(wide * spread)))
-    sd = tuple(float(curved.sd[p]) for p in where)
-    return Delays(
-        tuple(paths), sd, tuple(separations), study.time_unit, _sentence(separations, study.time_unit)
-    )
+        pair = (paths[a], paths[b])
+        separations.append({"pair": pair, "smallest_difference": float(wide * spread), "level": LEVEL})
+    rows = [
+        {"path": path, "sd": float(curved.sd[p]), "unit": study.time_unit}
+        for path, p in zip(paths, where, strict=True)
+    ]
+    return {
+        "paths": rows,
+        "separations": separations,
+        "sentence": _sentence(separations, study.time_unit),
+    }
 
 
-def _sentence(separations: list[Separation], unit: str) -> str:
-    unresolved = [separation for separation in separations if not np.isfinite(separation.smallest)]
-    if len(unresolved) == len(separations):
+def _sentence(separations: list[dict[str, Any]], unit: str) -> str:
+    resolved = [one for one in separations if np.isfinite(one["smallest_difference"])]
+    if not resolved:
         return "no two path delays can be distinguished: the records bound at most one of them"
-    worst = max(
-        (separation for separation in separations if separation not in unresolved),
-        key=lambda separation: separation.smallest,
-    )
-    smallest = f"{worst.pair[0]} and {worst.pair[1]} from a difference of {worst.smallest:.2g} {unit}"
-    if unresolved:
+    worst = max(resolved, key=lambda one: float(one["smallest_difference"]))
+    smallest = f"{' and '.join(worst['pair'])} from a difference of {worst['smallest_difference']:.2g} {unit}"
+    if len(resolved) < len(separations):
         return (
-            f"{len(unresolved)} of {len(separations)} pairs of path delays cannot be distinguished; the "
-            f"least resolved of the others: {smallest}"
+            f"{len(separations) - len(resolved)} of {len(separations)} pairs of path delays cannot be "
+            f"distinguished; the least resolved of the others: {smallest}"
         )
     return f"all path delays can be distinguished, the least resolved pair {smallest}"

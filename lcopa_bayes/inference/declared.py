@@ -167,14 +167,9 @@ def declared(
         acting,
         ranges,
         np.array([places.get(record.name, 0.0) for record in records]),
-        tuple(_times(record) for record in records),
+        tuple(record.sampled for record in records),
         tuple(fitted.index(record.name) if record.name in fitted else None for record in records),
     )
-
-
-def _times(record: Record) -> Vector:
-    """Times at which any axis was sampled [time unit]."""
-    return np.asarray(record.time[np.isfinite(record.response).any(axis=1)])
 
 
 def effect_rows(

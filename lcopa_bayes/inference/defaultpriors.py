@@ -1,7 +1,7 @@
 """Default priors, derived from the time span and the amplitude of the fit records. All of them are here.
 
-With span = longest time from a record's first drive change to its last sample, period = median sampling
-period, A = range of a response axis over the records, D = largest deviation of a drive from rest:
+With span = longest time from the first change of a drive to the last sample of its record, period = median
+sampling period, A = range of a response axis over the records, D = largest deviation of a drive from rest:
 
 ===========  ======================================  ============================================
 parameter    prior                                   why
@@ -87,9 +87,8 @@ class Scales:
     @classmethod
     def of(cls, records: Sequence[Record]) -> Scales:
         """Scales of the fit records."""
-        spans = []
-        for record in records:
-            spans.append(record.time[-1] - first_change(record))
+        driven = [record for record in records if (record.drive != record.drive[0]).any()] or records
+        spans = [record.time[-1] - first_change(record) for record in driven]
         response = np.concatenate([record.response for record in records])
         amplitude = np.nanmax(response, axis=0) - np.nanmin(response, axis=0)
         period = sampling_period(records)

@@ -37,6 +37,15 @@ class Observed:
     gaps: Vector
     """Time since the previous sample, in sampling periods; 1 for the first."""
 
+    def first(self, count: int) -> Observed:
+        """The first samples."""
+        return Observed(self.index[:count], self.values[:count], self.gaps[:count])
+
+    def every(self, step: int) -> Observed:
+        """One sample of so many, the first included."""
+        since = np.cumsum(self.gaps)[::step]
+        return Observed(self.index[::step], self.values[::step], np.diff(since, prepend=since[:1] - 1.0))
+
     @cached_property
     def chosen(self) -> Index | slice:
         """`index`, as a slice where it is one: taking a slice copies nothing."""
@@ -82,9 +91,8 @@ class Samples:
 
     def quiet(self, axis: int) -> Observed:
         """Samples of an axis taken before any drive change can have acted, that at the change included."""
-        observed = self.axes[axis]
-        n = int(np.searchsorted(self.times[observed.index], self.first_change, side="right"))
-        return Observed(observed.index[:n], observed.values[:n], observed.gaps[:n])
+        times = self.times[self.axes[axis].index]
+        return self.axes[axis].first(int(np.searchsorted(times, self.first_change, side="right")))
 
     def level_samples(self, axis: int) -> tuple[Flags, str]:
         """Samples of an axis that give the offset of a record that was not fitted, and what they are."""
@@ -123,7 +131,7 @@ class Samples:
 
 def sampling_period(records: Sequence[Record]) -> float:
     """Median time between samples over the records [time unit]; the unit in which noise correlates."""
-    steps = [np.diff(record.time[~np.isnan(record.response).all(axis=1)]) for record in records]
+    steps = [np.diff(record.sampled) for record in records]
     return float(np.median(np.concatenate(steps)))
 
 

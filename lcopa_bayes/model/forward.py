@@ -228,15 +228,17 @@ class ForwardModel:
                     seen.append((number, axis))
         return shared
 
-    def unit_slopes(self, dynamics: Dynamics, *, in_orders: bool = True) -> list[tuple[Array, list[Array]]]:
-        """`unit_responses` with exact derivatives, per experiment.
+    def unit_slopes(
+        self, dynamics: Dynamics, known: StepResponses | None = None, *, in_orders: bool = True
+    ) -> list[tuple[Array, list[Array]]]:
+        """`unit_responses` with exact derivatives, per experiment; `known` as there, from this method.
 
         The second entry holds one array per unit, (2 terms + 1, batch, samples): derivatives in the
         logarithms of the time constants, the orders, and the delay [per time unit]; NaN in the orders where
         `in_orders` is false, which takes a third less time.
         """
         wanted: Slopes = "all" if in_orders else "times"
-        known: StepResponses = {}
+        known = {} if known is None else known
         superposed = {step: Superposition(circle) for step, circle in self.circles.items()}
         out = []
         for experiment in self.experiments:

@@ -338,45 +338,8 @@ def largest_linearisation_error(array: LinearArray, phase_limit: float) -> float
     return float(np.abs(linearisation_error(array, [0.0, phase_limit])).max())
 
 
-@final
-@dataclass(frozen=True)
-class GeometryCheck:
-    """Whether one pitch agrees with both the simulation and the experiment (claim S4)."""
-
-    step: float
-    """Phase step of the experiment [rad]."""
-    measured_angle: float
-    """Steady deflection measured at that step [rad]."""
-    simulated_angle: float
-    """Deflection Eq. 5 gives with that pitch [rad]."""
-    implied_pitch: float
-    """Pitch for which Eq. 5 gives the measured angle [m]."""
-    implied_pitch_in_wavelengths: float
-    """[-]."""
-    pitch_ratio: float
-    """Implied over simulated pitch [-]; 1 if one geometry agrees with both."""
-    element_width: float
-    """x of Eq. 21 [m]."""
-    angle_at_element_width: float
-    """Deflection Eq. 5 gives with a pitch of one element width [rad]."""
-
-
-def geometry_check(stated: Stated = PAPER) -> GeometryCheck:
-    """Claim S4: pitch implied by the measured step (Table 1), pitch of Section 2 and width of Eq. 21.
-
-    All numbers come from `stated`.
-    """
-    optics, step, angle = stated.optics, stated.records.step_drive, stated.records.measured.steady
-    simulated = paper_array(optics)
-    implied = optics.wavelength * step / (2 * pi * sin(angle))
-    wide = LinearArray(optics.elements, optics.element_width, optics.wavelength)
-    return GeometryCheck(
-        step,
-        angle,
-        simulated_angle=float(simulated.steering_angle(step)),
-        implied_pitch=implied,
-        implied_pitch_in_wavelengths=implied / optics.wavelength,
-        pitch_ratio=implied / simulated.pitch,
-        element_width=optics.element_width,
-        angle_at_element_width=float(wide.steering_angle(step)),
-    )
+def implied_array(stated: Stated = PAPER) -> LinearArray:
+    """The array for which Eq. 5 gives the measured angle (Table 1) at the step of the experiment."""
+    optics, records = stated.optics, stated.records
+    pitch = optics.wavelength * records.step_drive / (2 * pi * sin(records.measured.steady))
+    return LinearArray(optics.elements, pitch, optics.wavelength)

@@ -10,7 +10,7 @@ import numpy as np
 from lcopa_bayes.model.literature import PAPER, Stated, StatedOptics
 from lcopa_bayes.optics.array import (
     LinearArray,
-    geometry_check,
+    implied_array,
     largest_linearisation_error,
     paper_array,
     strongest_grating_lobe,
@@ -97,8 +97,7 @@ def linearised_steering(stated: Stated, evidence: Evidence) -> Verdict:
     """
     optics, records = stated.optics, stated.records
     largest = max(records.step_drive, records.single_axis_drive, *records.two_axis_drive)
-    pitch = geometry_check(stated).implied_pitch
-    used = largest_linearisation_error(LinearArray(optics.elements, pitch, optics.wavelength), largest)
+    used = largest_linearisation_error(implied_array(stated), largest)
     there, beyond = (largest_linearisation_error(paper_array(optics), limit) for limit in (largest, pi))
     limit = records.steady_state_error
     how = (
@@ -112,13 +111,16 @@ def linearised_steering(stated: Stated, evidence: Evidence) -> Verdict:
 
 def one_geometry(stated: Stated, evidence: Evidence) -> Verdict:
     """S4: the pitch that the measured step implies over the pitch of Section 2."""
-    check = geometry_check(stated)
+    optics, step = stated.optics, stated.records.step_drive
+    simulated, pitch = paper_array(optics), implied_array(stated).pitch
+    wide = LinearArray(optics.elements, optics.element_width, optics.wavelength)
+    ratio = pitch / simulated.pitch
     how = (
-        f"By Eq. 5 {check.step:.4f} rad -> {check.measured_angle:g} rad needs d = "
-        f"{check.implied_pitch_in_wavelengths:.2f} lambda = {1e6 * check.implied_pitch:.2f} um, where "
-        f"Section 2 has {stated.optics.pitch_in_wavelengths:g} lambda, which would deflect by "
-        f"{check.simulated_angle:.4f} rad; one geometry would agree within {100 * SAME_PITCH:.0f} %. The "
-        f"element width of Eq. 21, {1e6 * check.element_width:.2f} um, gives "
-        f"{check.angle_at_element_width:.4f} rad. Number: implied over simulated pitch."
+        f"By Eq. 5 {step:.4f} rad -> {stated.records.measured.steady:g} rad needs d = "
+        f"{pitch / optics.wavelength:.2f} lambda = {1e6 * pitch:.2f} um, where "
+        f"Section 2 has {optics.pitch_in_wavelengths:g} lambda, which would deflect by "
+        f"{float(simulated.steering_angle(step)):.4f} rad; one geometry would agree within "
+        f"{100 * SAME_PITCH:.0f} %. The element width of Eq. 21, {1e6 * optics.element_width:.2f} um, gives "
+        f"{float(wide.steering_angle(step)):.4f} rad. Number: implied over simulated pitch."
     )
-    return Verdict(Kind.of(abs(check.pitch_ratio - 1) <= SAME_PITCH), check.pitch_ratio, "-", how)
+    return Verdict(Kind.of(abs(ratio - 1) <= SAME_PITCH), ratio, "-", how)

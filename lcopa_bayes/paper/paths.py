@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
+from scipy.interpolate import make_interp_spline
 from scipy.special import gamma
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
@@ -82,12 +83,9 @@ class Blocks:
 
 def _means(grid: Grid, knots: Vector, heights: Vector) -> Vector:
     """Block means of the straight lines through the knots, exact."""
-    areas = np.concatenate(([0.0], np.cumsum(np.diff(knots) * (heights[1:] + heights[:-1]) / 2)))
     edges = np.clip(grid.edges, knots[0], knots[-1])  # rounding may put the last edge beyond the last sample
-    piece = np.minimum(np.searchsorted(knots, edges, side="right") - 1, knots.size - 2)
-    into = edges - knots[piece]
-    slope = np.diff(heights)[piece] / np.diff(knots)[piece]
-    return np.asarray(np.diff(areas[piece] + into * (heights[piece] + slope * into / 2)) / grid.step)
+    areas = make_interp_spline(knots, heights, k=1).antiderivative()(edges)
+    return np.asarray(np.diff(areas) / grid.step)
 
 
 @final

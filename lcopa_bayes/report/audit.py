@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from lcopa_bayes.report.page import Drawings, write_graded
+from lcopa_bayes.report.page import Drawings
 from lcopa_bayes.report.savedrun import SavedRun, load_run
 from lcopa_bayes.report.theme import (
     BAND,
@@ -34,22 +34,17 @@ _PAIRS = 6
 _DOTS = 1500
 
 
-def write_audit(folder: Path) -> Path:
-    """`audit.html` with verdicts, profiles, spectrum and pairs; returns its path.
-
-    InputError when the folder holds no audit or it cannot be used.
-    """
-
-    def drawn(values: Mapping[str, Any]) -> Drawings:
-        run, rows = load_run(folder), values["parameters"]
-        caption = (
-            "Line: fall of twice the log likelihood along the profile, its 90 % level dashed, an open side "
-            "where the line stays below to the end. Filled: marginal posterior on the scale of the axis."
-        )
-        profiles = paged("profiles", rows, _PER_FIGURE, lambda part: _profile_page(part, run), caption)
-        return {"profiles": profiles, "spectrum": _spectrum(values), "pairs": _pairs(values, run)}
-
-    return write_graded(folder, "audit", "identifiability", drawn)
+def drawn(folder: Path, values: Mapping[str, Any]) -> Drawings:
+    """Profiles, spectrum and pairs of an audit; InputError when a file of its fit cannot be used."""
+    run = load_run(folder)
+    caption = (
+        "Line: fall of twice the log likelihood along the profile, its 90 % level dashed, an open side "
+        "where the line stays below to the end. Filled: marginal posterior on the scale of the axis."
+    )
+    profiles = paged(
+        "profiles", values["parameters"], _PER_FIGURE, lambda part: _profile_page(part, run), caption
+    )
+    return {"profiles": profiles, "spectrum": _spectrum(values), "pairs": _pairs(values, run)}
 
 
 def _profile_page(rows: Sequence[Mapping[str, Any]], run: SavedRun) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from lcopa_bayes.report.formatting import figures, percent
-from lcopa_bayes.report.page import Drawings, write_graded
+from lcopa_bayes.report.page import Drawings
 from lcopa_bayes.report.theme import BAND, HELD_OUT, INK, NOISE, Drawing, blank, grid, paged, plain, svg_of
 
 Draw: TypeAlias = Callable[[Axes, Mapping[str, Any], Mapping[str, Any]], None]
@@ -18,12 +18,8 @@ _PER_FIGURE = 18
 """Most quantities on one figure of ranks."""
 
 
-def write_calibration(folder: Path) -> Path:
-    """`report.html` with coverage, ranks and grades; returns its path. InputError when keys are missing."""
-    return write_graded(folder, "calibrate", "calibration", _drawn, file="results.json", name="report.html")
-
-
-def _drawn(results: Mapping[str, Any]) -> Drawings:
+def drawn(folder: Path, results: Mapping[str, Any]) -> Drawings:
+    """Coverage, ranks and replicas of a calibration."""
     among, count = len(results["ranks"][0]["counts"]) - 1, results["replicas"]
     bound = f"with a probability of {percent(results['simultaneous'])}"
     coverage = (

@@ -13,7 +13,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from lcopa_bayes.report import records
-from lcopa_bayes.report.page import Drawings, Verdict, write_graded
+from lcopa_bayes.report.page import Drawings, Verdict
 from lcopa_bayes.report.records import draw_drives
 from lcopa_bayes.report.savedrun import TABLES, SavedRun, read_tables
 from lcopa_bayes.report.theme import HELD_OUT, SEEN, Drawing, blank, draw_line, label, plain, svg_of
@@ -22,35 +22,21 @@ from lcopa_bayes.results.firstlook import TABLES as SHOWN
 _COLUMNS = ("record", "role", "axis", "unit", "time", "value", "held_out")
 
 
-def write_check(folder: Path) -> Path:
-    """`check.html` with the records and what was understood of them, and the priors; returns its path.
-
-    InputError when a file of the check is missing or cannot be used.
-    """
-    paths = {"records": folder / "tables" / "check_records.csv"}
+def checked(folder: Path, values: Mapping[str, Any]) -> Drawings:
+    """The records of a check; InputError when its table is missing or cannot be used."""
+    paths, unit = {"records": folder / "tables" / "check_records.csv"}, str(values["time_unit"])
     table = read_tables(paths, "check", {"records": _COLUMNS})["records"]
-
-    def drawn(values: Mapping[str, Any]) -> Drawings:
-        unit = str(values["time_unit"])
-        return {
-            one["record"]: [_record(one, table[table["record"] == one["record"]], unit)]
-            for one in values["records"]
-        }
-
-    return write_graded(
-        folder, "check", "what was understood", drawn, box=lambda values: Verdict("", values["verdict"], "")
-    )
+    names = [one["record"] for one in values["records"]]
+    pairs = zip(names, values["records"], strict=True)
+    records = {name: [_record(one, table[table["record"] == name], unit)] for name, one in pairs}
+    return {"verdict": Verdict("", values["verdict"], ""), "records": records}
 
 
-def write_look(folder: Path) -> Path:
-    """`look.html` with the records, their bands and residuals, and the parameters; returns its path.
-
-    InputError when a file of the look is missing or cannot be used.
-    """
+def looked(folder: Path, values: Mapping[str, Any]) -> Drawings:
+    """The records of a first look, their bands and residuals; InputError when a table of it is missing or
+    cannot be used."""
     tables = read_tables({name: folder / "tables" / f"look_{name}.csv" for name in SHOWN}, "look", TABLES)
-    return write_graded(
-        folder, "look", "first look", lambda values: records.drawn(SavedRun(values, {}, tables, {}))
-    )
+    return records.drawn(SavedRun(values, {}, tables, {}))
 
 
 def _record(one: Mapping[str, Any], rows: pd.DataFrame, unit: str) -> Drawing:

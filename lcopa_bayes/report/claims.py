@@ -3,21 +3,21 @@ lobes, steering."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import pi
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.literature import PAPER, Stated
 from lcopa_bayes.optics.array import (
-    LinearArray,
-    geometry_check,
+    implied_array,
     linearisation_error,
     paper_array,
     strongest_grating_lobe,
 )
-from lcopa_bayes.optics.tiltlaw import continuous_law, printed_law
 from lcopa_bayes.paper.modelclaims import (
     RECORD_LENGTH,
     SETTLING_BANDS,
@@ -29,7 +29,8 @@ from lcopa_bayes.paper.numericsclaims import delay_costs
 from lcopa_bayes.paper.opticsclaims import FAR_WEAKER, tilt_checks
 from lcopa_bayes.paper.paths import response_to
 from lcopa_bayes.report.formatting import figures
-from lcopa_bayes.report.page import write_graded
+from lcopa_bayes.report.optics import draw_laws
+from lcopa_bayes.report.page import Drawings
 from lcopa_bayes.report.theme import (
     BAND,
     CYCLE,
@@ -46,18 +47,9 @@ _SHOWN = 100.0
 """Time of the long panel [ms]."""
 
 
-def write_claims(folder: Path) -> Path:
-    """`claims.html` with every claim, its verdict and the figures behind them; returns its path.
-
-    InputError when `claims.json` cannot be used.
-    """
-    return write_graded(
-        folder, "claims", "Claims of the paper", lambda values: {"claims": _drawn(PAPER)}, box=None
-    )
-
-
-def _drawn(stated: Stated) -> list[tuple[str, Drawing]]:
+def drawn(folder: Path, values: Mapping[str, Any]) -> Drawings:
     """A title and a figure for each family of claims."""
+    stated = PAPER
     rival, costs = integer_rival(stated), delay_costs(stated)
     shown = (
         (
@@ -99,7 +91,8 @@ def _drawn(stated: Stated) -> list[tuple[str, Drawing]]:
             "Section 2 and for the pitch that the measured step implies.",
         ),
     )
-    return [(title, Drawing(f"claim_{stem}", draw(stated), caption)) for title, stem, draw, caption in shown]
+    families = [(title, Drawing(f"claim_{stem}", draw(stated), said)) for title, stem, draw, said in shown]
+    return {"verdict": None, "claims": families}
 
 
 def _steady(stated: Stated) -> str:
@@ -186,14 +179,7 @@ def _tilt(stated: Stated) -> str:
             panel.plot(
                 check.curve.voltage, check.curve.mean, color=colour, label=f"{check.curve.field.value} field"
             )
-        for law, shade, name, dashes in (
-            (printed_law(optics), STEADY, "Eq. 24 as printed", "-"),
-            (continuous_law(optics), CYCLE[2], "Eq. 24, continuous", (0, (4, 2))),
-        ):
-            below = np.array([0.0, np.nextafter(optics.knee_voltage, 0)])
-            above = np.array([optics.knee_voltage, optics.largest_voltage])
-            panel.plot(below, law(below), color=shade, ls=dashes, label=name)
-            panel.plot(above, law(above), color=shade, ls=dashes)
+        draw_laws(panel, optics)
         panel.axhline(pi / 2, color=NOISE, lw=0.7, label="pi/2")
         panel.set_xlabel("voltage [V]")
     whole.set(ylabel="mean tilt [rad]", ylim=(0, 1.8))
@@ -203,7 +189,7 @@ def _tilt(stated: Stated) -> str:
 
 
 def _steering(stated: Stated) -> str:
-    optics, check = stated.optics, geometry_check(stated)
+    optics, records, implied = stated.optics, stated.records, implied_array(stated)
     figure = blank(2.9)
     lobes, error, angle = figure.subplots(1, 3)
     targets = np.linspace(0.0, max(optics.targets_1d_deg), 81)
@@ -213,18 +199,16 @@ def _steering(stated: Stated) -> str:
     lobes.axhline(FAR_WEAKER, color=NOISE, lw=0.8, ls=(0, (4, 3)), label="far weaker")
     lobes.set(xlabel="steering angle [deg]", ylabel="grating lobe over main lobe [-]", ylim=(0, 1.45))
     phases = np.linspace(0.0, pi, 400)
-    implied = LinearArray(optics.elements, check.implied_pitch, optics.wavelength)
     pitches = (
         (paper_array(optics), HELD_OUT, f"d = {optics.pitch_in_wavelengths:g} wavelengths"),
-        (implied, BAND, f"d = {check.implied_pitch_in_wavelengths:.2f} wavelengths"),
+        (implied, BAND, f"d = {implied.pitch / optics.wavelength:.2f} wavelengths"),
     )
     for array, colour, name in pitches:
         error.semilogy(phases, np.abs(linearisation_error(array, phases)), color=colour, label=name)
         angle.plot(phases, array.steering_angle(phases), color=colour, label=name)
-    limit = stated.records.steady_state_error
-    error.axhline(limit, color=NOISE, lw=0.8, ls=(0, (4, 3)), label="claimed error")
+    error.axhline(records.steady_state_error, color=NOISE, lw=0.8, ls=(0, (4, 3)), label="claimed error")
     error.set(ylabel="error of Eq. 26 [-]", ylim=(1e-6, 2.0))
-    angle.plot(check.step, check.measured_angle, "o", ms=4, color=STEADY, label="measured")
+    angle.plot(records.step_drive, records.measured.steady, "o", ms=4, color=STEADY, label="measured")
     angle.set(ylabel="angle [rad]", ylim=(0, 0.65))
     for panel in (error, angle):
         panel.set_xlabel("phase step [rad]")

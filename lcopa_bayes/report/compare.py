@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from lcopa_bayes.comparison.compare import folder_name
 from lcopa_bayes.report.formatting import figures
-from lcopa_bayes.report.page import Drawings, Verdict, write_graded
+from lcopa_bayes.report.page import Drawings, Verdict
 from lcopa_bayes.report.savedrun import read_tables
 from lcopa_bayes.report.theme import (
     CYCLE,
@@ -33,16 +33,10 @@ _NEAR = 60.0
 """Log evidence below the best that is still shown [nat]."""
 
 
-def write_comparison(folder: Path) -> Path:
-    """`compare.html` with scores, orders, fits and residuals; returns its path.
-
-    InputError when the folder holds no comparison or it cannot be used.
-    """
-
-    def drawn(values: Mapping[str, Any]) -> Drawings:
-        return {"candidates": [*_evidence(values), *_records(values, _curves(folder, values))]}
-
-    return write_graded(folder, "compare", "comparison", drawn, box=_verdict)
+def drawn(folder: Path, values: Mapping[str, Any]) -> Drawings:
+    """Scores, fits and residuals of a comparison; InputError when a table of it cannot be used."""
+    shown = [*_evidence(values), *_records(values, _curves(folder, values))]
+    return {"verdict": _verdict(values), "candidates": shown}
 
 
 def _verdict(results: Mapping[str, Any]) -> Verdict:

@@ -8,21 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from lcopa_bayes.report.page import Drawings, write_graded
+from lcopa_bayes.report.page import Drawings
 from lcopa_bayes.report.theme import BAND, HELD_OUT, INK, Drawing, grid, label, plain, svg_of
 
 
-def write_design(folder: Path) -> Path:
-    """`design.html` with the table of drives, precision against bench time and its confirmation.
-
-    InputError when the folder holds no design or it cannot be used.
-    """
-
-    def drawn(values: Mapping[str, Any]) -> Drawings:
-        ranked = sorted(values["table"], key=lambda row: -(row["factor_over_step"] or 0.0))
-        return {"curve": _curve(values), "ranked": ranked}
-
-    return write_graded(folder, "design", "what to measure next", drawn)
+def drawn(folder: Path, values: Mapping[str, Any]) -> Drawings:
+    """Drives by rank and precision against bench time of a design."""
+    ranked = sorted(values["table"], key=lambda row: -(row["factor_over_step"] or 0.0))
+    return {"curve": _curve(values), "ranked": ranked}
 
 
 def _curve(results: Mapping[str, Any]) -> tuple[Drawing, ...]:

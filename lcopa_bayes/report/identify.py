@@ -12,7 +12,7 @@ import pandas as pd
 from lcopa_bayes.model.path import Normalisation
 from lcopa_bayes.paper.steptable import KINDS, PRINTED
 from lcopa_bayes.report.formatting import figures, interval
-from lcopa_bayes.report.page import Drawings, write_graded
+from lcopa_bayes.report.page import Drawings
 from lcopa_bayes.report.savedrun import read_tables
 from lcopa_bayes.report.theme import (
     CYCLE,
@@ -28,41 +28,29 @@ from lcopa_bayes.report.theme import (
     plain,
     svg_of,
 )
-from lcopa_bayes.results.stored import stored_values
 
 Values: TypeAlias = Mapping[str, Any]
 """A part of `identify.json`."""
 _COLOURS = dict(zip(KINDS, (CYCLE[0], CYCLE[1], CYCLE[2], CYCLE[3]), strict=True))
 
 
-def write_identification(folder: Path) -> Path:
-    """`identify.html` with models, Table 1 and records; returns its path.
-
-    InputError when `identify.json` or a table of samples cannot be used.
-    """
-    values = stored_values(folder, "identify", ("study", "time_unit", "paths", "step_metrics", "records"))
-    paths = {entry["samples"]: folder / entry["samples"] for entry in values["records"]}
+def drawn(folder: Path, values: Values) -> Drawings:
+    """The records of an identification; InputError when a table of samples cannot be used."""
+    paths, unit = {one["samples"]: folder / one["samples"] for one in values["records"]}, values["time_unit"]
     samples = read_tables(paths, "identify")
-
-    def drawn(values: Values) -> Drawings:
-        unit = values["time_unit"]
-        return {"records": [_drawing(one, samples[one["samples"]], unit) for one in values["records"]]}
 
     def credible(one: Values) -> str:
         lower, upper = one["lower"], one["upper"]
         return interval(lower, upper, None if None in (lower, upper) else abs(upper - lower) / 4)
 
-    return write_graded(
-        folder,
-        "identify",
-        "identification",
-        drawn,
-        box=None,
-        normalisations=[one.value for one in Normalisation],
-        kinds=KINDS,
-        columns=PRINTED,
-        credible_interval=credible,
-    )
+    return {
+        "verdict": None,
+        "records": [_drawing(one, samples[one["samples"]], unit) for one in values["records"]],
+        "normalisations": [one.value for one in Normalisation],
+        "kinds": KINDS,
+        "columns": PRINTED,
+        "credible_interval": credible,
+    }
 
 
 def _drawing(entry: Values, samples: pd.DataFrame, time_unit: str) -> Drawing:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from lcopa_bayes.report.page import Drawings, Verdict, write_graded
+from lcopa_bayes.report.page import Drawings, Verdict
 from lcopa_bayes.report.theme import BAND, HELD_OUT, NOISE, SEEN, Drawing, blank, label, plain, svg_of
 from lcopa_bayes.results.stored import stored_values
 
@@ -17,28 +17,18 @@ _MOST_CURVES = 12
 _LONGEST = 20
 
 
-def write_loop(folder: Path) -> Path:
-    """`loop.html` with verdict, evidence, errors before and after and residuals side by side; returns its
-    path.
-
-    InputError when the folder holds no loop or it cannot be used.
-    """
+def drawn(folder: Path, values: Mapping[str, Any]) -> Drawings:
+    """Evidence, residuals side by side and views of a loop; InputError when its curves cannot be used."""
     shown = stored_values(folder, "loop", ("views", "curves"), file="loop_curves.json")
-
-    def drawn(values: Mapping[str, Any]) -> Drawings:
-        residuals = _residuals(values, shown["curves"])
-        return {
-            "evidence": _bars(values),
-            "residuals": residuals,
-            "views": _views(shown["views"]),
-            "curves_left": len(shown["curves"]) - len(residuals),
-        }
-
-    def box(values: Mapping[str, Any]) -> Verdict:
-        sentence = f"{values['verdict']} ({values['confidence']}): {values['sentence']}"
-        return Verdict(str(values["grade"]), sentence, str(values["grade_reason"]))
-
-    return write_graded(folder, "loop", "what the model lacks", drawn, box=box)
+    residuals = _residuals(values, shown["curves"])
+    sentence = f"{values['verdict']} ({values['confidence']}): {values['sentence']}"
+    return {
+        "verdict": Verdict(str(values["grade"]), sentence, str(values["grade_reason"])),
+        "evidence": _bars(values),
+        "residuals": residuals,
+        "views": _views(shown["views"]),
+        "curves_left": len(shown["curves"]) - len(residuals),
+    }
 
 
 def _bars(results: Mapping[str, Any]) -> tuple[Drawing, ...]:

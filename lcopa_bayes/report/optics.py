@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import log10
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.model.literature import StatedOptics
 from lcopa_bayes.optics.tiltlaw import continuous_law, printed_law
 from lcopa_bayes.paper.staticoptics import OpticsPlan, StaticOptics, static_optics
-from lcopa_bayes.report.page import Drawings, write_graded
+from lcopa_bayes.report.page import Drawings
 from lcopa_bayes.report.theme import CYCLE, HELD_OUT, STEADY, Drawing, blank, extremes, grid, svg_of
-from lcopa_bayes.results.stored import stored_values
 
 _FLOOR = -50.0
 """Lowest intensity shown [dB]."""
@@ -21,30 +24,19 @@ _MOST = 1600
 """Points of a pattern that are drawn: its nulls are narrow."""
 
 
-def write_optics(folder: Path) -> Path:
-    """`optics.html` with far fields, director, tilt law and chain; returns its path.
+def drawn(folder: Path, values: Mapping[str, Any]) -> Drawings:
+    """Far fields, director, tilt law and steering chain; all is solved again for the plan in the values.
 
-    All is solved again for the plan in `optics.json`; InputError when that file cannot be used.
+    InputError when this plan cannot be used.
     """
-    plan = stored_values(folder, "optics", ("plan",))["plan"]
     try:
-        calculated = static_optics(OpticsPlan(**plan))
+        calculated = static_optics(OpticsPlan(**values["plan"]))
     except TypeError as error:
         raise InputError(f"{folder / 'optics.json'}: holds no plan ({error}); run `optics` again") from None
-    return write_graded(
-        folder,
-        "optics",
-        "Static optics of the array",
-        lambda values: _drawn(calculated),
-        box=None,
-        calculated=calculated,
-        decibel=lambda intensity: 10 * log10(intensity),
-    )
-
-
-def _drawn(calculated: StaticOptics) -> Drawings:
-    """Far fields, director, tilt law and steering chain."""
     return {
+        "verdict": None,
+        "calculated": calculated,
+        "decibel": lambda intensity: 10 * log10(intensity),
         "far_field": [
             Drawing(
                 "farfield_1d",
@@ -142,20 +134,25 @@ def _curve(calculated: StaticOptics) -> str:
     figure = blank(3.0)
     panel = figure.subplots()
     panel.plot(curve.voltage, curve.mean, color=CYCLE[0], label="solved")
-    knee = optics.knee_voltage
-    parts = (np.linspace(0, np.nextafter(knee, 0), 50), np.linspace(knee, optics.largest_voltage, 50))
-    for law, colour, name, style in (
-        (printed_law(optics), STEADY, "Eq. 24 as printed", "-"),
-        (continuous_law(optics), CYCLE[2], "Eq. 24, continuous", (0, (4, 2))),
-    ):
-        for k, part in enumerate(parts):
-            panel.plot(part, law(part), color=colour, ls=style, label=name if k == 0 else None)
+    draw_laws(panel, optics)
     panel.axhline(np.pi / 2, color="#b0b0b0", lw=0.7)
     panel.annotate("pi/2", (0.02, np.pi / 2), va="bottom", fontsize=7.5)
     panel.set(xlabel="voltage [V]", ylabel="mean tilt [rad]")
     panel.set(xlim=(0, optics.largest_voltage), ylim=(0, None))
     panel.legend(loc="lower right")
     return svg_of(figure)
+
+
+def draw_laws(panel: Axes, optics: StatedOptics) -> None:
+    """Eq. 24 as printed and as continuous, each with its two straight branches."""
+    for law, colour, name, style in (
+        (printed_law(optics), STEADY, "Eq. 24 as printed", "-"),
+        (continuous_law(optics), CYCLE[2], "Eq. 24, continuous", (0, (4, 2))),
+    ):
+        below = np.array([0.0, np.nextafter(optics.knee_voltage, 0)])
+        above = np.array([optics.knee_voltage, optics.largest_voltage])
+        panel.plot(below, law(below), color=colour, ls=style, label=name)
+        panel.plot(above, law(above), color=colour, ls=style)
 
 
 def _chain(calculated: StaticOptics) -> str:

@@ -13,15 +13,13 @@ from itertools import product
 from pathlib import Path
 from typing import Any, TypeAlias, final
 
-from jinja2 import ChoiceLoader, Environment, FileSystemLoader, PackageLoader, StrictUndefined, UndefinedError
+from jinja2 import ChoiceLoader, Environment, FileSystemLoader, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.files import writable_folder, write_text
 from lcopa_bayes.report import formatting
-from lcopa_bayes.report.theme import Drawing, inlined, look
+from lcopa_bayes.report.theme import Drawing, inlined
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
-from lcopa_bayes.results.stored import stored_values
 
 Drawings: TypeAlias = Mapping[str, Any]
 """Figures by the name under which a template places them, and what else it shows as it is."""
@@ -150,35 +148,6 @@ def tied(text: str) -> Markup:
     return Markup(words.replace(" %", "\u00a0%").replace("p = ", "p\u00a0=\u00a0"))
 
 
-def write_graded(
-    folder: Path,
-    verb: str,
-    title: str,
-    draw: Callable[[Mapping[str, Any]], Drawings] = lambda values: {},
-    *,
-    box: Callable[[Mapping[str, Any]], Verdict] | None = Verdict.of,
-    file: str | None = None,
-    name: str | None = None,
-    **more: Any,
-) -> Path:
-    """Write the page of a verb's result by the verb's template, with the figures that `draw` gives of its
-    values and `more` beside them; returns the path of the page.
-
-    `file` and `name`, of values and page, are by default named after the verb. InputError when the values
-    cannot be read or a key is absent.
-    """
-    values = stored_values(folder, verb, (), file=file)
-    try:
-        shown = ": ".join(filter(None, (values.get("study"), title)))
-        with look():
-            drawn = draw(values)
-        return write_page(
-            folder, f"{verb}.html", shown, values, drawn, verdict=box and box(values), name=name, **more
-        )
-    except (KeyError, UndefinedError) as error:
-        raise InputError(f"{folder / (file or f'{verb}.json')}: lacks {error}; run `{verb}` again") from error
-
-
 def write_page(
     folder: Path,
     template: str | Path,
@@ -188,12 +157,10 @@ def write_page(
     *,
     verdict: Verdict | None = None,
     name: str | None = None,
-    **more: Any,
 ) -> Path:
     """Write a page and its figures; returns the path of the page, by default named as the template.
 
-    The template, the package's by its name or a file, sees `values` as `v`, the figures as `drawn`, and
-    `more`.
+    The template, the package's by its name or a file, sees `values` as `v`, and the figures as `drawn`.
     """
     page, template = Page(), Path(template)
     environment = Environment(
@@ -211,7 +178,7 @@ def write_page(
     environment.globals |= {key: getattr(page, key) for key in ("section", "p", "table", "cells", "figures")}
     environment.globals |= {"each": each, "pairs": zip, "product": product}
     environment.globals |= {"POINTWISE": POINTWISE, "SIMULTANEOUS": SIMULTANEOUS}
-    body = environment.get_template(template.name).render(v=values, drawn=drawn, **more)
+    body = environment.get_template(template.name).render(v=values, drawn=drawn)
     whole = environment.get_template("page.html")
     text = whole.render(title=title, titles=page.titles, body=Markup(body), verdict=verdict) + "\n"
     figures = writable_folder(folder / "figures")

@@ -5,25 +5,36 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
+from jinja2 import UndefinedError
+
+from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.inference import defaultpriors
-from lcopa_bayes.report import draws, records, responses
-from lcopa_bayes.report.audit import write_audit
-from lcopa_bayes.report.calibrate import write_calibration
-from lcopa_bayes.report.check import write_check, write_look
-from lcopa_bayes.report.claims import write_claims
-from lcopa_bayes.report.compare import write_comparison
-from lcopa_bayes.report.design import write_design
-from lcopa_bayes.report.identify import write_identification
-from lcopa_bayes.report.loop import write_loop
-from lcopa_bayes.report.optics import write_optics
-from lcopa_bayes.report.page import Drawings, write_graded
-from lcopa_bayes.report.predict import write_prediction
+from lcopa_bayes.report import (
+    audit,
+    calibrate,
+    check,
+    claims,
+    compare,
+    design,
+    draws,
+    identify,
+    loop,
+    optics,
+    predict,
+    records,
+    responses,
+)
+from lcopa_bayes.report.page import Drawings, Verdict, write_page
 from lcopa_bayes.report.savedrun import SavedRun, load_run
 from lcopa_bayes.report.theme import look
+from lcopa_bayes.results.stored import stored_values
 
+Draw: TypeAlias = Callable[[Path, Mapping[str, Any]], Drawings]
+"""Gives the figures of a page from the run folder and the values of a result, under `verdict` the box at its
+top where it is another than that of the values, or None."""
 Part: TypeAlias = Callable[[SavedRun], Drawings]
 _PARTS: tuple[Part, ...] = (
     draws.pairs,
@@ -44,18 +55,9 @@ def write_report(folder: Path, *, jobs: int = 1) -> Path:
     run = load_run(folder)
     with workers(run, jobs=jobs) as crew:
         parts = list(crew.each(_drawn, _PARTS))
-
     rules = inspect.cleandoc(defaultpriors.__doc__ or "")
-    return write_graded(
-        folder,
-        "fit",
-        "",
-        lambda _: {key: one for part in parts for key, one in part.items()},
-        file="results.json",
-        name="report.html",
-        run=run,
-        default_priors=rules,
-    )
+    shown = {key: one for part in parts for key, one in part.items()} | {"run": run, "rules": rules}
+    return _written(folder, "fit", "", run.results, lambda *_: shown)
 
 
 def _drawn(run: SavedRun, part: Part) -> Drawings:
@@ -64,20 +66,22 @@ def _drawn(run: SavedRun, part: Part) -> Drawings:
         return part(run)
 
 
-_PAGES: Mapping[str, Callable[[Path], Path]] = {
-    "check": write_check,
-    "look": write_look,
-    "fit": write_report,
-    "audit": write_audit,
-    "design": write_design,
-    "compare": write_comparison,
-    "loop": write_loop,
-    "calibrate": write_calibration,
-    "predict": write_prediction,
-    "optics": write_optics,
-    "identify": write_identification,
-    "claims": write_claims,
+_PAGES: Mapping[str, tuple[str, Draw]] = {
+    "check": ("what was understood", check.checked),
+    "look": ("first look", check.looked),
+    "audit": ("identifiability", audit.drawn),
+    "design": ("what to measure next", design.drawn),
+    "compare": ("comparison", compare.drawn),
+    "loop": ("what the model lacks", loop.drawn),
+    "calibrate": ("calibration", calibrate.drawn),
+    "predict": ("response to {drive}", predict.drawn),
+    "optics": ("Static optics of the array", optics.drawn),
+    "identify": ("identification", identify.drawn),
+    "claims": ("Claims of the paper", claims.drawn),
 }
+"""Title, which may hold entries of the values, and what draws the figures."""
+_REPORTS = ("fit", "calibrate")
+"""Verbs whose values and page are called results and report."""
 
 
 def write_page_of(verb: str, folder: Path, *, jobs: int = 1) -> Path:
@@ -86,4 +90,21 @@ def write_page_of(verb: str, folder: Path, *, jobs: int = 1) -> Path:
     The figures of a fit, the most of any page, are drawn in `jobs` processes.
     InputError when a file is missing or cannot be used.
     """
-    return write_report(folder, jobs=jobs) if verb == "fit" else _PAGES[verb](folder)
+    if verb == "fit":
+        return write_report(folder, jobs=jobs)
+    title, draw = _PAGES[verb]
+    values = stored_values(folder, verb, (), file="results.json" if verb in _REPORTS else None)
+    return _written(folder, verb, title, values, draw)
+
+
+def _written(folder: Path, verb: str, title: str, values: Mapping[str, Any], draw: Draw) -> Path:
+    """Write a page by the template of its verb, with the verdict that is drawn, else that of the values."""
+    name, file = ("report.html", "results.json") if verb in _REPORTS else (f"{verb}.html", f"{verb}.json")
+    try:
+        with look():
+            shown = draw(folder, values)
+        verdict = shown["verdict"] if "verdict" in shown else Verdict.of(values)
+        titled = ": ".join(filter(None, (values.get("study"), title.format_map(values))))
+        return write_page(folder, f"{verb}.html", titled, values, shown, verdict=verdict, name=name)
+    except (KeyError, UndefinedError) as error:
+        raise InputError(f"{folder / file}: lacks {error}; run `{verb}` again") from error

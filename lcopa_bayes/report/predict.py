@@ -9,41 +9,32 @@ from typing import Any
 import pandas as pd
 from matplotlib.axes import Axes
 
-from lcopa_bayes.report.page import Drawings, write_graded
+from lcopa_bayes.report.page import Drawings
 from lcopa_bayes.report.records import BANDS as RESPONSE
 from lcopa_bayes.report.records import above_drives, draw_response
 from lcopa_bayes.report.savedrun import read_tables
 from lcopa_bayes.report.theme import BAND, HELD_OUT, NOISE, Drawing, draw_line, legend_above, svg_of
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
 from lcopa_bayes.results.newdrive import BANDS, DRIVES
-from lcopa_bayes.results.stored import stored_values
 
 _OUTSIDE = "#faf0e8"
 """Shade of what lies outside the fitted range."""
 
 
-def write_prediction(folder: Path) -> Path:
-    """`predict.html` with bands, drives and what lies outside the fitted range; returns its path.
-
-    InputError when a file of the prediction is missing or cannot be used.
-    """
+def drawn(folder: Path, values: Mapping[str, Any]) -> Drawings:
+    """Bands, drives and what lies outside the fitted range; InputError when a table of the prediction is
+    missing or cannot be used."""
     paths = {name: folder / "tables" / name for name in (BANDS, DRIVES)}
     bands, drives = read_tables(paths, "predict").values()
-
-    def drawn(values: Mapping[str, Any]) -> Drawings:
-        curves = [
-            Drawing(
-                f"predict_{number:02d}_{entry['axis']}",
-                _drawn(values, bands[bands["axis"] == str(entry["axis"])], drives),
-                f"Response {entry['axis']}, offset: {entry['offset_from']}. {values['draws']} draws.",
-            )
-            for number, entry in enumerate(values["axes"], start=1)
-        ]
-        return {"curves": curves}
-
-    return write_graded(
-        folder, "predict", f"response to {stored_values(folder, 'predict', ('drive',))['drive']}", drawn
-    )
+    curves = [
+        Drawing(
+            f"predict_{number:02d}_{entry['axis']}",
+            _drawn(values, bands[bands["axis"] == str(entry["axis"])], drives),
+            f"Response {entry['axis']}, offset: {entry['offset_from']}. {values['draws']} draws.",
+        )
+        for number, entry in enumerate(values["axes"], start=1)
+    ]
+    return {"curves": curves}
 
 
 def _drawn(values: Mapping[str, Any], rows: pd.DataFrame, drives: pd.DataFrame) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
@@ -23,7 +24,7 @@ from lcopa_bayes.results.adequacy import limitations
 from lcopa_bayes.results.datatree import POSTERIOR, posterior_tree, save_tree
 from lcopa_bayes.results.discretisation import Discretisation, discretisation, optima_of, resolved_optima
 from lcopa_bayes.results.firstlook import FirstLook
-from lcopa_bayes.results.frequency import FrequencyResponse, frequency_response
+from lcopa_bayes.results.frequency import FrequencyResponse
 from lcopa_bayes.results.nearby import surrogate_about
 from lcopa_bayes.results.prediction import Band, study_bands
 from lcopa_bayes.results.predictive import Predictive
@@ -44,6 +45,7 @@ from lcopa_bayes.sampling.weighted import Weighted
 from lcopa_bayes.sampling.weightedrun import QUICK_STARTS, STARTS, weighted_run
 
 if TYPE_CHECKING:
+    from lcopa_bayes.results.alternatives import Alternatives
     from lcopa_bayes.results.integerrival import Rival
     from lcopa_bayes.results.structure import Structure
 
@@ -70,25 +72,33 @@ class Fit(Predictive):
     """Unit step responses of every path over the longest record, at each draw."""
     metrics: tuple[Estimate, ...]
     """Rise, delay, settling [time unit], overshoot [-] and levels [response unit] of every path."""
-    sensitivity: tuple[Sensitivity, ...]
-    """How far each parameter's median moves with the power of prior or likelihood [posterior sd]."""
     evidence: Evidence | None
     """None for a single ensemble, which cannot tell its error."""
     discretisation: Discretisation
     """How far the width of the blocks moves the posterior."""
-    frequency: FrequencyResponse
-    """Over the frequencies that the fit records resolve."""
     cross_check: CrossCheck | None = None
     """How a second, independent sampling method agrees; None without one."""
     rival: Rival | None = None
     """The same study with integer orders, and how it predicts; None when none was fitted."""
     structure: Structure | None = None
     """What other structures the records allow; None where the study states its terms."""
+    alternatives: Alternatives | None = None
+    """Sums of lags that follow the records too, and the numbers over both; None likewise."""
 
     @property
     def near(self) -> Posterior:
         """The posterior, with effects by what the draws were made with: a response costs a hundredth."""
         return replace(self.problem.posterior, surrogate=self.run.surrogate)
+
+    @cached_property
+    def sensitivity(self) -> tuple[Sensitivity, ...]:
+        """How far each parameter's median moves with the power of prior or likelihood [posterior sd]."""
+        return sensitivity(self.draws, self.near)
+
+    @cached_property
+    def frequency(self) -> FrequencyResponse:
+        """Over the frequencies that the fit records resolve."""
+        return self.frequency_response()
 
     @property
     def verdict(self) -> str:
@@ -213,10 +223,6 @@ def _derived(
         rng = np.random.default_rng([run.plan.seed, 4])
         draws = draws.limited(limitations(problem, draws, shown, remaining, rng))
     metrics = step_metrics(draws, curves, time_unit=study.time_unit)
-    moved = sensitivity(draws, replace(problem.posterior, surrogate=run.surrogate))
-    response = frequency_response(
-        draws, span=problem.scales.span, period=problem.scales.period, time_unit=study.time_unit
-    )
     return Fit(
         problem=problem,
         run=run,
@@ -225,10 +231,8 @@ def _derived(
         residuals=tuple(remaining),
         curves=curves,
         metrics=tuple(metrics),
-        sensitivity=moved,
         evidence=weighed,
         discretisation=width,
-        frequency=response,
         cross_check=check,
     )
 

@@ -141,9 +141,25 @@ def record_draws(
     draws: Draws, model: ForwardModel, samples: Sequence[Samples], noise: Noise, *, held_out: bool, seed: int
 ) -> Iterator[tuple[tuple[str, Axis, bool], Vector, Vector, Matrix, Matrix, tuple[Vector, str, int]]]:
     """The draws behind `bands`, axis by axis of every record: arguments of `band_of`."""
+    drawn = axis_draws(draws, model, samples, noise, held_out=held_out, seed=seed)
+    for record, axis, values, response, seen, offset, rng in drawn:
+        observed = record.axes[axis]
+        parameters = values[:, [draws.table.at(name, axis) for name in noise.names]]
+        noises = noise.draw(parameters, observed.gaps, rng)
+        if seen is not response:
+            noises += seen - response
+        one = (record.record.name, record.record.response_axes[axis], held_out)
+        yield one, record.times[observed.index], observed.values, response, noises, offset
+
+
+def axis_draws(
+    draws: Draws, model: ForwardModel, samples: Sequence[Samples], noise: Noise, *, held_out: bool, seed: int
+) -> Iterator[tuple[Samples, int, Matrix, Matrix, Matrix, tuple[Vector, str, int], np.random.Generator]]:
+    """Of every record and axis with samples: table values (draws, rows); responses at the samples without
+    offset, of the plant and with what differs from record to record, (draws, n) [response unit]; the offset
+    as `offset_draws` gives it; random numbers for what else is drawn."""
     for r, record in enumerate(samples):
-        rng = named_rng(seed, record.record.name)
-        alone = model.only(r)
+        rng, alone = named_rng(seed, record.record.name), model.only(r)
         values, plant = plant_draws(draws, alone)
         apart = disturbances(draws.table, alone, values, plant, rng) if held_out else None
         for axis, observed in enumerate(record.axes):
@@ -154,13 +170,7 @@ def record_draws(
             offset = offset_draws(
                 draws.table, values, axis, r, record, seen, noise, held_out=held_out, rng=rng
             )
-            parameters = values[:, [draws.table.at(name, axis) for name in noise.names]]
-            times = record.times[observed.index]
-            noises = noise.draw(parameters, observed.gaps, rng)
-            if apart is not None:
-                noises += apart[axis][:, observed.index]
-            one = (record.record.name, record.record.response_axes[axis], held_out)
-            yield one, times, observed.values, response, noises, offset
+            yield record, axis, values, response, seen, offset, rng
 
 
 def disturbances(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -227,16 +228,23 @@ def step_metrics(draws: Draws, curves: StepCurves, *, time_unit: str) -> list[Es
 
 
 def metrics_of(table: ParameterTable, curves: StepCurves, *, time_unit: str) -> list[Metric]:
+    """`figures_of` of a plant of a parameter table."""
+    return figures_of(table.layout, curves, lambda time: _later(table, curves, time), time_unit=time_unit)
+
+
+def figures_of(
+    layout: Layout, curves: StepCurves, later_at: Callable[[Vector], Array], *, time_unit: str
+) -> list[Metric]:
     """Metrics of every path: rise 10-90 %, delay, settling, overshoot, value at the end, steady state.
 
     Times are counted from the step. What is not reached within the record is open above; a response has
-    settled when it stays within the band after the record too, to which the overshoot refers as well.
+    settled when it stays within the band after the record too, to which the overshoot refers as well:
+    `later_at` has the curves at such times, (curves, draws, n) [-].
     """
-    layout = table.layout
     out: list[Metric] = []
     end = float(curves.time[-1])
     after = end * (1 + _LATER * np.arange(1, _LATER_POINTS + 1) / _LATER_POINTS)
-    later = _later(table, curves, after)
+    later = later_at(after)
     time = np.concatenate((curves.time, after))
 
     def add(name: str, unit: str, values: Vector, note: str = "") -> None:

@@ -175,7 +175,7 @@ def verdict(fit: Fit) -> str:
             f"At least one step response has not reached its steady state within the longest record "
             f"({100 * slow:.0f} % of draws are more than 2 % away): algebraic tails are slow."
         )
-    parts += [one.sentence for one in (fit.structure, fit.rival) if one is not None]
+    parts += [one.sentence for one in (fit.structure, fit.alternatives, fit.rival) if one is not None]
     return " ".join(parts)
 
 
@@ -222,6 +222,7 @@ def results(fit: Fit) -> dict[str, Any]:
             "held_out": scores(fit, held_out=True),
             "rival": fit.rival.as_json() if fit.rival else None,
             "structure": fit.structure.as_json() if fit.structure else None,
+            "alternatives": fit.alternatives.as_json() if fit.alternatives else None,
             "fit_scores": scores(fit, held_out=False),
             "modes": [
                 r.as_json() | {"grade": fit.draws.level(r.parameter, shares_grade(r))}

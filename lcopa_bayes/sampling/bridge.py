@@ -1,14 +1,16 @@
 """Draws transferred from one posterior to another of the same coordinates, without starting from the prior.
 
-Populations of one posterior follow ``source^(1-b) target^b`` while b rises from 0 to 1, resampled
-and moved at every rise (Del Moral, Doucet and Jasra 2006, J. R. Statist. Soc. B 68), and then sample the
-target. This refits a model to fewer samples, or under other priors, at a fraction of the cost. Modes
-that no walker of the source was in, such as one excluded by the omitted data, are reached by moves alone.
+A mixture fitted to draws of one posterior proposes draws of the other, which are weighted (`importance`).
+Where their weights do not converge populations follow ``source^(1-b) target^b`` while b rises from 0 to 1,
+resampled and moved at every rise (Del Moral, Doucet and Jasra 2006, J. R. Statist. Soc. B 68), and then
+sample the target. This refits a model to fewer samples, or under other priors, at a fraction of the cost.
+Modes that no walker of the source was in, such as one excluded by the omitted data, are reached by tails of
+the mixture and by moves alone.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import emcee
@@ -17,12 +19,19 @@ from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.sampling.evidence import Evidence
+from lcopa_bayes.sampling.importance import Effort, ImportancePlan, importance
+from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.mixturemoves import learned
 from lcopa_bayes.sampling.ridgemoves import emcee_sampler
-from lcopa_bayes.sampling.sampler import SamplePlan
 from lcopa_bayes.sampling.tempering import largest_rise, survivors
-from lcopa_bayes.sampling.weightedrun import weighted_run
+from lcopa_bayes.sampling.weighted import BATCHES, CHAIN
+from lcopa_bayes.sampling.weightedrun import usable
 
+_PLAN = ImportancePlan((Effort(3_000, 1_000, 4),))
+"""Effort of importance sampling."""
+_DELIVERED = 400
+"""Draws of each of its batches that are delivered."""
 _MOVES = 15
 """Moves of every walker at each rise."""
 _BURN = 40
@@ -44,6 +53,8 @@ class Transferred:
     """Smallest effective sample size over the coordinates [draws]."""
     rhat: float
     """Largest nested R-hat between ensembles [-]."""
+    evidence: Evidence | None = None
+    """Of the target, where importance sampling gave it."""
 
 
 def transferred(
@@ -52,17 +63,12 @@ def transferred(
     """Draws of `target` from walkers (ensembles, walkers, dimension) of `source`.
 
     With `jump` in one rise: for posteriors whose supports differ, but little else. Deterministic given
-    `seed`. With effects by importance sampling of the target, where its weights are usable.
+    `seed`.
     """
-    if target.simulation is not None:
-        plan = SamplePlan.of(
-            target.dimension, seed=seed, ensembles=len(positions), walkers=positions.shape[1]
-        )
-        result = weighted_run(target, plan)
-        if result is not None:
-            run, draws = result
-            return Transferred(run.kept()[0], draws.ess, max(quality.rhat for quality in draws.qualities))
     mixture = learned(target, list(positions), seed)
+    weighed = _weighed(target, mixture, np.random.default_rng([seed, 3_001]))
+    if weighed is not None:
+        return weighed
     chains = []
     for number, position in enumerate(positions):
         sequence = np.random.SeedSequence(seed, spawn_key=(number, 3_000))
@@ -85,6 +91,18 @@ def transferred(
         sampler.run_mcmc(emcee.State(position), _KEPT, thin_by=_THIN, skip_initial_state_check=True)
         chains.append(sampler.get_chain().swapaxes(0, 1))
     return _judged(np.stack(chains))
+
+
+def _weighed(target: Posterior, mixture: Mixture, rng: np.random.Generator) -> Transferred | None:
+    """Importance draws of the target that begin with a mixture in its chart; None where they will not do."""
+    tried = importance(target, (), rng, _PLAN, begin=mixture)
+    if tried is None or not usable(tried.weighted):
+        return None
+    weighted = tried.weighted
+    drawn = weighted.coordinates[weighted.batches(_DELIVERED, rng)]
+    judged = _judged(drawn.reshape(BATCHES, -1, CHAIN, target.dimension))
+    level = Evidence(weighted.log_evidence, weighted.log_evidence_sd, ())
+    return replace(judged, ess=weighted.ess, evidence=level)
 
 
 @final

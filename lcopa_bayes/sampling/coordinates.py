@@ -1,9 +1,10 @@
 """A chart of the posterior: coordinates without bounds in which its ridges are close to straight.
 
 Elements are given by their shape at fixed frequencies (`shapecoordinates`) in place of their time constants,
-gains by their ratio to the element's level, and what lies between two finite ends by its probit: a density
-that is highest at an end has a tail there like that of a normal one. In the chart a few ellipsoids cover a
-posterior that is thin and curved in the sampled coordinates.
+gains by their ratio to the element's level, and what lies between two finite ends by its probit, a scale
+below a largest one by that of their ratio: a density that is highest at an end has a tail there like that of
+a normal one. In the chart a few ellipsoids cover a posterior that is thin and curved in the sampled
+coordinates.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ from functools import cached_property
 from typing import Any, final
 
 import numpy as np
-from scipy.special import ndtr, ndtri
+from scipy.special import log_ndtr, ndtr, ndtri, ndtri_exp
+from scipy.stats import norm
 
 from lcopa_bayes.core.arrays import Flags, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
@@ -53,6 +55,12 @@ class Chart:
         return np.asarray(bounded)
 
     @cached_property
+    def _limited(self) -> Flags:
+        """Columns with an upper end alone: logarithms of scales, charted by the probit of the scale over its
+        largest."""
+        return np.asarray(np.isneginf(self.low) & np.isfinite(self.high))
+
+    @cached_property
     def _frequencies(self) -> list[Vector]:
         ends = np.log(self.terrain.slowest), np.log(self.terrain.fastest)
         return [np.exp(np.linspace(*ends, element.ratios + 1)) for element in self.terrain.elements]
@@ -77,6 +85,7 @@ class Chart:
         width = (self.high - self.low)[self._bounded]
         with np.errstate(divide="ignore"):
             y[:, self._bounded] = ndtri((z[:, self._bounded] - self.low[self._bounded]) / width)
+            y[:, self._limited] = ndtri_exp(np.minimum(z[:, self._limited] - self.high[self._limited], 0.0))
         log_volume -= self._log_steepness(y)
         return y, log_volume
 
@@ -91,7 +100,10 @@ class Chart:
         z = y.copy()
         width = (self.high - self.low)[self._bounded]
         z[:, self._bounded] = self.low[self._bounded] + width * ndtr(y[:, self._bounded])
-        exists: Flags = np.asarray(((z > self.low) & (z < self.high))[:, self._bounded].all(axis=1))
+        z[:, self._limited] = self.high[self._limited] + log_ndtr(y[:, self._limited])
+        exists: Flags = np.asarray(
+            ((z > self.low) & (z < self.high)).all(axis=1, where=self._bounded | self._limited)
+        )
         exists &= self.terrain.in_order(z)
         for element, frequencies in zip(self.terrain.elements, self._frequencies, strict=True):
             safe = np.where(exists[:, None], z[:, element.orders], 1.0)
@@ -105,9 +117,10 @@ class Chart:
 
     def _log_steepness(self, y: Matrix) -> Vector:
         """Log of the product of d coordinate / d probit, (batch,)."""
-        probits = y[:, self._bounded]
+        probits, limited = y[:, self._bounded], y[:, self._limited]
         width = (self.high - self.low)[self._bounded]
-        return np.asarray((np.log(width / np.sqrt(2 * np.pi)) - 0.5 * probits**2).sum(axis=1))
+        steep = (np.log(width / np.sqrt(2 * np.pi)) - 0.5 * probits**2).sum(axis=1)
+        return np.asarray(steep + (norm.logpdf(limited) - log_ndtr(limited)).sum(axis=1))
 
 
 def charted_density(posterior: Posterior, chart: Chart, y: Matrix, mapped: Mapped = map) -> Vector:

@@ -108,17 +108,21 @@ def importance(
     plan: ImportancePlan = ImportancePlan(),
     mapped: Mapped = map,
     late: Callable[[], bool] = lambda: False,
+    begin: Mixture | None = None,
     rough: Callable[[Matrix], Vector] | None = None,
-) -> Importance:
-    """Importance sampling around given optima, one or more; `mapped` spreads the density over processes. Once
-    it is `late` no further attempt is made. The proposal is fitted to a `rough` density of charted
+) -> Importance | None:
+    """Importance sampling around given optima, one or more, or from a proposal to `begin` with, in the chart;
+    `mapped` spreads the density over processes. Once it is `late` no further attempt is made. None where no
+    optimum has a surrounding inside the prior. The proposal is fitted to a `rough` density of charted
     coordinates, where there is a cheaper one; its draws are weighted by the posterior itself.
 
     FloatingPointError where the density is NaN.
     """
     chart = Chart.of(posterior)
     chosen = weighty(optima)
-    first, groups = around(posterior, chart, chosen, rng), _apart(posterior)
+    first, groups = begin or around(posterior, chart, chosen, rng), _apart(posterior)
+    if first is None:
+        return None
     cores = [first, *(first.marginal(own) for own in groups if len(groups) > 1)]
     proposal: Proposal = first
     rough = rough or partial(charted_density, posterior, chart, mapped=mapped)

@@ -222,7 +222,9 @@ class Search:
             posterior, crew, self._crew, optima, hunted, self._rng, wanted, self._late
         )
         self.unfinished = not enough and self._late()
-        return weighted if enough or (self.unfinished and weighted.ess >= _FEWEST) else None
+        if weighted is None or enough:
+            return weighted
+        return weighted if self.unfinished and weighted.ess >= _FEWEST else None
 
     def _last(
         self, first: Product, learned: Proposal, seen: Seen, wanted: float, expected: float

@@ -26,6 +26,8 @@ _GROUP = 3
 """Components that start around one optimum: a curved or skewed posterior needs more than one [-]."""
 _AROUND = 400
 """Gaussian draws around an optimum that give its components their place and size in the chart."""
+_MORE = 20
+"""Most times that so many are drawn again where too few are inside the prior."""
 _SMALL = 0.02
 """Scale of such draws, over the linearised standard deviation, at which the chart is straight [-]."""
 _BENT = 3.0
@@ -73,15 +75,16 @@ def weighty(optima: Sequence[Optimum]) -> list[Optimum]:
 
 def around(
     posterior: Posterior, chart: Chart, optima: Sequence[Optimum], rng: np.random.Generator
-) -> Mixture:
-    """Groups of Gaussian shape around optima, first as wide in the chart as their linearised covariance."""
+) -> Mixture | None:
+    """Groups of Gaussian shape around optima, first as wide in the chart as their linearised covariance; None
+    where no optimum has a surrounding inside the prior and its chart."""
     means, factors = [], []
     for optimum in optima:
         centre = posterior.coordinates(optimum.values[None])[0]
         root = root_of(optimum.covariance)
         standard = rng.standard_normal((_AROUND, centre.size))
         near, wide = (
-            _charted(posterior, chart, centre + scale * standard @ root.T) for scale in (_SMALL, 1.0)
+            _inside(posterior, chart, centre, scale * root, standard, rng) for scale in (_SMALL, 1.0)
         )
         if min(len(near), len(wide)) < 2 * centre.size:
             continue
@@ -96,8 +99,20 @@ def around(
         means += [mean, *(mean + standard[: _GROUP - 1] @ factor.T)]
         factors += [factor] * _GROUP
     if not means:
-        raise FloatingPointError("no optimum has a surrounding inside the prior and its chart")
+        return None
     return Mixture(np.full(len(means), 1 / len(means)), np.array(means), np.array(factors))
+
+
+def _inside(
+    posterior: Posterior, chart: Chart, centre: Vector, root: Matrix, first: Matrix, rng: np.random.Generator
+) -> Matrix:
+    """Charted points about a centre that are inside the prior; of an optimum in a corner few of the first."""
+    inside = _charted(posterior, chart, centre + first @ root.T)
+    for _ in range(_MORE):
+        if len(inside) < 2 * centre.size:
+            more = centre + rng.standard_normal(first.shape) @ root.T
+            inside = np.concatenate([inside, _charted(posterior, chart, more)])
+    return inside
 
 
 def split(core: Mixture, rng: np.random.Generator) -> Mixture:

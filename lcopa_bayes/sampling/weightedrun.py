@@ -88,7 +88,10 @@ def weighted_run(
         if posterior.simulation is not None and len(chosen) == 1:
             near, weighted, share = _by_surrogate(posterior, chosen[0], rng, wanted, mapped)
         if weighted is None or not usable(weighted):
-            near, weighted = posterior, importance(posterior, optima, rng, wanted, mapped).weighted
+            tried = importance(posterior, optima, rng, wanted, mapped)
+            if tried is None:
+                return None
+            near, weighted = posterior, tried.weighted
             share = weighted.ess / weighted.count
     if not usable(weighted):
         return None
@@ -124,9 +127,10 @@ def _by_surrogate(
         return posterior, None, 0.0
     near = replace(posterior, surrogate=surrogate)
     enough = replace(plan, wanted=_SURPLUS * plan.wanted, efficient=False)  # walkers show what it misses
-    first = importance(near, [optimum], rng, enough, mapped).weighted
-    if first.ess < _FEWEST:
+    about_optimum = importance(near, [optimum], rng, enough, mapped)
+    if about_optimum is None or about_optimum.weighted.ess < _FEWEST:
         return posterior, None, 0.0
+    first = about_optimum.weighted
     tried = first.batches(_TRIED // BATCHES, rng).ravel()
     held = _efficiency(posterior, first.coordinates[tried], first.log_density[tried], mapped)
     if held < LEAST_EFFICIENCY:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from lcopa_bayes.core.parallel import meanwhile
+from lcopa_bayes.results.alternatives import with_alternatives
 from lcopa_bayes.results.firstlook import FirstLook, first_look
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.fit import fit as sampled
@@ -65,7 +66,8 @@ def fit(
             )
         if rival:
             fitted = replace(fitted, rival=integer_rival(fitted, jobs=jobs, quick=quick, quiet=quiet))
-        fitted = replace(fitted, structure=structure)
+        if structure:
+            fitted = with_alternatives(replace(fitted, structure=structure))
         if place is not None:
             fitted.save(place)
     return fitted

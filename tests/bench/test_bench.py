@@ -20,7 +20,7 @@ import lcopa_bayes.bench
 from lcopa_bayes.bench import device as bench_device
 from lcopa_bayes.bench import inversion
 from lcopa_bayes.bench.campaignfile import load_plan
-from lcopa_bayes.bench.command import Command, on_off, prbs, quiet, staircase, step, two_axis
+from lcopa_bayes.bench.command import Command, joint, on_off, prbs, quiet, staircase, step
 from lcopa_bayes.bench.device import (
     PAPER_BENCH,
     PAPER_DEVICE,
@@ -280,7 +280,7 @@ def test_commands_hold_from_their_instant_on():
 
 
 def test_two_axes_keep_their_own_instants():
-    both = two_axis(step(1.0, at=2.0), on_off(5.0, hold=1.0, at=1.0))
+    both = joint(step(1.0, at=2.0), on_off(5.0, hold=1.0, at=1.0))
     assert_array_equal(both.times, [1, 2])
     assert_array_equal(both.values, [[0, 5], [1, 0]])
 
@@ -455,7 +455,7 @@ def test_refresh_delays_the_response_but_not_the_log():
 
 def test_simulated_is_truth_plus_seeded_noise():
     bench = Bench(noise_sd=(0.1, 0.2), noise_correlation=0.6, exposure=0.05, refresh=1.0)
-    command = two_axis(step(1.0, at=0.234), quiet())
+    command = joint(step(1.0, at=0.234), quiet())
     clean = truth(PAPER_DEVICE, bench, command, duration=10.0, name="r")
     noisy = [
         simulate(PAPER_DEVICE, bench, command, duration=10.0, name="r", rng=np.random.default_rng(seed))

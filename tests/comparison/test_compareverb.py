@@ -20,7 +20,7 @@ from lcopa_bayes.data.record import save_record
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.paper.claims import judge
 from lcopa_bayes.paper.verdict import Evidence
-from lcopa_bayes.report.compare import write_comparison
+from lcopa_bayes.report.pages import write_page_of
 from lcopa_bayes.results.fit import plan_of
 
 FEW = {"ensembles": 2, "walkers": 16, "steps": 600, "thin": 2, "target_ess": 100}
@@ -49,7 +49,9 @@ def told(folder) -> dict:
 
 def test_the_generating_model_is_preferred_and_the_reason_told(told):
     assert told["preferred"] == "fractional-1"
-    assert told["fractional"]["verdict"] == "warranted"
+    assert told["fractional"]["verdict"] == "not shown"  # 40 samples do not tell it from two lags
+    assert "sums of 2 lags for y" in told["fractional"]["sentence"]
+    assert told["fractional"]["log_bayes_factor"] > 10
     assert told["agreement"]["agree"]
     first, whole = told["models"]
     assert first["log_evidence"] - whole["log_evidence"] > 10
@@ -199,7 +201,7 @@ def test_a_comparison_of_an_earlier_version_is_refused_by_the_page(folder, told,
     old = told | {"models": [{k: v for k, v in row.items() if k != "containment"} for row in told["models"]]}
     (tmp_path / "compare.json").write_text(json.dumps(old))
     with pytest.raises(InputError, match="run `compare` again"):
-        write_comparison(tmp_path)
+        write_page_of("compare", tmp_path)
 
 
 def test_a_comparison_samples_as_a_fit_does():

@@ -282,6 +282,7 @@ def card(name: str, evidence: float | None, lpd: float, **told: object) -> dict:
         "fit_scores": scores,
         "held_out": [],
         "order_is_integer": [],
+        "sums_of_lags": [],
         "containment": {"contains": [], "sampled_again": False, "met": True},
     }
     return base | told
@@ -351,6 +352,22 @@ def test_a_fractional_win_needs_evidence_and_prediction():
     assert fractional(2.0, 10.0) == "not shown"
     assert fractional(20.0, -10.0) == "not warranted"
     assert fractional(-20.0, 0.0) == "not warranted"
+
+
+def test_a_win_needs_sums_of_lags_to_lose_too():
+    def held(support: str, advantage: float) -> dict:
+        lags = {"lags": 2, "paths": ["p"], "support": support, "aic_advantage": advantage}
+        free = card("free", 20.0, 10.0, parameters=6, sums_of_lags=[lags])
+        return dict(outcome(free, card("first-order", 0.0, 0.0))["fractional"])
+
+    assert held("plant", -30.0)["verdict"] == "warranted"
+    assert "against first-order and sums of lags" in held("plant", -30.0)["sentence"]
+    assert held("both", 3.0)["verdict"] == "not shown"
+    assert (
+        "sums of 2 lags for p (AIC lower by 3.0) follow the records as well" in held("both", 3.0)["sentence"]
+    )
+    assert held("lags", 30.0)["verdict"] == "not warranted"
+    assert "AIC lower by 30.0) follow the records better" in held("lags", 30.0)["sentence"]
 
 
 def test_a_win_that_hangs_on_the_prior_is_not_claimed():

@@ -123,7 +123,7 @@ def test_gains_and_levels_are_integrated_out_of_a_sequence(rng, noise, offset):
     values[:, posterior.table.of_kind("sigma")] = 0.02
     for part in parts_of(posterior, []):
         target, own = without(posterior, part), posterior.samples[part.record]
-        told = linear_densities(target, part, own, _model(posterior, part), values, 0, 3)
+        told = linear_densities(target, part, own, _model(posterior, part), values, [3])[0]
         for upto in (4, own.times.size):
             whole = first_known(posterior, part, upto).log_likelihood(values)
             known = first_known(posterior, part, 3).log_likelihood(values)
@@ -137,14 +137,14 @@ def test_a_held_out_record_is_predicted_as_one_that_is_left_out(rng):
     values = both.posterior.table.draw(4, rng)
     values[:, both.posterior.table.of_kind("sigma")] = 0.02
     known, samples = without(both.posterior, part), both.posterior.samples[1]
-    own = linear_densities(known, part, samples, _model(known, part), values, 0, 3)
+    own = linear_densities(known, part, samples, _model(known, part), values, [3])[0]
     # the same priors: those of the pair look at both amplitudes
     names = {row.name: row for row in both.posterior.table.rows}
     names["offset"] = names["offset_a"]
     table = replace(alone.posterior.table, rows=tuple(names[row.name] for row in alone.posterior.table.rows))
     same = replace(alone.posterior, table=table)
     fewer = np.delete(values, both.posterior.table.names.index("offset_b"), axis=1)
-    told = linear_densities(same, held, samples, _model(known, part), fewer, 0, 3)
+    told = linear_densities(same, held, samples, _model(known, part), fewer, [3])[0]
     assert_allclose(told, own, rtol=1e-6)
 
 
@@ -203,7 +203,7 @@ def exact_elpd(fitted, part) -> float:
 
 
 def _model(posterior, part):
-    return predictivedensity._one(posterior.model, part.record)
+    return posterior.model.only(part.record)
 
 
 @pytest.mark.parametrize("way", ["importance weights", "refit"])

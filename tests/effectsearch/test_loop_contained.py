@@ -9,7 +9,7 @@ import pytest
 from small import record, study
 
 from lcopa_bayes.bench.command import on_off, staircase
-from lcopa_bayes.effectsearch import basefit, refits, terms
+from lcopa_bayes.effectsearch import basefit, basemodel, refits
 from lcopa_bayes.effectsearch.refits import refit
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.model.effects.catalogue import bundled
@@ -28,7 +28,7 @@ PAIR = [bundled()["odd_curvature"](), bundled()["overdrive_pulse"](1.0)]
 
 @pytest.fixture(scope="module")
 def base():
-    return terms._based(STUDY)
+    return basemodel._based(STUDY)
 
 
 def astray(heeds_near):
@@ -50,9 +50,9 @@ def astray(heeds_near):
 @pytest.mark.parametrize("heeds_near", [True, False])
 def test_more_terms_are_at_least_as_likely_as_fewer(base, monkeypatch, heeds_near):
     """Though the wider fit's own starts lead astray: from the smaller model's optimum, at first or again."""
-    monkeypatch.setattr(terms, "base_fit", astray(heeds_near))
-    lost = terms._based(TWO, 2)
-    wider = terms._wider(TWO, base, 2)
+    monkeypatch.setattr(basemodel, "base_fit", astray(heeds_near))
+    lost = basemodel._based(TWO, 2)
+    wider = basemodel._wider(TWO, base, 2)
     inner = Regression(base.fit.model, wider.fit.regression.whitening).descend(base.fit.optimum.x)
     assert wider.fit.optimum.cost <= inner.cost + 0.5
     assert wider.fit.failed == ""
@@ -62,17 +62,17 @@ def test_more_terms_are_at_least_as_likely_as_fewer(base, monkeypatch, heeds_nea
 
 def test_more_terms_that_stay_less_likely_are_no_base(base, monkeypatch):
     """Where no start reaches what the smaller model does, the wider one is not used."""
-    monkeypatch.setattr(terms, "base_fit", astray(False))
+    monkeypatch.setattr(basemodel, "base_fit", astray(False))
     monkeypatch.setattr(Regression, "best", lambda self, starts: self.at(starts[0]))
-    wider = terms._wider(TWO, base, 2)
+    wider = basemodel._wider(TWO, base, 2)
     assert "less likely than that of fewer" in wider.fit.failed
 
 
 def test_starts_of_a_wider_model_are_close_to_the_smaller_one(base):
-    problem = terms.problem_of(replace(STUDY, model=replace(STUDY.model, terms=3)))
-    model = terms.ExtendedModel(problem.posterior)
+    problem = basemodel.problem_of(replace(STUDY, model=replace(STUDY.model, terms=3)))
+    model = basemodel.ExtendedModel(problem.posterior)
     regression = Regression(model, base.fit.regression.whitening)
-    starts = terms._lifted(model, base, np.random.default_rng(1))
+    starts = basemodel._lifted(model, base, np.random.default_rng(1))
     low, high = model.bounds
     assert len(starts) == 6
     costs = [regression.cost(np.clip(start, low, high)) for start in starts]

@@ -16,12 +16,12 @@ from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.effectsearch.basefit import base_fit
-from lcopa_bayes.effectsearch.crossvalidation import PARTS, groups
+from lcopa_bayes.effectsearch.basemodel import fitted_base
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.noise import Law, joint_noise
+from lcopa_bayes.effectsearch.scores import PARTS, groups
 from lcopa_bayes.effectsearch.signature import Scale
-from lcopa_bayes.effectsearch.terms import fitted_base
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.defaultpriors import Scales
@@ -209,10 +209,10 @@ def test_a_dependent_residual_counts_as_fewer_samples():
 def test_a_single_record_leaves_out_samples_from_all_over_it():
     posterior = problem_of(stepped(10.0)).posterior
     chosen = groups(Whitening(posterior.samples, (Law(1.0),)))
-    rows = np.sort(np.concatenate([group.rows for group in chosen]))
+    rows = np.sort(np.concatenate(chosen))
     assert len(chosen) == PARTS
     np.testing.assert_array_equal(rows, np.arange(posterior.size))
-    assert all(np.ptp(group.rows) > 0.7 * posterior.size for group in chosen)
+    assert all(np.ptp(rows) > 0.7 * posterior.size for rows in chosen)
 
 
 def test_an_overflow_does_not_harden():

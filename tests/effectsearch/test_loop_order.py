@@ -100,7 +100,7 @@ def test_orders_of_unlike_terms_never_change_places(gap):
     optimum = regression.descend(start, most=60)
     assert optimum.x[FIRST] >= optimum.x[SECOND]
     assert np.isfinite(optimum.cost)
-    assert model.supported(optimum.x[None], every=False)[0]
+    assert model.supported(optimum.x[None])[0]
 
 
 @pytest.mark.parametrize("start", [[1.9, -6.0, 0.8, 1.0], [0.9, -6.0, 0.8, 1.0], [1.3, -1.0, 0.5, -5.0]])
@@ -118,9 +118,9 @@ def test_terms_stay_resolved_wherever_a_descent_begins(start):
     rng = np.random.default_rng(3)
     for x in optimum.x + 2.0 * rng.standard_normal((200, 6)):  # nor does any step within the bounds leave it
         inside = np.clip(x, *model.bounds)
-        if model.supported(inside[None], every=False)[0]:
+        if model.supported(inside[None])[0]:
             step = np.clip(inside + rng.standard_normal(6), *model.bounds_about(inside))
-            assert model.supported(step[None], every=False)[0]
+            assert model.supported(step[None])[0]
 
 
 def test_shifts_are_those_of_the_reported_numbers():

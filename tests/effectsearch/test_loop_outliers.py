@@ -39,7 +39,7 @@ def struck(
 
 
 def fitted(made: Study):
-    return base_fit(ExtendedModel(problem_of(made).posterior), np.random.default_rng(1), starts=1)
+    return base_fit(ExtendedModel(problem_of(made).posterior), np.random.default_rng(1))
 
 
 def test_outliers_are_found_where_they_are():

@@ -20,11 +20,18 @@ from lcopa_bayes.calibration.replica import device_of
 from lcopa_bayes.cli import main
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.record import load_record, save_record
-from lcopa_bayes.experiments.candidates import PLAIN, Candidate, candidates, template
+from lcopa_bayes.experiments.candidates import (
+    PLAIN,
+    Candidate,
+    Limits,
+    bench_times,
+    candidates,
+    limits_of,
+    template,
+)
 from lcopa_bayes.experiments.confirmation import confirm, confirmed
 from lcopa_bayes.experiments.design import checked, cramer_rao, design, promises, reached, within
 from lcopa_bayes.experiments.information import Bench, refit
-from lcopa_bayes.experiments.limits import Limits, bench_times, limits_of
 from lcopa_bayes.experiments.summary import as_json, next_measurement
 from lcopa_bayes.identifiability.curvature import sensitivities
 from lcopa_bayes.inference.assembly import Problem
@@ -165,7 +172,7 @@ def test_information_is_that_of_the_likelihood(one):
     at = [found.names.index(name) for name in bench.names]
     rest = found.names.index("offset")
     seen = gram[np.ix_(at, at)] - np.outer(gram[at, rest], gram[rest, at]) / gram[rest, rest]
-    mine = bench.gram(values, bench.elements(values), drive)
+    mine = bench.gram(values, drive, {})
     np.testing.assert_allclose(mine, seen, rtol=1e-6, atol=1e-6 * seen.max())
 
 
@@ -191,7 +198,7 @@ def test_correlated_noise_costs_what_its_whitening_says():
         rows = {name: (TRUTH | {"rho": rho})[name] for name in table.names} | {"time_1": 1e-3}
         bench = Bench(made, 2000.0, 0.2)
         values = row_values(table, rows)
-        gram = bench.gram(values, bench.elements(values), step(1.0))
+        gram = bench.gram(values, step(1.0), {})
         found[rho] = gram[0, 0]
     assert found[0.6] / found[0.0] == pytest.approx(0.4 / 1.6, rel=0.02)
 

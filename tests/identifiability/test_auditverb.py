@@ -198,17 +198,17 @@ TERMS = {"terms": {"direct": 2, "cross": 1}}
 def test_delays_of_one_path_are_not_in_question():
     only = problem(record(camera=0.6))
     values = only.posterior.table.draw(1, np.random.default_rng(1))[0]
-    assert delays(only.study, only.posterior.table, values).separations == ()
+    assert delays(only.study, only.posterior.table, values)["separations"] == ()
 
 
 def test_paths_driven_one_after_the_other_are_told_apart_and_an_idle_drive_is_not():
     apart = separated(on_off((1.0, 0.6), hold=5.0, at=0.35), **TERMS)
     single = separated(step((1.0, 0.0), at=0.35), **TERMS)
-    assert len(apart.separations) == len(single.separations) == 6
-    finite = {one.pair for one in single.separations if one.smallest < float("inf")}
+    assert len(apart["separations"]) == len(single["separations"]) == 6
+    finite = {one["pair"] for one in single["separations"] if one["smallest_difference"] < float("inf")}
     assert finite == {("x_x", "y_x")}
-    assert single.as_json()["paths"][1]["sd"] is None
-    assert "cannot be distinguished" in single.sentence
+    assert single["paths"][1]["sd"] == float("inf")
+    assert "cannot be distinguished" in single["sentence"]
 
 
 # -- what is said when every parameter is identified ----------------------------------------------

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from small import ONE, problem, record
 
-from lcopa_bayes.bench.command import on_off, prbs, staircase, two_axis
+from lcopa_bayes.bench.command import joint, on_off, prbs, staircase
 from lcopa_bayes.bench.device import Device
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.drive import AxisDrive
@@ -60,8 +60,8 @@ def two_axes() -> tuple[Effected, np.ndarray, list[np.ndarray]]:
     paths = ((path(1.0, direct), path(0.2, cross)), (path(0.3, cross), path(1.5, direct)))
     device = Device(paths, axes, axes, (0.1, 0.1))
     commands = (
-        two_axis(on_off(1.0, hold=9.3, at=0.37), staircase([0.5, -0.4, 0.2], hold=6.1, start=1.03)),
-        two_axis(on_off(-0.6, hold=7.2, at=1.38, rest=0.2), on_off(0.8, hold=5.0, at=2.64)),
+        joint(on_off(1.0, hold=9.3, at=0.37), staircase([0.5, -0.4, 0.2], hold=6.1, start=1.03)),
+        joint(on_off(-0.6, hold=7.2, at=1.38, rest=0.2), on_off(0.8, hold=5.0, at=2.64)),
     )
     made = [
         record(k, device=device, command=c, camera=0.1, duration=25.0, noise_sd=0.0, name=f"r{k}")

@@ -36,6 +36,7 @@ CASES = {
         "terms": 1,
         "priors": {"delay": ("uniform", {"loc": 0.2, "scale": 1.0}), "sigma": ("uniform", {"loc": 0.01})},
     },
+    "scale below its largest": {"terms": 1, "priors": {"sigma": ("uniform", {"loc": 0.0, "scale": 0.3})}},
     "two axes": {"share": "all", "noise": "student"},
 }
 
@@ -86,7 +87,8 @@ def test_the_volume_is_that_of_central_differences(name):
 
 @pytest.mark.parametrize("name", CASES)
 def test_what_is_charted_as_stated(name):
-    """Logits between two finite ends, ratios for times, gain over level; all else as it is."""
+    """Probits between two ends and of a scale below its largest, ratios for times, gain over level; all
+    else as it is."""
     posterior, chart = made(name)
     z = drawn(name, 10, seed=2)
     y, _ = chart.charted(z)
@@ -105,6 +107,8 @@ def test_what_is_charted_as_stated(name):
         low, high = posterior.table.rows[k].sampled_domain
         if column not in touched and np.isfinite(high - low):
             assert_allclose(y[:, column], ndtri((z[:, column] - low) / (high - low)), rtol=1e-9, atol=1e-9)
+        elif column not in touched and np.isfinite(high):
+            assert_allclose(y[:, column], ndtri(np.exp(z[:, column] - high)), rtol=1e-9, atol=1e-9)
         elif column not in touched:
             assert_array_equal(y[:, column], z[:, column])
 

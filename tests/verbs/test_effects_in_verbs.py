@@ -19,7 +19,7 @@ from lcopa_bayes.comparison.candidates import candidates_of, derived, known_sett
 from lcopa_bayes.data.settings import EffectsSettings, PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studywriter import write_study
-from lcopa_bayes.experiments.information import Bench, refit, with_effects
+from lcopa_bayes.experiments.information import Bench, refit
 from lcopa_bayes.identifiability.curvature import sensitivities
 from lcopa_bayes.identifiability.profile import profile
 from lcopa_bayes.identifiability.symmetries import DIFFERENCED, structure
@@ -121,12 +121,12 @@ def test_information_of_a_new_drive_holds_the_effect(stiff: tuple[Problem, np.nd
     bench = Bench(problem, 12.0, 0.3)
     assert bench.names[-1] == "cubic_stiffness.c"
     command = Command(np.array([0.6, 5.1]), np.array([[0.9], [-0.4]]), np.zeros(1))
-    (slopes,) = bench.slopes(truth, bench.elements(truth), command)
+    (slopes,) = bench.slopes(truth, command, {})
     up, down = truth.copy(), truth.copy()
     k = bench.columns[-1]
     up[k] += 1e-3
     down[k] -= 1e-3
-    sides = [with_effects(problem, values, command, bench.sample_times)[:, 0] for values in (up, down)]
+    sides = [bench.responses(values, command, bench.sample_times)[:, 0] for values in (up, down)]
     change = (sides[0] - sides[1]) / 2e-3 / TRUTH["sigma"]
     level = np.full(change.size, 1 / np.sqrt(change.size))
     assert_allclose(slopes[-1], change - (change @ level) * level, atol=2e-3 * np.abs(change).max())

@@ -10,7 +10,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Vector
 from lcopa_bayes.data.drive import AxisDrive
-from lcopa_bayes.model.effects.effect import Card, Constant, DriveEffect, Ranges, Scene, single
+from lcopa_bayes.model.effects.effect import Acting, Card, Constant, DriveEffect, Ranges, Scene, single
 
 
 @final
@@ -41,9 +41,7 @@ class OverdrivePulse(DriveEffect):
         longest = max(6 * ranges.speed, 8 * ranges.period)
         return tuple(cls(float(frame)) for frame in np.geomspace(2 * ranges.period, longest, 16))
 
-    def commands(
-        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[AxisDrive, float]:
+    def commands(self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector) -> Acting:
         """One more pair of changes per change."""
         jumps = drive.jumps
         times = np.concatenate((drive.times, drive.times + self.frame))
@@ -85,15 +83,13 @@ class RefreshHold(DriveEffect):
         refresh, phase = super().internal(ranges)
         return refresh, replace(phase, high=1.0)
 
-    def commands(
-        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[AxisDrive, float]:
+    def commands(self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector) -> Acting:
         """Of several changes that fall to one refresh the sum acts."""
         ticks = np.ceil(drive.times / self.refresh - self.phase - 1e-9) + self.phase
         return drive.later(psi[0] * (self.refresh * ticks - drive.times)), rest
 
 
-def _mapped(drive: AxisDrive, levels: Vector) -> tuple[AxisDrive, float]:
+def _mapped(drive: AxisDrive, levels: Vector) -> Acting:
     """The drive with other levels: that at rest, then one per change."""
     return AxisDrive.of_jumps(drive.times, np.diff(levels)), float(levels[0])
 
@@ -133,9 +129,7 @@ class GreyQuantisation(DriveEffect):
         usual = (15, 16, 31, 32, 63, 64, 127, 128, 255)
         return tuple(cls(float(levels)) for levels in (*usual, *np.geomspace(6.0, 62.0, 156)))
 
-    def commands(
-        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[AxisDrive, float]:
+    def commands(self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector) -> Acting:
         """Level by level."""
         step, levels = scene.ranges.drive[axis] / self.levels, _levels(drive, rest)
         return _mapped(drive, levels + psi[0] * (step * np.round(levels / step) - levels))
@@ -165,9 +159,7 @@ class Hysteresis(DriveEffect):
         """Widths from 2 to 50 % of the range."""
         return tuple(cls(width) for width in (0.02, 0.05, 0.1, 0.2, 0.35, 0.5))
 
-    def commands(
-        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[AxisDrive, float]:
+    def commands(self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector) -> Acting:
         """The play starts where the drive rests."""
         radius, levels = self.width * scene.ranges.drive[axis], _levels(drive, rest)
         played = levels.copy()
@@ -191,9 +183,7 @@ class VoltageKnee(DriveEffect):
         mistaken_for="gain; odd_curvature",
     )
 
-    def commands(
-        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[AxisDrive, float]:
+    def commands(self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector) -> Acting:
         """Level by level."""
         levels = _levels(drive, rest)
         return _mapped(drive, levels * (1 + psi[0] * (1 - np.abs(levels) / scene.ranges.drive[axis])))
@@ -213,9 +203,7 @@ class FieldDependentDelay(DriveEffect):
         mistaken_for="delay, exactly so with one amplitude",
     )
 
-    def commands(
-        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[AxisDrive, float]:
+    def commands(self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector) -> Acting:
         """Every change is shifted by its own part of the delay of the drive's own path."""
         own = np.flatnonzero(scene.ranges.direct == axis)
         delay = float(scene.delays[own[0] if own.size else 0, axis])
@@ -244,8 +232,6 @@ class SampledDrive(DriveEffect):
         """Half a period earlier where w is 1."""
         return np.asarray(-0.5 * psi[0] * ranges.period)
 
-    def commands(
-        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[AxisDrive, float]:
+    def commands(self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector) -> Acting:
         """All changes by the same time."""
         return drive.later(float(self.lag(scene.ranges, psi))), rest

@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, NamedTuple, Self, final
+from typing import Any, ClassVar, Literal, NamedTuple, Self, TypeAlias, final
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.data.drive import AxisDrive
@@ -225,6 +225,10 @@ class Effect(ABC):
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
+Acting: TypeAlias = tuple[AxisDrive, float]
+"""Commands as they act, deviations from the resting drive, and that rest [drive unit]."""
+
+
 class DriveEffect(Effect):
     """Changes the commands of one drive axis."""
 
@@ -236,10 +240,8 @@ class DriveEffect(Effect):
         raise NotImplementedError(f"{self.name} does more than delay its commands")
 
     @abstractmethod
-    def commands(
-        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[AxisDrive, float]:
-        """Commands as they act: deviations from the resting drive, and that rest [drive unit]."""
+    def commands(self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector) -> Acting:
+        """Commands as they act."""
 
 
 class ElementEffect(Effect):

@@ -18,7 +18,7 @@ from lcopa_bayes.model.effects.effect import (
     per_axis,
     single,
 )
-from lcopa_bayes.model.effects.parallel import falling, relaxing, summed
+from lcopa_bayes.model.effects.parallel import falling, relaxed, relaxing, summed
 
 _LAGS = 6
 _WAVES = 8
@@ -93,13 +93,6 @@ class UnmodelledLag(ParallelEffect):
         for (i, j), gain in np.ndenumerate(scene.gains):
             out[:, i] += psi[0] * gain * relaxed(scene, i, j, self.time)
         return out
-
-
-def relaxed(scene: Scene, response: int, drive: int, lag: float) -> Vector:
-    """A drive after the delay of its path to a response and a lag [time unit], (samples,) [drive unit]."""
-    own, delay = scene.drives[drive], float(scene.delays[response, drive])
-    moved = summed(scene.times, own, delay, own.jumps, relaxing(lag))
-    return np.asarray(scene.rest[drive] + moved)
 
 
 @final

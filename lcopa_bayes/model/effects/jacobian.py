@@ -39,14 +39,8 @@ def coefficient_slopes(simulator: Simulator, plant: Plant, psi: Vector) -> list[
                 steps, weights = np.array([step, 2 * step]), np.array([-1.5, 2.0, -0.5])
             elif not effect.linear:
                 steps, weights = np.array([step, -step]), np.array([0.0, 0.5, -0.5])
-            parts.append(
-                (
-                    columns,
-                    effect.card.per_record,
-                    weights / step,
-                    slice(len(cases), len(cases) + steps.size),
-                )
-            )
+            place = slice(len(cases), len(cases) + steps.size)
+            parts.append((columns, effect.card.per_record, weights / step, place))
             for each in steps:
                 moved = psi.copy()
                 moved[columns] += each

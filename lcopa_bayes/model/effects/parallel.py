@@ -93,6 +93,12 @@ def falling(drive: AxisDrive, rest: float) -> Array:
     return np.asarray(levels[1:] < levels[:-1])
 
 
+def relaxed(scene: Scene, response: int, drive: int, lag: float) -> Vector:
+    """A drive after the delay of its path to a response and a lag [time unit], (samples,) [drive unit]."""
+    own, delay = scene.drives[drive], float(scene.delays[response, drive])
+    return np.asarray(scene.rest[drive] + summed(scene.times, own, delay, own.jumps, relaxing(lag)))
+
+
 def own_responses(scene: Scene, size: float, shape: Callable[[Array], Array]) -> Matrix:
     """``size K (rest + sum_k jump_k shape(t - t_k - delay))`` of every axis, (samples, axes).
 
@@ -270,7 +276,6 @@ class MissingCrossPath(ParallelEffect):
         pairs = ((i, j) for i in range(scene.ranges.axes) for j in range(scene.ranges.drive.size))
         other = ((i, j) for i, j in pairs if j != scene.ranges.direct[i])
         for k, (i, j) in zip(psi, other, strict=True):
-            drive, unit = scene.drives[j], scene.ranges.response[i] / scene.ranges.drive[j]
-            moved = summed(scene.times, drive, float(scene.delays[i, j]), drive.jumps, relaxing(self.time))
-            out[:, i] += k * unit * (scene.rest[j] + moved)
+            unit = scene.ranges.response[i] / scene.ranges.drive[j]
+            out[:, i] += k * unit * relaxed(scene, i, j, self.time)
         return out

@@ -11,6 +11,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.model.effects.effect import (
+    Acting,
     Card,
     Coefficient,
     DriveEffect,
@@ -62,12 +63,9 @@ class ClockSkew(DriveEffect):
         """e [-]."""
         return single("e", 2 * ranges.period / ranges.span)
 
-    def commands(
-        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[AxisDrive, float]:
+    def commands(self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector) -> Acting:
         """All changes are stretched."""
-        start = scene.times[0]
-        return AxisDrive.of_jumps(drive.times + psi[0] * (drive.times - start), drive.jumps), rest
+        return drive.later(psi[0] * (drive.times - scene.times[0])), rest
 
 
 @final
@@ -89,11 +87,9 @@ class TriggerJitter(DriveEffect):
         """dt [time unit]."""
         return single("dt", 2 * ranges.period, "time")
 
-    def commands(
-        self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector
-    ) -> tuple[AxisDrive, float]:
+    def commands(self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector) -> Acting:
         """All changes are shifted alike."""
-        return AxisDrive.of_jumps(drive.times + psi[0], drive.jumps), rest
+        return drive.later(psi[0]), rest
 
 
 @final

@@ -64,11 +64,8 @@ def _of_unit(values: Vector, units: Sequence[str]) -> Vector:
 
 def _largest(experiment: Experiment) -> Vector:
     """Largest magnitude of every drive [drive unit]."""
-    levels = [
-        np.concatenate(([rest], rest + drive.values))
-        for drive, rest in zip(experiment.drives, experiment.rest, strict=True)
-    ]
-    return np.array([np.abs(level).max() for level in levels])
+    pairs = zip(experiment.drives, experiment.rest, strict=True)
+    return np.array([np.abs([rest, *(rest + drive.values)]).max() for drive, rest in pairs])
 
 
 def _speed(plant: Plant, element: int, span: float) -> float:

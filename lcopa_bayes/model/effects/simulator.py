@@ -111,14 +111,12 @@ class Simulator:
         out = []
         for r, (scene, deflection) in enumerate(moved):
             y = deflection
-            for kind in (ParallelEffect, ReadoutEffect):
-                for e, effect in enumerate(self.effects):
-                    if isinstance(effect, kind):
-                        mine = self.part(psi, e, r)
-                        if isinstance(effect, ParallelEffect):
-                            y = y + effect.added(scene, mine)
-                        elif isinstance(effect, ReadoutEffect):
-                            y = effect.seen(y, scene, mine)
+            for e, effect in enumerate(self.effects):
+                if isinstance(effect, ParallelEffect):
+                    y = y + effect.added(scene, self.part(psi, e, r))
+            for e, effect in enumerate(self.effects):
+                if isinstance(effect, ReadoutEffect):
+                    y = effect.seen(y, scene, self.part(psi, e, r))
             out.append(y)
         return out
 

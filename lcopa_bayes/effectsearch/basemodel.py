@@ -1,4 +1,5 @@
-"""How many viscous terms the base model needs and what its paths share, before anything is missing."""
+"""What the base model needs before anything is missing: a drive before the first row where no record shows
+the plant at rest, and as many viscous terms as the records ask for."""
 
 from __future__ import annotations
 
@@ -8,9 +9,11 @@ from functools import partial
 from typing import NamedTuple, final
 
 import numpy as np
+from scipy.optimize import minimize
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import refuse_if
+from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.requirements import not_at_rest, unmet_apart_from_rest
 from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.data.study import Study
@@ -20,13 +23,100 @@ from lcopa_bayes.effectsearch.refits import log_bayes_factor
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.rounds import leading
 from lcopa_bayes.effectsearch.scores import State
-from lcopa_bayes.effectsearch.startlevel import Mended, started
 from lcopa_bayes.effectsearch.trace import trace
+from lcopa_bayes.effectsearch.verdict import MARGIN
+from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.declared import campaign_places
 from lcopa_bayes.inference.nestedmodels import lifted
 from lcopa_bayes.model.effects.effect import Effect
 from lcopa_bayes.results.discretisation import FACTORS, largest_shift, narrowed
+
+_EVALUATIONS = 60
+_STEPS = 8
+"""Evaluations of the descent at each level tried [-]."""
+
+
+@final
+class Mended(NamedTuple):
+    """A study whose base model lost an assumption that its records contradict."""
+
+    study: Study
+    sentence: str
+    """What was changed."""
+
+
+def started(study: Study, fit: BaseFit) -> Mended | None:
+    """The study with one common drive before the first row of every record, when that is worth 3 nat.
+
+    Before its first row the plant rests under the first row's drive; a record that begins while the plant
+    moves would show the difference as a misfit of every slow effect at once. Where no record says or shows
+    what it rests under (an early row without a response, quiet samples) the level is tried: a single value
+    per drive, since records that each begin elsewhere would predict no other. Its own uncertainty is not
+    part of what follows. None where rest is known or the level brings nothing.
+    """
+    if fit.noise_known or any(np.isnan(one.response[0]).all() for one in study.fit):
+        return None
+    drive = np.concatenate([one.drive for one in study.fit])
+    low, high = drive.min(axis=0), drive.max(axis=0)
+    reach = high - low
+
+    def left(level: Vector) -> float:
+        return _power(_begun(study, level), fit)
+
+    first = np.mean([one.drive[0] for one in study.fit], axis=0)
+    ends = list(zip(low - reach, high + reach, strict=True))
+    best = minimize(left, first, method="Powell", bounds=ends, options={"maxfev": _EVALUATIONS, "xtol": 1e-2})
+    if not np.isfinite(best.fun):
+        return None
+    count = fit.optimum.effective
+    power = float(fit.optimum.residual @ fit.optimum.residual)
+    gain = 0.5 * count * np.log(power / best.fun) - 0.5 * first.size * np.log(count)
+    if not gain > MARGIN:
+        return None
+    levels = " and ".join(
+        f"{value:.4g} {axis.unit} of {axis.name}"
+        for value, axis in zip(best.x, study.drive_axes, strict=True)
+    )
+    return Mended(
+        _begun(study, best.x),
+        "No record shows the plant at rest, and it did not rest under the first row's drive: a drive before "
+        f"the first row, the same for all records, was fitted ({levels}, worth {gain:.0f} nat); an early row "
+        "with a drive and no response would state it.",
+    )
+
+
+def _begun(study: Study, level: Vector) -> Study:
+    """All records with an early row of that drive and no response."""
+    return replace(
+        study,
+        fit=tuple(_after(one, level) for one in study.fit),
+        held_out=tuple(_after(one, level) for one in study.held_out),
+    )
+
+
+def _after(record: Record, level: Vector) -> Record:
+    period = float(np.median(np.diff(record.time)))
+    return replace(
+        record,
+        time=np.concatenate([[record.time[0] - period], record.time]),
+        drive=np.vstack([level, record.drive]),
+        response=np.vstack([np.full(record.response.shape[1], np.nan), record.response]),
+    )
+
+
+def _power(study: Study, fit: BaseFit) -> float:
+    """Squared residual of the base model from where it stood [response unit^2]; infinite where it fails."""
+    model = ExtendedModel(problem_of(study).posterior)
+    white = Whitening(model.plant.samples, fit.regression.whitening.noise)
+    regression = Regression(model, white)
+    try:
+        x, _ = regression.reached(fit.optimum.x, most=_STEPS, gain=0.1)
+        residual = white.observed - model.predict(x)
+    except ArithmeticError:
+        return np.inf
+    return float(residual @ residual)
+
 
 _MOST = 3
 _GAIN = 10.0
@@ -166,7 +256,7 @@ def _fit(problem: Problem, key: Sequence[int], contained: Base | None) -> BaseFi
 
 def _state(study: Study, fit: BaseFit) -> State:
     model = fit.model.at_scales(fit.optimum.x, campaign_places(study))
-    return State(model, fit.optimum, fit.regression.whitening, fit.optimum.covariance)
+    return State(model, fit.optimum, fit.regression.whitening)
 
 
 def _shift(fit: BaseFit, problem: Problem) -> float:
@@ -182,7 +272,7 @@ def _gain(base: Base, wider: Base) -> float:
     """Log evidence of the wider model over the other under the wider one's noise [nat]."""
     quiet = float(sum(wider.fit.noise_samples))
     same = Regression(base.fit.model, wider.fit.regression.whitening).descend(base.fit.optimum.x)
-    ordering = wider.fit.model.log_support - base.fit.model.log_support
+    ordering = wider.fit.model.plant.table.log_support - base.fit.model.plant.table.log_support
     return log_bayes_factor(same, wider.fit.optimum, quiet) + ordering
 
 
@@ -207,7 +297,7 @@ def _later(study: Study, fit: BaseFit) -> Mended | None:
         name: PriorSettings(name, dist="uniform", parameters={"loc": 0.0, "scale": _LONGER * end})
         for name, end in stuck
     }
-    names = ", ".join(f"{name} (ends at {end:.4g} {model.time_unit})" for name, end in stuck)
+    names = ", ".join(f"{name} (ends at {end:.4g} {study.time_unit})" for name, end in stuck)
     return Mended(
         replace(study, priors={**study.priors, **longer}),
         f"The default prior of {names} is too short for these records and was doubled.",

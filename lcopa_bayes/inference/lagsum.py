@@ -1,0 +1,332 @@
+"""Sums of first-order lags with a delay: what a path may be if it is no Kelvin element.
+
+    y_i(t) = offset + sum_j sum_k w_ijk (1 - exp(-(t - L_ij) / T_ijk))  for a unit step of every drive j
+
+Weights of either sign make sums and, by partial fractions, products of lags with zeros between them; a
+diffusion or a distributed order is approached by a few. Weights and offsets enter linearly and are integrated
+out under Gaussian noise (Golub and Pereyra 1973, SIAM J. Numer. Anal. 10, of least squares), so that a
+response axis has the time constants and delays of its paths as its only coordinates.
+
+Responses are tabulated once over time constants and delays, whitened, and reduced to the directions in which
+they differ by more than the noise can hide; a likelihood then costs the same for a hundred samples as for ten
+thousand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import final
+
+import numpy as np
+from scipy.linalg import eigh, orth
+from scipy.optimize import least_squares
+
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.inference.noise import GaussianNoise
+from lcopa_bayes.inference.posterior import Posterior
+
+MOST = 4
+"""Most lags of a path."""
+_PER_DECADE = 10
+"""Tabulated time constants in a decade [-]: between them a response is interpolated to 1e-4."""
+_SHORTEST, _LONGEST = 0.5, 3.0
+"""Time constants between this share of a sampling period and this multiple of the span of the records [-]:
+what is slower cannot be told from a drift."""
+WEIGHT = 1.0
+"""Prior standard deviation of a weight, in ranges of response over ranges of drive [-]."""
+_VISIBLE = 1e-4
+"""Squared whitened response below which a direction is left out [-]."""
+_SAMPLES = 4_000
+"""Most samples of a response axis: of more one in so many is used, which widens intervals."""
+_VALUES = 4_000_000
+"""Most values simulated at once."""
+_APART = 0.7
+"""Least distance of the time constants a search starts from [-, natural logarithm]."""
+_STARTS = 3
+"""Places where a further lag is tried."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class LagTable:
+    """Responses of lags on one response axis, whitened and without what its offsets explain."""
+
+    log_times: Vector
+    """Natural logarithms of the tabulated time constants, equally spaced, (times,) [time unit]."""
+    delays: Matrix
+    """Tabulated delays of every path, equally spaced, (paths, delays) [time unit]."""
+    responses: Array
+    """In the directions that are kept, (paths, times, delays, directions) [per unit weight]."""
+    target: Vector
+    """The record, (directions,)."""
+    remainder: float
+    """Its squared part in no direction [-]."""
+    size: int
+    """Samples behind it [-]."""
+
+    @property
+    def paths(self) -> int:
+        """Number of paths."""
+        return len(self.delays)
+
+    def ends(self, lags: int) -> tuple[Vector, Vector]:
+        """Smallest and largest coordinates of paths of so many lags: log times path by path, then delays."""
+        count = self.paths * lags
+        low = np.concatenate([np.full(count, self.log_times[0]), self.delays[:, 0]])
+        high = np.concatenate([np.full(count, self.log_times[-1]), self.delays[:, -1]])
+        return low, high
+
+    def parts(self, coordinates: Matrix) -> tuple[Array, Matrix]:
+        """Log times (batch, paths, lags) and delays (batch, paths) of coordinates (batch, dimension)."""
+        count = coordinates.shape[1] - self.paths
+        return coordinates[:, :count].reshape(len(coordinates), self.paths, -1), coordinates[:, count:]
+
+    def columns(self, coordinates: Matrix) -> Array:
+        """Responses of every lag, (batch, paths * lags, directions): cubic between tabulated log times,
+        linear between tabulated delays."""
+        log_times, delays = self.parts(coordinates)
+        at = (log_times - self.log_times[0]) / (self.log_times[1] - self.log_times[0])
+        first = np.clip(np.floor(at).astype(int) - 1, 0, self.log_times.size - 4)
+        along = (delays - self.delays[:, 0]) / (self.delays[:, 1] - self.delays[:, 0])
+        before = np.clip(np.floor(along).astype(int), 0, self.delays.shape[1] - 2)[..., None]
+        share = (along[..., None] - before)[..., None]
+        path = np.arange(self.paths)[:, None]
+        out = np.zeros((*first.shape, self.target.size))
+        for step, weight in enumerate(_cubic(at - first)):
+            near, far = (self.responses[path, first + step, before + later] for later in (0, 1))
+            out += weight[..., None] * ((1 - share) * near + share * far)
+        return out.reshape(len(coordinates), -1, self.target.size)
+
+    def conditional(self, coordinates: Matrix) -> Conditional:
+        """Distribution of the weights at coordinates (batch, dimension)."""
+        columns = self.columns(coordinates)
+        precision = columns @ columns.swapaxes(1, 2) + np.eye(columns.shape[1]) / WEIGHT**2
+        root = np.asarray(np.linalg.cholesky(precision), dtype=float)
+        bent = np.linalg.solve(root, (columns @ self.target)[..., None])[..., 0]
+        return Conditional(root, bent, self.remainder + float(self.target @ self.target))
+
+    def log_density(self, coordinates: Matrix) -> Vector:
+        """Log of the likelihood without its constants, weights integrated out, (batch,); -inf outside."""
+        low, high = self.ends((coordinates.shape[1] - self.paths) // self.paths)
+        inside = np.flatnonzero(((coordinates >= low) & (coordinates <= high)).all(axis=1))
+        out = np.full(len(coordinates), -np.inf)
+        if inside.size:
+            out[inside] = self.conditional(coordinates[inside]).log_marginal
+        return out
+
+    def residual(self, coordinates: Vector) -> Vector:
+        """What the most probable weights leave, and what their prior adds to the cost."""
+        columns = self.columns(coordinates[None])[0]
+        precision = columns @ columns.T + np.eye(len(columns)) / WEIGHT**2
+        weights = np.linalg.solve(precision, columns @ self.target)
+        return np.concatenate([self.target - weights @ columns, weights / WEIGHT])
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Conditional:
+    """Normal distributions of the weights, each given its time constants and delays."""
+
+    root: Array
+    """Of the precision, lower triangular (batch, weights, weights)."""
+    bent: Matrix
+    """``root^-1 X'y``, (batch, weights)."""
+    square: float
+    """``y'y``."""
+
+    @property
+    def log_marginal(self) -> Vector:
+        """Weights integrated out, (batch,) [nat]."""
+        half = np.log(np.diagonal(self.root, axis1=1, axis2=2)).sum(axis=1)
+        explained = np.einsum("bw,bw->b", self.bent, self.bent)
+        return np.asarray(0.5 * (explained - self.square) - half - self.bent.shape[1] * np.log(WEIGHT))
+
+    def draw(self, rng: np.random.Generator) -> Matrix:
+        """One draw of the weights for each, (batch, weights)."""
+        standard = self.bent + rng.standard_normal(self.bent.shape)
+        return np.asarray(np.linalg.solve(self.root.swapaxes(1, 2), standard[..., None])[..., 0])
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class LagFit:
+    """Least squares with so many lags in every path."""
+
+    lags: int
+    coordinates: Vector
+    """Log times path by path, then delays, (dimension,)."""
+    jacobian: Matrix
+    square: float
+    """Whitened residual and weights, squared [-]."""
+    size: int
+
+    @property
+    def parameters(self) -> int:
+        """Time constants, weights and delays [-]."""
+        paths = self.coordinates.size // (self.lags + 1)
+        return paths * (2 * self.lags + 1)
+
+    @property
+    def bic(self) -> float:
+        """Up to what all fits of one record have in common [-]."""
+        return float(self.square + self.parameters * np.log(self.size))
+
+    @cached_property
+    def covariance(self) -> Matrix:
+        """Of the coordinates near the optimum, (dimension, dimension)."""
+        return np.asarray(np.linalg.pinv(self.jacobian.T @ self.jacobian))
+
+
+def lag_fits(table: LagTable) -> tuple[LagFit, ...]:
+    """The best of a few searches for each number of lags, 1 to `MOST`: a further lag begins where it alone
+    explains most of what the others leave."""
+    fits: list[LagFit] = []
+    for lags in range(1, MOST + 1):
+        tried = [_descended(table, lags, start) for start in _starts(table, fits[-1] if fits else None)]
+        fits.append(min(tried, key=lambda one: one.square))
+    return tuple(fits)
+
+
+def _starts(table: LagTable, fewer: LagFit | None) -> list[Vector]:
+    nodes = table.log_times[2:-2]
+    if fewer is None:
+        low, high = table.delays[:, 0], table.delays[:, -1]
+        places = np.quantile(nodes, (0.25, 0.5, 0.75))
+        return [
+            np.concatenate([np.full(table.paths, place), low + share * (high - low)])
+            for place in places
+            for share in (0.1, 0.5, 0.9)
+        ]
+    log_times, delays = table.parts(fewer.coordinates[None])
+    further = np.broadcast_to(nodes[:, None, None], (nodes.size, table.paths, 1))
+    every = np.concatenate([np.repeat(log_times, nodes.size, axis=0), further], axis=2)
+    flat = every.reshape(nodes.size, -1)
+    starts = np.concatenate([flat, np.repeat(delays, nodes.size, axis=0)], axis=1)
+    chosen: list[int] = []
+    for k in np.argsort(-table.conditional(starts).log_marginal):
+        if all(abs(nodes[k] - nodes[other]) > _APART for other in chosen):
+            chosen.append(int(k))
+    return list(starts[chosen[:_STARTS]])
+
+
+def _descended(table: LagTable, lags: int, start: Vector) -> LagFit:
+    low, high = table.ends(lags)
+    optimum = least_squares(
+        table.residual, np.clip(start, low, high), bounds=(low, high), x_scale=high - low, max_nfev=40
+    )
+    square = 2 * float(optimum.cost) + table.remainder
+    return LagFit(lags, optimum.x, np.asarray(optimum.jac), square, table.size)
+
+
+def _cubic(at: Array) -> tuple[Array, ...]:
+    """Lagrange weights of nodes 0, 1, 2 and 3."""
+    a, b, c = at - 1, at - 2, at - 3
+    return -a * b * c / 6, at * b * c / 2, -at * a * c / 2, at * a * b / 6
+
+
+def lag_problem(study: Study) -> Problem:
+    """The records of a study prepared for lags: one with a delay of its own for every path, offsets and noise
+    as in the study; InputError as `problem_of`."""
+    model = replace(study.model, terms=1, orders=(1.0,), share="none", delay="path")
+    priors = {name: prior for name, prior in study.priors.items() if name.startswith("offset")}
+    problem = problem_of(replace(study, model=model, priors=priors))
+    return replace(problem, posterior=thinned(problem.posterior))
+
+
+def thinned(posterior: Posterior) -> Posterior:
+    """A posterior of no more samples than lags are held against."""
+    most = max(
+        sum(samples.axes[axis].values.size for samples in posterior.samples)
+        for axis in range(len(posterior.table.layout.responses))
+    )
+    step = -(-most // _SAMPLES)
+    kept = [replace(one, axes=tuple(axis.every(step) for axis in one.axes)) for one in posterior.samples]
+    return replace(posterior, samples=tuple(kept)) if step > 1 else posterior
+
+
+def lag_table(problem: Problem, axis: int, drives: Sequence[int], noise: Vector, delays: Matrix) -> LagTable:
+    """Responses of one axis to some drives, of a `lag_problem` under Gaussian `noise` (parameters,).
+
+    `delays` (paths, delays) [time unit] are those tabulated. A weight is in ranges of the response over
+    ranges of the drive (`Scales`).
+    """
+    posterior, scales = problem.posterior, problem.scales
+    assert isinstance(posterior.noise, GaussianNoise)
+    first, last = np.log(_SHORTEST * scales.period), np.log(_LONGEST * scales.span)
+    log_times = np.linspace(first, last, max(8, round(_PER_DECADE * (last - first) / np.log(10)) + 1))
+    offsets = [k for k in posterior.table.of_kind("offset") if posterior.table.rows[k].response == axis]
+    offsets = [k for k in offsets if posterior.table.rows[k].free]
+    values = _values(problem, axis, drives, np.exp(log_times), delays)
+    count = len(drives) * len(values)
+    stacked = _columns(problem, axis, drives, values)
+    white = []
+    for r, (samples, columns) in enumerate(zip(posterior.samples, stacked, strict=True)):
+        observed = samples.axes[axis]
+        none = np.zeros((0, 1, observed.values.size))  # offsets need no response
+        acting = [posterior.column(k, axis, r, observed, none) for k in offsets]
+        own = [np.zeros(observed.values.size) if column is None else column[0] for column in acting]
+        held = values[:1].copy()
+        held[:, [*posterior.table.of_kind("gain"), *offsets]] = 0.0
+        target = posterior.residual(axis, r, observed, held, none)
+        whole = np.concatenate([columns, np.reshape(own, (len(offsets), -1)), target])
+        if observed.values.size:
+            white.append(posterior.noise.whiten(whole[None], noise[None], observed.gaps)[0][0])
+    joined = np.concatenate(white, axis=1)
+    if offsets:
+        basis = orth(joined[count:-1].T)
+        joined = joined - (joined @ basis) @ basis.T
+    reduced, target = _reduced(joined[:count], joined[-1])
+    remainder = max(0.0, float(joined[-1] @ joined[-1] - target @ target))
+    shape = (len(drives), log_times.size, delays.shape[1], -1)
+    return LagTable(log_times, delays, reduced.reshape(shape), target, remainder, joined.shape[1])
+
+
+def _columns(problem: Problem, axis: int, drives: Sequence[int], values: Matrix) -> list[Matrix]:
+    """Responses to each drive at table values (batch, rows), of every record (drives * batch, samples)
+    [response unit per unit weight]."""
+    posterior, scales = problem.posterior, problem.scales
+    table, units = posterior.table, scales.amplitude[axis] / scales.excursion
+    sizes = [samples.axes[axis].values.size for samples in posterior.samples]
+    out = [np.zeros((len(drives), len(values), size)) for size in sizes]
+    simulated = sum(samples.times.size for samples in posterior.samples) * len(table.layout.units)
+    size = max(1, _VALUES // simulated)
+    for first in range(0, len(values), size):
+        portion = slice(first, first + size)
+        read = posterior.model.unit_responses(table.dynamics(values[portion]))
+        for r, samples in enumerate(posterior.samples):
+            for p, drive in enumerate(drives):
+                gain = table.at("gain", axis, drive)
+                column = posterior.column(gain, axis, r, samples.axes[axis], read[r])
+                if column is not None:
+                    out[r][p, portion] = units[drive] * column
+    return [one.reshape(len(drives) * len(values), -1) for one in out]
+
+
+def _values(problem: Problem, axis: int, drives: Sequence[int], times: Vector, delays: Matrix) -> Matrix:
+    """Table values of every tabulated lag, its delay changing fastest, (times * delays, rows)."""
+    table = problem.posterior.table
+    fixed = np.array([0.0 if row.free else row.value for row in table.rows])
+    values = np.tile(fixed, (times.size * delays.shape[1], 1))
+    for terms in table.terms:
+        values[:, terms.times] = np.repeat(times, delays.shape[1])[:, None]
+        values[:, terms.orders] = 1.0
+    for drive, nodes in zip(drives, delays, strict=True):
+        slot = table.layout.delay_of[axis][drive]
+        values[:, table.at("delay", slot)] = np.tile(nodes, times.size)
+    return values
+
+
+def _reduced(columns: Matrix, target: Vector) -> tuple[Matrix, Vector]:
+    """Columns (columns, samples) and target in the principal directions of the columns that show."""
+    if columns.shape[0] < columns.shape[1]:
+        squares, vectors = eigh(columns @ columns.T)
+        kept = squares > _VISIBLE
+        roots = np.sqrt(squares[kept])
+        return vectors[:, kept] * roots, vectors[:, kept].T @ (columns @ target) / roots
+    squares, vectors = eigh(columns.T @ columns)
+    kept = squares > _VISIBLE
+    return columns @ vectors[:, kept], vectors[:, kept].T @ target

@@ -1,0 +1,369 @@
+"""Numbers over structures: what the fitted plant and sums of lags leave open together.
+
+A plant of Kelvin elements with its structure chosen is one family; the records may be followed as well by
+others, whose steady values and delays are elsewhere though both leave the same residual. Sums of lags
+(`inference.lagsum`) stand for these. Where Akaike's criterion leaves both any support, each counts one half,
+whatever the evidence says: it rewards the family that needs fewer parameters, not the one that is true
+(Burnham and Anderson 2002, Model Selection and Multimodel Inference, sect. 2.6). Bands of records are those
+of the fitted plant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal, final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Array, Vector
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.estimate import Estimate, plain
+from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.lagsum import lag_problem, thinned
+from lcopa_bayes.inference.noise import GaussianNoise
+from lcopa_bayes.model.layout import PathSlot
+from lcopa_bayes.results.fit import Fit
+from lcopa_bayes.results.steps import Metric, StepCurves, figures_of, metrics_of
+from lcopa_bayes.sampling.convergence import TENTATIVE_ESS, Limitation
+from lcopa_bayes.sampling.lagdraws import LagDraws, lag_draws
+
+_SUPPORT = 10.0
+"""Difference of Akaike's criterion beyond which the worse plant has no support [-]."""
+_RISEN = 0.3
+"""Share of its value at the end of the record that a response has reached before which its delay ends [-]."""
+_MOVED = 0.5
+"""Shift of a median over its standard deviation that is told [-]."""
+_NORMAL = 3.29
+"""Standard deviations that 90 % of a normal distribution take [-]."""
+_WIDER = 1.5
+"""Width of an interval over that of the fitted plant that is told [-]."""
+_SHOWN = 4
+"""Most numbers named in a sentence."""
+_STREAM = 17
+"""Marks the randomness of these draws."""
+
+Support = Literal["plant", "both", "lags"]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Alternative:
+    """Sums of lags in place of the paths to one response axis."""
+
+    paths: tuple[PathSlot, ...]
+    """Those whose drive moves and whose gain is not known."""
+    lags: LagDraws
+    advantage: float
+    """Akaike's criterion of the fitted plant less that of the lags [-]."""
+
+    @property
+    def support(self) -> Support:
+        """Which of both the records leave in question."""
+        if abs(self.advantage) <= _SUPPORT:
+            return "both"
+        return "lags" if self.advantage > 0 else "plant"
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        times = np.exp(self.lags.best.coordinates[: -len(self.paths)]).reshape(len(self.paths), -1)
+        return {
+            "paths": [one.name for one in self.paths],
+            "lags": self.lags.best.lags,
+            "times": [sorted(row) for row in times.tolist()],
+            "ess": self.lags.ess,
+            "aic_advantage": self.advantage,
+            "support": self.support,
+        }
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Averaged:
+    """One number over both plants."""
+
+    estimate: Estimate
+    plant: Vector
+    """At draws of the fitted plant, (draws,) [unit]."""
+    lags: Vector
+    """At draws of the sums of lags, (draws,) [unit]."""
+    weight: float
+    """Of the sums of lags [-]."""
+
+    @cached_property
+    def moved(self) -> bool:
+        """Whether the number is elsewhere, or open farther, than the fitted plant by itself says."""
+        low, middle, high = np.quantile(self.plant, (0.05, 0.5, 0.95), method="nearest")
+        here = self.estimate
+        if not np.isfinite([low, high]).all():
+            return False
+        if not np.isfinite([here.lower, here.value, here.upper]).all():
+            return True
+        shifted = abs(here.value - middle) > _MOVED * (high - low) / _NORMAL
+        return bool(shifted or here.upper - here.lower > _WIDER * (high - low))
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values: the estimate, its parts, and what each plant says by itself."""
+        alone = {
+            name: np.quantile(values, (0.05, 0.5, 0.95), method="nearest").tolist()
+            for name, values in (("plant", self.plant), ("lags", self.lags))
+        }
+        noise, structure = parts_of_sd([self.plant, self.lags], np.array([1 - self.weight, self.weight]))
+        return self.estimate.as_json() | alone | {"sd_noise": noise, "sd_structure": structure}
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Alternatives:
+    """Sums of lags beside a fitted plant, and the numbers that both have."""
+
+    alternatives: tuple[Alternative, ...]
+    """One per response axis that has any."""
+    numbers: tuple[Averaged, ...]
+    """Figures of the step responses that the sums of lags have a part in."""
+
+    @property
+    def sentence(self) -> str:
+        """Which plants the records leave in question."""
+        figures = "figures of the step responses are"
+        said = {
+            "both": f"follow the records as well as the fitted plant does: {figures} over both",
+            "lags": f"follow the records better than the fitted plant: {figures} theirs",
+            "plant": "do not follow the records as well as the fitted plant does",
+        }
+        return " ".join(
+            f"Sums of {one.lags.best.lags} to {one.lags.times.shape[2]} lags"
+            f"{f' for {_listed([path.name for path in one.paths])}' if len(self.alternatives) > 1 else ''} "
+            f"{said[one.support]} (AIC {'lower' if one.advantage > 0 else 'higher'} by "
+            f"{abs(one.advantage):.1f})."
+            for one in self.alternatives
+        )
+
+    def limitations(self, names: Mapping[str, tuple[str, ...]]) -> list[Limitation]:
+        """What this says of the parameters of the fitted plant, by the figure each of them is: `names` has
+        the parameters of every figure."""
+        out = []
+        for one in self.alternatives:
+            if one.support == "lags":
+                paths = _listed([path.name for path in one.paths])
+                out.append(
+                    Limitation(
+                        "tentative",
+                        f"a sum of {one.lags.best.lags} lags follows {paths} better than the fitted plant "
+                        f"(AIC lower by {one.advantage:.0f})",
+                        "read figures of the step responses, which are of the sum of lags, and let `compare` "
+                        "weigh other structures",
+                    )
+                )
+        moved = [one.estimate for one in self.numbers if one.weight == 0.5 and one.moved]
+        moved = [one for one in moved if one.name in names]
+        if moved:
+            said = [f"{one.name} at {one.lower:.4g} to {one.upper:.4g} {one.unit}" for one in moved]
+            more = f" and {len(said) - _SHOWN} more open" if len(said) > _SHOWN else ""
+            concerned = dict.fromkeys(parameter for one in moved for parameter in names[one.name])
+            out.append(
+                Limitation(
+                    "tentative",
+                    f"sums of lags follow the records as well and leave {_listed(said[:_SHOWN])}{more}",
+                    "record until the response settles, and sample its onset",
+                    tuple(concerned),
+                )
+            )
+        return out
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return plain(
+            {
+                "sums_of_lags": [one.as_json() for one in self.alternatives],
+                "numbers": [one.as_json() for one in self.numbers],
+                "sentence": self.sentence,
+            }
+        )
+
+
+def alternatives_of(fitted: Fit) -> Alternatives | None:
+    """Sums of lags beside a fit; None where its noise is not Gaussian, its plant has effects, no drive moves
+    or the records do not determine them."""
+    posterior = fitted.problem.posterior
+    if posterior.simulation is not None or not isinstance(posterior.noise, GaussianNoise):
+        return None
+    try:
+        problem = lag_problem(fitted.study)
+    except InputError:
+        return None
+    found = []
+    for axis in range(len(posterior.table.layout.responses)):
+        paths = _open(fitted, axis)
+        if paths:
+            found.append(_alternative(fitted, problem, axis, paths))
+    if not found:
+        return None
+    return Alternatives(tuple(found), tuple(_numbers(fitted, problem, found)))
+
+
+def with_alternatives(fitted: Fit) -> Fit:
+    """A fit with the figures of its step responses over both plants, and what follows for its grade."""
+    other = alternatives_of(fitted)
+    if other is None:
+        return fitted
+    table = fitted.draws.table
+    names = {}
+    for one in table.layout.paths:
+        slot = table.at("delay", table.layout.delay_of[one.response][one.drive])
+        names[f"steady_state[{one.name}]"] = (table.names[table.at("gain", one.response, one.drive)],)
+        names[f"delay[{one.name}]"] = (table.names[slot],)
+    free = {name for row, name in zip(table.rows, table.names, strict=True) if row.free}
+    own = {key: value for key, value in names.items() if set(value) <= free}
+    by_name = {number.estimate.name: number.estimate for number in other.numbers}
+    return replace(
+        fitted,
+        draws=fitted.draws.limited(other.limitations(own)),
+        metrics=tuple(by_name.get(one.name, one) for one in fitted.metrics),
+        alternatives=other,
+    )
+
+
+def parts_of_sd(values: Sequence[Vector], weights: Vector) -> tuple[float, float]:
+    """Standard deviation within and between the components of a mixture, each given by equally probable
+    values; NaN where a component with a weight is open. Their squares add up to the mixture's variance."""
+    kept = [(one, weight) for one, weight in zip(values, weights, strict=True) if weight > 0]
+    if not all(np.isfinite(one).all() for one, _ in kept):
+        return np.nan, np.nan
+    share = np.array([weight for _, weight in kept])
+    means = np.array([one.mean() for one, _ in kept])
+    within = float(share @ np.array([one.var() for one, _ in kept]))
+    between = float(share @ (means - share @ means) ** 2)
+    return float(np.sqrt(within)), float(np.sqrt(between))
+
+
+def _open(fitted: Fit, axis: int) -> tuple[PathSlot, ...]:
+    """Paths to a response axis whose drive moves while it is sampled and whose gain is free; none where
+    another gain is known and not zero."""
+    posterior = fitted.problem.posterior
+    table, out = posterior.table, []
+    for one in table.layout.paths:
+        if one.response != axis:
+            continue
+        row = table.rows[table.at("gain", axis, one.drive)]
+        if not row.free and row.value != 0.0:
+            return ()
+        moves = any(
+            experiment.drives[one.drive].moves and samples.axes[axis].values.size
+            for experiment, samples in zip(posterior.model.experiments, posterior.samples, strict=True)
+        )
+        if row.free and moves:
+            out.append(one)
+    return tuple(out)
+
+
+def _alternative(fitted: Fit, problem: Problem, axis: int, paths: tuple[PathSlot, ...]) -> Alternative:
+    posterior, draws = thinned(fitted.problem.posterior), fitted.draws
+    best = draws.flat[[int(draws.log_density.argmax())]]
+    best = posterior.complete(posterior.coordinates(best), None)
+    noise = posterior.noise_parameters(best, axis)
+    units, square = posterior.responses(best), 0.0
+    for r, samples in enumerate(posterior.samples):
+        observed = samples.axes[axis]
+        residual = posterior.residual(axis, r, observed, best, units[r])
+        square += float((posterior.noise.standard(residual, noise, observed.gaps) ** 2).sum())
+    ends = np.array([_ends(fitted, one) for one in paths])
+    seed = fitted.run.plan.seed * 1_000 + 10 * _STREAM + axis
+    lags = lag_draws(problem, axis, [one.drive for one in paths], noise[0], ends, seed)
+    advantage = square + 2 * _parameters(fitted, paths) - lags.best.square - 2 * lags.best.parameters
+    return Alternative(paths, lags, advantage)
+
+
+def _parameters(fitted: Fit, paths: Sequence[PathSlot]) -> int:
+    """Free parameters of the fitted plant that the paths use [-]."""
+    table = fitted.draws.table
+    used: set[int] = set()
+    for one in paths:
+        used.add(table.at("gain", one.response, one.drive))
+        used.add(table.at("delay", table.layout.delay_of[one.response][one.drive]))
+        used.update(table.terms[table.layout.element_of[one.response][one.drive]].every)
+    return sum(table.rows[k].free for k in used)
+
+
+def _ends(fitted: Fit, path: PathSlot) -> tuple[float, float]:
+    """Ends of the delays that are looked at: those of the prior, not after the response has visibly begun."""
+    curves, table = fitted.curves, fitted.draws.table
+    row = table.rows[table.at("delay", table.layout.delay_of[path.response][path.drive])]
+    if not row.free:
+        return row.value, row.value + 1e-6 * fitted.problem.scales.period
+    low, high = (max(float(end), 0.0) for end in row.domain)
+    curve = np.median(curves.normalised[curves.curve_of[path.response][path.drive]], axis=0)
+    begun = float(curves.time[(curve >= _RISEN * curve[-1]).argmax()])
+    period = fitted.problem.scales.period
+    return low, max(min(high, max(begun, low + 2 * period)), low + 1e-6 * period)
+
+
+def _numbers(fitted: Fit, problem: Problem, found: Sequence[Alternative]) -> list[Averaged]:
+    """Every figure of the step responses that sums of lags have a part in, over both plants."""
+    weights = {"plant": 0.0, "both": 0.5, "lags": 1.0}
+    weight_of = {path.name: weights[one.support] for one in found for path in one.paths}
+    own = metrics_of(fitted.draws.table, fitted.curves, time_unit=fitted.study.time_unit)
+    other = {one.name: one for one in _figures(fitted, problem, found)}
+    ess = min(fitted.draws.ess, *(one.lags.ess for one in found))
+    grade = fitted.draws.grade.level if ess >= TENTATIVE_ESS else "tentative"
+    out = []
+    for one in own:
+        if one.name not in other:
+            continue
+        weight = _weight(one.name, weight_of)
+        if weight > 0:
+            out.append(_averaged(one, other[one.name], weight, ess, grade))
+    return out
+
+
+def _weight(name: str, weight_of: Mapping[str, float]) -> float:
+    """Of the sums of lags in a figure: that of its path, of a crosstalk the least of the paths involved."""
+    path = name.partition("[")[2].removesuffix("]")
+    return weight_of[path] if path in weight_of else min(weight_of.values())
+
+
+def _averaged(plant: Metric, lags: Metric, weight: float, ess: float, grade: str) -> Averaged:
+    count = min(plant.values.size, lags.values.size)
+    ours, theirs = (
+        one.values[np.linspace(0, one.values.size - 1, count).astype(int)] for one in (plant, lags)
+    )
+    pooled = theirs if weight == 1.0 else np.concatenate([ours, theirs])
+    own = f"of the fitted plant {plant.note}" if plant.note else ""
+    notes = (
+        ("of sums of lags", lags.note) if weight == 1.0 else ("over the fitted plant and sums of lags", own)
+    )
+    joined = "; ".join(note for note in notes if note)
+    here = Estimate.of(plant.name, plant.unit, pooled, ess=ess, grade=grade, note=joined)
+    return Averaged(here, plant.values, lags.values, weight)
+
+
+def _figures(fitted: Fit, problem: Problem, found: Sequence[Alternative]) -> list[Metric]:
+    """Figures of the step responses of sums of lags; of paths without any nothing."""
+    layout, time = problem.posterior.table.layout, fitted.curves.time
+    count = min(len(one.lags.delays) for one in found)
+    shape = (len(layout.responses), len(layout.drives))
+    gains, delays = np.zeros((count, *shape)), np.zeros((count, len(layout.delays)))
+    own = {}
+    for one in found:
+        for p, path in enumerate(one.paths):
+            own[path.response, path.drive] = (one.lags, p)
+            gains[:, path.response, path.drive] = one.lags.gains[:count, p]
+            delays[:, layout.delay_of[path.response][path.drive]] = one.lags.delays[:count, p]
+
+    def normalised(at: Vector) -> Array:
+        out = np.zeros((shape[0] * shape[1], count, at.size))
+        for (i, j), (lags, p) in own.items():
+            steady = gains[:, i, j, None]
+            out[i * shape[1] + j] = lags.response(p, at)[:count] / np.where(steady == 0.0, 1.0, steady)
+        return out
+
+    curve_of = tuple(tuple(i * shape[1] + j for j in range(shape[1])) for i in range(shape[0]))
+    curves = StepCurves(time, normalised(time), gains, delays, curve_of, np.empty((count, 0)))
+    without = [one.name for one in layout.paths if (one.response, one.drive) not in own]
+    figures = figures_of(layout, curves, normalised, time_unit=fitted.study.time_unit)
+    return [one for one in figures if not any(f"[{name}]" in one.name for name in without)]
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + f" and {names[-1]}"

@@ -1,0 +1,167 @@
+"""Draws of the sums of lags that a response axis may be: time constants and delays by emcee, weights exactly.
+
+The number of lags is the best by BIC and one more, which the records need not show: what it leaves open of a
+number is part of that number's interval. Delays are tabulated over all that is asked first and then where
+they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, final
+
+import emcee
+import numpy as np
+from arviz_stats.base import array_stats  # type: ignore[attr-defined]
+
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.lagsum import MOST, LagFit, LagTable, lag_fits, lag_table
+
+_COARSE, _FINE = 17, 33
+"""Delays tabulated over all that is asked, and where they are."""
+_NEAR = 20.0
+"""BIC above the least of a number of lags whose delay is still looked at [-]."""
+_REACH = 10.0
+"""Standard deviations of a delay that are tabulated on either side [-]."""
+_WALKERS, _STEPS, _THIN = 48, 1_000, 10
+_ROUNDS = 4
+"""Most times that many steps are made; the first are left out."""
+_WANTED = 200.0
+"""Effective draws that end them."""
+_KEPT = 1_000
+"""Most draws that are kept."""
+_AT_END = 0.01
+"""Share of the draws beside an end of the tabulated delays that moves the end."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class LagDraws:
+    """Equally probable sums of lags of the paths of one response axis."""
+
+    times: Array
+    """Time constants, (draws, paths, lags) [time unit]."""
+    weights: Array
+    """Theirs, (draws, paths, lags) [response unit / drive unit]."""
+    delays: Matrix
+    """(draws, paths) [time unit]."""
+    best: LagFit
+    """Least squares with the number of lags that is best by BIC."""
+    ess: float
+    """Smallest effective sample size of a steady value or delay [draws]."""
+
+    @property
+    def gains(self) -> Matrix:
+        """Steady response per unit step, (draws, paths)."""
+        return np.asarray(self.weights.sum(axis=2))
+
+    def response(self, path: int, time: Vector) -> Matrix:
+        """Response to a unit step at time 0, (draws, n)."""
+        since = np.maximum(time - self.delays[:, path, None], 0.0)
+        out = np.zeros(since.shape)
+        for k in range(self.times.shape[2]):
+            out -= self.weights[:, path, k, None] * np.expm1(-since / self.times[:, path, k, None])
+        return out
+
+
+def lag_draws(
+    problem: Problem, axis: int, drives: Sequence[int], noise: Vector, delays: Matrix, seed: int
+) -> LagDraws:
+    """Draws for one axis of a `lag_problem` and some drives; `delays` (paths, 2) [time unit] are the ends
+    between which delays are uniform."""
+    rng = np.random.default_rng(seed)
+    table = lag_table(problem, axis, drives, noise, _nodes(delays, _COARSE))
+    near = _near(table, lag_fits(table), delays)
+    while True:
+        table = lag_table(problem, axis, drives, noise, _nodes(near, _FINE))
+        fits = lag_fits(table)
+        best = min(fits, key=lambda one: one.bic)
+        chain, ess = _sampled(table, fits, best, rng)
+        wider = _wider(table, chain, near, delays)
+        if (wider == near).all():
+            break
+        near = wider
+    kept = chain.reshape(-1, chain.shape[-1])
+    kept = kept[rng.choice(len(kept), min(_KEPT, len(kept)), replace=False)]
+    log_times, own = table.parts(kept)
+    units = [problem.scales.amplitude[axis] / problem.scales.excursion[drive] for drive in drives]
+    weights = table.conditional(kept).draw(rng).reshape(log_times.shape) * np.array(units)[:, None]
+    return LagDraws(np.exp(log_times), weights, own, best, ess)
+
+
+def _near(table: LagTable, fits: Sequence[LagFit], delays: Matrix) -> Matrix:
+    """Ends between which delays are, (paths, 2): those of every likely number of lags and around."""
+    least = min(one.bic for one in fits)
+    likely = [one for one in fits if one.bic < least + _NEAR]
+    best = min(fits, key=lambda one: one.bic)
+    places = np.array([one.coordinates[-table.paths :] for one in likely])
+    reach = (
+        _REACH * np.sqrt(np.diag(best.covariance)[-table.paths :]) + table.delays[:, 1] - table.delays[:, 0]
+    )
+    low = np.maximum(places.min(axis=0) - reach, delays[:, 0])
+    return np.stack([low, np.minimum(places.max(axis=0) + reach, delays[:, 1])], axis=1)
+
+
+def _wider(table: LagTable, chain: Array, near: Matrix, delays: Matrix) -> Matrix:
+    """The same ends, farther out where draws stand beside them."""
+    own, width = chain[..., -table.paths :].reshape(-1, table.paths), near[:, 1] - near[:, 0]
+    edge = width / (_FINE - 1)
+    below = (own < near[:, 0] + edge).mean(axis=0) > _AT_END
+    above = (own > near[:, 1] - edge).mean(axis=0) > _AT_END
+    low = np.where(below, np.maximum(near[:, 0] - width, delays[:, 0]), near[:, 0])
+    return np.stack([low, np.where(above, np.minimum(near[:, 1] + width, delays[:, 1]), near[:, 1])], axis=1)
+
+
+def _sampled(
+    table: LagTable, fits: Sequence[LagFit], best: LagFit, rng: np.random.Generator
+) -> tuple[Array, float]:
+    """Coordinates with a lag more than the best, (walkers, draws, dimension), and their effective number."""
+    lags = min(best.lags + 1, MOST)
+    position = _begun(table, fits[lags - 1], best, lags, rng)
+    moves = [(emcee.moves.DEMove(), 0.8), (emcee.moves.StretchMove(), 0.2)]
+    sampler = emcee.EnsembleSampler(*position.shape, table.log_density, vectorize=True, moves=moves)
+    state = emcee.State(position, random_state=np.random.RandomState(rng.integers(2**32)).get_state())
+    state = sampler.run_mcmc(state, _STEPS)
+    sampler.reset()
+    for _ in range(_ROUNDS):
+        state = sampler.run_mcmc(state, _STEPS, thin_by=1)
+        chain = sampler.get_chain()[_THIN - 1 :: _THIN].swapaxes(0, 1)
+        ess = _ess(table, chain)
+        if ess >= _WANTED:
+            break
+    return chain, ess
+
+
+def _ess(table: LagTable, chain: Array) -> float:
+    """Smallest effective number of draws, of the mean steady values and of the delays."""
+    flat = chain.reshape(-1, chain.shape[-1])
+    conditional = table.conditional(flat)
+    mean = np.linalg.solve(conditional.root.swapaxes(1, 2), conditional.bent[..., None])[..., 0]
+    gains = mean.reshape(len(flat), table.paths, -1).sum(axis=2)
+    values = np.concatenate([gains, flat[:, -table.paths :]], axis=1).reshape(*chain.shape[:2], -1)
+    stats: Any = array_stats
+    return float(min(stats.ess(values[..., k], chain_axis=0, draw_axis=1) for k in range(values.shape[2])))
+
+
+def _begun(table: LagTable, richer: LagFit, best: LagFit, lags: int, rng: np.random.Generator) -> Matrix:
+    """Walkers, (walkers, dimension): half near the optimum of so many lags, half with one lag anywhere."""
+    low, high = table.ends(lags)
+    count = max(_WALKERS, 4 * low.size)
+    root = np.linalg.cholesky(richer.covariance + 1e-12 * np.diag((high - low) ** 2))
+    near = richer.coordinates + 0.3 * rng.standard_normal((count, low.size)) @ root.T
+    log_times, delays = table.parts(np.repeat(best.coordinates[None], count, axis=0))
+    if lags > best.lags:
+        anywhere = rng.uniform(table.log_times[0], table.log_times[-1], (count, table.paths, 1))
+        log_times = np.concatenate([log_times, anywhere], axis=2)
+    other = np.concatenate([log_times.reshape(count, -1), delays], axis=1)
+    other += 1e-3 * rng.standard_normal(other.shape) * (high - low)
+    mixed = np.where(rng.random((count, 1)) < 0.5, near, other)
+    inside = (mixed > low) & (mixed < high)
+    return np.where(inside, mixed, rng.uniform(low, high, mixed.shape))
+
+
+def _nodes(ends: Matrix, count: int) -> Matrix:
+    """Equally spaced delays between ends (paths, 2), (paths, count)."""
+    return np.asarray(ends[:, :1] + (ends[:, 1:] - ends[:, :1]) * np.linspace(0, 1, count))

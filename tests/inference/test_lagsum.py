@@ -1,0 +1,151 @@
+"""Sums of lags: their tabulated likelihood is the exact one, least squares gives back what made a record."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from small import U, Y
+
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.data.record import Record
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.defaultpriors import Scales
+from lcopa_bayes.inference.lagsum import WEIGHT, LagTable, lag_fits, lag_problem, lag_table
+
+SD = 0.01
+GAINS, TIMES, DELAY = (0.7, 0.5), (0.6, 3.0), 0.43
+HEIGHTS = (1.0, -0.5)
+
+
+def lags(time: Vector, gains: tuple[float, ...], times: tuple[float, ...], delay: float) -> Vector:
+    since = np.maximum(time - delay, 0.0)
+    return sum(-gain * np.expm1(-since / one) for gain, one in zip(gains, times, strict=True))  # type: ignore[return-value]
+
+
+def made(seed: int = 0, sd: float = SD, count: int = 150) -> Study:
+    rng = np.random.default_rng(seed)
+    records = []
+    for k, height in enumerate(HEIGHTS):
+        time = np.linspace(-2.0, 12.0, count)
+        time -= time[int(np.abs(time).argmin())]
+        drive = np.where(time >= 0, height, 0.0)[:, None]
+        read = 0.3 * k + height * lags(time, GAINS, TIMES, DELAY) + sd * rng.standard_normal(count)
+        records.append(Record(f"r{k}", time, drive, read[:, None], (U,), (Y,), "s"))
+    return Study("lags", None, "s", 0, tuple(records), (), noise={"kind": "white"})
+
+
+def tabulated(problem: Problem, low: float = 0.2, high: float = 0.7) -> LagTable:
+    return lag_table(problem, 0, [0], np.array([SD]), np.linspace(low, high, 33)[None])
+
+
+def exact_log_marginal(problem: Problem, coordinates: Vector) -> float:
+    """Weights integrated out of the closed form, offsets under a prior without an end."""
+    scale = problem.scales.amplitude[0] / problem.scales.excursion[0]
+    columns, target = [], []
+    offsets = np.eye(len(HEIGHTS))
+    times, delay = np.exp(coordinates[:-1]), float(coordinates[-1])
+    for k, record in enumerate(problem.study.fit):
+        one = [HEIGHTS[k] * scale * lags(record.time, (1.0,), (time,), delay) for time in times]
+        columns.append(np.stack([*one, *np.outer(offsets[k], np.ones(record.time.size))]) / SD)
+        target.append(record.response[:, 0] / SD)
+    whole, y = np.concatenate(columns, axis=1), np.concatenate(target)
+    prior = np.diag([*np.full(times.size, WEIGHT**-2.0), 0.0, 0.0])
+    precision = whole @ whole.T + prior
+    mean = np.linalg.solve(precision, whole @ y)
+    offset_part = np.linalg.slogdet(whole[-2:] @ whole[-2:].T)[1]
+    half = 0.5 * (np.linalg.slogdet(precision)[1] - offset_part)
+    return float(0.5 * (mean @ whole @ y - y @ y) - half - times.size * np.log(WEIGHT))
+
+
+@pytest.mark.parametrize("times", [(0.6,), (0.55, 3.3), (0.2, 1.1, 7.0)])
+def test_the_tabulated_likelihood_is_that_of_the_closed_form(times: tuple[float, ...]) -> None:
+    problem = lag_problem(made())
+    table = tabulated(problem)
+    first = np.array([*np.log(times), 0.45])
+    places = np.array([first, [*np.log(times), table.delays[0, 10]], [*np.log(times), table.delays[0, 20]]])
+    exact = np.array([exact_log_marginal(problem, one) for one in places])
+    own = table.log_density(places)
+    assert own[1:] == pytest.approx(exact[1:], abs=0.1, rel=1e-3)
+    assert own[0] == pytest.approx(exact[0], abs=2.0, rel=1e-3)  # between delays the onset is interpolated
+
+
+def test_outside_what_is_tabulated_nothing_is_likely() -> None:
+    table = tabulated(lag_problem(made()))
+    low, high = table.ends(1)
+    outside = np.array([[low[0] - 0.1, 0.4], [high[0] + 0.1, 0.4], [0.0, 0.1], [0.0, 0.8]])
+    assert np.isneginf(table.log_density(outside)).all()
+    assert np.isfinite(table.log_density(np.array([[0.0, 0.4]]))).all()
+
+
+def test_the_cost_of_a_search_is_the_square_of_the_likelihood() -> None:
+    table = tabulated(lag_problem(made()))
+    at = np.array([np.log(0.5), np.log(2.0), 0.5])
+    conditional = table.conditional(at[None])
+    square = conditional.square - float(conditional.bent[0] @ conditional.bent[0])
+    assert float(np.sum(table.residual(at) ** 2)) + table.remainder == pytest.approx(square, rel=1e-9)
+
+
+def test_least_squares_gives_back_what_made_the_records() -> None:
+    study = made(sd=1e-6)
+    table = tabulated(lag_problem(study), DELAY - 0.1, DELAY + 0.1)
+    two = lag_fits(table)[1]
+    assert np.sort(np.exp(two.coordinates[:-1])) == pytest.approx(TIMES, rel=2e-3)
+    assert two.coordinates[-1] == pytest.approx(DELAY, abs=2e-3)
+
+
+def test_bic_finds_the_number_of_lags_and_more_never_fit_worse() -> None:
+    found = [lag_fits(tabulated(lag_problem(made(seed)))) for seed in range(3)]
+    assert [min(fits, key=lambda one: one.bic).lags for fits in found] == [2, 2, 2]
+    for fits in found:
+        squares = [one.square for one in fits]
+        assert all(later <= earlier + 0.5 for earlier, later in pairwise(squares))
+        assert fits[1].bic == pytest.approx(fits[1].square + 5 * np.log(fits[1].size))
+        # chi-square of the residual and of two weights of the size of the range
+        assert abs(fits[1].square - fits[1].size) < 5 * np.sqrt(2 * fits[1].size)
+
+
+def test_records_of_twice_the_noise_have_a_quarter_of_the_square() -> None:
+    problem = lag_problem(made())
+    nodes = np.linspace(0.2, 0.7, 33)[None]
+    one, two = (lag_table(problem, 0, [0], np.array([sd]), nodes) for sd in (SD, 2 * SD))
+    squares = [float(table.target @ table.target) + table.remainder for table in (one, two)]
+    assert squares[1] == pytest.approx(squares[0] / 4, rel=1e-9)
+
+
+def test_a_record_whose_drive_is_still_tells_nothing_of_the_lags() -> None:
+    moved = made().fit[0]
+    still = replace(moved, name="still", drive=np.zeros_like(moved.drive))
+    both, alone = (lag_problem(replace(made(), fit=records)) for records in ((moved, still), (moved,)))
+    places = np.array([[np.log(time), delay] for time in (0.4, 1.0, 3.0) for delay in (0.3, 0.5)])
+    levels = [tabulated(problem).log_density(places) for problem in (both, alone)]
+    assert np.ptp(levels[0] - levels[1]) < 1e-3 * np.ptp(levels[1])
+
+
+def test_a_record_whose_drive_is_still_has_no_span() -> None:
+    moved = made().fit[0]
+    still = replace(moved, name="still", drive=np.zeros_like(moved.drive))
+    end = moved.time[-1] - moved.time[np.flatnonzero(moved.drive[:, 0])[0]]
+    assert Scales.of([moved, still]).span == pytest.approx(end)
+    assert Scales.of([still]).span == pytest.approx(moved.time[-1] - moved.time[0])
+
+
+def test_every_other_sample_keeps_the_time_between_samples() -> None:
+    whole = lag_problem(made()).posterior.samples[0].axes[0]
+    gaps = np.arange(1.0, whole.values.size + 1)
+    half = replace(whole, gaps=gaps).every(2)
+    assert (half.values == whole.values[::2]).all()
+    assert half.gaps[0] == 1.0
+    assert half.gaps[1:] == pytest.approx(gaps[1:-1:2] + gaps[2::2])
+
+
+def test_of_many_samples_some_are_used_and_the_answer_stays() -> None:
+    few, many = (lag_problem(made(count=count)) for count in (1_500, 6_000))
+    assert few.posterior.size == 3_000
+    assert 1_500 < many.posterior.size <= 4_000
+    times = [np.sort(np.exp(lag_fits(tabulated(one))[1].coordinates[:-1])) for one in (few, many)]
+    assert times[0] == pytest.approx(TIMES, rel=0.1)
+    assert times[1] == pytest.approx(TIMES, rel=0.1)

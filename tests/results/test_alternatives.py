@@ -1,0 +1,155 @@
+"""Numbers over the fitted plant and sums of lags hold what is true of plants that are no Kelvin element."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from inference.test_lagsum import DELAY, GAINS, SD, TIMES, lags, made
+from small import record, study
+
+from lcopa_bayes.bench.command import step
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.results.alternatives import Alternatives, alternatives_of, parts_of_sd, with_alternatives
+from lcopa_bayes.results.fit import Fit
+from lcopa_bayes.results.fit import fit as sampled
+from lcopa_bayes.verbs.fit import fit
+
+QUICK = {"ensembles": 2, "walkers": 16, "steps": 200, "thin": 1, "target_ess": 50}
+
+
+def one_term(study: Study) -> Fit:
+    """Fitted as a plant of one term, though it is none."""
+    return sampled(
+        Study("short", None, "s", 0, study.fit, (), terms=1, noise={"kind": "white"}, sampler=QUICK)
+    )
+
+
+@pytest.fixture(scope="module")
+def short() -> Fit:
+    return one_term(made())
+
+
+@pytest.fixture(scope="module")
+def over(short: Fit) -> Alternatives:
+    other = alternatives_of(short)
+    assert other is not None
+    return other
+
+
+def test_a_plant_that_records_reject_gives_way_to_the_lags(short: Fit, over: Alternatives) -> None:
+    (one,) = over.alternatives
+    assert one.support == "lags"
+    assert one.lags.best.lags == len(TIMES)
+    numbers = {number.estimate.name: number for number in over.numbers}
+    truth = {
+        "steady_state[y]": sum(GAINS),
+        "delay[y]": DELAY,
+        "value_at_end[y]": float(lags(np.array([short.curves.time[-1]]), GAINS, TIMES, DELAY)[0]),
+    }
+    for name, true in truth.items():
+        here = numbers[name]
+        assert here.estimate.lower <= true <= here.estimate.upper
+    for name in ("steady_state[y]", "delay[y]"):
+        alone = np.quantile(numbers[name].plant, (0.05, 0.95))
+        assert numbers[name].moved
+        assert not alone[0] <= truth[name] <= alone[1]
+
+
+def test_the_advantage_is_akaikes_criterion_of_two_least_squares(short: Fit, over: Alternatives) -> None:
+    """Second method: chi-square of the closed form at the optimum of the lags, and of the band's median."""
+    (one,) = over.alternatives
+    lagged, plant = 0.0, 0.0
+    best = one.lags.best.coordinates
+    noise = float(short.draws.column("sigma").mean())
+    columns, target = [], []
+    for k, made_record in enumerate(short.study.fit):
+        height = made_record.drive[-1, 0]
+        parts = [
+            height * lags(made_record.time, (1.0,), (time,), float(best[-1])) for time in np.exp(best[:-1])
+        ]
+        columns.append(np.stack([*parts, *np.outer(np.eye(2)[k], np.ones(made_record.time.size))]))
+        target.append(made_record.response[:, 0])
+    whole, y = np.concatenate(columns, axis=1), np.concatenate(target)
+    weights = np.linalg.lstsq(whole.T, y, rcond=None)[0]
+    lagged = float(np.sum((y - weights @ whole) ** 2)) / noise**2
+    plant = sum(float(np.sum((band.observed - band.plant[2]) ** 2)) for band in short.bands) / noise**2
+    expected = plant + 2 * 4 - lagged - 2 * 5
+    assert one.advantage == pytest.approx(expected, rel=0.15)
+
+
+def test_a_better_sum_of_lags_limits_every_number(short: Fit) -> None:
+    fitted = with_alternatives(short)
+    assert fitted.draws.grade.level == "tentative"
+    assert "a sum of 2 lags follows y better" in fitted.draws.grade.reason
+    reported = {one.name: one for one in fitted.metrics}["delay[y]"]
+    assert reported.lower <= DELAY <= reported.upper
+    assert "of sums of lags" in reported.note
+
+
+@pytest.fixture(scope="module")
+def own() -> Fit:
+    """Of the plant that made the records."""
+    records = [
+        record(k, command=step(h, at=0.35), name=f"r{k}", noise_sd=0.004) for k, h in ((1, 1.0), (2, -0.5))
+    ]
+    return sampled(study(*records, sampler=QUICK))
+
+
+def test_where_both_follow_the_records_intervals_are_over_both(own: Fit) -> None:
+    other = alternatives_of(own)
+    assert other is not None
+    (one,) = other.alternatives
+    fitted = with_alternatives(own)
+    if one.support == "plant":
+        assert other.numbers == ()
+        assert fitted.metrics == own.metrics
+        return
+    assert one.support == "both"
+    number = {number.estimate.name: number for number in other.numbers}["steady_state[y]"]
+    pooled = np.concatenate([number.plant, number.lags])
+    assert number.estimate.lower == pytest.approx(float(np.quantile(pooled, 0.05)), rel=0.02)
+    noise, structure = parts_of_sd([number.plant, number.lags], np.array([0.5, 0.5]))
+    assert noise**2 + structure**2 == pytest.approx(float(np.var(pooled)), rel=1e-6)
+
+
+def test_a_number_that_moves_limits_its_parameter_alone() -> None:
+    other = alternatives_of(one_term(made(sd=4 * SD)))
+    assert other is not None
+    assert other.alternatives[0].support == "both"
+    limitations = other.limitations({"delay[y]": ("delay",), "steady_state[y]": ("gain",)})
+    assert limitations
+    assert {name for one in limitations for name in one.parameters} <= {"delay", "gain"}
+    assert all(one.level == "tentative" for one in limitations)
+
+
+def test_without_gaussian_noise_or_a_moving_drive_there_is_none() -> None:
+    students = study(record(), noise="student", sampler=QUICK)
+    assert alternatives_of(sampled(students)) is None
+
+
+def test_a_fit_whose_structure_the_records_chose_shows_them(tmp_path: Path) -> None:
+    fitted = fit(study(record(), terms="auto", sampler=QUICK), folder=tmp_path)
+    values = json.loads((tmp_path / "results.json").read_text())["alternatives"]
+    assert fitted.alternatives is not None
+    assert values == fitted.alternatives.as_json()
+    assert values["sentence"] in fitted.verdict
+    page = fitted.report(tmp_path).read_text()
+    assert "sums of lags" in page
+
+
+def test_a_stated_structure_has_none() -> None:
+    assert fit(study(record(), sampler=QUICK)).alternatives is None
+
+
+def test_the_square_of_the_parts_is_the_variance_of_the_mixture() -> None:
+    rng = np.random.default_rng(0)
+    values = [rng.normal(0, 1, 4000), rng.normal(2, 3, 4000)]
+    weights = np.array([0.25, 0.75])
+    noise, structure = parts_of_sd(values, weights)
+    means = np.array([one.mean() for one in values])
+    second = weights @ np.array([np.mean(one**2) for one in values])
+    assert noise**2 + structure**2 == pytest.approx(float(second - (weights @ means) ** 2))
+    assert np.isnan(parts_of_sd([np.array([1.0, np.inf]), values[0]], weights)).all()

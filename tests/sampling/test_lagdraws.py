@@ -1,0 +1,83 @@
+"""Draws of sums of lags are those of their density, and hold what made the records."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from inference.test_lagsum import DELAY, GAINS, SD, lags, made
+
+from lcopa_bayes.inference.lagsum import lag_fits, lag_problem, lag_table
+from lcopa_bayes.sampling.lagdraws import LagDraws, _sampled, lag_draws
+
+ENDS = np.array([[0.0, 1.0]])
+
+
+def drawn(seed: int = 0) -> LagDraws:
+    return lag_draws(lag_problem(made(seed)), 0, [0], np.array([SD]), ENDS, seed)
+
+
+def test_draws_agree_with_quadrature() -> None:
+    """Of one lag and a spare one: three coordinates on a grid."""
+    study = made()
+    problem = lag_problem(study)
+    table = lag_table(problem, 0, [0], np.array([20 * SD]), np.linspace(0.1, 0.9, 33)[None])
+    fits = lag_fits(table)
+    assert min(fits, key=lambda one: one.bic).lags == 1
+    chain, ess = _sampled(table, fits, fits[0], np.random.default_rng(1))
+    low, high = table.ends(2)
+    axes = [np.linspace(low[k], high[k], 41)[:-1] + (high[k] - low[k]) / 80 for k in range(3)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    level = np.concatenate([table.log_density(part) for part in np.array_split(grid, 40)])
+    weight = np.exp(level - level.max())
+    weight /= weight.sum()
+    for of in (lambda x: x[:, 2], lambda x: x[:, :2].max(axis=1), lambda x: x[:, :2].min(axis=1)):
+        values = of(grid)
+        mean = float(weight @ values)
+        sd = float(np.sqrt(weight @ (values - mean) ** 2))
+        own = of(chain.reshape(-1, 3))
+        assert own.mean() == pytest.approx(mean, abs=4 * sd / np.sqrt(ess))
+        assert own.std() == pytest.approx(sd, rel=0.25)
+
+
+def test_intervals_hold_what_made_the_records() -> None:
+    held = []
+    for seed in range(4):
+        one = drawn(seed)
+        for values, true in (
+            (one.gains[:, 0], sum(GAINS)),
+            (one.delays[:, 0], DELAY),
+            (
+                one.response(0, np.array([12.0]))[:, 0],
+                float(lags(np.array([12.0]), GAINS, (0.6, 3.0), DELAY)[0]),
+            ),
+        ):
+            low, high = np.quantile(values, (0.01, 0.99))
+            held.append(low <= true <= high)
+    assert sum(held) >= 10  # of 12 at 98 %: fewer once in 700 times
+
+
+def test_the_same_seed_gives_the_same_draws() -> None:
+    one, two, other = drawn(1), drawn(1), lag_draws(lag_problem(made(1)), 0, [0], np.array([SD]), ENDS, 2)
+    assert (one.times == two.times).all()
+    assert (one.weights == two.weights).all()
+    assert not (one.times == other.times).all()
+
+
+def test_a_delay_at_the_end_of_the_first_table_is_followed() -> None:
+    one = lag_draws(lag_problem(made()), 0, [0], np.array([SD]), np.array([[0.0, 4.0]]), 0)
+    assert np.median(one.delays) == pytest.approx(DELAY, abs=0.1)
+
+
+def test_the_response_is_the_sum_of_its_lags() -> None:
+    one = drawn()
+    time = np.array([0.1, 0.5, 1.0, 10.0, 1e4])
+    expected = np.array(
+        [
+            lags(time, tuple(weights), tuple(times), float(delay))
+            for weights, times, delay in zip(
+                one.weights[:5, 0], one.times[:5, 0], one.delays[:5, 0], strict=True
+            )
+        ]
+    )
+    assert one.response(0, time)[:5] == pytest.approx(expected, abs=1e-12)
+    assert one.response(0, time)[:, -1] == pytest.approx(one.gains[:, 0], rel=1e-9, abs=1e-9)
