@@ -44,7 +44,8 @@ def around_optima(
 ) -> tuple[bool, Weighted | None]:
     """Draws of a proposal around optima, and whether they will do: not where the proposal does not come
     close to the posterior, nor where it does not cover what points of the whole prior show; none where no
-    optimum has a surrounding inside the prior. It is fitted by `scouts`, whose posterior may differ a little.
+    optimum has a surrounding inside the prior. The proposal is fitted by `scouts`, whose posterior may differ
+    a little.
 
     `hunted` are coordinates of such points, (points, dimension), log densities there and log weights, whose
     sum estimates the evidence [nat]. A few may be far out in a tail, heavy by chance: a second attempt
@@ -64,7 +65,7 @@ def around_optima(
             replace(_PLAN, wanted=wanted),
             weighing,
             late,
-            partial(charted_density, posterior, chart, mapped=learning),
+            rough=partial(charted_density, posterior, chart, mapped=learning),
         )
         if tried is None:
             return False, None

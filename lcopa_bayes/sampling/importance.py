@@ -108,13 +108,13 @@ def importance(
     plan: ImportancePlan = ImportancePlan(),
     mapped: Mapped = map,
     late: Callable[[], bool] = lambda: False,
-    rough: Callable[[Matrix], Vector] | None = None,
     begin: Mixture | None = None,
+    rough: Callable[[Matrix], Vector] | None = None,
 ) -> Importance | None:
     """Importance sampling around given optima, one or more, or from a proposal to `begin` with, in the chart;
-    `mapped` spreads the density over processes. Once it is `late` no further attempt is made. The proposal is
-    fitted to a `rough` density of charted coordinates, where there is a cheaper one; its draws are weighted
-    by the posterior itself. None where no optimum has a surrounding inside the prior.
+    `mapped` spreads the density over processes. Once it is `late` no further attempt is made. None where no
+    optimum has a surrounding inside the prior. The proposal is fitted to a `rough` density of charted
+    coordinates, where there is a cheaper one; its draws are weighted by the posterior itself.
 
     FloatingPointError where the density is NaN.
     """

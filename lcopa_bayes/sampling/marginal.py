@@ -75,7 +75,7 @@ _LEARNED = 0.15
 """Share of the last of these in proposals whose draws count: wider than they are [-]."""
 _LOST = 0.03
 """Effective draws per draw below which a few are of a region that proposals did not cover [-]."""
-_MOST, _MOST_DRAWN = 4, 40.0
+_MOST, _MOST_DRAWN = 4, 80.0
 """Most draws of a round over the least, and of all that count over the effective draws wanted [-]."""
 _VISITED = 6_000
 """Most points that a first proposal is learned from."""
