@@ -53,7 +53,7 @@ def find_optima(
     posterior: Posterior, rng: np.random.Generator, *, starts: int = 12, near: Sequence[Vector] = ()
 ) -> tuple[Optimum, ...]:
     """Local optima from the best of many prior draws and of poles from a regression, best first, duplicates
-    removed; `near` are further table values, (rows,), looked at like draws.
+    removed; the likeliest of further table values `near`, (rows,), is a start of its own.
 
     Screening and a first solve treat the residual as nearly white; a second solve uses the noise model with
     its parameters estimated from the first residual. With effects the plant alone is searched first, and its
@@ -64,7 +64,7 @@ def find_optima(
         alone = find_optima(posterior.without_effects, rng, starts=starts)
         return _kept(posterior, _descended(posterior, _near(posterior, effect_starts(posterior, alone, rng))))
     drawn = table.draw(_SCREENED, rng)
-    drawn = np.vstack([*near, regressed(posterior, drawn), drawn])
+    drawn = np.vstack([regressed(posterior, drawn), drawn, *near])
     for axis, scale in enumerate(_spread(posterior)):
         for name, value in posterior.noise.nearly_white(0.05 * scale).items():
             if table.rows[table.at(name, axis)].free:
@@ -72,8 +72,11 @@ def find_optima(
     likelihood = posterior.log_likelihood(drawn)
     if np.isnan(likelihood).any():
         posterior.log_density(posterior.coordinates(drawn[np.isnan(likelihood)]))  # raises and says where
-    chosen = drawn[np.argsort(-likelihood, kind="stable")]
-    return _kept(posterior, _descended(posterior, _distinct(posterior, chosen, starts)))
+    own = len(drawn) - len(near)
+    begun = _distinct(posterior, drawn[np.argsort(-likelihood[:own], kind="stable")], starts)
+    if len(near):
+        begun.append(drawn[own + int(likelihood[own:].argmax())])
+    return _kept(posterior, _descended(posterior, begun))
 
 
 def again(posterior: Posterior, optima: Sequence[Optimum]) -> tuple[Optimum, ...]:

@@ -133,12 +133,12 @@ def resolved(problem: Problem, optima: Sequence[Optimum] | None = None) -> Probl
         return narrowed(problem, lambda each: optimum_shift(each, best))
 
 
-def optima_of(problem: Problem, *, starts: int = _STARTS) -> tuple[Optimum, ...]:
+def optima_of(problem: Problem, *, starts: int = _STARTS, near: Sequence[Vector] = ()) -> tuple[Optimum, ...]:
     """Least-squares optima of a study, best first: what the first look, the width of the blocks and sampling
-    begin with. The same problem gives the same optima."""
+    begin with; `near` as `find_optima`. The same problem gives the same optima."""
     with threadpool_limits(1):
         rng = np.random.default_rng([problem.study.seed, 6])
-        return find_optima(problem.posterior, rng, starts=starts)
+        return find_optima(problem.posterior, rng, starts=starts, near=near)
 
 
 def resolved_optima(problem: Problem, optima: Sequence[Optimum]) -> tuple[Problem, tuple[Optimum, ...]]:

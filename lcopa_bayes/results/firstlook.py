@@ -7,7 +7,7 @@ far the Gaussian is from it is measured by the weights. Other modes are not sear
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -23,6 +23,7 @@ from lcopa_bayes.data.agreement import disagreements
 from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
+from lcopa_bayes.inference.nestedmodels import lifted
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.results.discretisation import optima_of
@@ -46,6 +47,8 @@ _SHOWN = 400
 _FEWEST = 20
 """Effective draws below which the Gaussian is shown as it is; draws inside the priors below which it is
 narrowed."""
+_ADDED = 32
+"""Ways in which what a smaller model lacks is added to its optimum [-]."""
 _STREAM = 13
 """Marks the randomness of a first look."""
 _CLOSE = 0.3
@@ -153,11 +156,23 @@ def first_look(study: Study) -> FirstLook:
     return look_at(*searched(study))
 
 
-def searched(study: Study) -> tuple[Problem, tuple[Optimum, ...]]:
-    """A study prepared for inference and its least-squares optima, best first; InputError as `first_look`."""
+def searched(
+    study: Study, smaller: tuple[Posterior, Optimum] | None = None
+) -> tuple[Problem, tuple[Optimum, ...]]:
+    """A study prepared for inference and its least-squares optima, best first; InputError as `first_look`.
+
+    The optimum of a `smaller` model with its posterior is looked at too, with what that model lacks added in
+    a few ways: a richer model is no less likely.
+    """
     refuse_if(unmet(study))
     problem = problem_of(study)
-    optima = optima_of(problem)
+    near: Sequence[Vector] = ()
+    if smaller is not None:
+        source, optimum = smaller
+        rng = np.random.default_rng([study.seed, _STREAM, 1])
+        added = lifted(np.tile(optimum.values, (_ADDED, 1)), source, problem.posterior, rng)
+        near = () if added is None else list(added)
+    optima = optima_of(problem, near=near)
     if not optima:
         raise InputError(
             f"{study.name}: no least-squares search leads to a plant inside the priors; widen them or "

@@ -115,16 +115,16 @@ def structure_of(study: Study) -> Structure | None:
     least = with_least_terms(study)
     looked = [Looked(*searched(least))]
     for terms in range(least.model.most_terms + 1, _MOST + 1):
-        more = _if_possible(least, terms=terms)
+        more = _if_possible(least, looked[-1], terms=terms)
         if more is None:
             break
         looked.append(more)
         if Structure(tuple(looked)).chosen is not more:
             break
     for variant in _SHARING if len(study.drive_axes) * len(study.response_axes) > 1 else ():
-        best = Structure(tuple(looked)).chosen.study
-        more = _if_possible(best, **variant)
-        if more is not None and more.study.model != best.model:
+        best = Structure(tuple(looked)).chosen
+        more = _if_possible(best.study, best, **variant)
+        if more is not None and more.study.model != best.study.model:
             looked.append(more)
     return Structure(tuple(looked))
 
@@ -160,9 +160,10 @@ def _table(study: Study) -> ParameterTable:
     return table_of(study, layout, Scales.of(study.fit))[2]
 
 
-def _if_possible(study: Study, **model: Any) -> Looked | None:
+def _if_possible(study: Study, smaller: Looked, **model: Any) -> Looked | None:
     """None where the records cannot determine so many parameters, or priors are of other parameters."""
     try:
-        return Looked(*searched(replace(study, model=replace(study.model, **model))))
+        wanted = replace(study, model=replace(study.model, **model))
+        return Looked(*searched(wanted, (smaller.problem.posterior, smaller.optima[0])))
     except InputError:
         return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from itertools import pairwise
 from math import log
 from pathlib import Path
 
@@ -122,3 +123,12 @@ def test_a_fit_says_what_was_chosen_of_what(tmp_path: Path) -> None:
     assert 'id="structure"' in fitted.report(tmp_path).read_text()
     with pytest.raises(ValueError, match="not settled"):
         sampled(campaign)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_richer_structure_is_never_less_likely(seed: int) -> None:
+    structure = structure_of(replace(steps(LAGS), seed=seed))
+    assert structure is not None
+    assert structure.chosen.study.model.terms == 2
+    for fewer, more in pairwise(structure.looked):
+        assert more.max_log_likelihood >= fewer.max_log_likelihood - 0.5
