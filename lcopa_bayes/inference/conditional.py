@@ -21,6 +21,8 @@ from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.inference.expansion import expanded
 from lcopa_bayes.inference.posterior import Posterior
 
+_COMPUTABLE = 1e100
+"""Largest time constant, and inverse of the smallest, whose response is computed [time unit]."""
 _SHRINK = 0.1
 """Least factor by which a share changes in one step of the descent [-]."""
 _DAMPING = (1e-2, 1e-9, 1e6)
@@ -195,7 +197,7 @@ class Conditional:
             orders = template[:, element.orders][:, element.free]
             with np.errstate(over="ignore", under="ignore"):
                 times = shares ** (1 / orders)
-            exists &= np.isfinite(times).all(axis=1) & (times > 0).all(axis=1)
+            exists &= ((times > 1 / _COMPUTABLE) & (times < _COMPUTABLE)).all(axis=1)
             out[:, [element.times[i] for i in element.free]] = times
         for position, e in self.gains:
             out[:, self.columns[position]] = x[:, position] / np.where(exists, inverse[e], 1.0)

@@ -98,3 +98,14 @@ def test_a_descent_from_prior_draws_reaches_one_optimum():
             predicted -= 0.5 * sd[column] ** 2 * at.information[one, column, column]
             exact = made.log_likelihood(conditional.values(away, at.values[[one]])[0])[0]
             assert abs(exact - predicted) < 0.05
+
+
+def test_times_whose_response_overflows_do_not_exist():
+    posterior = problem(record(camera=0.6)).posterior
+    conditional = Conditional(posterior, delays=True)
+    values = drawn(posterior, 1)
+    assert conditional.values(conditional.x(values), values)[1].all()
+    x = conditional.x(values)
+    x[:, conditional.elements[0].part] = 0.9
+    values[:, posterior.table.at("order", 0, 0)] = 0.001  # 0.9 / 0.1 to the power of 1000
+    assert not conditional.values(x, values)[1].any()
