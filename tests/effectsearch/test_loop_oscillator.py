@@ -81,7 +81,7 @@ def test_a_search_keeps_a_damping_term_faster_than_the_samples_resolve():
     low, high = least.bounds_around(steep)
     assert high[order] > 1.4
     assert low[time] == pytest.approx(np.log(table.resolution))
-    (found,) = find_optima(least.posterior, np.random.default_rng(1), starts=1, near=[start])
+    found, *_ = find_optima(least.posterior, np.random.default_rng(1), starts=1, near=[start])
     assert found.values[table.at("sigma", 0)] < 0.3 * OUTPUT
 
 
