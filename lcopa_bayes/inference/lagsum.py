@@ -24,6 +24,7 @@ from scipy.linalg import eigh, orth
 from scipy.optimize import least_squares
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.noise import GaussianNoise
@@ -178,7 +179,7 @@ class LagFit:
     @cached_property
     def covariance(self) -> Matrix:
         """Of the coordinates near the optimum, (dimension, dimension)."""
-        return np.asarray(np.linalg.pinv(self.jacobian.T @ self.jacobian))
+        return covariance_of(self.jacobian.T @ self.jacobian)
 
 
 def lag_fits(table: LagTable) -> tuple[LagFit, ...]:

@@ -16,6 +16,7 @@ import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.covariance import root_of
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.lagsum import MOST, LagFit, LagTable, lag_fits, lag_table
 
@@ -123,7 +124,7 @@ def _sampled(
     moves = [(emcee.moves.DEMove(), 0.8), (emcee.moves.StretchMove(), 0.2)]
     sampler = emcee.EnsembleSampler(*position.shape, table.log_density, vectorize=True, moves=moves)
     state = emcee.State(position, random_state=np.random.RandomState(rng.integers(2**32)).get_state())
-    state = sampler.run_mcmc(state, _STEPS)
+    state = sampler.run_mcmc(state, _STEPS, skip_initial_state_check=True)
     sampler.reset()
     for _ in range(_ROUNDS):
         state = sampler.run_mcmc(state, _STEPS, thin_by=1)
@@ -149,7 +150,7 @@ def _begun(table: LagTable, richer: LagFit, best: LagFit, lags: int, rng: np.ran
     """Walkers, (walkers, dimension): half near the optimum of so many lags, half with one lag anywhere."""
     low, high = table.ends(lags)
     count = max(_WALKERS, 4 * low.size)
-    root = np.linalg.cholesky(richer.covariance + 1e-12 * np.diag((high - low) ** 2))
+    root = root_of(richer.covariance)
     near = richer.coordinates + 0.3 * rng.standard_normal((count, low.size)) @ root.T
     log_times, delays = table.parts(np.repeat(best.coordinates[None], count, axis=0))
     if lags > best.lags:
