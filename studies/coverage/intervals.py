@@ -135,7 +135,7 @@ def main() -> None:
             print(f"{len(done)} of {len(wanted)}: {_said(result)}", flush=True)
     result = summary([done[number] for number in sorted(done)])
     write_text(options.out / "summary.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
-    for row in (*result["by_figure"], *result["by_kind"]):
+    for row in (line for key in ("by_figure", "by_kind") for line in result[key] if line["reported"]["of"]):
         print(
             f"{row['name']:14} alone {row['alone']['share']:.2f}, reported {row['reported']['share']:.2f} "
             f"({row['reported']['lower']:.2f} to {row['reported']['upper']:.2f}) of {row['reported']['of']}"
