@@ -68,7 +68,8 @@ def fractional(usable: Sequence[Row]) -> dict[str, Any]:
     preferred = [one for one in lags if one["support"] == "lags"]
     if denied or preferred or most.nats + ERRORS * most.sd < 0:
         if preferred:
-            said = f"{_lags(free, preferred)} better. {said}"
+            better = _lags(free, preferred)
+            said = f"{better[0].upper()}{better[1:]} better. {said}"
         return values | {
             "verdict": "not warranted",
             "sentence": f"Fractional orders are not warranted. {said}.",

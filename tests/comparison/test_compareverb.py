@@ -227,4 +227,6 @@ def test_one_fractional_term_beats_second_order_on_the_heating_system(tmp_path):
     told = json.loads((out / "compare.json").read_text())
     free, whole = (one["held_out_rmse"]["plate"] for one in told["models"])
     assert free < 5.0 < whole
-    assert told["fractional"]["verdict"] == "warranted"
+    assert told["fractional"]["log_bayes_factor"] > 20
+    assert told["fractional"]["verdict"] == "not warranted"  # three lags do better than either
+    assert "Beside fractional-1, sums of 3 lags for plate" in told["fractional"]["sentence"]
