@@ -15,7 +15,7 @@ from small import path, record, study
 from test_comparison import card, outcome, prior_widths
 
 from lcopa_bayes.bench.device import Device
-from lcopa_bayes.comparison.averaging import Gain, by_prediction
+from lcopa_bayes.comparison.averaging import STRONG, Gain, by_prediction
 from lcopa_bayes.comparison.candidates import candidates_of
 from lcopa_bayes.comparison.compare import compare
 from lcopa_bayes.comparison.integerorder import DECISIVE, savage_dickey
@@ -192,5 +192,9 @@ def test_compared_records_of_known_order(order, most, least):
         ]
         one = study(*pair, noise="white", priors=priors, sampler=sampler, seed=seed)
         told = compare(candidates_of(one, (), ["fractional-1", "first-order"]))
-        found.append(told["fractional"]["verdict"])
-    assert least <= found.count("warranted") <= most, found
+        found.append(told["fractional"])
+    beaten = sum(one["least_over_priors"] > STRONG for one in found)
+    assert least <= beaten <= most, found
+    verdicts = [one["verdict"] for one in found]
+    assert verdicts.count("warranted") <= beaten  # so few samples seldom tell an order of 0.8 from two lags
+    assert order == 1.0 or "not warranted" not in verdicts
