@@ -192,6 +192,11 @@ def lag_fits(table: LagTable) -> tuple[LagFit, ...]:
     return tuple(fits)
 
 
+def best_of(fits: Sequence[LagFit]) -> LagFit:
+    """The one of the least BIC."""
+    return min(fits, key=lambda one: one.bic)
+
+
 def _starts(table: LagTable, fewer: LagFit | None) -> list[Vector]:
     nodes = table.log_times[2:-2]
     if fewer is None:

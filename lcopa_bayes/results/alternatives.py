@@ -12,20 +12,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any, Literal, final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Vector
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.core.estimate import Estimate, plain
+from lcopa_bayes.core.estimate import LEVEL, Estimate, plain, quantile
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.lagsum import lag_problem, thinned
 from lcopa_bayes.inference.noise import GaussianNoise
 from lcopa_bayes.model.layout import PathSlot
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.steps import Metric, StepCurves, figures_of, metrics_of
+from lcopa_bayes.results.summary import listed
 from lcopa_bayes.sampling.convergence import TENTATIVE_ESS, Limitation
 from lcopa_bayes.sampling.lagdraws import LagDraws, lag_draws
 
@@ -34,11 +34,11 @@ _SUPPORT = 10.0
 _RISEN = 0.3
 """Share of its value at the end of the record that a response has reached before which its delay ends [-]."""
 _MOVED = 0.5
-"""Shift of a median over its standard deviation that is told [-]."""
+"""Shift of a median over its standard deviation from which a number counts as moved [-] ..."""
+_WIDER = 1.5
+"""... as from this width of its interval over that of the fitted plant [-]."""
 _NORMAL = 3.29
 """Standard deviations that 90 % of a normal distribution take [-]."""
-_WIDER = 1.5
-"""Width of an interval over that of the fitted plant that is told [-]."""
 _SHOWN = 4
 """Most numbers named in a sentence."""
 _STREAM = 17
@@ -91,10 +91,10 @@ class Averaged:
     weight: float
     """Of the sums of lags [-]."""
 
-    @cached_property
+    @property
     def moved(self) -> bool:
         """Whether the number is elsewhere, or open farther, than the fitted plant by itself says."""
-        low, middle, high = np.quantile(self.plant, (0.05, 0.5, 0.95), method="nearest")
+        low, middle, high = _ends_and_median(self.plant)
         here = self.estimate
         if not np.isfinite([low, high]).all():
             return False
@@ -105,10 +105,7 @@ class Averaged:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values: the estimate, its parts, and what each plant says by itself."""
-        alone = {
-            name: np.quantile(values, (0.05, 0.5, 0.95), method="nearest").tolist()
-            for name, values in (("plant", self.plant), ("lags", self.lags))
-        }
+        alone = {"plant": _ends_and_median(self.plant), "lags": _ends_and_median(self.lags)}
         noise, structure = parts_of_sd([self.plant, self.lags], np.array([1 - self.weight, self.weight]))
         return self.estimate.as_json() | alone | {"sd_noise": noise, "sd_structure": structure}
 
@@ -134,7 +131,7 @@ class Alternatives:
         }
         return " ".join(
             f"Sums of {one.lags.best.lags} to {one.lags.times.shape[2]} lags"
-            f"{f' for {_listed([path.name for path in one.paths])}' if len(self.alternatives) > 1 else ''} "
+            f"{f' for {listed([path.name for path in one.paths])}' if len(self.alternatives) > 1 else ''} "
             f"{said[one.support]} (AIC {'lower' if one.advantage > 0 else 'higher'} by "
             f"{abs(one.advantage):.1f})."
             for one in self.alternatives
@@ -146,7 +143,7 @@ class Alternatives:
         out = []
         for one in self.alternatives:
             if one.support == "lags":
-                paths = _listed([path.name for path in one.paths])
+                paths = listed([path.name for path in one.paths])
                 out.append(
                     Limitation(
                         "tentative",
@@ -160,12 +157,11 @@ class Alternatives:
         moved = [one for one in moved if one.name in names]
         if moved:
             said = [f"{one.name} at {one.lower:.4g} to {one.upper:.4g} {one.unit}" for one in moved]
-            more = f" and {len(said) - _SHOWN} more open" if len(said) > _SHOWN else ""
             concerned = dict.fromkeys(parameter for one in moved for parameter in names[one.name])
             out.append(
                 Limitation(
                     "tentative",
-                    f"sums of lags follow the records as well and leave {_listed(said[:_SHOWN])}{more}",
+                    f"sums of lags follow the records as well and leave {listed(said, _SHOWN)}",
                     "record until the response settles, and sample its onset",
                     tuple(concerned),
                 )
@@ -365,5 +361,8 @@ def _figures(fitted: Fit, problem: Problem, found: Sequence[Alternative]) -> lis
     return [one for one in figures if not any(f"[{name}]" in one.name for name in without)]
 
 
-def _listed(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + f" and {names[-1]}"
+def _ends_and_median(values: Vector) -> tuple[float, float, float]:
+    """Lower end of the interval, median and upper end."""
+    tail = (1 - LEVEL) / 2
+    lower, middle, upper = (float(quantile(values, at)) for at in (tail, 0.5, 1 - tail))
+    return lower, middle, upper

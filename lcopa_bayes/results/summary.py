@@ -119,18 +119,19 @@ def _trusted(fit: Fit) -> str:
     if len(shown) == 1:
         ((grade, names),) = shown.items()
         return f"All {len(names)} parameters are {grade}."
-    return "; ".join(f"{grade}: {_listed(names)}" for grade, names in shown.items()) + "."
+    return "; ".join(f"{grade}: {listed(names)}" for grade, names in shown.items()) + "."
 
 
-def _listed(names: Sequence[str]) -> str:
-    more = len(names) - _NAMED
-    return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
+def listed(names: Sequence[str], most: int = _NAMED) -> str:
+    """The first few of some names, and how many more there are."""
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
 
 
 def _missing(fit: Fit) -> str:
     reasons = [one.reason for one in fit.draws.limitations if one.level != "reliable"]
     if fit.draws.modes:
-        names = _listed([one.parameter for one in fit.draws.modes])
+        names = listed([one.parameter for one in fit.draws.modes])
         reasons.append(f"the records leave several modes, of {names}")
     if not reasons:
         return "Nothing that the checks of the model against its records could see."

@@ -18,7 +18,7 @@ from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.core.covariance import root_of
 from lcopa_bayes.inference.assembly import Problem
-from lcopa_bayes.inference.lagsum import MOST, LagFit, LagTable, lag_fits, lag_table
+from lcopa_bayes.inference.lagsum import MOST, LagFit, LagTable, best_of, lag_fits, lag_table
 
 _COARSE, _FINE = 17, 33
 """Delays tabulated over all that is asked, and where they are."""
@@ -78,7 +78,7 @@ def lag_draws(
     while True:
         table = lag_table(problem, axis, drives, noise, _nodes(near, _FINE))
         fits = lag_fits(table)
-        best = min(fits, key=lambda one: one.bic)
+        best = best_of(fits)
         chain, ess = _sampled(table, fits, best, rng)
         wider = _wider(table, chain, near, delays)
         if (wider == near).all():
@@ -94,9 +94,8 @@ def lag_draws(
 
 def _near(table: LagTable, fits: Sequence[LagFit], delays: Matrix) -> Matrix:
     """Ends between which delays are, (paths, 2): those of every likely number of lags and around."""
-    least = min(one.bic for one in fits)
-    likely = [one for one in fits if one.bic < least + _NEAR]
-    best = min(fits, key=lambda one: one.bic)
+    best = best_of(fits)
+    likely = [one for one in fits if one.bic < best.bic + _NEAR]
     places = np.array([one.coordinates[-table.paths :] for one in likely])
     reach = (
         _REACH * np.sqrt(np.diag(best.covariance)[-table.paths :]) + table.delays[:, 1] - table.delays[:, 0]
@@ -127,7 +126,7 @@ def _sampled(
     state = sampler.run_mcmc(state, _STEPS, skip_initial_state_check=True)
     sampler.reset()
     for _ in range(_ROUNDS):
-        state = sampler.run_mcmc(state, _STEPS, thin_by=1)
+        state = sampler.run_mcmc(state, _STEPS)
         chain = sampler.get_chain()[_THIN - 1 :: _THIN].swapaxes(0, 1)
         ess = _ess(table, chain)
         if ess >= _WANTED:
