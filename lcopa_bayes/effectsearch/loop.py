@@ -191,7 +191,9 @@ def _looped(
     before = _side(problem, start)
     cautions = (*base.caution, *_alone(study))
     if base.failed:
-        verdict = Verdict("unexplained", "tentative", f"No effect is named, because {base.failed}.")
+        seen = missed(study, before.fit, before.unseen, start)
+        but = f" What remains: {seen.said}." if seen is not None and seen.far else ""
+        verdict = Verdict("unexplained", "tentative", f"No effect is named, because {base.failed}.{but}")
         return Loop(
             *(problem, base, enlarged, (), (), (), verdict, before, before, not study.held_out, cautions),
             outliers=outliers,
@@ -210,9 +212,9 @@ def _looped(
     names = tuple(effect.name for effect in added if not effect.card.dynamics)
     apart = bool(added) and all(effect.card.per_record for effect in added)
     # a model of the rest is not judged by samples that the noise throws anywhere
-    was, now = (
-        without_outliers(side.unseen) if outliers is not None else side.unseen for side in (before, reached)
-    )
+    was, now = before.unseen, reached.unseen
+    if outliers is not None:
+        was, now = without_outliers(was, now)
     verdict = decide(
         Findings(
             cautions=cautions,
@@ -233,7 +235,7 @@ def _looped(
             excess=start.whitening.excess(start.optimum.residual),
             enough=ALONE if alone else EXPLAINED,
             scatter=first.scatter,
-            missed=missed(study, before.fit, was, start) if study.held_out else np.nan,
+            missed=None if apart else missed(study, reached.fit, now, searched.state),
             unseen=unseen_share(study, was, now, searched.state) if study.held_out else np.nan,
             risen=risen(was, now) if study.held_out else np.nan,
             reached=np.nan if apart else over_noise(reached.fit, now, clear=not last.alarmed),
