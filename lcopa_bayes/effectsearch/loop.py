@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import Estimate
+from lcopa_bayes.data.agreement import Disagreement, disagreements
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.basefit import BaseFit
@@ -94,6 +95,8 @@ class Loop:
     """Draws of the explained study; None when none were asked for, or none could be had."""
     outliers: Outlying | None = None
     """Samples left out before anything was traced; None without any."""
+    contrary: tuple[Disagreement, ...] = ()
+    """Records that disagree."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -140,7 +143,8 @@ class Loop:
 
     @property
     def trace(self) -> Trace | None:
-        """Evidence of every effect in the first residual; None when the base fit failed."""
+        """Evidence of every effect in the first residual; None when the base fit failed, or no plant follows
+        the records as they are."""
         return self.rounds[0].trace if self.rounds else None
 
 
@@ -189,14 +193,17 @@ def _looped(
         study, kinds = outliers.study, [kind for kind in kinds if kind.card.name != OUTLIERS]
         problem, base, start, enlarged = fitted_base(study, kinds, as_stated=as_stated, draws=draws)
     before = _side(problem, start)
-    cautions = (*base.caution, *_alone(study))
-    if base.failed:
+    contrary = disagreements((*study.fit, *study.held_out))
+    cautions = (*(f"records disagree: {one}" for one in contrary), *base.caution, *_alone(study))
+    wrong = next((f"records disagree: {one}" for one in contrary if one.gross), base.failed)
+    if wrong:
         seen = missed(study, before.fit, before.unseen, start)
         but = f" What remains: {seen.said}." if seen is not None and seen.far else ""
-        verdict = Verdict("unexplained", "tentative", f"No effect is named, because {base.failed}.{but}")
+        verdict = Verdict("unexplained", "tentative", f"No effect is named, because {wrong}.{but}")
         return Loop(
             *(problem, base, enlarged, (), (), (), verdict, before, before, not study.held_out, cautions),
             outliers=outliers,
+            contrary=contrary,
         )
     alone = len(study.fit) == 1 and not study.held_out
     rng = np.random.default_rng([study.seed, 11])
@@ -278,6 +285,7 @@ def _looped(
         cautions,
         sampled[0] if sampled is not None else None,
         outliers,
+        contrary,
     )
 
 
