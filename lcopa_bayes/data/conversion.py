@@ -25,11 +25,11 @@ _TIME = re.compile(
 )
 _DRIVE = re.compile(
     r"(?<![a-z])(drive|driven|command|commanded|cmd|set ?point|input|stimulus|heater|heating|pwm|duty|valve"
-    r"|u\d*|excitation|stellgr(ö|oe)(ß|ss)e|sollwert)(?![a-z])"
+    r"|u\d*|excitation|stellgr(ö|oe)(ß|ss)e|sollwert|eingang)(?![a-z])|^in ?\d*$"
 )
 _RESPONSE = re.compile(
     r"(?<![a-z])(response|output|measured|measurement|sensor|temp|temperature|temperatur|position|angle|y\d*"
-    r"|istwert)(?![a-z])"
+    r"|istwert|ausgang)(?![a-z])|^out ?\d*$"
 )
 _UNIT_OF_TIME: Mapping[str, str] = {
     **{unit: unit for unit in TIME_UNITS},

@@ -200,6 +200,16 @@ def test_roles_follow_words_then_data_and_may_be_stated(tmp_path):
     assert swapped.time_unit == "ms"
 
 
+@pytest.mark.parametrize("names", [("in", "out"), ("Eingang", "Ausgang"), ("u1", "y1")])
+def test_usual_names_of_a_drive_that_never_rests_are_known(names, tmp_path):
+    rng = np.random.default_rng(2)
+    rows = [f"{t},{rng.normal():.4f},{rng.normal():.4f}" for t in range(20)]
+    path = tmp_path / "x.csv"
+    path.write_text("\n".join([f"time_s,{names[0]} [V],{names[1]} [V]", *rows]))
+    record = read(path)
+    assert [axis.name for axis in (*record.drive_axes, *record.response_axes)] == list(names)
+
+
 def test_a_quantised_response_is_no_drive(tmp_path):
     rng = np.random.default_rng(1)
     slow = np.round(np.cumsum(rng.random(400) < 0.05) * 0.1, 1)
