@@ -161,15 +161,21 @@ class Conditional:
         terms = self.powers(element, values) * self.strengths(element, values)
         return np.asarray(1.0 + terms[:, fixed].sum(axis=1))
 
+    def level(self, element: Element, values: Matrix) -> Vector:
+        """D(s_0), (batch,)."""
+        return np.asarray(1.0 + (self.powers(element, values) * self.strengths(element, values)).sum(axis=1))
+
+    def left(self, element: Element, values: Matrix) -> Vector:
+        """Part of D(s_0) that the terms whose times are sampled leave, (batch,): 1 less their shares, which
+        rounds to 0 where they are nearly all of it."""
+        return self.rest(element, values) / self.level(element, values)
+
     def x(self, values: Matrix) -> Matrix:
         """Coordinates of table values, (batch, size)."""
         out = values[:, self.columns].copy()
-        levels = []
-        for element in self.elements:
-            strength = self.strengths(element, values)
-            level = 1.0 + (self.powers(element, values) * strength).sum(axis=1)
-            out[:, element.part] = strength[:, element.free] / level[:, None]
-            levels.append(level)
+        levels = [self.level(element, values) for element in self.elements]
+        for element, level in zip(self.elements, levels, strict=True):
+            out[:, element.part] = self.strengths(element, values)[:, element.free] / level[:, None]
         for position, e in self.gains:
             out[:, position] /= levels[e]
         return out
@@ -212,7 +218,7 @@ class Conditional:
             powers = self.powers(element, values)[:, element.free]
             orders = values[:, element.orders][:, element.free]
             shares, part = x[:, element.part], element.part
-            left = 1.0 - (powers * shares).sum(axis=1)
+            left = self.left(element, values)
             own = powers[:, None, :] / left[:, None, None] + np.eye(len(element.free)) / shares[:, :, None]
             out[:, part, part] = own / orders[:, :, None]
             for position, of in self.gains:
@@ -304,7 +310,7 @@ class Conditional:
         length = np.ones(len(step))
         for element in self.elements:
             powers = self.powers(element, at.values)[:, element.free]
-            left = 1.0 - (powers * at.x[:, element.part]).sum(axis=1)
+            left = self.left(element, at.values)
             fall = (powers * step[:, element.part]).sum(axis=1)
             room = (1.0 - _SHRINK) * left
             length = np.minimum(length, np.where(fall > room, room / np.where(fall > 0, fall, 1.0), 1.0))

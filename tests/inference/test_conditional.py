@@ -109,3 +109,20 @@ def test_times_whose_response_overflows_do_not_exist():
     x[:, conditional.elements[0].part] = 0.9
     values[:, posterior.table.at("order", 0, 0)] = 0.001  # 0.9 / 0.1 to the power of 1000
     assert not conditional.values(x, values)[1].any()
+
+
+def test_slopes_exist_where_a_term_is_nearly_all_of_its_element():
+    """Its share of D(s_0) rounds to 1, and 1 less it to 0."""
+    posterior = problem(record(camera=0.6)).posterior
+    conditional = Conditional(posterior)
+    values = drawn(posterior, 3)
+    values[:, posterior.table.at("order", 0, 0)] = 1.5
+    values[:, posterior.table.at("time", 0, 0)] = [1e13, 1e15, 1e20]
+    element = conditional.elements[0]
+    level = (values[:, element.times] * conditional.frequency) ** 1.5
+    assert_allclose(conditional.left(element, values), 1 / level[:, 0], rtol=1e-12)
+    steep = conditional.steepness(values)
+    assert np.isfinite(steep).all()
+    assert_allclose(
+        steep[:, element.first, element.first] * conditional.x(values)[:, element.first], level[:, 0] / 1.5
+    )
