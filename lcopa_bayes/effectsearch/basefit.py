@@ -19,7 +19,7 @@ from lcopa_bayes.inference.observations import Observed
 from lcopa_bayes.inference.optimum import find_optima
 from lcopa_bayes.inference.posterior import Posterior
 
-_STARTS = 4
+STARTS = 4
 """Starts of the search for the optimum [-]."""
 _DELAYS = tuple(factor - 1.0 for factor in (0.7, 0.85, 1.15, 1.3))
 """Shares of the fitted delays by which the descent is started again later: delays can jump [-]."""
@@ -58,15 +58,17 @@ class BaseFit:
         return all(one.known for one in self.noise)
 
 
-def base_fit(model: ExtendedModel, rng: np.random.Generator, *, near: Sequence[Vector] = ()) -> BaseFit:
-    """The optimum of a fit's own search, then noise, and the optimum under it; `near` are further coordinates
-    to start from.
+def base_fit(
+    model: ExtendedModel, rng: np.random.Generator, *, starts: int = STARTS, near: Sequence[Vector] = ()
+) -> BaseFit:
+    """The optimum of a fit's own search from so many starts, then noise, and the optimum under it; `near` are
+    further coordinates to start from.
 
     Where an axis has too few quiet samples its noise is fitted to the residual in turn with the plant.
     """
     posterior = model.plant
     seeds = [model.values(x) for x in near]
-    optima = find_optima(replace(posterior, noise=White()), rng, starts=_STARTS, near=seeds)
+    optima = find_optima(replace(posterior, noise=White()), rng, starts=starts, near=seeds)
     # where no search ends inside the priors a draw of them is as good a start as any
     first = optima[0].values if optima else posterior.table.draw(1, rng)[0]
     x = model.coordinates(first)

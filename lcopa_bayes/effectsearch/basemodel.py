@@ -17,7 +17,7 @@ from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.requirements import not_at_rest, unmet_apart_from_rest
 from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.effectsearch.basefit import BaseFit, base_fit
+from lcopa_bayes.effectsearch.basefit import STARTS, BaseFit, base_fit
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.refits import log_bayes_factor
 from lcopa_bayes.effectsearch.regression import Regression
@@ -122,6 +122,9 @@ _MOST = 3
 _GAIN = 10.0
 """Log evidence that one more viscous term must bring [nat]: it is an assumption of the user's that
 changes."""
+_MORE_STARTS = 3 * STARTS
+"""Starts of the search for the optimum of a richer model [-], as many as a fit has: with a third of them one
+search in four for a second term ended where that has no part."""
 _COPIES = 6
 """Starts in which the terms that a smaller model lacks are added to its optimum [-]."""
 _BELOW = 0.5
@@ -256,8 +259,10 @@ def _based(study: Study, *key: int, contained: Base | None = None) -> Base:
 
 def _fit(problem: Problem, key: Sequence[int], contained: Base | None) -> BaseFit:
     model, seed = ExtendedModel(problem.posterior), [problem.study.seed, 10, *key]
-    near = _lifted(model, contained, np.random.default_rng([*seed, 1])) if contained else []
-    return base_fit(model, np.random.default_rng(seed), near=near)
+    if contained is None:
+        return base_fit(model, np.random.default_rng(seed))
+    near = _lifted(model, contained, np.random.default_rng([*seed, 1]))
+    return base_fit(model, np.random.default_rng(seed), starts=_MORE_STARTS, near=near)
 
 
 def _state(study: Study, fit: BaseFit) -> State:

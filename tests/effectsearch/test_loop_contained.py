@@ -36,7 +36,7 @@ def base():
 def astray(heeds_near):
     """A base fit that ends far from the records' plant with two terms, unless it `heeds_near` starts."""
 
-    def fit(model, rng, *, near=()):
+    def fit(model, rng, *, starts=4, near=()):
         found = basefit.base_fit(model, rng)
         if len(model.posterior.table.of_kind("order")) < 2:
             return found
