@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from lcopa_bayes import plot as plot
     from lcopa_bayes.core.errors import InputError as InputError
     from lcopa_bayes.data.drive import Drive as Drive
     from lcopa_bayes.data.record import Record as Record
@@ -70,10 +71,12 @@ _PLACES = {
 }
 """Modules of the public names; a module is imported when one of its names is first used."""
 _OF = {name: place for place, names in _PLACES.items() for name in names}
-__all__ = sorted(_OF)
+__all__ = sorted({*_OF, "plot"})
 
 
 def __getattr__(name: str) -> Any:
+    if name == "plot":
+        return import_module(f"{__name__}.plot")
     if name not in _OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f"{__name__}.{_OF[name]}"), name)
@@ -82,4 +85,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_OF})
+    return sorted({*globals(), *__all__})

@@ -6,32 +6,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from matplotlib.axes import Axes
-
+from lcopa_bayes.plot.audit import pairs_figure, profiles_figure, spectrum_figure
+from lcopa_bayes.plot.rundata import RunData, load_run
 from lcopa_bayes.report.page import Drawings
-from lcopa_bayes.report.savedrun import SavedRun, load_run
-from lcopa_bayes.report.theme import (
-    BAND,
-    CYCLE,
-    HELD_OUT,
-    INK,
-    Drawing,
-    blank,
-    grid,
-    label,
-    paged,
-    plain,
-    svg_of,
-)
+from lcopa_bayes.report.svg import Drawing, drawing, paged
 
 _PER_FIGURE = 12
-_TOP = 6.0
-"""Largest fall that is drawn [nat]."""
-_AT_90 = 2.706
-"""Fall at the ends of a 90 % interval [nat]."""
 _PAIRS = 6
-_DOTS = 1500
 
 
 def drawn(folder: Path, values: Mapping[str, Any]) -> Drawings:
@@ -42,64 +23,22 @@ def drawn(folder: Path, values: Mapping[str, Any]) -> Drawings:
         "where the line stays below to the end. Filled: marginal posterior on the scale of the axis."
     )
     profiles = paged(
-        "profiles", values["parameters"], _PER_FIGURE, lambda part: _profile_page(part, run), caption
+        "profiles", values["parameters"], _PER_FIGURE, lambda part: profiles_figure(part, run), caption
     )
-    return {"profiles": profiles, "spectrum": _spectrum(values), "pairs": _pairs(values, run)}
+    return {"profiles": profiles, "spectrum": _spectrum(values["spectrum"]), "pairs": _pairs(values, run)}
 
 
-def _profile_page(rows: Sequence[Mapping[str, Any]], run: SavedRun) -> str:
-    figure, panels = grid(len(rows), columns=3, height=1.7)
-    for panel, row in zip(panels, rows, strict=True):
-        name, curve = row["name"], row["profile"]
-        x, fall = np.array(curve["values"], dtype=float), np.array(curve["fall"], dtype=float)
-        draws, log = run.draws[name].ravel(), run.is_log(name)
-        if log:
-            panel.set_xscale("log")
-        inside = x[fall <= _TOP]
-        low, high = min(inside.min(), draws.min()), max(inside.max(), draws.max())
-        panel.plot(x, np.minimum(fall, 2 * _TOP), color=INK, marker=".", markersize=2.5, linewidth=1.0)
-        panel.axhline(_AT_90, color=HELD_OUT, linewidth=0.8, linestyle="--")
-        edges = np.geomspace(low, high, 41) if log else np.linspace(low, high, 41)
-        counts, _ = np.histogram(draws, edges)
-        panel.stairs(counts / max(counts.max(), 1) * 0.8 * _TOP, edges, fill=True, color=BAND, alpha=0.35)
-        margin = 0.03
-        if log:
-            panel.set_xlim(low * (low / high) ** margin, high * (high / low) ** margin)
-        else:
-            panel.set_xlim(low - margin * (high - low), high + margin * (high - low))
-            panel.locator_params(axis="x", nbins=4)
-        panel.set(ylim=(0.0, _TOP), xlabel=label(name, run.units[name]))
-        panel.set_title(row["verdict"], fontsize=7.5)
-    return svg_of(figure)
-
-
-def _spectrum(results: Mapping[str, Any]) -> tuple[Drawing, ...]:
-    rows = results["spectrum"]
+def _spectrum(rows: Sequence[Mapping[str, Any]]) -> tuple[Drawing, ...]:
     if not rows:
         return ()
-    figure = blank(0.9 + 0.24 * len(rows))
-    panel = figure.subplots()
-    floor = max(row["eigenvalue"] for row in rows) * 1e-16
-    for place, row in enumerate(rows):
-        value = max(row["eigenvalue"], floor)  # what is drawn; the table of numbers is in audit.json
-        panel.plot([value], [place], "o", color=BAND if row["eigenvalue"] >= 1 else HELD_OUT, markersize=4)
-        parts = ", ".join(f"{weight:+.2f} {name}" for name, weight in list(row["direction"].items())[:4])
-        panel.annotate(
-            plain(parts), (1.01, place), xycoords=("axes fraction", "data"), va="center", fontsize=7
-        )
-    panel.axvline(1.0, color=INK, linewidth=0.8, linestyle=":")
-    panel.set_xscale("log")
-    panel.invert_yaxis()
-    panel.set_yticks(range(len(rows)), [str(place + 1) for place in range(len(rows))])
-    panel.set(xlabel="precision of the data over that of the prior [-]", ylabel="direction")
     caption = (
         "Eigenvalues of the Fisher information at the maximum, in prior standard deviations; below 1 the "
         "prior is more informative than the data. Beside each, the parameters of its eigenvector."
     )
-    return (Drawing("sloppy_spectrum", svg_of(figure), caption),)
+    return (drawing("sloppy_spectrum", spectrum_figure(rows), caption),)
 
 
-def _pairs(results: Mapping[str, Any], run: SavedRun) -> tuple[Drawing, ...]:
+def _pairs(results: Mapping[str, Any], run: RunData) -> tuple[Drawing, ...]:
     pairs: dict[frozenset[str], tuple[str, str]] = {}
     for row in results["parameters"]:
         if row["verdict"] != "identified":
@@ -108,21 +47,8 @@ def _pairs(results: Mapping[str, Any], run: SavedRun) -> tuple[Drawing, ...]:
     shown = list(pairs.values())[:_PAIRS]
     if not shown:
         return ()
-    figure, panels = grid(len(shown), columns=3, height=2.1)
-    for panel, (a, b) in zip(panels, shown, strict=True):
-        _pair(panel, run, a, b)
     omitted = len(pairs) - len(shown)
     caption = "Draws of parameters that are not identified against the parameters that compensate them." + (
         f" {omitted} more pairs are not drawn." if omitted else ""
     )
-    return (Drawing("degenerate_pairs", svg_of(figure), caption),)
-
-
-def _pair(panel: Axes, run: SavedRun, a: str, b: str) -> None:
-    x, y = (run.draws[name].ravel() for name in (a, b))
-    step = max(1, x.size // _DOTS)
-    panel.plot(x[::step], y[::step], ".", color=CYCLE[0], markersize=1.5, alpha=0.5, rasterized=False)
-    for name, scale in ((a, panel.set_xscale), (b, panel.set_yscale)):
-        if run.spans_decades(name):
-            scale("log")
-    panel.set(xlabel=label(a, run.units[a]), ylabel=label(b, run.units[b]))
+    return (drawing("degenerate_pairs", pairs_figure(shown, run), caption),)

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
-import numpy as np
-from matplotlib.axes import Axes
-
+from lcopa_bayes.plot.calibration import Draw, coverage_figure, draw_difference, draw_histogram, ranks_figure
 from lcopa_bayes.report.formatting import figures, percent
 from lcopa_bayes.report.page import Drawings
-from lcopa_bayes.report.theme import BAND, HELD_OUT, INK, NOISE, Drawing, blank, grid, paged, plain, svg_of
+from lcopa_bayes.report.svg import Drawing, drawing, paged
 
-Draw: TypeAlias = Callable[[Axes, Mapping[str, Any], Mapping[str, Any]], None]
 _PER_FIGURE = 18
 """Most quantities on one figure of ranks."""
 
@@ -38,79 +35,16 @@ def drawn(folder: Path, results: Mapping[str, Any]) -> Drawings:
     )
 
     def pages(stem: str, draw: Draw, caption: str) -> tuple[Drawing, ...]:
-        return paged(stem, results["ranks"], _PER_FIGURE, lambda part: _panels(part, results, draw), caption)
+        return paged(
+            stem, results["ranks"], _PER_FIGURE, lambda part: ranks_figure(part, results, draw), caption
+        )
 
     return {
-        "coverage": [Drawing("calibration_coverage", _dots(results), coverage)],
-        "ranks": pages("calibration_ranks", _histogram, ranks),
-        "differences": pages("calibration_ecdf", _difference, differences),
+        "coverage": [drawing("calibration_coverage", coverage_figure(results), coverage)],
+        "ranks": pages("calibration_ranks", draw_histogram, ranks),
+        "differences": pages("calibration_ecdf", draw_difference, differences),
         "replicas": _replicas(results),
     }
-
-
-def _dots(results: Mapping[str, Any]) -> str:
-    """One row per quantity, one panel per level."""
-    names = list(dict.fromkeys(row["parameter"] for row in results["coverage"]))
-    levels = sorted({row["level"] for row in results["coverage"]})
-    figure = blank(0.9 + 0.27 * len(names))
-    panels = figure.subplots(1, len(levels), sharey=True, squeeze=False)[0]
-    groups = [(results, BAND, f"all {results['replicas']}")]
-    if results["reliable"]:
-        groups.append((results["reliable"], HELD_OUT, f"{results['reliable']['replicas']} reliable"))
-    for panel, level in zip(panels, levels, strict=True):
-        panel.axvline(level, color=NOISE, lw=0.9, ls=(0, (4, 3)))
-        for number, (group, colour, name) in enumerate(groups):
-            rows = [row for row in group["coverage"] if row["level"] == level]
-            at = np.arange(len(rows)) + 0.24 * (number - (len(groups) - 1) / 2)
-            seen = np.array([row["observed"] for row in rows])
-            ends = np.array([[row["lower"], row["upper"]] for row in rows]).T
-            panel.errorbar(seen, at, xerr=np.abs(ends - seen), fmt="o", ms=3, lw=1, color=colour, label=name)
-        panel.set(title=f"{percent(level)} intervals", xlabel="coverage [-]")
-    panels[0].set_yticks(range(len(names)), [plain(name) for name in names])
-    panels[0].set_ylim(len(names) - 0.5, -0.5)
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
-    return svg_of(figure)
-
-
-def _panels(rows: Sequence[Mapping[str, Any]], results: Mapping[str, Any], draw: Draw) -> str:
-    """One panel per quantity."""
-    figure, panels = grid(len(rows), columns=3, height=1.35)
-    for panel, row in zip(panels, rows, strict=True):
-        draw(panel, row, results)
-        panel.set_title(plain(row["parameter"]), fontsize=7.5)
-    for panel in panels[-3:]:
-        panel.set_xlabel("rank [-]")
-    return svg_of(figure)
-
-
-def _histogram(panel: Axes, row: Mapping[str, Any], results: Mapping[str, Any]) -> None:
-    counts, band = np.array(row["counts"]), results["rank_bins"]
-    edges = np.linspace(0, counts.size, band["bins"] + 1)
-    panel.axhspan(band["lower"], band["upper"], color=NOISE, alpha=0.3, lw=0)
-    panel.axhline(results["replicas"] / band["bins"], color=NOISE, lw=0.8)
-    panel.stairs(counts.reshape(band["bins"], -1).sum(axis=1), edges, fill=True, color=BAND, alpha=0.75)
-    panel.set(xlim=(0, counts.size), ylabel="replicas")
-
-
-def _difference(panel: Axes, row: Mapping[str, Any], results: Mapping[str, Any]) -> None:
-    counts, corridor = np.array(row["counts"]), results["rank_corridor"]
-    at = np.arange(1, counts.size)
-    expected = at / counts.size
-    lower, upper = (np.array(corridor[end]) / results["replicas"] - expected for end in ("lower", "upper"))
-    panel.fill_between(at, lower, upper, color=NOISE, alpha=0.3, lw=0, step="post")
-    panel.axhline(0.0, color=NOISE, lw=0.6)
-    panel.step(at, np.cumsum(counts)[:-1] / results["replicas"] - expected, where="post", color=BAND)
-    panel.set_xlim(0, counts.size)
-    panel.text(
-        0.98,
-        0.96,
-        f"p = {figures(row['p_value'], 2)}",
-        ha="right",
-        va="top",
-        fontsize=7,
-        color=INK,
-        transform=panel.transAxes,
-    )
 
 
 def _replicas(results: Mapping[str, Any]) -> dict[str, object]:

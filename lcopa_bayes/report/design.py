@@ -1,4 +1,4 @@
-"""The page of a design, drawn from `design.json` of its run folder alone."""
+"""The page of a design, drawn from `design.json` and the drive of its run folder alone."""
 
 from __future__ import annotations
 
@@ -6,36 +6,26 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from lcopa_bayes.data.drive import drive_of
+from lcopa_bayes.data.record import load_columns
+from lcopa_bayes.plot.designs import drive_figure, precision_figure
 from lcopa_bayes.report.page import Drawings
-from lcopa_bayes.report.theme import BAND, HELD_OUT, INK, Drawing, grid, label, plain, svg_of
+from lcopa_bayes.report.svg import Drawing, drawing
+
+_CURVE = (
+    "Expected relative standard deviation (median over draws) after the best drive and after the plain step; "
+    "dotted: 10 %. A gap: not determined at most draws."
+)
 
 
 def drawn(folder: Path, values: Mapping[str, Any]) -> Drawings:
-    """Drives by rank and precision against bench time of a design."""
+    """The recommended drive, drives by rank, and precision against bench time of a design."""
+    curve, drive = list[Drawing](), list[Drawing]()
+    if values["curve"][0]["best"]:
+        curve = [drawing("design_curve", precision_figure(values), _CURVE)]
+    if values["template"] is not None:
+        text = "The drive to play next; its rows are in " + str(values["template"]) + "."
+        figure = drive_figure(drive_of(load_columns(folder / values["template"], responses=False)))
+        drive = [drawing("design_drive", figure, text)]
     ranked = sorted(values["table"], key=lambda row: -(row["factor_over_step"] or 0.0))
-    return {"curve": _curve(values), "ranked": ranked}
-
-
-def _curve(results: Mapping[str, Any]) -> tuple[Drawing, ...]:
-    curve = results["curve"]
-    names = list(curve[0]["best"])
-    if not names:
-        return ()
-    figure, panels = grid(len(names), columns=3, height=1.7)
-    times = np.array([row["time"] for row in curve], dtype=float)
-    for panel, name in zip(panels, names, strict=True):
-        for key, colour, said in (("step", HELD_OUT, "plain step"), ("best", BAND, "best drive")):
-            spread = np.array([row[key][name] for row in curve], dtype=float)
-            panel.plot(times, spread, color=colour, marker=".", markersize=4, label=said)
-        panel.axhline(0.1, color=INK, linewidth=0.7, linestyle=":")
-        panel.set(xscale="log", yscale="log")
-        panel.set_title(plain(name), fontsize=7.5)
-        panel.set(xlabel=label("bench time", results["time_unit"]), ylabel="relative sd [-]")
-    panels[0].legend()
-    caption = (
-        "Expected relative standard deviation (median over draws) after the best drive and after the plain "
-        "step; dotted: 10 %. A gap: not determined at most draws."
-    )
-    return (Drawing("design_curve", svg_of(figure), caption),)
+    return {"curve": curve, "drive": drive, "ranked": ranked}

@@ -6,11 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from matplotlib.axes import Axes
-
+from lcopa_bayes.plot.loop import before_after_figure, effects_figure, view_figure
+from lcopa_bayes.report.formatting import figures
 from lcopa_bayes.report.page import Drawings, Verdict
-from lcopa_bayes.report.theme import BAND, HELD_OUT, NOISE, SEEN, Drawing, blank, label, plain, svg_of
+from lcopa_bayes.report.svg import Drawing, drawing
 from lcopa_bayes.results.stored import stored_values
 
 _MOST_CURVES = 12
@@ -38,25 +37,13 @@ def _bars(results: Mapping[str, Any]) -> tuple[Drawing, ...]:
     ][:_LONGEST]
     if not listed:
         return ()
-    figure = blank(0.6 + 0.2 * len(listed))
-    axes = figure.subplots()
-    names = [plain(effect_class["name"]) for effect_class in listed]
-    values = np.array([effect_class["log_bayes_factor"] for effect_class in listed])
-    axes.barh(
-        np.arange(len(names)), values, color=[BAND if v > evidence["threshold"] else NOISE for v in values]
-    )
-    axes.axvline(evidence["threshold"], color=HELD_OUT, lw=1.0, ls="--")
-    axes.set_yticks(np.arange(len(names)), names)
-    axes.invert_yaxis()
-    axes.set_xscale("symlog", linthresh=10)
-    axes.set_xlabel("log Bayes factor against nothing missing [nat]")
     top = listed[0]
-    above = int((values > evidence["threshold"]).sum())
+    above = sum(one["log_bayes_factor"] > evidence["threshold"] for one in listed)
     caption = (
         f"Of {len(evidence['classes'])} effects {above} exceed the level that chance reaches (dashed); the "
         f"largest is {top['name']}. Linear below 10 nat, logarithmic above."
     )
-    return (Drawing("loop_evidence", svg_of(figure), caption),)
+    return (drawing("loop_evidence", effects_figure(listed, evidence["threshold"]), caption),)
 
 
 def _residuals(results: Mapping[str, Any], curves: Sequence[Mapping[str, Any]]) -> list[Drawing]:
@@ -66,20 +53,15 @@ def _residuals(results: Mapping[str, Any], curves: Sequence[Mapping[str, Any]]) 
         :_MOST_CURVES
     ]
     for number, curve in enumerate(chosen, start=1):
-        figure = blank(1.9)
-        panels = figure.subplots(1, 2, sharey=True)
-        colour = HELD_OUT if curve["held_out"] else SEEN
-        for axes, when in zip(panels, ("before", "after"), strict=True):
-            _residual(axes, curve, when, colour, results["time_unit"])
-        panels[0].set_ylabel(label("residual", curve["unit"]))
         before, after = (_rmse(results[when], curve) for when in ("before", "after"))
         caption = (
-            f"{curve['record']}, {curve['axis']}: root mean square {before:.3g} before and {after:.3g} "
-            "after, noise "
-            f"{curve['noise_sd']:.3g} {curve['unit']}. Grey: 90 % band with noise."
+            f"{curve['record']}, {curve['axis']}: root mean square {figures(before)} before and "
+            f"{figures(after)} after, noise {figures(curve['noise_sd'])} {curve['unit']}. "
+            "Grey: 90 % band with noise."
         )
+        figure = before_after_figure(curve, results["time_unit"])
         stem = f"loop_residual_{number:02d}_{curve['record']}_{curve['axis']}"
-        drawings.append(Drawing(stem, svg_of(figure), caption, mark="held out" if curve["held_out"] else ""))
+        drawings.append(drawing(stem, figure, caption, "held out" * curve["held_out"]))
     return drawings
 
 
@@ -90,36 +72,14 @@ def _rmse(side: Mapping[str, Any], curve: Mapping[str, Any]) -> float:
     return float(next(score["rmse"] for score in side["scores"] if [score[key] for key in keys] == wanted))
 
 
-def _residual(axes: Axes, curve: Mapping[str, Any], when: str, colour: str, unit: str) -> None:
-    time = np.array(curve["time"], dtype=float)
-    width = np.array(curve[f"half_width_{when}"], dtype=float)
-    axes.fill_between(time, -width, width, color=NOISE, alpha=0.25, lw=0)
-    axes.plot(time, curve[when], ".", ms=1.6, mew=0, color=colour)
-    axes.axhline(0.0, color=NOISE, lw=0.6)
-    axes.set(title=plain(f"{curve['record']}, {curve['axis']}: {when}"), xlabel=label("time", unit))
-
-
 def _views(views: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[Drawing]:
     drawings = []
     pairs = [*zip(views["before"], views["after"], strict=True)]
     for number, (before, after) in enumerate(pairs, start=1):
         if not before["x"]:
             continue
-        figure = blank(1.9)
-        panels = figure.subplots(1, 2, sharey=True)
-        for axes, view, when in ((panels[0], before, "before"), (panels[1], after, "after")):
-            x, y, error = (np.array(view[key], dtype=float) for key in ("x", "y", "error"))
-            level = 0.0 if "mean" in view["along"] or "correlation" in view["along"] else 1.0
-            axes.axhline(level, color=NOISE, lw=0.7)
-            axes.errorbar(x, y, yerr=1.645 * error, fmt=".-", ms=3, lw=0.8, elinewidth=0.6, color=BAND)
-            if view["name"] == "spectrum" and x.size:
-                axes.set(xscale="log", yscale="log")
-            axes.set(
-                title=plain(f"{view['axis']}, {view['name']}: {when}"), xlabel=plain(str(view["across"]))[:70]
-            )
-        panels[0].set_ylabel(plain(str(before["along"])))
         caption = (
             f"Before: {before['sentence']}. After: {after['sentence']}. Bars: 90 % intervals of pure noise."
         )
-        drawings.append(Drawing(f"loop_view_{number:02d}", svg_of(figure), caption))
+        drawings.append(drawing(f"loop_view_{number:02d}", view_figure(before, after), caption))
     return drawings

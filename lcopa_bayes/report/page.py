@@ -18,7 +18,7 @@ from markupsafe import Markup, escape
 
 from lcopa_bayes.core.files import writable_folder, write_text
 from lcopa_bayes.report import formatting
-from lcopa_bayes.report.theme import Drawing, inlined
+from lcopa_bayes.report.svg import Drawing, inlined
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
 
 Drawings: TypeAlias = Mapping[str, Any]

@@ -12,6 +12,8 @@ from jinja2 import UndefinedError
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.inference import defaultpriors
+from lcopa_bayes.plot.rundata import RunData, load_run
+from lcopa_bayes.plot.theme import look
 from lcopa_bayes.report import (
     audit,
     calibrate,
@@ -28,14 +30,12 @@ from lcopa_bayes.report import (
     responses,
 )
 from lcopa_bayes.report.page import Drawings, Verdict, write_page
-from lcopa_bayes.report.savedrun import SavedRun, load_run
-from lcopa_bayes.report.theme import look
 from lcopa_bayes.results.stored import stored_values
 
 Draw: TypeAlias = Callable[[Path, Mapping[str, Any]], Drawings]
 """Gives the figures of a page from the run folder and the values of a result, under `verdict` the box at its
 top where it is another than that of the values, or None."""
-Part: TypeAlias = Callable[[SavedRun], Drawings]
+Part: TypeAlias = Callable[[RunData], Drawings]
 _PARTS: tuple[Part, ...] = (
     draws.pairs,
     draws.parameters,
@@ -60,7 +60,7 @@ def write_report(folder: Path, *, jobs: int = 1) -> Path:
     return _written(folder, "fit", "", run.results, lambda *_: shown)
 
 
-def _drawn(run: SavedRun, part: Part) -> Drawings:
+def _drawn(run: RunData, part: Part) -> Drawings:
     """A part of the report."""
     with look():
         return part(run)

@@ -35,7 +35,8 @@ from lcopa_bayes.data.record import Axis
 from lcopa_bayes.data.settings import ModelSettings, NoiseSettings, SamplerSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.model.path import TransferPath
-from lcopa_bayes.report.theme import BAND, HELD_OUT, NOISE, blank, look, svg_of
+from lcopa_bayes.plot.theme import BAND, HELD_OUT, NOISE, blank, look
+from lcopa_bayes.report.svg import svg_of
 from lcopa_bayes.verbs.calibrate import results
 
 CAMERA, DURATION, COMMAND = 0.2, 48.0, 2.0

@@ -18,10 +18,12 @@ from hypothesis.extra.numpy import arrays
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.inference import defaultpriors
-from lcopa_bayes.report import draws, records, write_page, write_report
+from lcopa_bayes.plot.draws import ranked
+from lcopa_bayes.plot.rundata import load_run
+from lcopa_bayes.plot.theme import extremes
+from lcopa_bayes.report import records, write_page, write_report
 from lcopa_bayes.report.formatting import NOT_REACHED, figures, interval, sentence, stopped, to_spread
-from lcopa_bayes.report.savedrun import load_run
-from lcopa_bayes.report.theme import Drawing, extremes, inlined
+from lcopa_bayes.report.svg import Drawing, inlined
 from lcopa_bayes.sampling.modes import Modes
 
 PARAMETERS = {
@@ -424,7 +426,7 @@ def test_intervals_and_significant_digits():
 
 def test_interesting_parameters_come_first_and_the_rest_is_named(tmp_path):
     names = ["sigma", "gain_a", "offset", "delay", "gate_1", "order_1", "time_2", "time_1"]
-    assert draws.ranked(names) == [
+    assert ranked(names) == [
         "time_2",
         "time_1",
         "order_1",

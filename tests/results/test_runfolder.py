@@ -22,7 +22,7 @@ from lcopa_bayes.bench.command import on_off
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.files import save_json, save_table
 from lcopa_bayes.data.record import Axis, Record
-from lcopa_bayes.report.savedrun import load_run
+from lcopa_bayes.plot.rundata import load_run
 from lcopa_bayes.results import datatree
 from lcopa_bayes.results.datatree import save_tree, variable_names
 from lcopa_bayes.results.fit import Fit, fit

@@ -14,8 +14,8 @@ from small import draws_of, problem, record, study
 from lcopa_bayes.cli import main
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.record import save_record
+from lcopa_bayes.plot.rundata import load_run
 from lcopa_bayes.report import write_report
-from lcopa_bayes.report.savedrun import load_run
 from lcopa_bayes.results.fit import Fit, fit
 from lcopa_bayes.results.summary import results, verdict
 from lcopa_bayes.sampling.convergence import Grade, Quality, limited

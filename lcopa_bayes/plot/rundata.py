@@ -1,4 +1,4 @@
-"""A run folder as the report reads it; everything the report needs is checked here."""
+"""Results, tables and draws of a fit as figures read them, from its run folder or just computed."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, final
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import pandas as pd
@@ -16,8 +17,12 @@ from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.results.bands import POINTWISE, QUANTILE_NAMES, SIMULTANEOUS
 from lcopa_bayes.results.datatree import posterior_draws
+from lcopa_bayes.results.fit import Fit
+from lcopa_bayes.results.result import Result
 from lcopa_bayes.results.runfolder import ORIGINS
+from lcopa_bayes.results.savedfit import SavedFit
 from lcopa_bayes.results.summary import IMPORTANCE
+from lcopa_bayes.results.tables import tables as computed
 
 T = TypeVar("T")
 _WORDS = ("record", "axis", "unit", "name", "path", "prior", "from")
@@ -53,13 +58,14 @@ _CHECK_TABLES: Mapping[str, tuple[str, ...]] = {
 
 @final
 @dataclass(frozen=True, eq=False)
-class SavedRun:
-    """Results, tables and draws read from a run folder."""
+class RunData:
+    """Results, tables and draws of a fit."""
 
     results: Mapping[str, Any]
     provenance: Mapping[str, Any]
-    """Of the fit."""
+    """Of the fit; nothing where it was not saved."""
     tables: Mapping[str, pd.DataFrame]
+    """By the names of their files; those that are needed are in `TABLES`."""
     draws: Mapping[str, Matrix]
     """Draws of each free parameter, (ensembles, draws), in the parameter's unit."""
 
@@ -77,6 +83,11 @@ class SavedRun:
     def units(self) -> dict[str, str]:
         """Unit of each free parameter."""
         return {row["name"]: row["unit"] for row in self.results["parameters"]}
+
+    @property
+    def varying(self) -> list[str]:
+        """Free parameters whose draws vary."""
+        return [name for name in self.units if np.ptp(self.draws[name]) > 0]
 
     def part(self, table: str, record: str, axis: str) -> pd.DataFrame:
         """Rows of one axis of one record."""
@@ -101,7 +112,31 @@ class SavedRun:
         return bool(density.loc[density["name"] == name, "log_scale"].any())
 
 
-def load_run(folder: Path) -> SavedRun:
+_COMPUTED: WeakKeyDictionary[Fit, RunData] = WeakKeyDictionary()
+"""Data of fits that were drawn already."""
+
+
+def fit_of(result: Result) -> Fit | SavedFit:
+    """The fit that a result is or rests on; InputError when it rests on none."""
+    fit = result if isinstance(result, Fit | SavedFit) else getattr(result, "fit", None)
+    if not isinstance(fit, Fit | SavedFit):
+        raise InputError(f"the result of `{result.verb}` rests on no fit that is at hand; give a fit")
+    return fit
+
+
+def run_of(result: Result) -> RunData:
+    """Data of the fit that a result is or rests on; InputError when there is none."""
+    fit = fit_of(result)
+    if isinstance(fit, SavedFit):
+        return load_run(fit.folder)
+    if fit not in _COMPUTED:
+        rows, (sets, _) = fit.draws.table.rows, fit.draws.log_density.shape
+        draws = {row.name: fit.draws.column(row.name).reshape(sets, -1) for row in rows if row.free}
+        _COMPUTED[fit] = RunData(fit.to_json(), {}, computed(fit), draws)
+    return _COMPUTED[fit]
+
+
+def load_run(folder: Path) -> RunData:
     """Read a run folder; InputError names every file that is missing or cannot be used."""
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such run folder; give the folder `fit` wrote")
@@ -122,7 +157,7 @@ def load_run(folder: Path) -> SavedRun:
             if row["name"] not in draws
         ]
     refuse_if(problems)
-    return SavedRun(results, origin, tables, draws)
+    return RunData(results, origin, tables, draws)
 
 
 def read_part(path: Path, read: Callable[[Path], T], problems: list[str], verb: str = "fit") -> T | None:

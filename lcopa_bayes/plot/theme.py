@@ -1,4 +1,4 @@
-"""How figures look, and how they become the same bytes every time.
+"""How figures look.
 
 Fewer points for the same picture: long curves are drawn through the extremes of short stretches.
 """
@@ -6,25 +6,22 @@ Fewer points for the same picture: long curves are drawn through the extremes of
 from __future__ import annotations
 
 import io
-import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from math import log10
-from typing import Any, TypeVar, final
+from typing import Any, final
 
 import matplotlib
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.backend_bases import RendererBase
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 from lcopa_bayes.core.arrays import Index, Vector
 
-T = TypeVar("T")
 INK = "#1a1a1a"
 SEEN = "#1a1a1a"
 """Observations of records that were fitted."""
@@ -41,7 +38,12 @@ _DECADES = 200.0
 """Ratio of the ends of a logarithmic axis from which only powers of ten are marked [-]."""
 _LOOK: Mapping[Any, Any] = {
     "svg.hashsalt": "lcopa-bayes",
-    "svg.fonttype": "path",
+    "svg.fonttype": "none",
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "axes.facecolor": "none",
     "font.family": "DejaVu Sans",
     "font.size": 8.5,
     "axes.titlesize": 9,
@@ -65,9 +67,6 @@ _LOOK: Mapping[Any, Any] = {
     "figure.dpi": 100,
 }
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-_COORDINATES = re.compile(r'\s(?:d|x|y)="[^"]*"')
-_LONG_DECIMALS = re.compile(r"(\.\d\d)\d+")
-_NO_METADATA = dict.fromkeys(("Date", "Creator", "Format", "Type"))
 
 
 @contextmanager
@@ -79,9 +78,29 @@ def look() -> Iterator[None]:
         yield
 
 
-def blank(height: float) -> Figure:
-    """An empty figure of a height [in]."""
-    return Figure(figsize=(WIDTH, height), layout="constrained")
+@final
+class StyledFigure(Figure):
+    """A figure that keeps this look whatever the settings of matplotlib are when it is shown or saved."""
+
+    def draw(self, renderer: RendererBase) -> None:
+        """Draw with round numbers on logarithmic axes."""
+        for panel in self.axes:
+            for axis in (panel.xaxis, panel.yaxis):
+                if axis.get_scale() == "log" and isinstance(axis.get_major_formatter(), LogFormatter):
+                    _log_ticks(axis)
+        with look():
+            super().draw(renderer)
+
+    def _repr_png_(self) -> bytes:
+        """The figure in a notebook."""
+        out = io.BytesIO()
+        self.savefig(out, format="png", dpi=100)
+        return out.getvalue()
+
+
+def blank(height: float, width: float = WIDTH) -> Figure:
+    """An empty figure of a height and a width [in]."""
+    return StyledFigure(figsize=(width, height), layout="constrained")
 
 
 def grid(count: int, *, columns: int, height: float) -> tuple[Figure, Sequence[Axes]]:
@@ -133,28 +152,6 @@ def plain(text: str) -> str:
 def label(name: str, unit: str) -> str:
     """Axis label `name [unit]`."""
     return f"{plain(name)} [{plain(unit)}]"
-
-
-def svg_of(figure: Figure) -> str:
-    """The figure as SVG without dates or links to software, its coordinates to a hundredth of a point."""
-    for panel in figure.axes:
-        for axis in (panel.xaxis, panel.yaxis):
-            if axis.get_scale() == "log" and isinstance(axis.get_major_formatter(), LogFormatter):
-                _log_ticks(axis)
-    out = io.StringIO()
-    # not `savefig`, which draws all of a figure with a layout once more, unseen
-    FigureCanvasSVG(figure).print_svg(out, metadata=_NO_METADATA)  # type: ignore[no-untyped-call]
-    return _COORDINATES.sub(lambda match: _LONG_DECIMALS.sub(r"\1", match[0]), out.getvalue())
-
-
-def inlined(svg: str, prefix: str) -> str:
-    """The `<svg>` element alone, with `prefix` before its ids to keep them unique within an HTML page."""
-    element = svg[svg.index("<svg") :]
-    element = re.sub(r'\sxmlns(:\w+)?="[^"]*"', "", element)
-    element = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", element, flags=re.DOTALL)
-    element = re.sub(r'\bid="', f'id="{prefix}-', element)
-    element = element.replace('href="#', f'href="#{prefix}-').replace("url(#", f"url(#{prefix}-")
-    return element.strip()
 
 
 MOST = 600
@@ -210,23 +207,3 @@ def extremes_note(size: int) -> str:
     if size <= MOST:
         return ""
     return f"Drawn through the extremes of short stretches: the record has {size} samples."
-
-
-@final
-@dataclass(frozen=True)
-class Drawing:
-    """A figure as SVG, with the stem of its file name and its caption."""
-
-    stem: str
-    svg: str
-    caption: str
-    mark: str = ""
-    """A word set before the caption that must not be overlooked, such as "held out"."""
-
-
-def paged(
-    stem: str, names: Sequence[T], most: int, draw: Callable[[Sequence[T]], str], caption: str
-) -> tuple[Drawing, ...]:
-    """Figures `<stem>_01` and so on, each of up to `most` of the `names`, as `draw` gives them."""
-    parts = [names[k : k + most] for k in range(0, len(names), most)]
-    return tuple(Drawing(f"{stem}_{k:02d}", draw(part), caption) for k, part in enumerate(parts, start=1))

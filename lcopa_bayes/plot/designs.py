@@ -1,0 +1,48 @@
+"""The drive to measure next, and how precise parameters become with bench time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from lcopa_bayes.data.drive import Drive
+from lcopa_bayes.plot.records import draw_drives
+from lcopa_bayes.plot.theme import BAND, HELD_OUT, INK, blank, grid, label, plain
+
+
+def precision_figure(results: Mapping[str, Any]) -> Figure:
+    """Expected relative sd of every parameter after the best drive and after the plain step."""
+    curve = results["curve"]
+    names = list(curve[0]["best"])
+    figure, panels = grid(len(names), columns=3, height=1.7)
+    times = np.array([row["time"] for row in curve], dtype=float)
+    for panel, name in zip(panels, names, strict=True):
+        for key, colour, said in (("step", HELD_OUT, "plain step"), ("best", BAND, "best drive")):
+            spread = np.array([row[key][name] for row in curve], dtype=float)
+            panel.plot(times, spread, color=colour, marker=".", markersize=4, label=said)
+        panel.axhline(0.1, color=INK, linewidth=0.7, linestyle=":")
+        panel.set(xscale="log", yscale="log")
+        panel.set_title(plain(name), fontsize=7.5)
+        panel.set(xlabel=label("bench time", results["time_unit"]), ylabel="relative sd [-]")
+    panels[0].legend()
+    return figure
+
+
+def drive_figure(drive: Drive) -> Figure:
+    """A drive over time, a panel for each unit."""
+    frames = [
+        pd.DataFrame({"axis": axis, "unit": unit or "-", "time": drive.time, "drive": values})
+        for axis, unit, values in zip(drive.axes, drive.units, drive.values.T, strict=True)
+    ]
+    rows = pd.concat(frames)
+    units = list(dict.fromkeys(rows["unit"]))
+    figure = blank(0.5 + 1.3 * len(units))
+    panels = figure.subplots(len(units), 1, sharex=True, squeeze=False)[:, 0]
+    for panel, unit in zip(panels, units, strict=True):
+        draw_drives(panel, rows[rows["unit"] == unit], unit, until=float(drive.time[-1]))
+    panels[-1].set_xlabel(label("time", drive.time_unit or "-"))
+    return figure

@@ -1,0 +1,61 @@
+"""Figures as SVG, the same bytes every time, with their captions."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar, final
+
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+
+T = TypeVar("T")
+_COORDINATES = re.compile(r'\s(?:d|x|y)="[^"]*"')
+_LONG_DECIMALS = re.compile(r"(\.\d\d)\d+")
+_NO_METADATA = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+
+
+def svg_of(figure: Figure) -> str:
+    """The figure as SVG without dates or links to software, its coordinates to a hundredth of a point."""
+    figure.set_facecolor("none")
+    out = io.StringIO()
+    # not `savefig`, which draws all of a figure with a layout once more, unseen
+    FigureCanvasSVG(figure).print_svg(out, metadata=_NO_METADATA)  # type: ignore[no-untyped-call]
+    return _COORDINATES.sub(lambda match: _LONG_DECIMALS.sub(r"\1", match[0]), out.getvalue())
+
+
+def inlined(svg: str, prefix: str) -> str:
+    """The `<svg>` element alone, with `prefix` before its ids to keep them unique within an HTML page."""
+    element = svg[svg.index("<svg") :]
+    element = re.sub(r'\sxmlns(:\w+)?="[^"]*"', "", element)
+    element = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", element, flags=re.DOTALL)
+    element = re.sub(r'\bid="', f'id="{prefix}-', element)
+    element = element.replace('href="#', f'href="#{prefix}-').replace("url(#", f"url(#{prefix}-")
+    return element.strip()
+
+
+@final
+@dataclass(frozen=True)
+class Drawing:
+    """A figure as SVG, with the stem of its file name and its caption."""
+
+    stem: str
+    svg: str
+    caption: str
+    mark: str = ""
+    """A word set before the caption that must not be overlooked, such as "held out"."""
+
+
+def drawing(stem: str, figure: Figure, caption: str, mark: str = "") -> Drawing:
+    """A figure as a drawing."""
+    return Drawing(stem, svg_of(figure), caption, mark)
+
+
+def paged(
+    stem: str, names: Sequence[T], most: int, draw: Callable[[Sequence[T]], Figure], caption: str
+) -> tuple[Drawing, ...]:
+    """Figures `<stem>_01` and so on, each of up to `most` of the `names`, as `draw` gives them."""
+    parts = [names[k : k + most] for k in range(0, len(names), most)]
+    return tuple(drawing(f"{stem}_{k:02d}", draw(part), caption) for k, part in enumerate(parts, start=1))
