@@ -5,7 +5,10 @@ from __future__ import annotations
 import argparse
 import gc
 import json
+import os
 import sys
+import tempfile
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from importlib import import_module
@@ -23,10 +26,14 @@ if TYPE_CHECKING:
     from lcopa_bayes.results.result import Result
     from lcopa_bayes.verbs.sources import FitLike
 
-_CODES = "exit codes: 0 done, 2 the input cannot be used (nothing is written), 130 interrupted"
+_CODES = (
+    "exit codes: 0 done, 1 unforeseen error, 2 the input cannot be used (nothing is written), 130 interrupted"
+)
 _COLLECTED = (100_000, 20, 100)
 """Thresholds of the garbage collector: modules and figures are hundreds of thousands of objects that stay,
 and to look through them again and again takes a sixth of the time of imports and pages."""
+FAILED = 1
+"""Exit code after an error that is no fault of the input."""
 INTERRUPTED = 130
 """Exit code after an interrupt from the keyboard."""
 PUBLISHED = Path("reports")
@@ -50,19 +57,38 @@ def main(arguments: Sequence[str] | None = None) -> int:
     gc.set_threshold(*_COLLECTED)
     try:
         values, text = _outcome(options, [PROGRAM, *given])
+        if options.json:
+            print(json.dumps(values, allow_nan=False))
+        elif not options.quiet:
+            print(text)
+        sys.stdout.flush()
     except InputError as error:
         return refused(error.problems, as_json=options.json)
     except FloatingPointError as error:  # a prior that reaches where the model cannot be computed
         return refused([f"{error}; narrow the priors that allow these values"], as_json=options.json)
+    except BrokenPipeError:  # who reads the output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
     except KeyboardInterrupt:
         resume = "; the same command with --resume goes on where it stopped" * hasattr(options, "resume")
         print(f"interrupted{resume}", file=sys.stderr)
         return INTERRUPTED
-    if options.json:
-        print(json.dumps(values, allow_nan=False))
-    elif not options.quiet:
-        print(text)
+    except Exception as error:
+        said = f"unforeseen {type(error).__name__}: {error}; {_details([PROGRAM, *given])}"
+        refused([said], as_json=options.json)
+        return FAILED
     return 0
+
+
+def _details(command: Sequence[str]) -> str:
+    """Where the command, the versions and the trace of the exception at hand are written, in words."""
+    from importlib.metadata import version
+
+    handle, path = tempfile.mkstemp(prefix=f"{PROGRAM}-", suffix=".txt")
+    with os.fdopen(handle, "w", encoding="utf-8") as file:
+        file.write(f"{' '.join(command)}\n{sys.version}\n{PROGRAM} {version(PROGRAM)}\n\n")
+        traceback.print_exc(file=file)
+    return f"details are in {path}, and what was finished before is kept"
 
 
 def _outcome(options: argparse.Namespace, command: Sequence[str]) -> Outcome:

@@ -114,6 +114,11 @@ SHAPES: Mapping[str, Shape] = {
     "repeats": Shape(records=4),
     "repeats, hours": Shape(records=4, unit="s", second=9_000.0),
     "microseconds": Shape(unit="s", second=2e-6),
+    "microseconds, dark record": Shape(unit="s", second=2e-6, dark=True),
+    "hours, missing cells, jittered clock": Shape(
+        unit="s", second=9_000.0, missing=0.3, jitter=0.8, records=3
+    ),
+    "few samples": Shape(samples=12),
     "missing cells": Shape(responses=2, missing=0.3),
     "eight bits": Shape(step=1 / 128),
     "offsets that drift": Shape(drift=0.2, records=3, settings={"model": {"offset": "record"}}),

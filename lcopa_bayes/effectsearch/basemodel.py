@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from lcopa_bayes.core.arrays import Vector
-from lcopa_bayes.core.errors import refuse_if
+from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.requirements import not_at_rest, unmet_apart_from_rest
 from lcopa_bayes.data.settings import PriorSettings
@@ -176,7 +176,7 @@ def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: boo
     for terms in range(2, _MOST + 1):
         try:
             wider = _wider(replace(study, model=replace(study.model, terms=terms)), base, terms)
-        except ArithmeticError:
+        except (ArithmeticError, InputError):  # not simulated, or more parameters than samples
             break
         gain = _gain(base, wider)
         if wider.fit.failed or not gain > _GAIN:
@@ -206,7 +206,7 @@ def _apart(study: Study, base: Base) -> tuple[Base, Study]:
     apart = replace(study, model=replace(study.model, share="none", delay="path"))
     try:
         wider = _wider(apart, base, 0)
-    except ArithmeticError:
+    except (ArithmeticError, InputError):
         return base, study
     gain = _gain(base, wider)
     if wider.fit.failed or not (gain > _GAIN or base.fit.failed):

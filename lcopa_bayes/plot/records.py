@@ -74,7 +74,7 @@ def above_drives(
     first, last = float(rows["time"].min()), float(rows["time"].max())
     for panel, unit in zip(below, units, strict=True):
         draw_drives(panel, drives[drives["unit"] == unit], unit, until=last)
-    margin = 0.02 * (last - first)
+    margin = 0.02 * (last - first) or 0.5 * abs(first) or 1.0  # one sample has no span
     top.set(
         ylabel=label(str(rows["axis"].iloc[0]), str(rows["unit"].iloc[0])),
         xlim=(first - margin, last + margin),

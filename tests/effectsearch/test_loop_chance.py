@@ -313,10 +313,11 @@ def test_a_clean_campaign_of_correlated_noise_stays_clean():
     ("rho", "quiet"), [(0.0, 64), (0.6, 64), (0.9, 64), (0.9, 176), (0.95, 400), (0.9, 40)]
 )
 def test_clean_campaigns_are_called_clean(rho, quiet):
-    """100 draws whose answer is known; an alarm by chance comes once in a hundred times."""
+    """100 draws whose answer is known; an alarm by chance comes once in a hundred times, and held-out errors
+    that chance explains in less than 2 % of campaigns twice."""
     records = noiseless(quiet)
     wrong = sum(looped(campaign(records, 1000 + seed, rho)).verdict.kind != "clean" for seed in range(100))
-    assert binom.sf(wrong - 1, 100, 0.01) > 1e-3
+    assert binom.sf(wrong - 1, 100, 0.03) > 0.01
 
 
 @pytest.mark.slow

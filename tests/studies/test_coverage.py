@@ -80,3 +80,17 @@ def test_a_record_without_a_row_or_refused_says_so() -> None:
     text = records.page([fitted, {"record": "b", "verb": "fit", "refused": "no drive", "cpu_seconds": 0.1}])
     assert "| a | 1 term | reliable | both | 3 | not run |" in text
     assert "| b | no drive |" in text
+
+
+def test_a_row_that_does_not_end_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def endless(_: Path) -> dict[str, object]:
+        while True:
+            pass
+
+    monkeypatch.setitem(records.ACTIONS, "loop", endless)
+    row = records.perform(str(tmp_path / "tank"), "loop", 1)
+    assert row["refused"] == "did not end in 1 s"
+    assert row["seconds"] < 10.0
+    assert "| tank | not run | | |  | did not end in 1 s | | |  |" in records.page([row])
+    monkeypatch.setitem(records.ACTIONS, "loop", lambda _: {"verdict": "clean"})
+    assert records.perform(str(tmp_path / "tank"), "loop", 1)["verdict"] == "clean"

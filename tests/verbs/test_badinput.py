@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import json
 import re
+import subprocess
+import sys
+import tempfile
 from dataclasses import replace
+from importlib.metadata import version
 
 import numpy as np
 import pytest
@@ -258,3 +263,36 @@ def test_numbers_of_the_command_line_that_cannot_be_used_are_named(option, least
     printed = f"argument {name}: must be a whole number of at least {least}; got {text!r}"
     assert printed in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_an_unforeseen_error_is_one_sentence_and_a_file_of_details(as_json, tmp_path, capsys, monkeypatch):
+    def broken(*_: object, **__: object) -> None:
+        raise RuntimeError("the floor is gone")
+
+    save_record(record(camera=0.6), tmp_path / "step.csv")
+    monkeypatch.setattr("lcopa_bayes.verbs.check.inventory", broken)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    words = ["check", str(tmp_path / "step.csv"), "--out", str(tmp_path / "out")]
+    assert main([*words, *["--json"] * as_json]) == 1
+    out, err = capsys.readouterr()
+    (said,) = json.loads(out)["errors"] if as_json else err.splitlines()
+    assert "unforeseen RuntimeError: the floor is gone" in said
+    (details,) = tmp_path.glob("lcopa-bayes-*.txt")
+    assert str(details) in said
+    written = details.read_text("utf-8")
+    assert written.startswith(f"lcopa-bayes check {tmp_path}")
+    assert "in broken" in written
+    assert version("lcopa-bayes") in written
+
+
+def test_a_reader_who_has_seen_enough_ends_it_without_a_trace(tmp_path):
+    save_record(record(camera=0.6), tmp_path / "step.csv")
+    words = ["check", tmp_path / "step.csv", "--out", tmp_path / "out"]
+    code = "import sys, time; from lcopa_bayes.cli import main; sys.exit(main(sys.argv[1:]))"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as end:
+        end.stdout.close()
+        assert end.stderr.read() == b""
+    assert end.returncode == 1

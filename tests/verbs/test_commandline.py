@@ -68,7 +68,7 @@ def test_help_shows_the_example_and_the_exit_codes(verb, capsys):
     assert exit_code(verb, "--help") == 0
     said = capsys.readouterr().out
     assert f"example: lcopa-bayes {verb} {USAGES[verb].example}" in said
-    assert "exit codes: 0 done, 2" in said
+    assert "exit codes: 0 done, 1 unforeseen error, 2" in said
 
 
 @pytest.mark.parametrize("term", TERMS)
