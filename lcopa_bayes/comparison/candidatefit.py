@@ -261,7 +261,7 @@ def card(
     weighed = None if candidate.improper else fitted.evidence
     parts = predictions(fitted) if usable else ()
     result = criteria(fitted, also)
-    lags = alternatives_of(fitted) if usable and not candidate.integer else None
+    lags = alternatives_of(fitted) if usable and not candidate.integer else ()
     entries: dict[str, Any] = plain(
         {
             **attributes(candidate, "name", "about", "notes", "integer", "terms"),
@@ -285,7 +285,7 @@ def card(
             "held_out": scores(fitted, held_out=True),
             "predictions": [one.as_json() | {"grade": one.grade(grade.level)} for one in parts],
             "order_is_integer": [one.as_json() for one in integer_orders(fitted)],
-            "sums_of_lags": [one.as_json() for one in lags.alternatives] if lags else [],
+            "sums_of_lags": [one.as_json() for one in lags],
             "estimates": [one.as_json() for one in fitted.draws.estimates()],
             "step_metrics": [one.as_json() for one in fitted.metrics],
             "residual_tests": [

@@ -26,8 +26,9 @@ _DELAYS = tuple(factor - 1.0 for factor in (0.7, 0.85, 1.15, 1.3))
 _EXPLAINED = 0.5
 """Share of the response variance that a usable base fit explains at least [-]."""
 _ROUNDS = 3
-_SPARE = 2
-"""Independent samples beyond the parameters with which a residual can be judged at all [-]."""
+_SPARE = 3
+"""Independent samples per parameter with which a residual can be judged at all [-]: with fewer the fit has
+followed more than a third of the noise that it is judged by."""
 _MOVED = 0.05
 """Change of the dead time from which the noise is measured anew [-]."""
 
@@ -138,7 +139,7 @@ def _alike(one: AxisNoise, other: AxisNoise) -> bool:
 def _failure(model: ExtendedModel, optimum: Optimum) -> str:
     if not optimum.converged:
         return "the base fit did not converge within its steps"
-    if optimum.effective < optimum.x.size + _SPARE:
+    if optimum.effective < _SPARE * optimum.x.size:
         return (
             f"the residual of the base fit is so smooth that its samples count as {optimum.effective:.0f} "
             f"independent ones, too few beside {optimum.x.size} parameters"

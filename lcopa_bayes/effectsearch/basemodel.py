@@ -153,17 +153,23 @@ def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: boo
     moves before its drive does and no drive before the first row explains that.
     """
     refuse_if(unmet_apart_from_rest(study))
+    alone = not as_stated and study.model.terms == 1 and study.model.orders == "free"
     base = _based(study)
-    for mended in (started, _later):
-        better = mended(study, base.fit)
-        if mended is started and better is None:
-            refuse_if(not_at_rest(study.fit, study.held_out))
-        if better is not None:
-            study = better.study
-            base = _based(study)._replace(sentence=f"{base.sentence} {better.sentence}".strip())
-    if as_stated or study.model.terms != 1 or study.model.orders != "free":
+    separate = _apart(study, base) if alone else (base, study)
+    # paths that share too much look like a plant that did not rest
+    mended = started(separate[1], separate[0].fit)
+    if mended is None:
+        refuse_if(not_at_rest(study.fit, study.held_out))
+    else:
+        study = replace(mended.study, model=study.model)
+        base = _based(study)._replace(sentence=mended.sentence)
+    later = _later(study, base.fit)
+    if later is not None:
+        study = later.study
+        base = _based(study)._replace(sentence=f"{base.sentence} {later.sentence}".strip())
+    if not alone:
         return base
-    base, study = _apart(study, base)
+    base, study = separate if mended is None and later is None else _apart(study, base)
     for terms in range(2, _MOST + 1):
         try:
             wider = _wider(replace(study, model=replace(study.model, terms=terms)), base, terms)

@@ -1,25 +1,27 @@
-"""What named effects leave on records that were not fitted."""
+"""What a model leaves on records that were not fitted: beyond chance, and beyond the noise beside effects."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
 from scipy.stats import chi2, norm
 
-from lcopa_bayes.core.arrays import Index, Vector
+from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basefit import axis_pieces
-from lcopa_bayes.effectsearch.noise import Law, laws, plausible
+from lcopa_bayes.effectsearch.noise import Law, joint_noise, laws
 from lcopa_bayes.effectsearch.scores import Score, State, pooled_rmse
+from lcopa_bayes.effectsearch.verdict import Miss
 from lcopa_bayes.inference.defaultpriors import Scales
+from lcopa_bayes.inference.recursions import correlated
 
 _ROOM = 0.05
 """Share of the range of a drive beyond which a model extrapolates [-]."""
-_DOUBTS = 9.0
-"""Variances of a prediction that an error must exceed [-]."""
+_REPEATS = 4
+"""Draws of noise beside each draw of a prediction [-]."""
 _SEEN = float(norm.sf(5.0))
 """p-value of noise alone below which error beyond noise is judged, five normal standard deviations [-]."""
 _PROCESSES = 400
@@ -44,20 +46,98 @@ def unseen_share(study: Study, before: Sequence[Score], after: Sequence[Score], 
     return now.beyond / was.beyond if was.p_value(_measured(state)) < _SEEN else np.nan
 
 
-def missed(study: Study, fit: Sequence[Score], scores: Sequence[Score], state: State) -> float:
-    """Root mean square error on held-out records over that of the fit, where it is more than that and three
-    standard deviations of what the fit leaves uncertain; NaN where it is not [-].
+def missed(study: Study, fit: Sequence[Score], scores: Sequence[Score], state: State) -> Miss | None:
+    """How far unseen records are missed, on the axis where chance reaches that least often; None without a
+    drawn prediction inside the drive range of the other records.
 
-    The fit's own residual, where nothing is found in it, knows the noise better than the quiet samples do:
-    neither of the two may explain the error.
+    Chance is noise as the residual of the fit has it, which knows it as well as quiet samples where nothing
+    is found in it, and what the fit leaves uncertain. Error and coverage have a p-value each by simulation;
+    their geometric mean, at most e times too small whatever their dependence (Vovk and Wang 2020, Biometrika
+    107), is multiplied by the number of axes.
     """
-    noise = {one.axis: max(pooled_rmse(fit, one.axis), one.noise_sd) for one in scores}
-    errors = _errors(study, scores, state, [(noise[one.axis], 0 * one.variance) for one in scores])
-    unsure = _errors(study, scores, state, [(noise[one.axis], _DOUBTS * one.variance) for one in scores])
-    for known in (_independent, _measured, _left_by_fit):
-        if not unsure.p_value(known(state)) < _SEEN:
-            return np.nan
-    return float(np.sqrt(1 + errors.beyond / errors.count))
+    if not study.held_out and state.whitening.dependence:
+        return None  # the residual was taken for noise, and errors of records left out are little else
+    rng = np.random.default_rng(_SEED)
+    names = [axis.name for axis in study.response_axes]
+    own = {axis: [one for one in scores if one.axis == axis and one.draws is not None] for axis in names}
+    seen = [_missed(study, fit, own[axis], state, k, rng) for k, axis in enumerate(names) if own[axis]]
+    judged = [one for one in seen if one is not None]
+    least = min(judged, key=lambda one: one.p, default=None)
+    return least and replace(least, p=min(1.0, least.p * len(judged)))
+
+
+def _missed(
+    study: Study,
+    fit: Sequence[Score],
+    scores: Sequence[Score],
+    state: State,
+    axis: int,
+    rng: np.random.Generator,
+) -> Miss | None:
+    name = study.response_axes[axis].name
+    sd, noise = max(pooled_rmse(fit, name), scores[0].noise_sd), _Residual.of(state, axis)
+    # samples that are weighted alike count by the power of their noise; means of it scatter more
+    slow = (1 + noise.rho) / np.sqrt(1 + noise.rho**2) if state.whitening.dependence else 1.0
+    followed = np.concatenate([one.variance for one in fit if one.axis == name]).mean()  # noise, by the fit
+    full = float(np.hypot(sd, slow * np.sqrt(followed)))
+    seen, chance, count = np.zeros(2), np.zeros((2, 1, 1)), 0
+    for one in scores:
+        near = one.time < _left(study, one.record)
+        if not near.any():
+            continue
+        assert one.draws is not None
+        error, draws = (one.observed - one.predicted)[near], slow * one.draws[:, near]
+        drawn = np.stack([noise.draw(full, one.time[near], len(draws), rng) for _ in range(_REPEATS)])
+        half = one.half_width[near]
+        seen, chance = seen + _error_and_misses(error, half), chance + _error_and_misses(drawn + draws, half)
+        count += error.size
+    if not count:
+        return None
+    shares = [
+        (1 + np.count_nonzero(each >= one)) / (1 + each.size) for one, each in zip(seen, chance, strict=True)
+    ]
+    ratio, coverage = np.sqrt(seen[0] / count) / sd, 1 - seen[1] / count
+    return Miss(name, float(ratio), float(coverage), float(np.sqrt(np.prod(shares))))
+
+
+def _error_and_misses(errors: Array, half_width: Vector) -> Array:
+    """Squared error [response unit^2], and samples outside the band [-], of errors (..., n), (2, ...)."""
+    return np.stack([(errors**2).sum(axis=-1), (np.abs(errors) > half_width).sum(axis=-1)])
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Residual:
+    """Noise as the residual of a fit has it on one axis: its memory and its tails."""
+
+    innovations: Vector
+    """What the past does not predict of it, of variance 1, (n,) [-]."""
+    rho: float
+    """Correlation one sampling period apart that gives as many independent samples [-]."""
+    independent: float
+    """Independent samples [-]."""
+    period: float
+    """Sampling period [time unit]."""
+
+    @classmethod
+    def of(cls, state: State, axis: int) -> _Residual:
+        """From the fitted records."""
+        posterior = state.model.plant
+        scales = Scales.of([one.record for one in posterior.samples])
+        pieces = axis_pieces(posterior, state.optimum.residual, axis)
+        known = joint_noise(pieces, "", 0, scales)
+        law = Law.of(known.posterior)
+        white = np.concatenate([law.whiten(piece.values, piece.gaps)[1:] for piece in pieces])
+        rho = np.sqrt((known.dependence - 1) / (known.dependence + 1))
+        return cls(white / white.std(), float(rho), known.samples / known.dependence, scales.period)
+
+    def draw(self, sd: float, times: Vector, count: int, rng: np.random.Generator) -> Matrix:
+        """Noise of about that `sd` [response unit], known from so many independent samples, (count, n)."""
+        link = self.rho ** (np.diff(times) / self.period)
+        out = rng.choice(self.innovations, (count, times.size))
+        out[:, 1:] *= np.sqrt(1 - link**2)
+        scale = sd * np.sqrt(self.independent / rng.chisquare(self.independent, count))
+        return scale[:, None] * correlated(out, link[None])
 
 
 @final
@@ -105,26 +185,12 @@ class Errors:
         return float(np.mean(chi2.sf(self.power.sum() / multiple, freedom)))
 
 
-def _independent(state: State) -> list[list[Law]]:
-    """Noise of independent samples: what it explains, correlated noise of that sd explains too."""
-    return [[Law(process.sd)] for process in state.whitening.noise]
-
-
 def _measured(state: State) -> list[list[Law]]:
     """Noise that the samples it was measured from leave plausible, per axis."""
     white, rng = state.whitening, np.random.default_rng(_SEED)
     if not white.posterior:
         return [[process] for process in white.noise]
     return [laws(one.draw(_PROCESSES, rng)) for one in white.posterior]
-
-
-def _left_by_fit(state: State) -> list[list[Law]]:
-    """Noise that the residual of the fit leaves plausible, per axis."""
-    posterior, rng = state.model.plant, np.random.default_rng(_SEED)
-    axes = range(len(state.whitening.noise))
-    scales = Scales.of([one.record for one in posterior.samples])
-    pieces = [axis_pieces(posterior, state.optimum.residual, axis) for axis in axes]
-    return [laws(plausible(one, scales).draw(_PROCESSES, rng)) for one in pieces]
 
 
 def _errors(
@@ -143,9 +209,10 @@ def _errors(
 
 
 def _left(study: Study, name: str) -> float:
-    """When a held-out record's drive leaves the range of the fitted ones [time unit]; infinite if never."""
-    record = next(one for one in study.held_out if one.name == name)
-    low, high = (pick([pick(one.drive, axis=0) for one in study.fit], axis=0) for pick in (np.min, np.max))
+    """When a record's drive leaves the range of the other, fitted ones [time unit]; infinite if never."""
+    record = next(one for one in (*study.fit, *study.held_out) if one.name == name)
+    others = [one.drive for one in study.fit if one.name != name]
+    low, high = (pick([pick(one, axis=0) for one in others], axis=0) for pick in (np.min, np.max))
     room = _ROOM * (high - low)
     beyond = ((record.drive < low - room) | (record.drive > high + room)).any(axis=1)
     return float(record.time[np.argmax(beyond)]) if beyond.any() else np.inf

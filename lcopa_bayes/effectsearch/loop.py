@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import Estimate
+from lcopa_bayes.data.agreement import Disagreement, disagreements
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.basefit import BaseFit
@@ -94,6 +95,8 @@ class Loop:
     """Draws of the explained study; None when none were asked for, or none could be had."""
     outliers: Outlying | None = None
     """Samples left out before anything was traced; None without any."""
+    contrary: tuple[Disagreement, ...] = ()
+    """Records that disagree."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -140,7 +143,8 @@ class Loop:
 
     @property
     def trace(self) -> Trace | None:
-        """Evidence of every effect in the first residual; None when the base fit failed."""
+        """Evidence of every effect in the first residual; None when the base fit failed, or no plant follows
+        the records as they are."""
         return self.rounds[0].trace if self.rounds else None
 
 
@@ -189,12 +193,17 @@ def _looped(
         study, kinds = outliers.study, [kind for kind in kinds if kind.card.name != OUTLIERS]
         problem, base, start, enlarged = fitted_base(study, kinds, as_stated=as_stated, draws=draws)
     before = _side(problem, start)
-    cautions = (*base.caution, *_alone(study))
-    if base.failed:
-        verdict = Verdict("unexplained", "tentative", f"No effect is named, because {base.failed}.")
+    contrary = disagreements((*study.fit, *study.held_out))
+    cautions = (*(f"records disagree: {one}" for one in contrary), *base.caution, *_alone(study))
+    wrong = next((f"records disagree: {one}" for one in contrary if one.gross), base.failed)
+    if wrong:
+        seen = missed(study, before.fit, before.unseen, start)
+        but = f" What remains: {seen.said}." if seen is not None and seen.far else ""
+        verdict = Verdict("unexplained", "tentative", f"No effect is named, because {wrong}.{but}")
         return Loop(
             *(problem, base, enlarged, (), (), (), verdict, before, before, not study.held_out, cautions),
             outliers=outliers,
+            contrary=contrary,
         )
     alone = len(study.fit) == 1 and not study.held_out
     rng = np.random.default_rng([study.seed, 11])
@@ -210,9 +219,9 @@ def _looped(
     names = tuple(effect.name for effect in added if not effect.card.dynamics)
     apart = bool(added) and all(effect.card.per_record for effect in added)
     # a model of the rest is not judged by samples that the noise throws anywhere
-    was, now = (
-        without_outliers(side.unseen) if outliers is not None else side.unseen for side in (before, reached)
-    )
+    was, now = before.unseen, reached.unseen
+    if outliers is not None:
+        was, now = without_outliers(was, now)
     verdict = decide(
         Findings(
             cautions=cautions,
@@ -233,7 +242,7 @@ def _looped(
             excess=start.whitening.excess(start.optimum.residual),
             enough=ALONE if alone else EXPLAINED,
             scatter=first.scatter,
-            missed=missed(study, before.fit, was, start) if study.held_out else np.nan,
+            missed=None if apart else missed(study, reached.fit, now, searched.state),
             unseen=unseen_share(study, was, now, searched.state) if study.held_out else np.nan,
             risen=risen(was, now) if study.held_out else np.nan,
             reached=np.nan if apart else over_noise(reached.fit, now, clear=not last.alarmed),
@@ -276,6 +285,7 @@ def _looped(
         cautions,
         sampled[0] if sampled is not None else None,
         outliers,
+        contrary,
     )
 
 

@@ -106,15 +106,24 @@ def outlying(study: Study, fit: BaseFit) -> Outlying | None:
     )
 
 
-def without_outliers(scores: Sequence[Score]) -> list[Score]:
-    """Scores where the noise has outliers, without the samples that lie as far from their neighbours."""
-    out = []
-    for one in scores:
-        distance = np.abs(_apart(one.observed - one.predicted))
-        near = distance <= _FAR * np.median(distance) / _NORMAL
-        arrays = {name: getattr(one, name)[near] for name in ("time", "observed", "predicted", "variance")}
-        out.append(replace(one, **arrays))
-    return out
+def without_outliers(
+    before: Sequence[Score], after: Sequence[Score]
+) -> tuple[tuple[Score, ...], tuple[Score, ...]]:
+    """Scores of one set of records by two models where the noise has outliers, without the samples that lie
+    as far from their neighbours in either."""
+    pairs = [(one, other, _near(one) & _near(other)) for one, other in zip(before, after, strict=True)]
+    kept = [(_only(one, near), _only(other, near)) for one, other, near in pairs]
+    return tuple(one for one, _ in kept), tuple(other for _, other in kept)
+
+
+def _near(one: Score) -> Flags:
+    distance = np.abs(_apart(one.observed - one.predicted))
+    return np.asarray(distance <= _FAR * np.median(distance) / _NORMAL)
+
+
+def _only(one: Score, near: Flags) -> Score:
+    arrays = {name: getattr(one, name)[near] for name in ("time", "observed", "predicted", "variance")}
+    return replace(one, **arrays, draws=None if one.draws is None else one.draws[:, near])
 
 
 def _apart(residual: Vector) -> Vector:

@@ -22,7 +22,7 @@ from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.noise import Law
 from lcopa_bayes.effectsearch.regression import Optimum
-from lcopa_bayes.effectsearch.whitening import Whitening
+from lcopa_bayes.effectsearch.whitening import Part, Whitening
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.declared import campaign_places
 from lcopa_bayes.inference.noise import Noise, WhiteAR1
@@ -89,6 +89,7 @@ _DRAWS = 100
 """Draws about an optimum behind the prediction of a held-out record [-]."""
 _MOST = 400
 """The same of a sampled posterior, at most [-]."""
+_SEED = 15
 _TRIES = 4
 """Draws for each of them within the support [-]."""
 WIDTH = float(norm.ppf(0.5 + LEVEL / 2))
@@ -115,6 +116,8 @@ class Score:
     noise_sd: float
     """Standard deviation of the noise [response unit]."""
     level_from: str
+    draws: Matrix | None = None
+    """Draws of the prediction less their mean, (draws, n) [response unit]; None where none were taken."""
 
     @property
     def half_width(self) -> Vector:
@@ -188,15 +191,31 @@ def fit_scores(state: State) -> list[Score]:
 
 def left_out_scores(state: State) -> list[Score]:
     """On the fit records, each left out in turn (one Gauss-Newton step away from the fit of all)."""
-    chosen = groups(state.whitening)
-    mean = state.fitted
-    variance = np.zeros_like(mean)
+    chosen, several = groups(state.whitening), len(state.whitening.samples) > 1
+    mean, rng = state.fitted, np.random.default_rng(_SEED)
+    variance, draws = np.zeros_like(mean), np.zeros((_DRAWS, mean.size))
     for rows, (shift, covariance) in zip(chosen, shifts(state.optimum, chosen), strict=True):
         tangents = state.optimum.tangents[rows]
         mean[rows] += tangents @ shift
         variance[rows] = np.einsum("nk,kl,nl->n", tangents, covariance, tangents, optimize=True)
-    own = len(state.whitening.samples) > 1 and _own_levels(state)
-    return _scores(state, mean, variance, "the other records", own_levels=own)
+        apart = rng.standard_normal((_DRAWS, len(shift))) @ root_of(covariance).T
+        draws[:, rows] = apart @ tangents.T
+    own = several and _own_levels(state)
+    scores = _scores(state, mean, variance, "the other records", own_levels=own)
+    if not several:  # parts of a record are beside what was fitted, and say nothing of another one
+        return scores
+    parts = zip(scores, state.whitening.parts, strict=True)
+    return [replace(one, draws=_of_part(state, part, draws[:, part.rows], own, rng)) for one, part in parts]
+
+
+def _of_part(state: State, part: Part, draws: Matrix, own: bool, rng: np.random.Generator) -> Matrix:
+    """Draws of a prediction, with `own` level about the level that would be taken from each."""
+    if own:
+        noise = state.whitening.noise[part.axis]
+        known = [_level(part.samples, part.axis, draw, noise) for draw in draws]
+        levels = np.array([level + np.sqrt(doubt) * rng.standard_normal() for level, doubt, _ in known])
+        draws = draws - levels[:, None]
+    return np.asarray(draws - draws.mean(axis=0))
 
 
 def held_out_scores(state: State, problem: Problem) -> list[Score]:
@@ -226,8 +245,9 @@ def held_out_scores(state: State, problem: Problem) -> list[Score]:
             raise UnstableError(names, record.record.name, "no draw has a bounded response")
         # what differs from record to record is 0 on average
         mean = plant[bounded].mean(axis=0) + level[bounded].mean()
-        variance = (seen + level[:, None])[bounded].var(axis=0)
-        out.append(_score(state, record, axis, (mean, variance), source, held_out=True))
+        apart = (seen + level[:, None])[bounded]
+        one = _score(state, record, axis, (mean, apart.var(axis=0)), source, held_out=True)
+        out.append(replace(one, draws=apart - apart.mean(axis=0)))
     return out
 
 

@@ -247,6 +247,8 @@ def moved(result: Loop) -> list[dict[str, Any]]:
 def next_measurement(result: Loop) -> str:
     """In words: what excitation splits a group, finds what is unexplained, or shows what stayed invisible."""
     trace = result.trace
+    if any(one.gross for one in result.contrary):
+        return "Correct the records that disagree first."
     if trace is None:
         return "Mend the base fit first: give it records in which it can follow the response."
     if not result.base.noise_known:

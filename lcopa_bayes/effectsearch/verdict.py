@@ -7,6 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, final
 
+from scipy.stats import norm
+
+from lcopa_bayes.core.estimate import LEVEL
+
 Kind = Literal["clean", "explained", "partly explained", "disturbance", "unexplained"]
 Confidence = Literal["firm", "tentative"]
 
@@ -24,7 +28,12 @@ MARGIN = 3.0
 FIRM = 30.0
 """Log evidence that every effect must have brought where names are firm [nat]."""
 REACHED = 1.1
-"""Root mean square error over noise that an explained axis has on unseen records at most [-]."""
+"""Root mean square error over noise that a clean or explained axis has on unseen records at most [-]."""
+COVERED = float(2 * norm.cdf(norm.ppf(0.5 + LEVEL / 2) / REACHED) - 1)
+"""Share of samples that 90 % bands hold of normal errors so large: bands that hold less do not cover [-]."""
+CHANCE = 0.02
+"""Probability below which chance does not explain such errors or bands on unseen records [-]: with that of an
+alarm, 1 %, three clean campaigns in a hundred are not called clean."""
 
 
 @final
@@ -35,6 +44,38 @@ class Verdict:
     kind: Kind
     confidence: Confidence
     sentence: str
+
+
+@final
+@dataclass(frozen=True)
+class Miss:
+    """Errors of one response axis on unseen records beside what chance gives."""
+
+    axis: str
+    ratio: float
+    """Root mean square error over the noise [-]."""
+    coverage: float
+    """Share of the samples inside 90 % bands [-]."""
+    p: float
+    """Probability of so large an error and so little coverage by chance [-]."""
+
+    @property
+    def far(self) -> bool:
+        """Whether the error is above 1.1 times the noise, or the bands do not cover."""
+        return self.ratio > REACHED or self.coverage < COVERED
+
+    @property
+    def significant(self) -> bool:
+        """Whether chance does not explain that."""
+        return self.far and self.p < CHANCE
+
+    @property
+    def said(self) -> str:
+        """The errors, a clause without a full stop."""
+        return (
+            f"on unseen records the error of {self.axis} is {self.ratio:.2f} times the noise and 90 % bands "
+            f"hold {_percent(self.coverage)} of the samples (by chance with probability {self.p:.2g})"
+        )
 
 
 @final
@@ -71,9 +112,8 @@ class Findings:
     """Share of the residual power that named effects must take when something significant remains [-]."""
     scatter: float = -math.inf
     """Evidence that the noise is not normal, in the first residual [nat]."""
-    missed: float = math.nan
-    """Root mean square error of the base model on held-out records over that of the fit; NaN where that and
-    what the fit leaves uncertain explain it [-]."""
+    missed: Miss | None = None
+    """Errors of the final model on unseen records; None where it says nothing."""
     unseen: float = math.nan
     """Squared error beyond noise on held-out records, with the effects over without [-]; NaN where it says
     nothing: no such records, no such error, or effects that differ from record to record."""
@@ -107,10 +147,13 @@ def decide(given: Findings) -> Verdict:
         )
     confidence = confidence if given.apart else "tentative"
     said = f"{named} {'was' if one else 'were'} missing"
-    if given.dynamics or given.reached > REACHED:
+    astray = given.missed is not None and given.missed.significant
+    if given.dynamics or astray or given.reached > REACHED:
         rest += " Linear dynamics without a name are missing too." if given.dynamics else ""
         if given.reached > REACHED:
             rest += f" On unseen records the error stays at {given.reached:.2f} times the noise."
+        elif astray and given.missed:
+            rest += f" But {given.missed.said}."
         said += f", but not all that is, worth {given.gained:.0f} nat together."
         return Verdict("partly explained", "tentative", said + rest)
     if set(given.effects) <= set(given.disturbances):
@@ -164,13 +207,22 @@ def _quiet(given: Findings, confidence: Confidence) -> Verdict:
         "Nothing is missing that these records could show: the largest log Bayes factor of any effect is "
         f"{given.largest:.1f} nat, and chance alone reaches {given.threshold:.1f} once in a hundred times."
     )
-    if given.missed > 0:
+    if given.missed is not None and given.missed.significant:
         return Verdict(
             "unexplained",
-            confidence,
-            f"The records held out are missed by {given.missed:.1f} times the residual of the fit, more than "
-            "it leaves uncertain, though the fitted ones show no effect (the largest log Bayes factor is "
-            f"{given.largest:.1f} nat): no name is forced.",
+            "tentative",
+            f"Something is missing: {given.missed.said}. The fitted records do not show what: the largest "
+            f"log Bayes factor of any effect is {given.largest:.1f} nat, and chance alone reaches "
+            f"{given.threshold:.1f}. So no name is given.",
+        )
+    if given.missed is not None and given.missed.far:
+        confidence, nothing = "tentative", f"{nothing} But {given.missed.said}."
+    elif given.reached > REACHED:
+        confidence = "tentative"
+        nothing += (
+            f" But on unseen records the error is {given.reached:.2f} times the noise, and chance cannot be "
+            "told from what is missing: their drive leaves the range of the fitted ones, or the noise is "
+            "known from the same residual alone."
         )
     if given.scatter > given.threshold:
         return Verdict(

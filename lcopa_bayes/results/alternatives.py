@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal, final
 
 import numpy as np
@@ -27,7 +28,7 @@ from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.steps import Metric, StepCurves, figures_of, metrics_of
 from lcopa_bayes.results.summary import listed
 from lcopa_bayes.sampling.convergence import TENTATIVE_ESS, Limitation
-from lcopa_bayes.sampling.lagdraws import LagDraws, lag_draws
+from lcopa_bayes.sampling.lagdraws import LagDraws, LagSearch, lag_draws
 
 _SUPPORT = 10.0
 """Difference of Akaike's criterion beyond which the worse plant has no support [-]."""
@@ -54,9 +55,11 @@ class Alternative:
 
     paths: tuple[PathSlot, ...]
     """Those whose drive moves and whose gain is not known."""
-    lags: LagDraws
+    search: LagSearch
     advantage: float
     """Akaike's criterion of the fitted plant less that of the lags [-]."""
+    seed: int
+    """Of the draws."""
 
     @property
     def support(self) -> Support:
@@ -65,14 +68,24 @@ class Alternative:
             return "both"
         return "lags" if self.advantage > 0 else "plant"
 
+    @cached_property
+    def draws(self) -> LagDraws:
+        """Drawn where they are asked for."""
+        return lag_draws(self.search, self.seed)
+
+    @property
+    def ess(self) -> float | None:
+        """Effective sample size of the draws [-]; None where the records give the lags no support."""
+        return None if self.support == "plant" else self.draws.ess
+
     def as_json(self) -> dict[str, Any]:
-        """Plain values."""
-        times = np.exp(self.lags.best.coordinates[: -len(self.paths)]).reshape(len(self.paths), -1)
+        """Plain values of the search."""
+        best = self.search.best
+        times = np.exp(best.coordinates[: -len(self.paths)]).reshape(len(self.paths), -1)
         return {
             "paths": [one.name for one in self.paths],
-            "lags": self.lags.best.lags,
+            "lags": best.lags,
             "times": [sorted(row) for row in times.tolist()],
-            "ess": self.lags.ess,
             "aic_advantage": self.advantage,
             "support": self.support,
         }
@@ -130,7 +143,7 @@ class Alternatives:
             "plant": "do not follow the records as well as the fitted plant does",
         }
         return " ".join(
-            f"Sums of {one.lags.best.lags} to {one.lags.times.shape[2]} lags"
+            f"Sums of {one.search.best.lags} to {one.search.lags} lags"
             f"{f' for {listed([path.name for path in one.paths])}' if len(self.alternatives) > 1 else ''} "
             f"{said[one.support]} (AIC {'lower' if one.advantage > 0 else 'higher'} by "
             f"{abs(one.advantage):.1f})."
@@ -147,7 +160,7 @@ class Alternatives:
                 out.append(
                     Limitation(
                         "tentative",
-                        f"a sum of {one.lags.best.lags} lags follows {paths} better than the fitted plant "
+                        f"a sum of {one.search.best.lags} lags follows {paths} better than the fitted plant "
                         f"(AIC lower by {one.advantage:.0f})",
                         "read figures of the step responses, which are of the sum of lags, and let `compare` "
                         "weigh other structures",
@@ -172,38 +185,33 @@ class Alternatives:
         """Plain values."""
         return plain(
             {
-                "sums_of_lags": [one.as_json() for one in self.alternatives],
+                "sums_of_lags": [one.as_json() | {"ess": one.ess} for one in self.alternatives],
                 "numbers": [one.as_json() for one in self.numbers],
                 "sentence": self.sentence,
             }
         )
 
 
-def alternatives_of(fitted: Fit) -> Alternatives | None:
-    """Sums of lags beside a fit; None where its noise is not Gaussian, its plant has effects, no drive moves
-    or the records do not determine them."""
+def alternatives_of(fitted: Fit) -> tuple[Alternative, ...]:
+    """Sums of lags beside a fit, one for each response axis that has any; none where its noise is not normal,
+    its plant has effects, no drive moves or the records do not determine them."""
     posterior = fitted.problem.posterior
     if posterior.simulation is not None or not isinstance(posterior.noise, GaussianNoise):
-        return None
+        return ()
     try:
         problem = lag_problem(fitted.study)
     except InputError:
-        return None
-    found = []
-    for axis in range(len(posterior.table.layout.responses)):
-        paths = _open(fitted, axis)
-        if paths:
-            found.append(_alternative(fitted, problem, axis, paths))
-    if not found:
-        return None
-    return Alternatives(tuple(found), tuple(_numbers(fitted, problem, found)))
+        return ()
+    open_paths = [_open(fitted, axis) for axis in range(len(posterior.table.layout.responses))]
+    return tuple(_alternative(fitted, problem, axis, paths) for axis, paths in enumerate(open_paths) if paths)
 
 
 def with_alternatives(fitted: Fit) -> Fit:
     """A fit with the figures of its step responses over both plants, and what follows for its grade."""
-    other = alternatives_of(fitted)
-    if other is None:
+    found = alternatives_of(fitted)
+    if not found:
         return fitted
+    other = Alternatives(found, tuple(_numbers(fitted, found)))
     table = fitted.draws.table
     names = {}
     for one in table.layout.paths:
@@ -266,9 +274,9 @@ def _alternative(fitted: Fit, problem: Problem, axis: int, paths: tuple[PathSlot
         square += float((posterior.noise.standard(residual, noise, observed.gaps) ** 2).sum())
     ends = np.array([_ends(fitted, one) for one in paths])
     seed = fitted.run.plan.seed * 1_000 + 10 * _STREAM + axis
-    lags = lag_draws(problem, axis, [one.drive for one in paths], noise[0], ends, seed)
-    advantage = square + 2 * _parameters(fitted, paths) - lags.best.square - 2 * lags.best.parameters
-    return Alternative(paths, lags, advantage)
+    search = LagSearch.over(problem, axis, [one.drive for one in paths], noise[0], ends)
+    advantage = square + 2 * _parameters(fitted, paths) - search.best.square - 2 * search.best.parameters
+    return Alternative(paths, search, advantage, seed)
 
 
 def _parameters(fitted: Fit, paths: Sequence[PathSlot]) -> int:
@@ -295,13 +303,18 @@ def _ends(fitted: Fit, path: PathSlot) -> tuple[float, float]:
     return low, max(min(high, max(begun, low + 2 * period)), low + 1e-6 * period)
 
 
-def _numbers(fitted: Fit, problem: Problem, found: Sequence[Alternative]) -> list[Averaged]:
+def _numbers(fitted: Fit, found: Sequence[Alternative]) -> list[Averaged]:
     """Every figure of the step responses that sums of lags have a part in, over both plants."""
     weights = {"plant": 0.0, "both": 0.5, "lags": 1.0}
-    weight_of = {path.name: weights[one.support] for one in found for path in one.paths}
-    own = metrics_of(fitted.draws.table, fitted.curves, time_unit=fitted.study.time_unit)
-    other = {one.name: one for one in _figures(fitted, problem, found)}
-    ess = min(fitted.draws.ess, *(one.lags.ess for one in found))
+    table = fitted.draws.table
+    weight_of = dict.fromkeys((one.name for one in table.layout.paths), 0.0)
+    weight_of |= {path.name: weights[one.support] for one in found for path in one.paths}
+    found = [one for one in found if weights[one.support] > 0]
+    if not found:
+        return []
+    own = metrics_of(table, fitted.curves, time_unit=fitted.study.time_unit)
+    other = {one.name: one for one in _figures(fitted, found)}
+    ess = min(fitted.draws.ess, *(one.draws.ess for one in found))
     grade = fitted.draws.grade.level if ess >= TENTATIVE_ESS else "tentative"
     out = []
     for one in own:
@@ -334,18 +347,18 @@ def _averaged(plant: Metric, lags: Metric, weight: float, ess: float, grade: str
     return Averaged(here, plant.values, lags.values, weight)
 
 
-def _figures(fitted: Fit, problem: Problem, found: Sequence[Alternative]) -> list[Metric]:
+def _figures(fitted: Fit, found: Sequence[Alternative]) -> list[Metric]:
     """Figures of the step responses of sums of lags; of paths without any nothing."""
-    layout, time = problem.posterior.table.layout, fitted.curves.time
-    count = min(len(one.lags.delays) for one in found)
+    layout, time = found[0].search.problem.posterior.table.layout, fitted.curves.time
+    count = min(len(one.draws.delays) for one in found)
     shape = (len(layout.responses), len(layout.drives))
     gains, delays = np.zeros((count, *shape)), np.zeros((count, len(layout.delays)))
     own = {}
     for one in found:
         for p, path in enumerate(one.paths):
-            own[path.response, path.drive] = (one.lags, p)
-            gains[:, path.response, path.drive] = one.lags.gains[:count, p]
-            delays[:, layout.delay_of[path.response][path.drive]] = one.lags.delays[:count, p]
+            own[path.response, path.drive] = (one.draws, p)
+            gains[:, path.response, path.drive] = one.draws.gains[:count, p]
+            delays[:, layout.delay_of[path.response][path.drive]] = one.draws.delays[:count, p]
 
     def normalised(at: Vector) -> Array:
         out = np.zeros((shape[0] * shape[1], count, at.size))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from io import BytesIO
 from itertools import count
+from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
@@ -30,6 +31,10 @@ POSTERIOR = "posterior.nc"
 """File of a run folder that holds the tree."""
 _PORTION = 64
 """Draws predicted at a time."""
+_CELLS = 10_000_000
+"""Draws times samples of a group of all fit records at most ..."""
+_FEWEST = 400
+"""... but so many draws at least [-]."""
 _PRIOR_DRAWS, _FEWER = 200, 32
 """Draws of the prior."""
 
@@ -77,10 +82,11 @@ def posterior_tree(fit: Fit) -> DataTree:
     Their dimension is `<record>_<axis>_time` with the times as coordinate. Drives are in the constant data
     by `<record>_drive_time` and `drive`, the axes' names; `record` lists the records.
 
-    The priors of single parameters add up to that of all but for a constant, the attribute `joint_support` of
-    `log_prior`: decreasing orders and resolved terms hold a part of the mass. A slash in a name, which netCDF
-    keeps for groups, is written as a vertical bar; names that would be the same get a number
-    (`variable_names`).
+    Of long records, `log_likelihood` and `posterior_predictive` hold every k-th draw, as their coordinate
+    `draw` says. The priors of single parameters add up to that of all but for a constant, the attribute
+    `joint_support` of `log_prior`: decreasing orders and resolved terms hold a part of the mass. A slash in a
+    name, which netCDF keeps for groups, is written as a vertical bar; names that would be the same get a
+    number (`variable_names`).
     """
     draws, problem = fit.draws, fit.problem
     posterior, table, study = problem.posterior, draws.table, fit.study
@@ -90,9 +96,12 @@ def posterior_tree(fit: Fit) -> DataTree:
     count = _PRIOR_DRAWS if table.effects is None else _FEWER
     prior = table.draw(count, np.random.default_rng([study.seed, 9]))
     fitted = _Series.of(posterior.samples)
-    likelihood, predictive = _predicted(fit, fitted, draws.flat, rng, likelihood=True)
-    _, before = _predicted(fit, fitted, prior, np.random.default_rng([study.seed, 10]), likelihood=False)
     shape = draws.values.shape[:2]
+    some = slice(None, None, _step(shape, sum(each.size for each in fitted.observed.values())))
+    kept = draws.values[:, some]
+    flat = kept.reshape(-1, kept.shape[2])
+    likelihood, predictive = _predicted(fit, fitted, flat, rng, likelihood=True)
+    _, before = _predicted(fit, fitted, prior, np.random.default_rng([study.seed, 10]), likelihood=False)
     groups: dict[str, dict[str, Any]] = {
         "posterior": {name: draws.values[..., k] for k, name in variables.items()},
         "sample_stats": {"lp": draws.log_density},
@@ -101,8 +110,10 @@ def posterior_tree(fit: Fit) -> DataTree:
             for k, name in variables.items()
         },
         "prior": {name: prior[None, :, k] for k, name in variables.items()},
-        "log_likelihood": {name: each.reshape(*shape, -1) for name, each in likelihood.items()},
-        "posterior_predictive": {name: each.reshape(*shape, -1) for name, each in predictive.items()},
+        "log_likelihood": {name: each.reshape(*kept.shape[:2], -1) for name, each in likelihood.items()},
+        "posterior_predictive": {
+            name: each.reshape(*kept.shape[:2], -1) for name, each in predictive.items()
+        },
         "prior_predictive": {name: each[None] for name, each in before.items()},
         "observed_data": fitted.observed,
     }
@@ -124,8 +135,16 @@ def posterior_tree(fit: Fit) -> DataTree:
         series, drives = [fitted, apart], drives | later
     dims, coords = _dimensions(series, drives, [axis.name for axis in study.drive_axes])
     tree = arviz_base.from_dict(groups, dims=dims, coords=coords, pred_dims=dims, pred_coords=coords)
+    for name in ("log_likelihood", "posterior_predictive"):
+        tree[name].coords["draw"] = np.arange(shape[1])[some]
     _describe(tree, fit, variables, series)
     return tree
+
+
+def _step(draws: tuple[int, ...], samples: int) -> int:
+    """Every so many draws of (chains, draws) are kept of what has one number for each sample."""
+    fits = max(_CELLS // max(samples, 1), _FEWEST)
+    return max(1, min(prod(draws) // fits, draws[1]))
 
 
 def _dimensions(

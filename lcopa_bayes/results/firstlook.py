@@ -157,22 +157,22 @@ def first_look(study: Study) -> FirstLook:
 
 
 def searched(
-    study: Study, smaller: tuple[Posterior, Optimum] | None = None
+    study: Study, others: Sequence[tuple[Posterior, Optimum]] = ()
 ) -> tuple[Problem, tuple[Optimum, ...]]:
     """A study prepared for inference and its least-squares optima, best first; InputError as `first_look`.
 
-    The optimum of a `smaller` model with its posterior is looked at too, with what that model lacks added in
-    a few ways: a richer model is no less likely.
+    Of `others`, posteriors with their optima, the first that the study's model contains is looked at too,
+    with what it lacks added in a few ways: a richer model is no less likely.
     """
     refuse_if(unmet(study))
     problem = problem_of(study)
-    near: Sequence[Vector] = ()
-    if smaller is not None:
-        source, optimum = smaller
-        rng = np.random.default_rng([study.seed, _STREAM, 1])
-        added = lifted(np.tile(optimum.values, (_ADDED, 1)), source, problem.posterior, rng)
-        near = () if added is None else list(added)
-    optima = optima_of(problem, near=near)
+    rng = np.random.default_rng([study.seed, _STREAM, 1])
+    lifts = (
+        lifted(np.tile(optimum.values, (_ADDED, 1)), source, problem.posterior, rng)
+        for source, optimum in others
+    )
+    near = next((added for added in lifts if added is not None), ())
+    optima = optima_of(problem, near=list(near))
     if not optima:
         raise InputError(
             f"{study.name}: no least-squares search leads to a plant inside the priors; widen them or "

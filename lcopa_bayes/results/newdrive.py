@@ -246,7 +246,7 @@ def _unmeasured(problem: Problem, draws: Draws, drive: Drive, level: Level) -> t
     times = _times(drive, scales.span, scales.period)
     gaps = np.concatenate(([1.0], np.diff(times) / scales.period))
     model = problem.driven(drive, times)
-    values, plant = plant_draws(draws, model)
+    values, plant = plant_draws(draws, model, study.seed)
     noise, out = problem.posterior.noise, []
     rng, alike = named_rng(study.seed, drive.name), fitted.resting_at(drive.drive[0])
     apart = disturbances(draws.table, model, values, plant, rng)

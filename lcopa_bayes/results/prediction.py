@@ -19,6 +19,7 @@ from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.simulation import Simulation
 from lcopa_bayes.model.forward import ForwardModel, deflections
 from lcopa_bayes.results.bands import LEVELS, POINTWISE, Bands, named
+from lcopa_bayes.results.responsesurface import surfaced
 from lcopa_bayes.sampling.draws import Draws
 
 _CELLS = 2_000_000
@@ -160,7 +161,7 @@ def axis_draws(
     as `offset_draws` gives it; random numbers for what else is drawn."""
     for r, record in enumerate(samples):
         rng, alone = named_rng(seed, record.record.name), model.only(r)
-        values, plant = plant_draws(draws, alone)
+        values, plant = plant_draws(draws, alone, seed)
         apart = disturbances(draws.table, alone, values, plant, rng) if held_out else None
         for axis, observed in enumerate(record.axes):
             if observed.values.size == 0:
@@ -188,14 +189,21 @@ def named_rng(seed: int, name: str) -> np.random.Generator:
     return np.random.default_rng([seed, 2, *name.encode()])
 
 
-def plant_draws(draws: Draws, model: ForwardModel) -> tuple[Matrix, Array]:
+def plant_draws(draws: Draws, model: ForwardModel, seed: int) -> tuple[Matrix, Array]:
     """Table values behind the bands of a model's one experiment, (draws, rows), and the plant's responses
-    without offsets, (axes, draws, samples) [response unit]."""
+    without offsets, (axes, draws, samples) [response unit]; with effects as `surfaced` gives them."""
     size = model.experiments[0].mesh.reading.samples
     most = max(_FEWEST, _CELLS // size)
     values = draws.thinned(most if model.effects is None else min(most, _WITH_EFFECTS))
-    parts = np.array_split(values, max(1, values.shape[0] * size // _CELLS * 4))
-    return values, np.concatenate([responses(draws.table, model, part)[0] for part in parts], axis=1)
+
+    def simulated(own: Matrix) -> Array:
+        parts = np.array_split(own, max(1, own.shape[0] * size // _CELLS * 4))
+        return np.concatenate([responses(draws.table, model, part)[0] for part in parts], axis=1)
+
+    if model.effects is None:
+        return values, simulated(values)
+    moving = [k for k, row in enumerate(draws.table.rows) if not row.noise and row.kind != "offset"]
+    return values, surfaced(simulated, values, values[:, moving], np.random.default_rng(seed))
 
 
 def band_of(

@@ -1,15 +1,15 @@
 """How many terms a plant has and what its paths share, where a study leaves that to its records.
 
-Structures are looked at by least squares: the fewest terms per element, then one more, until a further one is
-not worth its parameters; then an element, and a delay, of its own for every path. The best by BIC is fitted
-(Schwarz 1978, Ann. Statist. 6): Laplace's approximation of the evidence needs a mode that is close to a
-normal distribution, which that of a plant with a term too many is not. What other structures leave open of a
-number is a question for `compare`, which samples them.
+Structures are looked at by least squares, from the fewest terms per element on: those beside the best so far,
+which differ from it in an element, or a delay, of its own for every path, or by one term, until none of them
+is better. The best by BIC is fitted (Schwarz 1978, Ann. Statist. 6): Laplace's approximation of the evidence
+needs a mode that is close to a normal distribution, which that of a plant with a term too many is not. What
+other structures leave open of a number is a question for `compare`, which samples them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import log
@@ -17,6 +17,7 @@ from typing import Any, final
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import attributes, plain
+from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, table_of
 from lcopa_bayes.inference.defaultpriors import Scales
@@ -27,8 +28,6 @@ from lcopa_bayes.results.firstlook import FirstLook, look_at, searched
 
 _MOST = 4
 """Most terms that are looked at."""
-_SHARING: tuple[Mapping[str, str], ...] = ({"share": "none"}, {"delay": "path"})
-"""What is asked of a plant with several paths: an element for each of them, a delay for each of them."""
 
 
 @final
@@ -114,19 +113,30 @@ def structure_of(study: Study) -> Structure | None:
         return None
     least = with_least_terms(study)
     looked = [Looked(*searched(least))]
-    for terms in range(least.model.most_terms + 1, _MOST + 1):
-        more = _if_possible(least, looked[-1], terms=terms)
-        if more is None:
-            break
-        looked.append(more)
-        if Structure(tuple(looked)).chosen is not more:
-            break
-    for variant in _SHARING if len(study.drive_axes) * len(study.response_axes) > 1 else ():
-        best = Structure(tuple(looked)).chosen
-        more = _if_possible(best.study, best, **variant)
-        if more is not None and more.study.model != best.study.model:
+    tried = [least.model]
+    while True:
+        best = Structure(tuple(looked)).chosen.study.model
+        model = next((one for one in _beside(best, least) if one not in tried), None)
+        if model is None:
+            return Structure(tuple(looked))
+        tried.append(model)
+        more = _if_possible(replace(least, model=model), looked)
+        if more is not None:
             looked.append(more)
-    return Structure(tuple(looked))
+
+
+def _beside(model: ModelSettings, least: Study) -> Iterator[ModelSettings]:
+    """Structures one step from another: more or less is shared than paths do from the start, a term more or
+    less."""
+    own = least.model
+    if len(least.drive_axes) * len(least.response_axes) > 1:
+        yield replace(model, share="none" if model.share == own.share else own.share)
+        yield replace(model, delay="path" if model.delay == own.delay else own.delay)
+    terms = model.most_terms
+    if terms < _MOST:
+        yield replace(model, terms=terms + 1)
+    if terms > own.most_terms:
+        yield replace(model, terms=terms - 1)
 
 
 def settled(study: Study) -> Study:
@@ -160,10 +170,10 @@ def _table(study: Study) -> ParameterTable:
     return table_of(study, layout, Scales.of(study.fit))[2]
 
 
-def _if_possible(study: Study, smaller: Looked, **model: Any) -> Looked | None:
+def _if_possible(study: Study, looked: Sequence[Looked]) -> Looked | None:
     """None where the records cannot determine so many parameters, or priors are of other parameters."""
+    likeliest = sorted(looked, key=lambda one: one.max_log_likelihood, reverse=True)
     try:
-        wanted = replace(study, model=replace(study.model, **model))
-        return Looked(*searched(wanted, (smaller.problem.posterior, smaller.optima[0])))
+        return Looked(*searched(study, [(one.problem.posterior, one.optima[0]) for one in likeliest]))
     except InputError:
         return None

@@ -8,7 +8,8 @@ they are.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, final
 
 import emcee
@@ -39,6 +40,50 @@ _AT_END = 0.01
 
 @final
 @dataclass(frozen=True, eq=False)
+class LagSearch:
+    """Least squares of sums of lags for some drives of a `lag_problem` on one response axis."""
+
+    problem: Problem
+    axis: int
+    drives: tuple[int, ...]
+    noise: Vector
+    """Its parameters, (names,)."""
+    delays: Matrix
+    """Ends between which delays are uniform, (paths, 2) [time unit]."""
+    near: Matrix
+    """Those between which they are tabulated, (paths, 2) [time unit]."""
+
+    @classmethod
+    def over(
+        cls, problem: Problem, axis: int, drives: Sequence[int], noise: Vector, delays: Matrix
+    ) -> LagSearch:
+        """A search over all delays between their ends (paths, 2) [time unit], and again where they are."""
+        table = lag_table(problem, axis, drives, noise, _nodes(delays, _COARSE))
+        return cls(problem, axis, tuple(drives), noise, delays, _near(table, lag_fits(table), delays))
+
+    @cached_property
+    def table(self) -> LagTable:
+        """Responses of the delays that are tabulated."""
+        return lag_table(self.problem, self.axis, self.drives, self.noise, _nodes(self.near, _FINE))
+
+    @cached_property
+    def fits(self) -> tuple[LagFit, ...]:
+        """The best with each number of lags."""
+        return lag_fits(self.table)
+
+    @property
+    def best(self) -> LagFit:
+        """With the number of lags that is best by BIC."""
+        return best_of(self.fits)
+
+    @property
+    def lags(self) -> int:
+        """Lags of the draws: one more than the best has, where there may be so many."""
+        return min(self.best.lags + 1, MOST)
+
+
+@final
+@dataclass(frozen=True, eq=False)
 class LagDraws:
     """Equally probable sums of lags of the paths of one response axis."""
 
@@ -48,8 +93,6 @@ class LagDraws:
     """Theirs, (draws, paths, lags) [response unit / drive unit]."""
     delays: Matrix
     """(draws, paths) [time unit]."""
-    best: LagFit
-    """Least squares with the number of lags that is best by BIC."""
     ess: float
     """Smallest effective sample size of a steady value or delay [draws]."""
 
@@ -67,29 +110,22 @@ class LagDraws:
         return out
 
 
-def lag_draws(
-    problem: Problem, axis: int, drives: Sequence[int], noise: Vector, delays: Matrix, seed: int
-) -> LagDraws:
-    """Draws for one axis of a `lag_problem` and some drives; `delays` (paths, 2) [time unit] are the ends
-    between which delays are uniform."""
+def lag_draws(search: LagSearch, seed: int) -> LagDraws:
+    """Draws about the optima of a search, tabulated farther out where they stand beside an end."""
     rng = np.random.default_rng(seed)
-    table = lag_table(problem, axis, drives, noise, _nodes(delays, _COARSE))
-    near = _near(table, lag_fits(table), delays)
-    while True:
-        table = lag_table(problem, axis, drives, noise, _nodes(near, _FINE))
-        fits = lag_fits(table)
-        best = best_of(fits)
-        chain, ess = _sampled(table, fits, best, rng)
-        wider = _wider(table, chain, near, delays)
-        if (wider == near).all():
-            break
-        near = wider
+    chain, ess = _sampled(search, rng)
+    wider = _wider(search, chain)
+    while (wider != search.near).any():
+        search = replace(search, near=wider)
+        chain, ess = _sampled(search, rng)
+        wider = _wider(search, chain)
     kept = chain.reshape(-1, chain.shape[-1])
     kept = kept[rng.choice(len(kept), min(_KEPT, len(kept)), replace=False)]
-    log_times, own = table.parts(kept)
-    units = [problem.scales.amplitude[axis] / problem.scales.excursion[drive] for drive in drives]
-    weights = table.conditional(kept).draw(rng).reshape(log_times.shape) * np.array(units)[:, None]
-    return LagDraws(np.exp(log_times), weights, own, best, ess)
+    log_times, own = search.table.parts(kept)
+    scales = search.problem.scales
+    units = scales.amplitude[search.axis] / scales.excursion[list(search.drives)]
+    weights = search.table.conditional(kept).draw(rng).reshape(log_times.shape) * units[:, None]
+    return LagDraws(np.exp(log_times), weights, own, ess)
 
 
 def _near(table: LagTable, fits: Sequence[LagFit], delays: Matrix) -> Matrix:
@@ -104,9 +140,10 @@ def _near(table: LagTable, fits: Sequence[LagFit], delays: Matrix) -> Matrix:
     return np.stack([low, np.minimum(places.max(axis=0) + reach, delays[:, 1])], axis=1)
 
 
-def _wider(table: LagTable, chain: Array, near: Matrix, delays: Matrix) -> Matrix:
-    """The same ends, farther out where draws stand beside them."""
-    own, width = chain[..., -table.paths :].reshape(-1, table.paths), near[:, 1] - near[:, 0]
+def _wider(search: LagSearch, chain: Array) -> Matrix:
+    """The ends of the tabulated delays, farther out where draws stand beside them."""
+    near, delays, paths = search.near, search.delays, len(search.drives)
+    own, width = chain[..., -paths:].reshape(-1, paths), near[:, 1] - near[:, 0]
     edge = width / (_FINE - 1)
     below = (own < near[:, 0] + edge).mean(axis=0) > _AT_END
     above = (own > near[:, 1] - edge).mean(axis=0) > _AT_END
@@ -114,12 +151,10 @@ def _wider(table: LagTable, chain: Array, near: Matrix, delays: Matrix) -> Matri
     return np.stack([low, np.where(above, np.minimum(near[:, 1] + width, delays[:, 1]), near[:, 1])], axis=1)
 
 
-def _sampled(
-    table: LagTable, fits: Sequence[LagFit], best: LagFit, rng: np.random.Generator
-) -> tuple[Array, float]:
-    """Coordinates with a lag more than the best, (walkers, draws, dimension), and their effective number."""
-    lags = min(best.lags + 1, MOST)
-    position = _begun(table, fits[lags - 1], best, lags, rng)
+def _sampled(search: LagSearch, rng: np.random.Generator) -> tuple[Array, float]:
+    """Coordinates of draws, (walkers, draws, dimension), and their effective number."""
+    table = search.table
+    position = _begun(search, rng)
     moves = [(emcee.moves.DEMove(), 0.8), (emcee.moves.StretchMove(), 0.2)]
     sampler = emcee.EnsembleSampler(*position.shape, table.log_density, vectorize=True, moves=moves)
     state = emcee.State(position, random_state=np.random.RandomState(rng.integers(2**32)).get_state())
@@ -145,8 +180,10 @@ def _ess(table: LagTable, chain: Array) -> float:
     return float(min(stats.ess(values[..., k], chain_axis=0, draw_axis=1) for k in range(values.shape[2])))
 
 
-def _begun(table: LagTable, richer: LagFit, best: LagFit, lags: int, rng: np.random.Generator) -> Matrix:
+def _begun(search: LagSearch, rng: np.random.Generator) -> Matrix:
     """Walkers, (walkers, dimension): half near the optimum of so many lags, half with one lag anywhere."""
+    table, best, lags = search.table, search.best, search.lags
+    richer = search.fits[lags - 1]
     low, high = table.ends(lags)
     count = max(_WALKERS, 4 * low.size)
     root = root_of(richer.covariance)

@@ -1,19 +1,21 @@
 """What `fit` and `loop` say of every measured record: one table.
 
-    python studies/measured/records.py [--records FOLDER] [--only NAME ...] [--jobs N] [--out FOLDER]
+    python studies/measured/records.py [--records FOLDER] [--only NAME ...] [--jobs N] [--limit SECONDS]
+        [--out FOLDER]
 
 Every folder of records is fitted and looped with the study file it comes with, the structure left to the
 records where that file does not state it. Finished rows are kept in the folder: a killed run goes on where it
-stopped, and a row that ended in an error says so.
+stopped, and a row that ended in an error, or not within the limit, says so.
 """
 
 import argparse
 import json
 import os
+import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.files import writable_folder, write_text
@@ -66,14 +68,20 @@ def looped(folder: Path) -> dict[str, Any]:
 ACTIONS: dict[str, Callable[[Path], dict[str, Any]]] = {"fit": fitted, "loop": looped}
 
 
-def perform(folder: str, verb: str) -> dict[str, Any]:
-    """One verb on one record, with its time; an InputError is its result."""
+def perform(folder: str, verb: str, limit: int) -> dict[str, Any]:
+    """One verb on one record, with its time; an InputError is its result, and so is `limit` [s]."""
     began, cpu = time.perf_counter(), time.process_time()
     row: dict[str, Any] = {"record": Path(folder).name, "verb": verb}
+    signal.signal(signal.SIGALRM, _too_long)
+    signal.alarm(limit)
     try:
         row |= ACTIONS[verb](Path(folder))
     except InputError as error:
         row["refused"] = str(error)
+    except TimeoutError:
+        row["refused"] = f"did not end in {limit} s"
+    finally:
+        signal.alarm(0)
     return row | {"seconds": time.perf_counter() - began, "cpu_seconds": time.process_time() - cpu}
 
 
@@ -113,8 +121,12 @@ def _loop_cells(row: dict[str, Any] | None) -> str:
     )
 
 
-def _perform(_: None, task: tuple[str, str]) -> dict[str, Any]:
-    return perform(*task)
+def _too_long(*_: object) -> NoReturn:
+    raise TimeoutError
+
+
+def _perform(limit: int, task: tuple[str, str]) -> dict[str, Any]:
+    return perform(*task, limit)
 
 
 def main() -> None:
@@ -124,6 +136,7 @@ def main() -> None:
     parser.add_argument("--records", type=Path, default=RECORDS)
     parser.add_argument("--only", nargs="*")
     parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--limit", type=int, default=1800)
     parser.add_argument("--out", type=Path, default=Path("reports/measured"))
     options = parser.parse_args()
     folders = sorted(path.parent for path in options.records.glob("*/study.toml"))
@@ -135,7 +148,7 @@ def main() -> None:
         path = kept / f"{Path(folder).name}.{verb}.json"
         if path.exists():
             done[folder, verb] = json.loads(path.read_text(encoding="utf-8"))
-    with workers(None, jobs=options.jobs) as crew:
+    with workers(options.limit, jobs=options.jobs) as crew:
         for row in crew.finished(_perform, [task for task in tasks if task not in done]):
             folder = next(str(path) for path in folders if path.name == row["record"])
             done[folder, row["verb"]] = row

@@ -20,9 +20,9 @@ from lcopa_bayes.effectsearch.heldouteffects import unseen_share
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.noise import axis_noise, repeat_pieces
 from lcopa_bayes.effectsearch.regression import Regression
-from lcopa_bayes.effectsearch.scores import log_scores, risen
+from lcopa_bayes.effectsearch.scores import WIDTH, log_scores, risen
 from lcopa_bayes.effectsearch.summary import drawn, results, words
-from lcopa_bayes.effectsearch.verdict import Findings, decide
+from lcopa_bayes.effectsearch.verdict import COVERED, Findings, Miss, decide
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.defaultpriors import Scales
@@ -301,7 +301,12 @@ FOUND = Findings((), True, 50.0, 3.0, ("a",), (), 48.0, 20.0, "smooth", 1.0, 3.0
         ({}, "explained"),
         ({"alarmed": False}, "clean"),
         ({"alarmed": False, "scatter": 50.0}, "disturbance"),
-        ({"alarmed": False, "scatter": 50.0, "missed": 3.0}, "unexplained"),
+        ({"alarmed": False, "missed": Miss("y", 1.2, 0.9, 0.019)}, "unexplained"),
+        ({"alarmed": False, "missed": Miss("y", 1.0, 0.8, 0.019)}, "unexplained"),
+        ({"alarmed": False, "missed": Miss("y", 1.2, 0.8, 0.021)}, "clean"),
+        ({"alarmed": False, "missed": Miss("y", 1.09, 0.87, 0.001)}, "clean"),
+        ({"alarmed": False, "scatter": 50.0, "missed": Miss("y", 3.0, 0.5, 0.001)}, "unexplained"),
+        ({"missed": Miss("y", 1.0, 0.8, 0.019)}, "partly explained"),
         ({"effects": ()}, "unexplained"),
         ({"disturbances": ("a",)}, "disturbance"),
         ({"remaining": 40.0, "share": 0.5}, "unexplained"),
@@ -319,6 +324,23 @@ FOUND = Findings((), True, 50.0, 3.0, ("a",), (), 48.0, 20.0, "smooth", 1.0, 3.0
 )
 def test_the_verdict_follows_from_what_was_found(change, kind):
     assert decide(replace(FOUND, **change)).kind == kind
+
+
+def test_what_chance_may_explain_is_said_beside_clean():
+    """And takes the firmness of the verdict."""
+    sure = decide(replace(FOUND, alarmed=False))
+    less = decide(replace(FOUND, alarmed=False, missed=Miss("y", 1.2, 0.84, 0.07)))
+    assert (sure.confidence, less.confidence) == ("firm", "tentative")
+    assert "1.20 times the noise and 90 % bands hold 84 % of the samples" in less.sentence
+    assert "probability 0.07" in less.sentence
+    far = decide(replace(FOUND, alarmed=False, reached=8.1))
+    assert (far.kind, far.confidence) == ("clean", "tentative")
+    assert "8.10 times the noise, and chance cannot be told" in far.sentence
+
+
+def test_normal_errors_of_the_largest_size_are_held_as_often_as_bands_must_hold():
+    errors = 1.1 * np.random.default_rng(2).normal(size=200_000)
+    assert np.mean(np.abs(errors) <= WIDTH) == pytest.approx(COVERED, abs=4 * np.sqrt(0.12 / 200_000))
 
 
 def test_the_error_that_has_risen_is_that_of_the_worst_axis(clean):

@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small import record, study
+from small import path, record, study
 
-from lcopa_bayes.bench.command import on_off, staircase
+from lcopa_bayes.bench.command import joint, on_off, staircase
+from lcopa_bayes.bench.device import Device
+from lcopa_bayes.data.record import Axis
 from lcopa_bayes.effectsearch import basefit, basemodel, refits
 from lcopa_bayes.effectsearch.refits import refit
 from lcopa_bayes.effectsearch.regression import Regression
@@ -103,3 +105,29 @@ def test_a_refit_is_at_least_as_likely_as_without_its_effect(base, effect, monke
     assert stuck.optimum.cost > made.before.cost + 10.0
     again = stuck.under(state.whitening)
     assert again.optimum.cost <= again.before.cost + 1e-9
+
+
+APART = Device(
+    (
+        (path(0.8, 2.0, (8.0,), (1.0,)), path(2.5, 5.0, (15.0,), (1.0,))),
+        (path(-0.5, 4.0, (25.0,), (1.0,)), path(0.01, 4.0, (5.0,), (1.0,))),
+    ),
+    (Axis("heater", "%"), Axis("fan", "V")),
+    (Axis("warm", "degC"), Axis("damp", "%")),
+    (25.0, 50.0),
+)
+
+
+def test_a_plant_of_separate_paths_at_rest_is_not_said_to_have_begun_elsewhere():
+    """Before the first change of a drive it rests; paths that share too much make it look otherwise."""
+    command = joint(on_off(40.0, hold=60.0, at=10.2, rest=20.0), on_off(3.0, hold=60.0, at=40.2, rest=1.0))
+    one = record(3, device=APART, command=command, duration=120.0, camera=0.5, noise_sd=0.15)
+    seen = ~np.isnan(one.response).any(axis=1)  # without the early row that states the rest
+    made = study(replace(one, time=one.time[seen], drive=one.drive[seen], response=one.response[seen]))
+    base = basemodel.fitted_base(made, (), as_stated=False, draws=100)
+    assert not base.fit.noise_known
+    assert "before the first row" not in base.sentence
+    assert "an element and a delay of its own" in base.sentence
+    shared = basemodel._based(made)
+    mended = basemodel.started(made, shared.fit)
+    assert mended is not None  # what the shared structure alone would have said

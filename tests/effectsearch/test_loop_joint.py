@@ -14,7 +14,6 @@ from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.effectsearch.basefit import base_fit
 from lcopa_bayes.effectsearch.basemodel import started
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
-from lcopa_bayes.effectsearch.heldouteffects import missed
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.rounds import SINGLE
 from lcopa_bayes.effectsearch.signature import Projection, Scale, Signature
@@ -74,14 +73,6 @@ def test_a_start_level_predicts_records_held_out():
     found = loop(study_of(3.5), library=[], sample=False, quick=True, as_stated=True)
     assert "V of x" in found.enlarged
     assert found.before.unseen[0].rmse == pytest.approx(0.02, rel=0.15)
-
-
-def test_held_out_records_that_only_noise_separates_are_not_missed():
-    found = loop(study_of(3.5), library=[], sample=False, quick=True, as_stated=True)
-    score, state = found.before.unseen[0], found.before.state
-    assert np.isnan(missed(found.study, found.before.fit, [score], state))
-    away = replace(score, predicted=score.predicted + 3 * score.noise_sd)
-    assert missed(found.study, found.before.fit, [away], state) == pytest.approx(np.sqrt(10), rel=0.1)
 
 
 def test_a_bend_is_named_from_a_residual_that_holds_it():

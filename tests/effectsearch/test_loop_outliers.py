@@ -12,7 +12,8 @@ from lcopa_bayes.effectsearch.basefit import base_fit
 from lcopa_bayes.effectsearch.explained import explained_study
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.loop import loop
-from lcopa_bayes.effectsearch.outliers import outlying
+from lcopa_bayes.effectsearch.outliers import outlying, without_outliers
+from lcopa_bayes.effectsearch.scores import Score
 from lcopa_bayes.effectsearch.summary import results
 from lcopa_bayes.effectsearch.verdict import Verdict, beside
 from lcopa_bayes.inference.assembly import problem_of
@@ -96,3 +97,17 @@ def test_outliers_of_held_out_records_are_no_error_of_the_model():
     assert found.outliers is not None
     assert found.verdict.kind == "disturbance"
     assert found.names == ("outliers",)
+
+
+def test_two_models_are_compared_on_the_same_samples():
+    """A sample that is far from its neighbours beside one of them only counts for neither."""
+    rng = np.random.default_rng(4)
+    t, noise = np.arange(200.0), rng.normal(size=200)
+    base = Score("a", "y", "V", True, t, noise, np.zeros(200), np.zeros(200), 1.0, "the fit")
+    before = replace(base, predicted=np.where(t == 50.0, 40.0, 0.0), draws=rng.normal(size=(3, 200)))
+    after = replace(base, predicted=np.where(t == 120.0, 40.0, 0.0))
+    (was,), (now,) = without_outliers([before], [after])
+    np.testing.assert_array_equal(was.time, now.time)
+    assert not {50.0, 120.0} & set(was.time)
+    assert was.draws.shape == (3, was.time.size)
+    assert was.time.size > 180

@@ -34,7 +34,7 @@ def short() -> Fit:
 
 @pytest.fixture(scope="module")
 def over(short: Fit) -> Alternatives:
-    other = alternatives_of(short)
+    other = with_alternatives(short).alternatives
     assert other is not None
     return other
 
@@ -42,7 +42,7 @@ def over(short: Fit) -> Alternatives:
 def test_a_plant_that_records_reject_gives_way_to_the_lags(short: Fit, over: Alternatives) -> None:
     (one,) = over.alternatives
     assert one.support == "lags"
-    assert one.lags.best.lags == len(TIMES)
+    assert one.search.best.lags == len(TIMES)
     numbers = {number.estimate.name: number for number in over.numbers}
     truth = {
         "steady_state[y]": sum(GAINS),
@@ -62,7 +62,7 @@ def test_the_advantage_is_akaikes_criterion_of_two_least_squares(short: Fit, ove
     """Second method: chi-square of the closed form at the optimum of the lags, and of the band's median."""
     (one,) = over.alternatives
     lagged, plant = 0.0, 0.0
-    best = one.lags.best.coordinates
+    best = one.search.best.coordinates
     noise = float(short.draws.column("sigma").mean())
     columns, target = [], []
     for k, made_record in enumerate(short.study.fit):
@@ -99,10 +99,10 @@ def own() -> Fit:
 
 
 def test_where_both_follow_the_records_intervals_are_over_both(own: Fit) -> None:
-    other = alternatives_of(own)
+    fitted = with_alternatives(own)
+    other = fitted.alternatives
     assert other is not None
     (one,) = other.alternatives
-    fitted = with_alternatives(own)
     if one.support == "plant":
         assert other.numbers == ()
         assert fitted.metrics == own.metrics
@@ -116,7 +116,7 @@ def test_where_both_follow_the_records_intervals_are_over_both(own: Fit) -> None
 
 
 def test_a_number_that_moves_limits_its_parameter_alone() -> None:
-    other = alternatives_of(one_term(made(sd=4 * SD)))
+    other = with_alternatives(one_term(made(sd=4 * SD))).alternatives
     assert other is not None
     assert other.alternatives[0].support == "both"
     limitations = other.limitations({"delay[y]": ("delay",), "steady_state[y]": ("gain",)})
@@ -127,7 +127,7 @@ def test_a_number_that_moves_limits_its_parameter_alone() -> None:
 
 def test_without_gaussian_noise_or_a_moving_drive_there_is_none() -> None:
     students = study(record(), noise="student", sampler=QUICK)
-    assert alternatives_of(sampled(students)) is None
+    assert alternatives_of(sampled(students)) == ()
 
 
 def test_a_fit_whose_structure_the_records_chose_shows_them(tmp_path: Path) -> None:

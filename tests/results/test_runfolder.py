@@ -23,6 +23,7 @@ from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.files import save_json, save_table
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.plot.rundata import load_run
+from lcopa_bayes.results import datatree
 from lcopa_bayes.results.datatree import save_tree, variable_names
 from lcopa_bayes.results.fit import Fit, fit
 from lcopa_bayes.results.runfolder import opened
@@ -144,6 +145,21 @@ def test_every_variable_is_compressed_without_loss(fitted, folder):
             for name in node.data_vars:
                 assert stored[f"{group}/{name}"].compression == "gzip"
         assert_array_equal(stored["posterior/gain"], fitted.draws.values[..., 0])
+
+
+def test_long_records_keep_every_kth_draw_of_what_has_a_number_a_sample(fitted, monkeypatch):
+    """The same log likelihoods, at the draws that the coordinate names."""
+    whole = fitted.to_datatree()
+    monkeypatch.setattr(datatree, "_CELLS", 0)
+    monkeypatch.setattr(datatree, "_FEWEST", fitted.draws.flat.shape[0] // 3)
+    some = fitted.to_datatree()
+    where = some["log_likelihood"].coords["draw"].to_numpy()
+    assert some.sizes.get("draw") is None
+    assert where.tolist() == list(range(0, whole["posterior"].sizes["draw"], 3))
+    assert some["posterior_predictive"]["a_y"].shape == some["log_likelihood"]["a_y"].shape
+    expected = whole["log_likelihood"]["a_y"].sel(draw=where)
+    np.testing.assert_array_equal(some["log_likelihood"]["a_y"], expected)
+    assert some["posterior"].sizes == whole["posterior"].sizes
 
 
 def test_log_prior_and_log_likelihood_are_consistent_with_the_density(fitted, folder):

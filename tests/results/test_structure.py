@@ -91,6 +91,33 @@ def test_paths_that_share_no_delay_are_recognised() -> None:
     assert settled(alike).model.delay == "shared"
 
 
+def test_paths_that_share_nothing_are_recognised_before_terms_are_added() -> None:
+    """A second term follows the records better than one that paths share, and is not what made them."""
+    apart = Device(
+        (
+            (path(1.0, 0.3, (1.0,), (1.0,)), path(0.6, 1.5, (3.0,), (1.0,))),
+            (path(0.5, 2.0, (6.0,), (1.0,)), path(1.5, 0.9, (2.0,), (1.0,))),
+        ),
+        (Axis("x", "V"), Axis("y", "V")),
+        (Axis("x", "rad"), Axis("y", "rad")),
+        (0.0, 0.0),
+    )
+    campaign = study(
+        *(
+            record(k, device=apart, command=on_off(to, hold=5.0, at=0.35, rest=(0.0, 0.0)), name=f"r{k}")
+            for k, to in ((1, (1.0, 0.0)), (2, (0.0, 1.0)))
+        ),
+        terms="auto",
+    )
+    structure = structure_of(campaign)
+    assert structure is not None
+    assert structure.chosen.name == "1 term, elements: 4, delays: 4"
+    models = [one.study.model for one in structure.looked]
+    assert all(models.count(model) == 1 for model in models)
+    beside = {one.name for one in structure.looked}
+    assert {"2 terms, elements: 4, delays: 4", "1 term, elements: 2, delays: 4"} <= beside
+
+
 def test_priors_need_terms_and_unknown_ones_are_refused() -> None:
     made = steps(ONE)
     both = replace(made, priors=study(record(), terms=2, priors={"order_2": 0.5}).priors)

@@ -6,24 +6,27 @@ import numpy as np
 import pytest
 from inference.test_lagsum import DELAY, GAINS, SD, lags, made
 
-from lcopa_bayes.inference.lagsum import lag_fits, lag_problem, lag_table
-from lcopa_bayes.sampling.lagdraws import LagDraws, _sampled, lag_draws
+from lcopa_bayes.core.arrays import Matrix
+from lcopa_bayes.inference.lagsum import lag_problem
+from lcopa_bayes.sampling.lagdraws import LagDraws, LagSearch, _sampled, lag_draws
 
 ENDS = np.array([[0.0, 1.0]])
 
 
 def drawn(seed: int = 0) -> LagDraws:
-    return lag_draws(lag_problem(made(seed)), 0, [0], np.array([SD]), ENDS, seed)
+    return lag_draws(searched(seed), seed)
+
+
+def searched(seed: int = 0, ends: Matrix = ENDS) -> LagSearch:
+    return LagSearch.over(lag_problem(made(seed)), 0, [0], np.array([SD]), ends)
 
 
 def test_draws_agree_with_quadrature() -> None:
     """Of one lag and a spare one: three coordinates on a grid."""
-    study = made()
-    problem = lag_problem(study)
-    table = lag_table(problem, 0, [0], np.array([20 * SD]), np.linspace(0.1, 0.9, 33)[None])
-    fits = lag_fits(table)
-    assert min(fits, key=lambda one: one.bic).lags == 1
-    chain, ess = _sampled(table, fits, fits[0], np.random.default_rng(1))
+    search = LagSearch(lag_problem(made()), 0, (0,), np.array([20 * SD]), ENDS, np.array([[0.1, 0.9]]))
+    table = search.table
+    assert search.best.lags == 1
+    chain, ess = _sampled(search, np.random.default_rng(1))
     low, high = table.ends(2)
     axes = [np.linspace(low[k], high[k], 41)[:-1] + (high[k] - low[k]) / 80 for k in range(3)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -57,14 +60,14 @@ def test_intervals_hold_what_made_the_records() -> None:
 
 
 def test_the_same_seed_gives_the_same_draws() -> None:
-    one, two, other = drawn(1), drawn(1), lag_draws(lag_problem(made(1)), 0, [0], np.array([SD]), ENDS, 2)
+    one, two, other = drawn(1), drawn(1), lag_draws(searched(1), 2)
     assert (one.times == two.times).all()
     assert (one.weights == two.weights).all()
     assert not (one.times == other.times).all()
 
 
 def test_a_delay_at_the_end_of_the_first_table_is_followed() -> None:
-    one = lag_draws(lag_problem(made()), 0, [0], np.array([SD]), np.array([[0.0, 4.0]]), 0)
+    one = lag_draws(searched(ends=np.array([[0.0, 4.0]])), 0)
     assert np.median(one.delays) == pytest.approx(DELAY, abs=0.1)
 
 
