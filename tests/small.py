@@ -186,10 +186,11 @@ def same_quantiles(a: Draws, b: Draws) -> bool:
 
 
 def check_page(path: Path) -> str:
-    """The page stands alone: no script, nothing fetched, no duplicate ids."""
+    """The page stands alone: nothing fetched, files of its run folder alone named, no duplicate ids."""
     page = path.read_text(encoding="utf-8")
-    assert "<script" not in page
-    assert not re.search(r'(?:src|href)="(?!#|data:)', page)
+    assert not re.search(r'src="(?!data:)|https?:', page)
+    linked = re.findall(r'href="(?!#|data:)([^"]*)"', page)
+    assert [name for name in linked if not (path.parent / name).is_file()] == []
     ids = re.findall(r'\bid="([^"]+)"', page)
     assert len(ids) == len(set(ids))
     return page

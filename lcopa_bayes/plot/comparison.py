@@ -8,7 +8,6 @@ from typing import Any
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from lcopa_bayes.plot.theme import (
     CYCLE,
@@ -90,7 +89,8 @@ def evidence_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
     panel.set_ylim(bottom=max(1.1 * low, -NEAR) - 3)
     panel.axhline(0.0, color=NOISE, lw=0.7)
     panel.set(xlabel="viscous terms [-]", ylabel="log evidence less the best [nat]")
-    panel.xaxis.set_major_locator(MaxNLocator(integer=True))
-    panel.margins(x=0.15)
+    terms = sorted(beside)
+    panel.set_xticks(terms)
+    panel.set_xlim(terms[0] - 0.5, terms[-1] + 0.5)
     panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure

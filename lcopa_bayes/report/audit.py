@@ -22,8 +22,9 @@ def drawn(folder: Path, values: Mapping[str, Any]) -> Drawings:
         "Line: fall of twice the log likelihood along the profile, its 90 % level dashed, an open side "
         "where the line stays below to the end. Filled: marginal posterior on the scale of the axis."
     )
+    rows = values["parameters"]
     profiles = paged(
-        "profiles", values["parameters"], _PER_FIGURE, lambda part: profiles_figure(part, run), caption
+        "profiles", rows, _PER_FIGURE, lambda part: profiles_figure(part, run), caption, "audit.json"
     )
     return {"profiles": profiles, "spectrum": _spectrum(values["spectrum"]), "pairs": _pairs(values, run)}
 
@@ -35,7 +36,7 @@ def _spectrum(rows: Sequence[Mapping[str, Any]]) -> tuple[Drawing, ...]:
         "Eigenvalues of the Fisher information at the maximum, in prior standard deviations; below 1 the "
         "prior is more informative than the data. Beside each, the parameters of its eigenvector."
     )
-    return (drawing("sloppy_spectrum", spectrum_figure(rows), caption),)
+    return (drawing("sloppy_spectrum", spectrum_figure(rows), caption, data="audit.json"),)
 
 
 def _pairs(results: Mapping[str, Any], run: RunData) -> tuple[Drawing, ...]:
@@ -51,4 +52,4 @@ def _pairs(results: Mapping[str, Any], run: RunData) -> tuple[Drawing, ...]:
     caption = "Draws of parameters that are not identified against the parameters that compensate them." + (
         f" {omitted} more pairs are not drawn." if omitted else ""
     )
-    return (drawing("degenerate_pairs", pairs_figure(shown, run), caption),)
+    return (drawing("degenerate_pairs", pairs_figure(shown, run), caption, data="posterior.nc"),)

@@ -50,7 +50,7 @@ def _evidence(results: Mapping[str, Any]) -> list[Drawing]:
     )
     if below:
         caption += f" Below the figure: {', '.join(below)}."
-    return [drawing("compare_evidence", evidence_figure(rows), caption)]
+    return [drawing("compare_evidence", evidence_figure(rows), caption, data="compare.json")]
 
 
 def _records(results: Mapping[str, Any], curves: Mapping[str, pd.DataFrame]) -> list[Drawing]:
@@ -72,7 +72,8 @@ def _records(results: Mapping[str, Any], curves: Mapping[str, pd.DataFrame]) -> 
                 f"compare_{number:02d}_{record}_{axis}",
                 candidates_figure(results, parts, str(record), str(axis), held=bool(held)),
                 _caption(rows, str(record), str(axis), held=bool(held)),
-                mark="held out" if held else "",
+                "held out" * bool(held),
+                f"candidates/{folder_name(str(results['preferred'] or rows[0]['name']))}/tables/curves.csv",
             )
         )
     return drawings

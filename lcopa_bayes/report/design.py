@@ -22,10 +22,10 @@ def drawn(folder: Path, values: Mapping[str, Any]) -> Drawings:
     """The recommended drive, drives by rank, and precision against bench time of a design."""
     curve, drive = list[Drawing](), list[Drawing]()
     if values["curve"][0]["best"]:
-        curve = [drawing("design_curve", precision_figure(values), _CURVE)]
+        curve = [drawing("design_curve", precision_figure(values), _CURVE, data="design.json")]
     if values["template"] is not None:
         text = "The drive to play next; its rows are in " + str(values["template"]) + "."
         figure = drive_figure(drive_of(load_columns(folder / values["template"], responses=False)))
-        drive = [drawing("design_drive", figure, text)]
+        drive = [drawing("design_drive", figure, text, data=values["template"])]
     ranked = sorted(values["table"], key=lambda row: -(row["factor_over_step"] or 0.0))
     return {"curve": curve, "drive": drive, "ranked": ranked}

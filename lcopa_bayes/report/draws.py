@@ -11,6 +11,7 @@ from lcopa_bayes.plot.draws import (
     corner_figure,
     draw_methods,
     draw_prior,
+    forest_figure,
     marginals,
     ranked,
     traces_figure,
@@ -32,7 +33,7 @@ def pairs(run: RunData) -> Drawings:
         f"lines mark the 5, 50 and 95 % quantiles; each axis spans {100 * MIDDLE:g} % of the draws."
     )
     rest = f" Not shown for lack of space: {', '.join(left_out)}." if left_out else ""
-    return {"pairs": [drawing("corner", corner_figure(run, shown), caption + rest)]}
+    return {"pairs": [drawing("corner", corner_figure(run, shown), caption + rest, data="posterior.nc")]}
 
 
 _PER_FIGURE = 12
@@ -54,9 +55,24 @@ def parameters(run: RunData) -> Drawings:
         "logarithmic, both are densities per natural logarithm of the parameter."
     )
     own = [name for name in dict.fromkeys(density["name"]) if name in run.draws]
+    forest = (
+        "Median and 90 % interval of every free parameter, a panel for each unit; hollow where not graded "
+        "reliable."
+    )
+    shown = forest_figure(run.results["parameters"])
     return {
-        "traces": paged("trace", names, _PER_FIGURE, lambda part: traces_figure(run, part), trace),
-        "priors": paged("priors", own, _PER_FIGURE, lambda part: marginals(run, part, draw_prior), prior),
+        "forest": [drawing("forest", shown, forest, data="tables/parameters.csv")],
+        "traces": paged(
+            "trace", names, _PER_FIGURE, lambda part: traces_figure(run, part), trace, "posterior.nc"
+        ),
+        "priors": paged(
+            "priors",
+            own,
+            _PER_FIGURE,
+            lambda part: marginals(run, part, draw_prior),
+            prior,
+            "tables/prior_density.csv",
+        ),
         "prior_table": run.tables["priors"].to_dict("records"),
     }
 

@@ -15,6 +15,7 @@ NONE = "–"  # noqa: RUF001
 """An entry that is not defined."""
 _MINUS = "−"  # noqa: RUF001
 _HYPHEN = re.compile(r"(?<![\w.)\]-])-(?=\.?\d)")
+_POWER = re.compile(r"(?<![\w.])\d(?:\.\d+)?e[+-]?\d+(?!\w)")
 _NO_SIGN = re.compile(f"{_MINUS}(0(?:\\.0*)?)(?![\\d.])")
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _PLAIN_FROM, _PLAIN_TO = 1e-3, 1e6
@@ -37,7 +38,7 @@ def to_spread(value: float | None, spread: float | None) -> str:
     """
     if value is None or not isfinite(value):
         return NONE
-    if spread is None or not isfinite(spread) or spread <= 0:
+    if spread is None or not isfinite(spread) or spread <= 0 or (value == 0 and spread < _PLAIN_FROM):
         return figures(value)
     places = _place(spread)
     if value != 0 and abs(value) > 1e-6 * spread:
@@ -76,8 +77,16 @@ def with_error(value: float | None, error: float | None, places: int = 2, *, bar
 
 
 def signed(text: str) -> str:
-    """Text with true minus signs before its numbers, and none before a zero."""
-    return _NO_SIGN.sub(r"\1", _HYPHEN.sub(_MINUS, text))
+    """Text with true minus signs before its numbers, and none before a zero; powers of ten are raised."""
+    return _NO_SIGN.sub(r"\1", _HYPHEN.sub(_MINUS, _POWER.sub(_raised, text)))
+
+
+def _raised(found: re.Match[str]) -> str:
+    """A number such as 3.5e-05 with a raised power of ten, or in full where it is of usual size."""
+    mantissa, _, power = found[0].partition("e")
+    if _PLAIN_FROM <= float(found[0]) < _PLAIN_TO:
+        return f"{float(found[0]):g}"
+    return f"{mantissa}×10{str(int(power)).translate(_RAISED)}"  # noqa: RUF001
 
 
 def sentence(clause: str) -> str:

@@ -43,7 +43,8 @@ def _bars(results: Mapping[str, Any]) -> tuple[Drawing, ...]:
         f"Of {len(evidence['classes'])} effects {above} exceed the level that chance reaches (dashed); the "
         f"largest is {top['name']}. Linear below 10 nat, logarithmic above."
     )
-    return (drawing("loop_evidence", effects_figure(listed, evidence["threshold"]), caption),)
+    figure = effects_figure(listed, evidence["threshold"])
+    return (drawing("loop_evidence", figure, caption, data="loop.json"),)
 
 
 def _residuals(results: Mapping[str, Any], curves: Sequence[Mapping[str, Any]]) -> list[Drawing]:
@@ -61,7 +62,7 @@ def _residuals(results: Mapping[str, Any], curves: Sequence[Mapping[str, Any]]) 
         )
         figure = before_after_figure(curve, results["time_unit"])
         stem = f"loop_residual_{number:02d}_{curve['record']}_{curve['axis']}"
-        drawings.append(drawing(stem, figure, caption, "held out" * curve["held_out"]))
+        drawings.append(drawing(stem, figure, caption, "held out" * curve["held_out"], "loop_curves.json"))
     return drawings
 
 
@@ -81,5 +82,6 @@ def _views(views: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[Drawing]:
         caption = (
             f"Before: {before['sentence']}. After: {after['sentence']}. Bars: 90 % intervals of pure noise."
         )
-        drawings.append(drawing(f"loop_view_{number:02d}", view_figure(before, after), caption))
+        figure = view_figure(before, after)
+        drawings.append(drawing(f"loop_view_{number:02d}", figure, caption, data="loop_curves.json"))
     return drawings

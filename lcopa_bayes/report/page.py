@@ -6,9 +6,11 @@ result through the functions of `formatting`. A page needs nothing else; its fig
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib.resources import files
 from itertools import product
 from pathlib import Path
 from typing import Any, TypeAlias, final
@@ -18,13 +20,16 @@ from markupsafe import Markup, escape
 
 from lcopa_bayes.core.files import writable_folder, write_text
 from lcopa_bayes.report import formatting
-from lcopa_bayes.report.svg import Drawing, inlined
+from lcopa_bayes.report.svg import COLOURS, Drawing, inlined
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
 
 Drawings: TypeAlias = Mapping[str, Any]
 """Figures by the name under which a template places them, and what else it shows as it is."""
 _KINDS = ("text", "number", "grade", "code", "interval", "prose")
 """Cells of `text` and `number` stay on one line; those of `interval` and `prose` may wrap."""
+_UNFOLDED = 4
+"""Figures of a series that are shown at once."""
+_CODE = re.compile(r"`([^`\n]+)`")
 _PRINTED = ("figures", "percent", "ends", "sentence", "stopped", "probability")
 """Functions of `formatting` that are filters; a template calls the others."""
 _CALLED = ("interval", "to_spread", "with_error", "NONE", "OPEN")
@@ -61,15 +66,18 @@ class Verdict:
 class Page:
     """What a template puts on a page, in the order it does so."""
 
+    folder: Path
+    """The run folder, whose files a figure may name."""
     titles: list[str] = field(default_factory=list)
     drawings: list[Drawing] = field(default_factory=list)
     _kinds: list[str] = field(default_factory=list)
 
-    def section(self, title: str, caller: Callable[[], str]) -> Markup:
-        """A titled part of the page."""
+    def section(self, title: str, caller: Callable[[], str], folded: bool = False) -> Markup:
+        """A titled part of the page, which may be `folded` until it is asked for."""
         self.titles.append(title)
-        shown = '<section id="{}">\n<h2>{}</h2>\n{}</section>\n'
-        return Markup(shown).format(anchor(title), title, Markup(caller()))
+        shown = '<section id="{}">\n<details{}>\n<summary><h2>{}</h2></summary>\n{}</details>\n</section>\n'
+        state = "" if folded else Markup(" open")
+        return Markup(shown).format(anchor(title), state, title, Markup(caller()))
 
     def p(self, text: str = "", caller: Callable[[], str] | None = None) -> Markup:
         """A paragraph."""
@@ -78,7 +86,8 @@ class Page:
     def table(
         self, rows: Iterable[Any], *heads: str, caption: str = "", caller: Callable[[Any], str]
     ) -> Markup:
-        """A table with a row for each of `rows`, whose `cells` the template gives; nothing without rows.
+        """A table with a row for each of `rows`, whose `cells` the template gives; nothing without rows. Its
+        caption is by default the title of the section.
 
         `heads` are titles, each with the kind of its column behind a colon unless it is `text`.
         """
@@ -92,13 +101,17 @@ class Page:
         if not body:
             return Markup("")
         head = Markup("").join(
-            Markup('<th class="{}">{}</th>').format(kind, title) for title, kind in columns
+            Markup('<th scope="col" class="{}">{}</th>').format(kind, title) for title, kind in columns
         )
         shown = (
-            '<div class="wide">\n<table>\n<thead><tr>{}</tr></thead>\n<tbody>\n{}</tbody>\n</table>\n</div>\n'
+            '<div class="wide" tabindex="0" role="group" aria-label="{}">\n<table>\n'
+            "<caption{}><span>{}</span></caption>\n<thead><tr>{}</tr></thead>\n<tbody>\n{}</tbody>\n"
+            "</table>\n</div>\n"
         )
-        note = Markup('<p class="note">{}</p>\n').format(tied(caption)) if caption else ""
-        return Markup(shown).format(head, Markup("").join(body)) + note
+        hidden = Markup("") if caption else Markup(' class="hidden"')
+        title = self.titles[-1] if self.titles else "Table"
+        name = f"{title}: {columns[0][0]}"
+        return Markup(shown).format(name, hidden, tied(caption or title), head, Markup("").join(body))
 
     def cells(self, *values: object) -> Markup:
         """Cells of a row; a number is printed to three digits, what is undefined as a dash.
@@ -107,27 +120,44 @@ class Page:
         """
         if len(values) != len(self._kinds):
             raise ValueError(f"each row needs {len(self._kinds)} cells; got {values}")
-        return Markup("").join(map(_cell, self._kinds, values))
+        row = Markup("").join(map(_cell, self._kinds, values))
+        return Markup(str(row).replace("<td", '<th scope="row"', 1).replace("</td>", "</th>", 1))
 
     def figures(self, drawings: Iterable[Drawing]) -> Markup:
-        """Figures with their captions."""
-        out = Markup("")
-        for one in drawings:
-            self.drawings.append(one)
-            mark = Markup('<span class="mark">{}</span>').format(one.mark) if one.mark else ""
-            shown = (
-                '<figure>\n<div class="wide" role="img" aria-label="{}">{}</div>\n'
-                "<figcaption>{}{}</figcaption>\n</figure>\n"
-            )
-            svg = Markup(inlined(one.svg, file_stem(one)))
-            out += Markup(shown).format(one.caption, svg, mark, tied(one.caption))
+        """Figures with their captions; of many alike all but the first few are folded."""
+        shown = [self._figure(one) for one in drawings]
+        first, rest = shown[:_UNFOLDED], shown[_UNFOLDED:]
+        out = Markup("").join(first)
+        if rest:
+            more = "<details>\n<summary>{} more</summary>\n{}</details>\n"
+            out += Markup(more).format(len(rest), Markup("").join(rest))
         return out
+
+    def _figure(self, one: Drawing) -> Markup:
+        self.drawings.append(one)
+        mark = Markup('<span class="mark">{}</span>').format(one.mark) if one.mark else ""
+        data = ""
+        if one.data and (self.folder / one.data).is_file():
+            data = Markup(' <a href="{0}">Numbers: {0}</a>').format(one.data)
+        values = ""
+        if one.series:
+            text = json.dumps(one.series, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+            values = Markup(
+                '<details class="explore">\n<summary>Values and zoom</summary>\n'
+                '<script type="application/json">{}</script>\n</details>\n'
+            ).format(Markup(text))
+        shown = (
+            '<figure>\n<div class="wide" role="img" aria-label="{}">{}</div>\n'
+            "<figcaption>{}{}{}</figcaption>\n{}</figure>\n"
+        )
+        svg = Markup(inlined(one.svg, file_stem(one)))
+        return Markup(shown).format(one.caption, svg, mark, tied(one.caption), data, values)
 
 
 def _cell(kind: str, value: object) -> Markup:
     number = kind == "number" and isinstance(value, float)
     text = formatting.figures(value) if value is None or number else value  # type: ignore[arg-type]
-    if kind in ("number", "interval", "prose"):
+    if kind not in ("code", "grade"):
         text = formatting.signed(str(text))
     return Markup('<td class="{}">{}</td>').format(f"{kind} {text}" if kind == "grade" else kind, text)
 
@@ -145,7 +175,18 @@ def anchor(title: str) -> str:
 def tied(text: str) -> Markup:
     """A paragraph with true minus signs, without line breaks in percentages and p-values."""
     words = formatting.signed(re.sub(r"[ \n]+", " ", escape(text)).strip())
-    return Markup(words.replace(" %", "\u00a0%").replace("p = ", "p\u00a0=\u00a0"))
+    words = words.replace(" %", "\u00a0%").replace("p = ", "p\u00a0=\u00a0")
+    return Markup(_CODE.sub(r"<code>\1</code>", words))
+
+
+def equation(lines: Sequence[str]) -> Markup:
+    """Lines of a transfer function with raised exponents."""
+    text = escape(formatting.signed("\n".join(lines)))
+    return Markup(re.sub(r"\^([\d.]+\d)", r"<sup>\1</sup>", str(text)))
+
+
+def _script(name: str) -> Markup:
+    return Markup(files("lcopa_bayes.report").joinpath(name).read_text(encoding="utf-8"))
 
 
 def write_page(
@@ -162,7 +203,7 @@ def write_page(
 
     The template, the package's by its name or a file, sees `values` as `v`, and the figures as `drawn`.
     """
-    page, template = Page(), Path(template)
+    page, template = Page(folder), Path(template)
     environment = Environment(
         loader=ChoiceLoader([FileSystemLoader(template.parent), PackageLoader("lcopa_bayes.report", ".")]),
         autoescape=True,
@@ -172,6 +213,7 @@ def write_page(
     )
     environment.filters |= {key: getattr(formatting, key) for key in _PRINTED} | {
         "anchor": anchor,
+        "equation": equation,
         "tied": tied,
     }
     environment.globals |= {key: getattr(formatting, key) for key in _CALLED}
@@ -180,12 +222,21 @@ def write_page(
     environment.globals |= {"POINTWISE": POINTWISE, "SIMULTANEOUS": SIMULTANEOUS}
     body = environment.get_template(template.name).render(v=values, drawn=drawn)
     whole = environment.get_template("page.html")
-    text = whole.render(title=title, titles=page.titles, body=Markup(body), verdict=verdict) + "\n"
+    explored = any(one.series for one in page.drawings)
+    text = whole.render(
+        title=title,
+        titles=page.titles,
+        body=Markup(body),
+        verdict=verdict,
+        colours=COLOURS,
+        styles=[_script("page.css"), *([_script("uplot.css")] if explored else [])],
+        scripts=[_script("page.js"), *(map(_script, ("uplot.js", "explore.js")) if explored else [])],
+    )
     figures = writable_folder(folder / "figures")
     for drawing in page.drawings:
         write_text(figures / f"{file_stem(drawing)}.svg", drawing.svg)
     path = folder / (name or template.name)
-    write_text(path, text)
+    write_text(path, f"{text}\n")
     return path
 
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
+from lcopa_bayes.core.arrays import Index, Vector
 from lcopa_bayes.plot.records import residual_figure, response_figure
 from lcopa_bayes.plot.rundata import RunData
-from lcopa_bayes.plot.theme import extremes_note
+from lcopa_bayes.plot.theme import extremes, extremes_note, label
 from lcopa_bayes.report.formatting import figures, percent, probability
 from lcopa_bayes.report.page import Drawings
 from lcopa_bayes.report.svg import drawing
@@ -32,16 +34,60 @@ def drawn(run: RunData) -> Drawings:
         score = scores.get((record, axis, held), {})
         caption = _described(score, record, axis, len(rows), held=held) + _before(run, rows, record)
         figure = response_figure(run, record, axis)
-        data.append(drawing(f"data_{number:02d}_{record}_{axis}", figure, caption, "held out" * held))
+        drives = run.tables["drives"]
+        series = explored(rows, drives[drives["record"] == record], run.time_unit)
+        stem = f"data_{number:02d}_{record}_{axis}"
+        data.append(drawing(stem, figure, caption, "held out" * held, "tables/bands.csv", series))
     for number, (record, axis) in enumerate(run.records("residuals"), start=1):
         rows = run.part("residuals", record, axis)
         held = bool(rows["held_out"].iloc[0])
         caption = _tested(run, record, axis, len(rows), held=held)
         figure = residual_figure(run, record, axis)
-        residuals.append(
-            drawing(f"residuals_{number:02d}_{record}_{axis}", figure, caption, "held out" * held)
-        )
+        stem = f"residuals_{number:02d}_{record}_{axis}"
+        residuals.append(drawing(stem, figure, caption, "held out" * held, "tables/residuals.csv"))
     return {"data": data, "residuals": residuals}
+
+
+def explored(rows: pd.DataFrame, drives: pd.DataFrame, time_unit: str) -> dict[str, Any]:
+    """Panels over time whose values a page shows: a response with its median and 90 % band with noise, what
+    the median leaves of it, and the drives of its record."""
+    seen, middle = rows["observed"].to_numpy(), rows[f"plant_{POINTWISE}_50"].to_numpy()
+    low, high = (rows[f"noisy_{POINTWISE}_{q}"].to_numpy() for q in ("05", "95"))
+    at, unit = extremes(seen, middle), str(rows["unit"].iloc[0])
+    measured = bool(np.isfinite(seen).any())
+    response = [
+        *([("observed", "points", "--ink", seen)] if measured else []),
+        ("median", "line", "--band", middle),
+        ("5 %", "band", "--band", low),
+        ("95 %", "band", "--band", high),
+    ]
+    time = rows["time"].to_numpy()
+    panels = [_panel(label(str(rows["axis"].iloc[0]), unit), time, at, response)]
+    if measured:
+        left = [("residual", "points", "--ink", seen - middle)]
+        panels.append(_panel(label("residual", unit), time, at, left))
+    for (axis, of), own in drives.groupby(["axis", "unit"], sort=False):
+        values = own["drive"].to_numpy()
+        drive = [(str(axis), "steps", "--held", values)]
+        panels.append(
+            _panel(label(f"drive {axis}", str(of)), own["time"].to_numpy(), extremes(values), drive)
+        )
+    return {"time": label("time", time_unit), "panels": panels}
+
+
+def _panel(
+    title: str, time: Vector, at: Index, curves: Sequence[tuple[str, str, str, Vector]]
+) -> dict[str, Any]:
+    """One of them, at some positions: name, kind, colour and values of each curve."""
+
+    def short(values: Vector, digits: int) -> list[float | None]:
+        return [float(f"{one:.{digits}g}") if np.isfinite(one) else None for one in values[at]]
+
+    series = [
+        {"label": name, "kind": kind, "colour": colour, "values": short(values, 5)}
+        for name, kind, colour, values in curves
+    ]
+    return {"title": title, "time": short(time, 8), "series": series}
 
 
 def _described(score: Mapping[str, Any], record: str, axis: str, size: int, *, held: bool) -> str:

@@ -39,9 +39,21 @@ def drawn(run: RunData) -> Drawings:
         "two sampling periods."
     )
     return {
-        "steps": paged("step", paths, _STEPS_PER_FIGURE, lambda part: steps_figure(run, part), steps),
+        "steps": paged(
+            "step",
+            paths,
+            _STEPS_PER_FIGURE,
+            lambda part: steps_figure(run, part),
+            steps,
+            "tables/step_response.csv",
+        ),
         "frequency": paged(
-            "frequency", answered, _BODE_PER_FIGURE, lambda part: bode_figure(run, part), frequency
+            "frequency",
+            answered,
+            _BODE_PER_FIGURE,
+            lambda part: bode_figure(run, part),
+            frequency,
+            "tables/frequency_response.csv",
         ),
         "metrics": [_metric(row) for row in run.results["step_metrics"]],
     }

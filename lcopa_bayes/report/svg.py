@@ -4,16 +4,29 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar, final
+from typing import Any, TypeVar, final
 
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
+from lcopa_bayes.plot.theme import BAND, HELD_OUT, INK, NOISE
+
 T = TypeVar("T")
 _COORDINATES = re.compile(r'\s(?:d|x|y)="[^"]*"')
 _LONG_DECIMALS = re.compile(r"(\.\d\d)\d+")
+COLOURS = {
+    INK: ("ink", "#e6e6e6"),
+    BAND: ("band", "#56b4e9"),
+    HELD_OUT: ("held", "#ff9a5c"),
+    NOISE: ("noise", "#a0a0a0"),
+    "#000000": ("black", "#ffffff"),
+    "#ffffff": ("paper", "#15181c"),
+    "#009e73": ("green", "#2fc79a"),
+    "#7a6a00": ("olive", "#c9b53a"),
+}
+"""Colours of figures that a page replaces by a variable: its name and what it is on a dark ground."""
 _NO_METADATA = dict.fromkeys(("Date", "Creator", "Format", "Type"))
 
 
@@ -31,6 +44,8 @@ def inlined(svg: str, prefix: str) -> str:
     element = svg[svg.index("<svg") :]
     element = re.sub(r'\sxmlns(:\w+)?="[^"]*"', "", element)
     element = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", element, flags=re.DOTALL)
+    for colour, (name, _) in COLOURS.items():
+        element = element.replace(colour, f"var(--{name})")
     element = re.sub(r'\bid="', f'id="{prefix}-', element)
     element = element.replace('href="#', f'href="#{prefix}-').replace("url(#", f"url(#{prefix}-")
     return element.strip()
@@ -46,16 +61,34 @@ class Drawing:
     caption: str
     mark: str = ""
     """A word set before the caption that must not be overlooked, such as "held out"."""
+    data: str = ""
+    """File of the run folder with the numbers that are drawn."""
+    series: Mapping[str, Any] | None = None
+    """Curves whose values the page shows under the cursor, in panels over time."""
 
 
-def drawing(stem: str, figure: Figure, caption: str, mark: str = "") -> Drawing:
+def drawing(
+    stem: str,
+    figure: Figure,
+    caption: str,
+    mark: str = "",
+    data: str = "",
+    series: Mapping[str, Any] | None = None,
+) -> Drawing:
     """A figure as a drawing."""
-    return Drawing(stem, svg_of(figure), caption, mark)
+    return Drawing(stem, svg_of(figure), caption, mark, data, series)
 
 
 def paged(
-    stem: str, names: Sequence[T], most: int, draw: Callable[[Sequence[T]], Figure], caption: str
+    stem: str,
+    names: Sequence[T],
+    most: int,
+    draw: Callable[[Sequence[T]], Figure],
+    caption: str,
+    data: str = "",
 ) -> tuple[Drawing, ...]:
     """Figures `<stem>_01` and so on, each of up to `most` of the `names`, as `draw` gives them."""
     parts = [names[k : k + most] for k in range(0, len(names), most)]
-    return tuple(drawing(f"{stem}_{k:02d}", draw(part), caption) for k, part in enumerate(parts, start=1))
+    return tuple(
+        drawing(f"{stem}_{k:02d}", draw(part), caption, data=data) for k, part in enumerate(parts, start=1)
+    )
