@@ -47,7 +47,7 @@ def save_chain(path: Path, chain: Chain, fingerprint: str) -> None:
                 for name in _ARRAYS:
                     group.create_dataset(name, data=getattr(ensemble, name))
                 group.attrs["steps"] = ensemble.steps
-                group.attrs["way"] = ensemble.tempering_moves
+                group.attrs["way"], group.attrs["near"] = ensemble.tempering_moves, ensemble.near
                 kind, keys, position, has_gauss, gauss = ensemble.random
                 group.attrs["random_kind"] = kind
                 group.create_dataset("random_keys", data=keys)
@@ -137,9 +137,8 @@ def _ensemble(group: h5py.Group) -> Ensemble:
     at, has_gauss, gauss = group.attrs["random_rest"]
     random = (group.attrs["random_kind"], group["random_keys"][()], int(at), int(has_gauss), float(gauss))
     steps, tempering_moves = int(group.attrs["steps"]), int(group.attrs["way"])
-    ensemble = Ensemble(
-        chain, log_density, position, position_log_density, accepted, steps, random, trail, tempering_moves
-    )
+    begun = trail, tempering_moves, bool(group.attrs["near"])
+    ensemble = Ensemble(chain, log_density, position, position_log_density, accepted, steps, random, *begun)
     if group.attrs["digest"] != _digest(ensemble):
         raise ValueError(f"{group.name} is not what was written")
     return ensemble
@@ -148,7 +147,7 @@ def _ensemble(group: h5py.Group) -> Ensemble:
 def _digest(ensemble: Ensemble) -> str:
     """Hash of all that an ensemble holds."""
     kind, keys, *rest = ensemble.random
-    numbers = [float(number) for number in (*rest, ensemble.steps, ensemble.tempering_moves)]
+    numbers = [float(number) for number in (*rest, ensemble.steps, ensemble.tempering_moves, ensemble.near)]
     held = hashlib.sha256(repr((kind, numbers)).encode())
     for array in (keys, *(getattr(ensemble, name) for name in _ARRAYS)):
         held.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())

@@ -169,7 +169,23 @@ def gather(posterior: Posterior, run: Run) -> Draws:
         ordered,
         run.plan.target_ess,
         multimodal,
-        _unconfirmed(run.unconfirmed),
+        (*_unconfirmed(run.unconfirmed), *_near(run, len(posterior.sampled))),
+    )
+
+
+def _near(run: Run, dimension: int) -> tuple[Limitation, ...]:
+    """Limitation of ensembles that began around optima."""
+    if not any(ensemble.near for ensemble in run.ensembles):
+        return ()
+    return (
+        Limitation(
+            "tentative",
+            f"no search met this posterior of {dimension} sampled parameters: ensembles began around its "
+            f"least-squares optima and ended after {run.ensembles[0].steps} steps, and a mode elsewhere is "
+            "missed",
+            'let [sampler] method = "ensembles" temper them from the prior, which takes hours, or fix '
+            "parameters that the record does not determine",
+        ),
     )
 
 

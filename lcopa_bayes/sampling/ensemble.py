@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, final
 
 import emcee
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.ridgemoves import emcee_sampler
-from lcopa_bayes.sampling.tempering import temper
+from lcopa_bayes.sampling.tempering import surroundings, temper
 
 
 @final
@@ -38,6 +40,8 @@ class Ensemble:
     """Positions of the population on the last part of the tempering path, (points, dimension)."""
     tempering_moves: int
     """Moves of tempering per walker [-]."""
+    near: bool = False
+    """Whether it began around optima, not in the whole prior."""
 
     @classmethod
     def started(
@@ -56,12 +60,15 @@ class Ensemble:
         sweeps: int,
         seed: np.random.SeedSequence,
         seconds: float = np.inf,
+        optima: Sequence[Optimum] = (),
     ) -> Ensemble:
-        """A population tempered from the prior; emcee needs a legacy generator, seeded here and nowhere
-        else; `seconds` as `temper`."""
+        """A population tempered from the prior, or from around `optima`; emcee needs a legacy generator,
+        seeded here and nowhere else; `seconds` as `temper`."""
         draw, moves = seed.spawn(2)
         random = tuple(np.random.RandomState(np.random.MT19937(moves)).get_state())
-        population, random = temper(posterior, walkers, sweeps, np.random.default_rng(draw), random, seconds)
+        rng = np.random.default_rng(draw)
+        near = surroundings(posterior, optima, walkers, rng) if optima else None
+        population, random = temper(posterior, walkers, sweeps, rng, random, seconds, near)
         return cls(
             np.empty((0, walkers, posterior.dimension)),
             np.empty((0, walkers)),
@@ -72,7 +79,17 @@ class Ensemble:
             random,
             population.trail,
             population.moves,
+            near is not None,
         )
+
+    def parted(self, seeds: Sequence[np.random.SeedSequence]) -> tuple[Ensemble, ...]:
+        """Ensembles of parts of its walkers, before any step."""
+        count, out = len(seeds), list[Ensemble]()
+        for k, seed in enumerate(seeds):
+            own = self.position[k::count], self.position_log_density[k::count], self.trail[k::count]
+            begun = Ensemble.started(*own, seed)
+            out.append(replace(begun, tempering_moves=self.tempering_moves, near=self.near))
+        return tuple(out)
 
     @property
     def acceptance(self) -> float:
@@ -106,4 +123,5 @@ def advance(
         tuple(sampler.random_state),
         ensemble.trail,
         ensemble.tempering_moves,
+        ensemble.near,
     )

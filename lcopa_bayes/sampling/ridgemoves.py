@@ -18,7 +18,7 @@ from lcopa_bayes.core.arrays import Flags, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.coordinates import Chart
 from lcopa_bayes.sampling.mixture import Mixture
-from lcopa_bayes.sampling.mixturemoves import MixtureMove, MixtureWalk
+from lcopa_bayes.sampling.mixturemoves import MixtureMove, MixtureWalk, parts
 from lcopa_bayes.sampling.moves import (
     LARGEST_ORDER,
     DifferenceMove,
@@ -204,10 +204,10 @@ def moves(posterior: Posterior, mixture: Mixture | None = None) -> list[tuple[em
     )
     if mixture is None:
         return local
-    chart = Chart.of(posterior)
+    chart, groups = Chart.of(posterior), parts(posterior, mixture)
     return [
-        (MixtureMove(chart, mixture), _ANEW),
-        (MixtureWalk(chart, mixture), _NEARBY),
+        (MixtureMove(chart, groups), _ANEW),
+        (MixtureWalk(chart, groups), _NEARBY),
         *((move, (1 - _ANEW - _NEARBY) * often) for move, often in local),
     ]
 

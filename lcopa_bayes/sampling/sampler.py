@@ -26,7 +26,8 @@ from lcopa_bayes.sampling.learning import due, taught
 from lcopa_bayes.sampling.marginal import Search
 from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.modes import Modes, modes_of
-from lcopa_bayes.sampling.outer import applies
+from lcopa_bayes.sampling.outer import Outer, applies
+from lcopa_bayes.sampling.proposal import weighty
 from lcopa_bayes.sampling.weighted import BATCHES, CHAIN, Weighted
 
 _ROUND = 20
@@ -47,6 +48,15 @@ _TREND = 2.0
 [-]: there chance is the less likely reason, and to go on costs little."""
 _THIN = 5
 """Steps per kept draw unless the study says otherwise."""
+_MAPPED = 13
+"""Most orders, delays and noise parameters that a search is tried on [-]: with more of them, some thousand
+points meet the posterior by chance alone."""
+_NEAR_WALKERS, _NEAR_PER_DIMENSION = 48, 2
+"""Most walkers of an ensemble that begins around optima, or over two per sampled coordinate if these are
+more: they are tempered as one population, by ..."""
+_NEAR_SWEEPS, _NEAR_THIN, _NEAR_ROUNDS = 10, 2, 10
+"""... so many moves at each temperature, and take so many steps per kept draw and rounds at most: few walkers
+that go far, since those that remember their start say nothing."""
 _TRAIL = 1_500
 """Draws per ensemble that the first mixture is learned from, where a search gave them."""
 _DELIVERED = 500
@@ -170,8 +180,9 @@ def sample(
     """Sample a posterior, as the plan allows by importance draws from a search over orders, delays and noise
     (`marginal`). Where their weights do not converge, rounds of emcee go on from the points of the search;
     importance draws around where the walkers have been are tried where a mode filled during them, unless the
-    search came nowhere near the posterior. Populations tempered from the prior begin where it did not, where
-    none is possible, or where the plan asks for ensembles.
+    search came nowhere near the posterior. Where it did not, or cannot for the number of parameters that it
+    maps, a limited number of rounds begins with a population tempered from around the optima. Populations
+    tempered from the prior begin where no search is possible or the plan asks for ensembles.
 
     The draws depend on the arguments alone, not on `jobs` nor on interruptions: with `resume`, a run killed
     at any moment continues from the last complete round in `chain_file`. `starts`, table values (starts,
@@ -195,13 +206,12 @@ def sample(
     if stored.weighted is not None:
         return Run(stored.ensembles, plan, stored.weighted)
     ensembles = stored.ensembles
-    rounds = max(2, -(-plan.steps // (_ROUND * plan.thin)))
-    done = ensembles[0].steps // (_ROUND * plan.thin) if ensembles else 0
     wanted = SURPLUS * plan.target_ess
     searched = plan.method == "auto" and applies(posterior)
     with workers(posterior, jobs=jobs) as crew:
         seeds = np.random.SeedSequence(plan.seed).spawn(plan.ensembles)
-        if not ensembles and searched and known is None:
+        mapped = searched and len(Outer(posterior).columns) <= _MAPPED
+        if not ensembles and mapped and known is None:
             with _points(quiet) as bar:
                 weighted, scouted = None, rough is not None and rough is not posterior
                 if rough is not None and scouted:
@@ -217,14 +227,28 @@ def sample(
                     _store(chain_file, Chain((), weighted), fingerprint)
                 return Run((), plan, weighted, stopped_after=stopped)
             ensembles = _begun(search, plan, seeds)
-        with Progress(total=rounds, initial=done, unit="round", quiet=quiet, desc="from the prior") as bar:
-            ensembles = ensembles or tuple(crew.each(_Birth(plan.walkers, left()), seeds))
-            if not done:
-                _store(chain_file, Chain(ensembles), fingerprint)
-            bar.set_description("sampling")
+        if not ensembles:
+            around_optima = tuple(weighty(optima)) if searched and known is None else ()
+            begun = "from around the optima" if around_optima else "from the prior"
+            with Progress(total=0, unit="ensemble", quiet=quiet, desc=begun):
+                if around_optima:
+                    walkers = max(_NEAR_WALKERS, _NEAR_PER_DIMENSION * posterior.dimension + 2)
+                    birth = _Birth(min(plan.walkers, walkers) * plan.ensembles, left(), around_optima)
+                    (whole,) = crew.each(birth, seeds[:1])
+                    ensembles = whole.parted([seed.spawn(1)[0] for seed in seeds])
+                else:
+                    ensembles = tuple(crew.each(_Birth(plan.walkers, left()), seeds))
+        near = ensembles[0].near
+        thin = min(plan.thin, _NEAR_THIN) if near else plan.thin
+        rounds = max(2, -(-plan.steps // (_ROUND * thin)))
+        rounds = min(rounds, _NEAR_ROUNDS) if near else rounds
+        done = ensembles[0].steps // (_ROUND * thin)
+        if not done:
+            _store(chain_file, Chain(ensembles), fingerprint)
+        with Progress(total=rounds, initial=done, unit="round", quiet=quiet, desc="sampling") as bar:
             mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
             hardest = max(ensemble.tempering_moves for ensemble in ensembles)
-            least = max(_LEAST, round(_AS_LONG * hardest / (_ROUND * plan.thin)))
+            least = max(_LEAST, round(_AS_LONG * hardest / (_ROUND * thin)))
             lasted = 0.0
             while True:
                 run = Run(ensembles, plan)
@@ -233,7 +257,7 @@ def sample(
                     return replace(run, stopped_after=stopped)
                 last = done >= rounds or (done >= least and finished(posterior, run, bar))
                 filling = _filling(posterior, run) if searched and last else ()
-                if filling and (known is not None or not hardest):
+                if filling and mapped and (known is not None or not hardest):
                     with _points(quiet) as beside:
                         search = Search(posterior, plan.seed + done, crew, beside)
                         weighted = search.around(run.visited, wanted)
@@ -245,7 +269,7 @@ def sample(
                 if due(done):
                     mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
                 at = monotonic()
-                ensembles = tuple(crew.each(_Round(plan.thin, mixture), ensembles))
+                ensembles = tuple(crew.each(_Round(thin, mixture), ensembles))
                 done, lasted = done + 1, monotonic() - at
                 _store(chain_file, Chain(ensembles), fingerprint)
                 bar.update()
@@ -354,9 +378,12 @@ class _Birth:
     walkers: int
     seconds: float
     """What is left of the budget [s]."""
+    optima: tuple[Optimum, ...] = ()
+    """Optima that it begins around; none: it begins in the prior."""
 
     def __call__(self, posterior: Posterior, seed: np.random.SeedSequence) -> Ensemble:
-        return Ensemble.tempered(posterior, self.walkers, _SWEEPS, seed, self.seconds)
+        sweeps = _NEAR_SWEEPS if self.optima else _SWEEPS
+        return Ensemble.tempered(posterior, self.walkers, sweeps, seed, self.seconds, self.optima)
 
 
 @final

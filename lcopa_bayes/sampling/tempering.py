@@ -8,6 +8,7 @@ emcee moves that sample the posterior (Del Moral, Doucet and Jasra 2006, J. R. S
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from time import monotonic
 from typing import Any, final
@@ -18,7 +19,9 @@ from scipy.optimize import brentq
 from scipy.special import logsumexp
 
 from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.covariance import root_of
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.convergence import rank_correlation
 from lcopa_bayes.sampling.mixturemoves import learned
@@ -60,17 +63,19 @@ def temper(
     rng: np.random.Generator,
     random: tuple[Any, ...],
     seconds: float = np.inf,
+    near: Matrix | None = None,
 ) -> tuple[Population, tuple[Any, ...]]:
     """A population of the posterior and the state of emcee's generator afterwards.
 
     At each temperature every walker makes moves until the population has lost its correlation with its start,
     at most `sweeps` of them and a third while the temperature is low. `_CROWD` times as many walkers come
     from the prior as are kept; those with a likelihood of 0 are drawn again. After `seconds` the moves at
-    each temperature are the fewest. Deterministic given `rng` and `random` where it takes less. InputError
-    when no draw of the prior has a likelihood above 0.
+    each temperature are the fewest. Points `near` the posterior, sampled coordinates of as many walkers as
+    are kept, may take the place of draws of the prior. Deterministic given `rng` and `random` where it takes
+    less. InputError when none of them has a likelihood above 0.
     """
-    crowd, begin = _CROWD * walkers, monotonic()
-    position = posterior.coordinates(posterior.table.draw(crowd, rng))
+    crowd, begin = _CROWD * walkers if near is None else walkers, monotonic()
+    position = posterior.coordinates(posterior.table.draw(crowd, rng)) if near is None else near
     prior = posterior.log_prior(position)
     likelihood = posterior.log_density(position) - prior
     while (dead := np.isneginf(likelihood)).any():  # where effects leave no bounded response
@@ -90,7 +95,7 @@ def temper(
         state = emcee.State(position, log_prob=prior + heat * likelihood)
         for _ in range(max(1, (sweeps if heat > _WARM else sweeps // 3) // _BLOCK)):
             state = sampler.run_mcmc(state, _BLOCK, skip_initial_state_check=True, store=False)
-            moves += _CROWD * _BLOCK
+            moves += crowd // walkers * _BLOCK
             late = monotonic() - begin > seconds
             if late or _memory(posterior, position, state.coords) <= _TRAVELLED:
                 break
@@ -102,6 +107,24 @@ def temper(
             trail.append(position)
     kept = rng.permutation(crowd)[:walkers]
     return Population(position[kept], (prior + likelihood)[kept], np.concatenate(trail), moves), random
+
+
+def surroundings(
+    posterior: Posterior, optima: Sequence[Optimum], count: int, rng: np.random.Generator
+) -> Matrix:
+    """Points of normal distributions about optima, as many about each, folded at the ends of the prior,
+    (count, dimension): about an optimum in a corner hardly a point would be inside."""
+    ends = [posterior.table.rows[k].sampled_domain for k in posterior.sampled]
+    low, high = np.array(ends).T
+    centres = posterior.coordinates(np.array([one.values for one in optima]))
+    roots = np.array([root_of(one.covariance) for one in optima])
+    chosen = np.arange(count) % len(optima)
+    z = centres[chosen] + np.einsum("nij,nj->ni", roots[chosen], rng.standard_normal((count, low.size)))
+    z = np.where(z < low, 2 * low - z, z)
+    z = np.where(z > high, 2 * high - z, z)
+    outside = ~np.isfinite(posterior.log_prior(z))
+    z[outside] = centres[chosen[outside]]
+    return np.asarray(z)
 
 
 def _memory(posterior: Posterior, before: Matrix, after: Matrix) -> float:

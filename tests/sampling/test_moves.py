@@ -13,8 +13,9 @@ from small import problem, record
 
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.sampling import mixturemoves
 from lcopa_bayes.sampling.mixture import Mixture
-from lcopa_bayes.sampling.mixturemoves import learned
+from lcopa_bayes.sampling.mixturemoves import learned, parts
 from lcopa_bayes.sampling.moves import DifferenceMove, PopulationMove
 from lcopa_bayes.sampling.ridgemoves import moves
 
@@ -126,6 +127,18 @@ def test_a_move_keeps_the_prior_beside_a_population_on_a_ridge(name, seed, monke
     walkers = COSTLY if name.startswith("Mixture") else WALKERS
     end, accepted = moved(made(name), monkeypatch, seed, walkers)
     assert accepted > (0.002 if name == "MixtureMove" else 0.1)
+    found = surprises(end)
+    assert min(found.values()) > 1e-5, (name, found)
+
+
+@pytest.mark.parametrize("name", ["MixtureMove", "MixtureWalk"])
+def test_a_move_in_groups_of_coordinates_keeps_the_prior(name, monkeypatch):
+    monkeypatch.setattr(mixturemoves, "_JOINTLY", 1)
+    every = parts(posterior(), mixture())
+    assert len(every) > 2
+    assert set(np.concatenate([own for own, _ in every])) == set(range(posterior().dimension))
+    end, accepted = moved(made(name), monkeypatch, 5, COSTLY)
+    assert accepted > 0.02
     found = surprises(end)
     assert min(found.values()) > 1e-5, (name, found)
 
