@@ -27,7 +27,7 @@ Drawings: TypeAlias = Mapping[str, Any]
 """Figures by the name under which a template places them, and what else it shows as it is."""
 _KINDS = ("text", "number", "grade", "code", "interval", "prose")
 """Cells of `text` and `number` stay on one line; those of `interval` and `prose` may wrap."""
-_UNFOLDED = 4
+UNFOLDED = 4
 """Figures of a series that are shown at once."""
 _CODE = re.compile(r"`([^`\n]+)`")
 _PRINTED = ("figures", "percent", "ends", "sentence", "stopped", "probability")
@@ -126,7 +126,7 @@ class Page:
     def figures(self, drawings: Iterable[Drawing]) -> Markup:
         """Figures with their captions; of many alike all but the first few are folded."""
         shown = [self._figure(one) for one in drawings]
-        first, rest = shown[:_UNFOLDED], shown[_UNFOLDED:]
+        first, rest = shown[:UNFOLDED], shown[UNFOLDED:]
         out = Markup("").join(first)
         if rest:
             more = "<details>\n<summary>{} more</summary>\n{}</details>\n"

@@ -13,22 +13,22 @@ from lcopa_bayes.plot.records import residual_figure, response_figure
 from lcopa_bayes.plot.rundata import RunData
 from lcopa_bayes.plot.theme import extremes, extremes_note, label
 from lcopa_bayes.report.formatting import figures, percent, probability
-from lcopa_bayes.report.page import Drawings
+from lcopa_bayes.report.page import UNFOLDED, Drawings
 from lcopa_bayes.report.svg import drawing
 from lcopa_bayes.results.bands import POINTWISE
 from lcopa_bayes.results.residuals import WHITE_P
 
 
 def drawn(run: RunData) -> Drawings:
-    """Observed and predicted responses with their drives, fitted records first, and of each the residual with
-    its autocorrelation and spectrum."""
+    """Observed and predicted responses with their drives, and of each the residual with its autocorrelation
+    and spectrum: fitted records first, or of many the worst."""
     scores = {
         (row["record"], row["axis"], held): row
         for key, held in (("fit_scores", False), ("held_out", True))
         for row in run.results[key]
     }
     data, residuals = [], []
-    for number, (record, axis) in enumerate(run.records("bands"), start=1):
+    for number, (record, axis) in enumerate(_worst_first(run, "bands"), start=1):
         rows = run.part("bands", record, axis)
         held = bool(rows["held_out"].iloc[0])
         score = scores.get((record, axis, held), {})
@@ -38,7 +38,7 @@ def drawn(run: RunData) -> Drawings:
         series = explored(rows, drives[drives["record"] == record], run.time_unit)
         stem = f"data_{number:02d}_{record}_{axis}"
         data.append(drawing(stem, figure, caption, "held out" * held, "tables/bands.csv", series))
-    for number, (record, axis) in enumerate(run.records("residuals"), start=1):
+    for number, (record, axis) in enumerate(_worst_first(run, "residuals"), start=1):
         rows = run.part("residuals", record, axis)
         held = bool(rows["held_out"].iloc[0])
         caption = _tested(run, record, axis, len(rows), held=held)
@@ -46,6 +46,17 @@ def drawn(run: RunData) -> Drawings:
         stem = f"residuals_{number:02d}_{record}_{axis}"
         residuals.append(drawing(stem, figure, caption, "held out" * held, "tables/residuals.csv"))
     return {"data": data, "residuals": residuals}
+
+
+def _worst_first(run: RunData, table: str) -> list[tuple[str, str]]:
+    """Record and axis pairs of a table: of more than a page shows at once, the least white residual first."""
+    pairs = run.records(table)
+    white = {(row["record"], row["axis"]): row["p_white"] for row in run.results["residual_tests"]}
+    return (
+        sorted(pairs, key=lambda one: 1.0 if (p := white.get(one)) is None else p)
+        if len(pairs) > UNFOLDED
+        else pairs
+    )
 
 
 def explored(rows: pd.DataFrame, drives: pd.DataFrame, time_unit: str) -> dict[str, Any]:

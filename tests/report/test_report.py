@@ -361,6 +361,19 @@ def test_records_too_short_for_residuals_leave_a_sentence(tmp_path):
     assert "too short" in section_of(write_report(folder).read_text(encoding="utf-8"), "residuals")
 
 
+def test_of_many_records_the_least_white_residual_comes_first_and_others_are_folded(tmp_path, monkeypatch):
+    shares = {"a": 0.5, "b": None, "c": 1e-4, "d": 0.03, "e": 0.9}
+    monkeypatch.setitem(globals(), "RECORDS", tuple((name, False) for name in shares))
+    folder, results = run_folder(tmp_path / "run"), results_of()
+    for test, share in zip(results["residual_tests"], shares.values(), strict=True):
+        test["p_white"] = share
+    (folder / "results.json").write_text(json.dumps(results), encoding="utf-8")
+    drawn = records.drawn(load_run(folder))
+    assert [one.stem[-3:] for one in drawn["residuals"]] == ["c_x", "d_x", "a_x", "e_x", "b_x"]
+    assert [one.stem[-3:] for one in drawn["data"]] == ["c_x", "d_x", "a_x", "e_x", "b_x"]
+    assert "<summary>1 more</summary>" in write_report(folder).read_text(encoding="utf-8")
+
+
 def test_names_that_look_like_numbers_or_nothing_stay_names(tmp_path):
     folder = run_folder(tmp_path / "run")
     for name in ("bands", "drives"):
