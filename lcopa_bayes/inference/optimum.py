@@ -65,7 +65,7 @@ def find_optima(
         return _kept(posterior, _descended(posterior, _near(posterior, effect_starts(posterior, alone, rng))))
     drawn = table.draw(_SCREENED, rng)
     drawn = np.vstack([regressed(posterior, drawn), drawn, *near])
-    for axis, scale in enumerate(_spread(posterior)):
+    for axis, scale in enumerate(spread_of(posterior)):
         for name, value in posterior.noise.nearly_white(0.05 * scale).items():
             if table.rows[table.at(name, axis)].free:
                 drawn[:, table.at(name, axis)] = value
@@ -140,11 +140,11 @@ def _apart(posterior: Posterior, one: Vector, other: Vector) -> float:
     return float((np.abs(first - second) / np.array(sizes)).max(initial=0.0))
 
 
-def _spread(posterior: Posterior) -> list[float]:
+def spread_of(posterior: Posterior) -> list[float]:
     """Standard deviation of each response axis [response unit]."""
     axes = range(len(posterior.table.layout.responses))
     pooled = [np.concatenate([s.axes[axis].values for s in posterior.samples]) for axis in axes]
-    return [float(values.std()) or 1.0 for values in pooled]
+    return [(float(values.std()) if values.size else 0.0) or 1.0 for values in pooled]
 
 
 def _distinct(posterior: Posterior, ranked: Matrix, count: int) -> list[Vector]:

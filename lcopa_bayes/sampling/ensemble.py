@@ -125,3 +125,36 @@ def advance(
         ensemble.tempering_moves,
         ensemble.near,
     )
+
+
+@final
+@dataclass(frozen=True)
+class Birth:
+    """Task: a new ensemble of a seed."""
+
+    walkers: int
+    sweeps: int
+    """Moves per temperature [-]."""
+    seconds: float
+    """What is left of the budget [s]."""
+    optima: tuple[Optimum, ...] = ()
+    """Optima that it begins around; none: it begins in the prior."""
+
+    def __call__(self, posterior: Posterior, seed: np.random.SeedSequence) -> Ensemble:
+        """The ensemble, tempered."""
+        return Ensemble.tempered(posterior, self.walkers, self.sweeps, seed, self.seconds, self.optima)
+
+
+@final
+@dataclass(frozen=True)
+class Round:
+    """Task: an ensemble some steps further."""
+
+    steps: int
+    thin: int
+    """Steps per kept draw [-]."""
+    mixture: Mixture | None
+
+    def __call__(self, posterior: Posterior, ensemble: Ensemble) -> Ensemble:
+        """The ensemble after them."""
+        return advance(posterior, ensemble, self.steps, self.thin, self.mixture)

@@ -61,11 +61,8 @@ def evidence_of(posterior: Posterior, run: Run, ess: float) -> Evidence | None:
     weighted = run.weighted
     if weighted is None:
         return evidence(posterior, run.kept()[0], ess, run.plan.seed)
-    by_batch = [
-        logsumexp(weighted.raw[part]) - np.log(weighted.count / len(weighted.parts))
-        for part in weighted.parts
-    ]
-    return Evidence(weighted.log_evidence, weighted.log_evidence_sd, tuple(map(float, by_batch)))
+    by_batch = tuple(weighted.batch_evidence.tolist())
+    return Evidence(weighted.log_evidence, weighted.log_evidence_sd, by_batch)
 
 
 def evidence(posterior: Posterior, coordinates: Array, ess: float, seed: int) -> Evidence | None:

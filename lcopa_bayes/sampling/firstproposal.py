@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
 from lcopa_bayes.inference.conditional import Conditional
 from lcopa_bayes.inference.leastsquares import LeastSquares
-from lcopa_bayes.inference.optimum import Optimum, again, find_optima
+from lcopa_bayes.inference.optimum import Optimum, again, find_optima, spread_of
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.outer import Optima, Outer, PriorOrders
@@ -113,9 +113,8 @@ def _rest(
 def _nearly_white(posterior: Posterior, values: Matrix) -> Matrix:
     """With noise of a twentieth of the responses' spread where it is free."""
     table, out = posterior.table, values.copy()
-    for axis in range(len(table.layout.responses)):
-        pooled = np.concatenate([samples.axes[axis].values for samples in posterior.samples])
-        for name, value in posterior.noise.nearly_white(0.05 * (float(pooled.std()) or 1.0)).items():
+    for axis, spread in enumerate(spread_of(posterior)):
+        for name, value in posterior.noise.nearly_white(0.05 * spread).items():
             if table.rows[table.at(name, axis)].free:
                 out[:, table.at(name, axis)] = value
     return out

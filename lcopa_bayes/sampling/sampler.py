@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from math import ceil, inf
 from pathlib import Path
 from time import monotonic
@@ -20,14 +20,14 @@ from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.inference.simulation import Simulated
 from lcopa_bayes.sampling.chainfile import Chain, load_chain, save_chain
 from lcopa_bayes.sampling.convergence import CERTAIN, Quality, drifts, qualities
-from lcopa_bayes.sampling.ensemble import Ensemble, advance
+from lcopa_bayes.sampling.ensemble import Birth, Ensemble, Round
 from lcopa_bayes.sampling.knownmodes import around
 from lcopa_bayes.sampling.learning import due, taught
 from lcopa_bayes.sampling.marginal import Search
-from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.modes import Modes, modes_of
 from lcopa_bayes.sampling.outer import Outer, applies
 from lcopa_bayes.sampling.proposal import weighty
+from lcopa_bayes.sampling.separateaxes import by_axis
 from lcopa_bayes.sampling.weighted import BATCHES, CHAIN, Weighted
 
 _ROUND = 20
@@ -89,6 +89,12 @@ class SamplePlan:
     seconds: float | None = None
     """Time after which sampling ends with what it has [s]; None: no limit."""
 
+    @property
+    def delivered(self) -> int:
+        """Resampled importance draws of each batch [-]."""
+        count = max(_DELIVERED, ceil(_PER_WANTED * self.target_ess / BATCHES))
+        return count + -count % CHAIN
+
     @classmethod
     def of(
         cls,
@@ -140,8 +146,7 @@ class Run:
         if self.weighted is None:
             return None
         rng = np.random.default_rng(np.random.SeedSequence(self.plan.seed, spawn_key=(1_001,)))
-        count = max(_DELIVERED, ceil(_PER_WANTED * self.plan.target_ess / BATCHES))
-        return self.weighted.batches(count + -count % CHAIN, rng)
+        return self.weighted.batches(self.plan.delivered, rng)
 
     @property
     def visited(self) -> Matrix:
@@ -206,6 +211,11 @@ def sample(
     if stored.weighted is not None:
         return Run(stored.ensembles, plan, stored.weighted)
     ensembles = stored.ensembles
+    if plan.method == "auto" and known is None and not ensembles:
+        drawn = partial(_of_factor, plan=plan, jobs=jobs, quiet=quiet)
+        separate = by_axis(posterior, optima, drawn, plan.delivered, plan.seed)
+        if separate is not None:
+            return Run((), plan, separate[0], stopped_after=separate[1])
     wanted = SURPLUS * plan.target_ess
     searched = plan.method == "auto" and applies(posterior)
     with workers(posterior, jobs=jobs) as crew:
@@ -233,11 +243,13 @@ def sample(
             with Progress(total=0, unit="ensemble", quiet=quiet, desc=begun):
                 if around_optima:
                     walkers = max(_NEAR_WALKERS, _NEAR_PER_DIMENSION * posterior.dimension + 2)
-                    birth = _Birth(min(plan.walkers, walkers) * plan.ensembles, left(), around_optima)
+                    birth = Birth(
+                        min(plan.walkers, walkers) * plan.ensembles, _NEAR_SWEEPS, left(), around_optima
+                    )
                     (whole,) = crew.each(birth, seeds[:1])
                     ensembles = whole.parted([seed.spawn(1)[0] for seed in seeds])
                 else:
-                    ensembles = tuple(crew.each(_Birth(plan.walkers, left()), seeds))
+                    ensembles = tuple(crew.each(Birth(plan.walkers, _SWEEPS, left()), seeds))
         near = ensembles[0].near
         thin = min(plan.thin, _NEAR_THIN) if near else plan.thin
         rounds = max(2, -(-plan.steps // (_ROUND * thin)))
@@ -269,10 +281,18 @@ def sample(
                 if due(done):
                     mixture = taught(posterior, ensembles, _ROUND, plan.seed, known)
                 at = monotonic()
-                ensembles = tuple(crew.each(_Round(thin, mixture), ensembles))
+                ensembles = tuple(crew.each(Round(_ROUND, thin, mixture), ensembles))
                 done, lasted = done + 1, monotonic() - at
                 _store(chain_file, Chain(ensembles), fingerprint)
                 bar.update()
+
+
+def _of_factor(
+    factor: Posterior, optima: Sequence[Optimum], seed: int, *, plan: SamplePlan, jobs: int, quiet: bool
+) -> tuple[Weighted | None, float | None]:
+    """Importance draws of a factor of a posterior, and the time after which its budget ended them [s]."""
+    run = sample(factor, replace(plan, seed=seed), jobs=jobs, quiet=quiet, optima=optima)
+    return run.weighted, run.stopped_after
 
 
 def _points(quiet: bool) -> Progress:
@@ -368,31 +388,3 @@ def _sampled_values(posterior: Posterior, run: Run, *, kept: bool = True) -> Arr
     coordinates = run.kept()[0] if kept else np.stack(chains).swapaxes(1, 2)
     values = posterior.values(coordinates.reshape(-1, coordinates.shape[-1]))[:, posterior.sampled]
     return values.reshape(*coordinates.shape[:3], -1)
-
-
-@final
-@dataclass(frozen=True)
-class _Birth:
-    """Task: a new ensemble of a seed."""
-
-    walkers: int
-    seconds: float
-    """What is left of the budget [s]."""
-    optima: tuple[Optimum, ...] = ()
-    """Optima that it begins around; none: it begins in the prior."""
-
-    def __call__(self, posterior: Posterior, seed: np.random.SeedSequence) -> Ensemble:
-        sweeps = _NEAR_SWEEPS if self.optima else _SWEEPS
-        return Ensemble.tempered(posterior, self.walkers, sweeps, seed, self.seconds, self.optima)
-
-
-@final
-@dataclass(frozen=True)
-class _Round:
-    """Task: an ensemble one round further."""
-
-    thin: int
-    mixture: Mixture | None
-
-    def __call__(self, posterior: Posterior, ensemble: Ensemble) -> Ensemble:
-        return advance(posterior, ensemble, _ROUND, self.thin, self.mixture)

@@ -54,6 +54,9 @@ class Weighted:
     """Values of the sampled parameters, (draws, parameters)."""
     logarithmic: tuple[bool, ...]
     """Whether modes of a sampled parameter are looked for in its logarithm."""
+    factors: tuple[tuple[Weighted, Index], ...] = ()
+    """Of draws of a product: those of its factors, whose accuracies hold, and which sampled parameters each
+    of them has."""
 
     @classmethod
     def of(
@@ -102,14 +105,53 @@ class Weighted:
         drawn = cls.of(posterior, coordinates, log_density, raw, len(raw), smooth=False)
         return replace(drawn, log_evidence_sd=sd)
 
+    @classmethod
+    def product(
+        cls,
+        posterior: Posterior,
+        coordinates: Matrix,
+        log_density: Vector,
+        raw: Vector,
+        factors: tuple[tuple[Weighted, Index], ...],
+    ) -> Weighted:
+        """Draws (draws, dimension) of equal weight of a product of factors; `raw`, (draws,), is the log
+        evidence of the batch that each is in [nat]."""
+        drawn = cls.of(posterior, coordinates, log_density, np.zeros(len(raw)), len(raw), smooth=False)
+        parts = [one for one, _ in factors]
+        return replace(
+            drawn,
+            raw=raw,
+            pareto_k=max(one.pareto_k for one in parts),
+            log_evidence=sum(one.log_evidence for one in parts),
+            log_evidence_sd=float(np.hypot.reduce([one.log_evidence_sd for one in parts])),
+            factors=factors,
+        )
+
+    @property
+    def batch_evidence(self) -> Vector:
+        """Log evidence by the draws of each batch, (batches,) [nat]."""
+        size = self.count / BATCHES
+        return np.array([logsumexp(self.raw[part]) - np.log(size) for part in self.parts])
+
+    def _of_factors(self, name: str) -> Vector:
+        """A property of every sampled parameter, from its factor, (parameters,)."""
+        out = np.empty(self.sampled.shape[1])
+        for one, own in self.factors:
+            out[own] = getattr(one, name)
+        return out
+
     @cached_property
     def ess(self) -> float:
         """Effective number of draws whatever is averaged, ``1 / sum w^2`` [draws]."""
+        if self.factors:
+            return min(one.ess for one, _ in self.factors)
         return effective(self.log_weights) if self.log_weights.size else 0.0
 
     @cached_property
     def centre_ess(self) -> Vector:
         """Effective sample size for the mean of each sampled parameter's normal scores, (parameters,)."""
+        if self.factors:
+            return self._of_factors("centre_ess")
         weights, out = self._weights, []
         for column in self.sampled.T:
             rank = np.argsort(column, kind="stable")
@@ -121,6 +163,8 @@ class Weighted:
     @cached_property
     def tail_ess(self) -> Vector:
         """The smaller effective sample size of the 5 and the 95 % quantile, (parameters,)."""
+        if self.factors:
+            return self._of_factors("tail_ess")
         weights, out = self._weights, []
         for column in self.sampled.T:
             rank = np.argsort(column, kind="stable")
@@ -132,6 +176,12 @@ class Weighted:
     @cached_property
     def boundaries(self) -> tuple[tuple[float, ...], ...]:
         """Between the modes of each sampled parameter, in its unit; a function of the weights alone."""
+        if self.factors:
+            edges: list[tuple[float, ...]] = [()] * self.sampled.shape[1]
+            for one, own in self.factors:
+                for k, found in zip(own.tolist(), one.boundaries, strict=True):
+                    edges[k] = found
+            return tuple(edges)
         columns = zip(self.sampled.T, self.centre_ess, self.logarithmic, strict=True)
         return tuple(
             boundaries(column, self._weights, ess, partial(error_of, self._weights), log_scale=logarithmic)
@@ -141,6 +191,9 @@ class Weighted:
     def shares(self, parameter: int) -> tuple[Vector, Vector]:
         """Posterior mass of each mode of a sampled parameter, and the number of independent draws that give
         it as accurately, (modes,)."""
+        for one, own in self.factors:
+            if parameter in own:
+                return one.shares(own.tolist().index(parameter))
         edges = self.boundaries[parameter]
         mode = np.searchsorted(edges, self.sampled[:, parameter])
         inside = [(mode == k).astype(float) for k in range(len(edges) + 1)]

@@ -1,0 +1,114 @@
+"""A plant whose response axes share nothing is sampled axis by axis."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from small import path, record, study
+
+from lcopa_bayes.bench.command import on_off
+from lcopa_bayes.bench.device import Device
+from lcopa_bayes.data.record import Axis
+from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.sampling import sampler
+from lcopa_bayes.sampling.draws import gather
+from lcopa_bayes.sampling.evidence import evidence_of
+from lcopa_bayes.sampling.sampler import Run, SamplePlan, sample
+from lcopa_bayes.sampling.separateaxes import separated
+
+PAIR = Device(
+    ((path(1.0, 0.3, (1.2,), (0.9,)),), (path(0.5, 0.8, (2.5,), (1.0,)),)),
+    (Axis("u", "V"),),
+    (Axis("x", "rad"), Axis("y", "rad")),
+    (0.0, 0.1),
+)
+ORDERS = {"order_1_x_u": 0.9, "order_1_y_u": 1.0}
+
+
+def posterior(**model: object) -> Posterior:
+    campaign = study(
+        record(1, device=PAIR, command=on_off([1.0], hold=5.0, at=0.35), camera=0.3),
+        **{"priors": ORDERS} | model,
+    )
+    return problem_of(campaign).posterior
+
+
+@pytest.fixture(scope="module")
+def whole() -> Posterior:
+    return posterior()
+
+
+@pytest.fixture(scope="module")
+def run(whole: Posterior) -> Run:
+    return sample(whole, plan())
+
+
+def plan(seed: int = 3) -> SamplePlan:
+    return SamplePlan.of(8, seed=seed, method="auto", target_ess=1000)
+
+
+def test_the_density_is_the_product_of_those_of_the_axes(whole: Posterior) -> None:
+    """Up to the priors of fixed parameters: differences of log densities add up."""
+    values = whole.table.draw(6, np.random.default_rng(0))
+    factors = separated(whole, values[0])
+    assert len(factors) == 2
+    assert sorted(k for one in factors for k in one.sampled) == list(whole.sampled)
+    assert sum(one.size for one in factors) == whole.size
+    total = sum(one.log_density(one.coordinates(values)) for one in factors)
+    np.testing.assert_allclose(total, whole.log_density(whole.coordinates(values)), rtol=1e-9)
+
+
+def test_what_shares_a_parameter_is_not_separated() -> None:
+    for sharing in ({"share": "all", "priors": {}}, {"delay": "shared"}):
+        shared = posterior(**sharing)
+        assert separated(shared, shared.table.draw(1, np.random.default_rng(0))[0]) == ()
+
+
+def test_draws_of_the_axes_are_those_of_the_whole(
+    whole: Posterior, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Against the same posterior sampled at once."""
+    assert run.weighted is not None
+    assert len(run.weighted.factors) == 2
+    monkeypatch.setattr(sampler, "by_axis", lambda *given: None)
+    other = sample(whole, plan(4))
+    assert other.weighted is not None
+    assert other.weighted.factors == ()
+    ours, theirs = gather(whole, run), gather(whole, other)
+    for name in whole.table.names:
+        one, two = ours.column(name), theirs.column(name)
+        if np.ptp(two) == 0.0:
+            continue
+        sd = float(two.std())
+        assert one.mean() == pytest.approx(two.mean(), abs=4 * sd * np.sqrt(1 / ours.ess + 1 / theirs.ess))
+        assert one.std() == pytest.approx(sd, rel=0.15)
+    evidences = [evidence_of(whole, each, 1000.0) for each in (run, other)]
+    assert evidences[0] is not None
+    assert evidences[1] is not None
+    error = np.hypot(evidences[0].sd, evidences[1].sd)
+    assert evidences[0].value == pytest.approx(evidences[1].value, abs=4 * error)
+    assert error < 0.2
+
+
+def test_effective_sizes_are_those_of_the_axis(whole: Posterior, run: Run) -> None:
+    weighted = run.weighted
+    assert weighted is not None
+    for one, own in weighted.factors:
+        np.testing.assert_array_equal(weighted.centre_ess[own], one.centre_ess)
+        np.testing.assert_array_equal(weighted.tail_ess[own], one.tail_ess)
+    assert weighted.ess == min(one.ess for one, _ in weighted.factors)
+    assert weighted.log_evidence == pytest.approx(sum(one.log_evidence for one, _ in weighted.factors))
+    np.testing.assert_allclose(
+        weighted.batch_evidence, sum(one.batch_evidence for one, _ in weighted.factors), rtol=1e-9
+    )
+    np.testing.assert_allclose(
+        weighted.log_density[:50], whole.log_density(weighted.coordinates[:50]), rtol=1e-9
+    )
+
+
+def test_the_axes_are_drawn_independently_of_each_other(whole: Posterior, run: Run) -> None:
+    assert run.weighted is not None
+    (_, first), (_, second) = run.weighted.factors
+    cross = np.corrcoef(run.weighted.sampled.T)[np.ix_(first, second)]
+    assert np.abs(cross).max() < 5 / np.sqrt(len(run.weighted.sampled))
