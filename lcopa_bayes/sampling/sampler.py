@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from math import ceil, inf
 from pathlib import Path
 from time import monotonic
@@ -211,12 +211,18 @@ def sample(
     if stored.weighted is not None:
         return Run(stored.ensembles, plan, stored.weighted)
     ensembles = stored.ensembles
-    if plan.method == "auto" and known is None and not ensembles:
-        drawn = partial(_of_factor, plan=plan, jobs=jobs, quiet=quiet)
-        separate = by_axis(posterior, optima, drawn, plan.delivered, plan.seed)
-        if separate is not None:
-            return Run((), plan, separate[0], stopped_after=separate[1])
     wanted = SURPLUS * plan.target_ess
+
+    def of_axis(factor: Posterior, own: Sequence[Optimum], seed: int) -> tuple[Weighted | None, bool]:
+        with workers(factor, jobs=jobs) as crew, _points(quiet) as bar:
+            search = Search(factor, seed, crew, bar, own, left)
+            return search.run(wanted), search.unfinished
+
+    if plan.method == "auto" and known is None and not ensembles:
+        separate = by_axis(posterior, optima, of_axis, plan.delivered, plan.seed)
+        if separate is not None:
+            stopped = monotonic() - begin if separate[1] else None
+            return Run((), plan, separate[0], stopped_after=stopped)
     searched = plan.method == "auto" and applies(posterior)
     with workers(posterior, jobs=jobs) as crew:
         seeds = np.random.SeedSequence(plan.seed).spawn(plan.ensembles)
@@ -285,14 +291,6 @@ def sample(
                 done, lasted = done + 1, monotonic() - at
                 _store(chain_file, Chain(ensembles), fingerprint)
                 bar.update()
-
-
-def _of_factor(
-    factor: Posterior, optima: Sequence[Optimum], seed: int, *, plan: SamplePlan, jobs: int, quiet: bool
-) -> tuple[Weighted | None, float | None]:
-    """Importance draws of a factor of a posterior, and the time after which its budget ended them [s]."""
-    run = sample(factor, replace(plan, seed=seed), jobs=jobs, quiet=quiet, optima=optima)
-    return run.weighted, run.stopped_after
 
 
 def _points(quiet: bool) -> Progress:

@@ -27,28 +27,28 @@ _NOTHING = Observed(np.empty(0, dtype=int), np.empty(0), np.empty(0))
 def by_axis(
     posterior: Posterior,
     optima: Sequence[Optimum],
-    sampled: Callable[[Posterior, Sequence[Optimum], int], tuple[Weighted | None, float | None]],
+    sampled: Callable[[Posterior, Sequence[Optimum], int], tuple[Weighted | None, bool]],
     count: int,
     seed: int,
-) -> tuple[Weighted, float | None] | None:
-    """Importance draws, `count` of each batch, and the time after which a budget ended any of them [s]; None
-    where axes share something, or one has no importance draws.
+) -> tuple[Weighted, bool] | None:
+    """Importance draws, `count` of each batch, and whether a budget ended any of them; None where axes share
+    something, or one has no importance draws.
 
     Parameters: `optima` of the posterior, best first; `sampled` gives the same of a factor from its optima
     and a seed.
     """
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1_002,)))
     values = optima[0].values if optima else posterior.table.draw(1, rng)[0]
-    factors, drawn, times = separated(posterior, values), list[Weighted](), list[float]()
+    factors, drawn, unfinished = separated(posterior, values), list[Weighted](), False
     for factor in factors:
         own, stopped = sampled(factor, of_factor(factor, posterior, optima), int(rng.integers(2**31)))
         if own is None:
             return None
         drawn.append(own)
-        times += [] if stopped is None else [stopped]
+        unfinished |= stopped
     if not factors:
         return None
-    return joined(posterior, factors, drawn, count, rng), sum(times) if times else None
+    return joined(posterior, factors, drawn, count, rng), unfinished
 
 
 def separated(posterior: Posterior, values: Vector) -> tuple[Posterior, ...]:
