@@ -212,18 +212,20 @@ def sample(
         return Run(stored.ensembles, plan, stored.weighted)
     ensembles = stored.ensembles
     wanted = SURPLUS * plan.target_ess
+    searched = plan.method == "auto" and applies(posterior)
 
     def of_axis(factor: Posterior, own: Sequence[Optimum], seed: int) -> tuple[Weighted | None, bool]:
+        if len(Outer(factor).columns) > _MAPPED:
+            return None, False
         with workers(factor, jobs=jobs) as crew, _points(quiet) as bar:
             search = Search(factor, seed, crew, bar, own, left)
             return search.run(wanted), search.unfinished
 
-    if plan.method == "auto" and known is None and not ensembles:
+    if searched and known is None and not ensembles:
         separate = by_axis(posterior, optima, of_axis, plan.delivered, plan.seed)
         if separate is not None:
             stopped = monotonic() - begin if separate[1] else None
             return Run((), plan, separate[0], stopped_after=stopped)
-    searched = plan.method == "auto" and applies(posterior)
     with workers(posterior, jobs=jobs) as crew:
         seeds = np.random.SeedSequence(plan.seed).spawn(plan.ensembles)
         mapped = searched and len(Outer(posterior).columns) <= _MAPPED
