@@ -836,7 +836,7 @@ def test_calibrate_writes_its_folder_and_prints_json(written, tmp_path, capsys, 
     }
     page = check_page(out / "report.html")
     assert page.count("<svg") == 3
-    assert '<td class="code">time_1</td>' in page
+    assert '<th scope="row" class="code">time_1</th>' in page
     before = (out / "report.html").read_bytes()
     (out / "report.html").unlink()
     code, printed, _ = run(capsys, "report", out)
