@@ -52,6 +52,8 @@ Outcome = tuple[Mapping[str, Any], str]
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb; returns the exit code."""
+    for library in ("OMP", "OPENBLAS", "MKL"):  # work is shared out to processes: threads would only wait
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     given = list(sys.argv[1:] if arguments is None else arguments)
     options = _parser(given).parse_args(given)
     gc.set_threshold(*_COLLECTED)
