@@ -122,6 +122,8 @@ def judged(found: Loop, made: Campaign) -> dict[str, Any]:
         "base_failed": found.base.failed,
         "before": errors(found.before, made),
         "after": errors(found.after, made),
+        "plant_before": deviations(found.before, made),
+        "plant_after": deviations(found.after, made),
         "coverage_before": pooled_coverage(found.before.unseen),
         "coverage_after": pooled_coverage(found.after.unseen),
         "share_with_band": float(np.mean([score.banded for score in found.after.unseen])),
@@ -145,6 +147,20 @@ def errors(side: Side, made: Campaign) -> dict[str, float]:
         "fit_over_noise": float(np.sqrt(np.mean(fit**2)) / NOISE),
         "held_out_truth_rmse": float(np.sqrt(np.mean(both**2))),
     }
+
+
+def deviations(side: Side, made: Campaign) -> dict[str, float]:
+    """Gains and delay less those of the device, on the scale they are sampled on, by name [posterior sd]."""
+    model, out = side.state.model, {}
+    sd = np.sqrt(np.diag(side.state.covariance))
+    for k in range(model.plant_size):
+        row = model.posterior.table.rows[model.columns[k]]
+        if row.kind not in ("gain", "delay"):
+            continue
+        path = made.device.paths[row.place.first][row.place.second] if row.kind == "gain" else None
+        truth = path.steady if path is not None else made.device.paths[0][0].delay
+        out[row.name] = float((side.state.optimum.x[k] - row.coordinate(truth)) / sd[k])
+    return out
 
 
 def _survival(found: Loop, name: str) -> float | None:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.stats import beta
+from scipy.stats import beta, norm
 
 Row = Mapping[str, Any]
 NAMING = ("explained", "partly explained", "disturbance")
@@ -35,17 +35,23 @@ def first_of(row: Row) -> str:
 
 
 def share(
-    name: str, rows: Sequence[Row], right: Callable[[Row], bool], target: float, side: str
+    name: str, rows: Sequence[Any], right: Callable[[Any], bool], target: Any, side: str
 ) -> dict[str, Any]:
-    """One line of the sheet: a share with its interval; `side` says whether it must be "least" or "most"."""
+    """One line of the sheet: a share with its interval; `side` says whether it must be "least", "most" or
+    "within" two numbers."""
     hits, trials = sum(map(right, rows)), len(rows)
     if not trials:
         return {"measure": name, "target": target, "side": side, "value": None, "trials": 0}
     low, high = bounds(hits, trials)
     value = hits / trials
-    reached = value <= target if side == "most" else value >= target
     line = {"measure": name, "target": target, "side": side, "value": value, "lower": low, "upper": high}
-    return line | {"trials": trials, "reached": reached}
+    return line | {"trials": trials, "reached": _reached(value, target, side)}
+
+
+def _reached(value: float, target: Any, side: str) -> bool:
+    if side == "within":
+        return bool(target[0] <= value <= target[1])
+    return bool(value <= target if side == "most" else value >= target)
 
 
 def number(
@@ -56,17 +62,13 @@ def number(
     if not finite:
         return {"measure": name, "target": target, "side": side, "value": None, "trials": 0}
     value = float(reduce(finite))
-    if side == "within":
-        reached = target[0] <= value <= target[1]
-    else:
-        reached = value <= target if side == "most" else value >= target
     return {
         "measure": name,
         "target": target,
         "side": side,
         "value": value,
         "trials": len(finite),
-        "reached": reached,
+        "reached": _reached(value, target, side),
         "quartiles": [float(q) for q in np.quantile(finite, [0.25, 0.75])],
     }
 
@@ -181,6 +183,9 @@ def sheet(rows: Sequence[Row], targets: Mapping[str, Any], seen: float) -> list[
         number(
             "90 % bands before correction", [r["coverage_before"] for r in corrected], np.mean, 0.0, "least"
         ),
+        *intervals("clean", [r for r in usable if r["verdict"] == "clean"], "plant_after", targets),
+        *intervals("corrected", plants, "plant_after", targets),
+        *intervals("before correction", plants, "plant_before", None),
         share("two effects, both found", by["pair"], _both, targets["two_effects"], "least"),
         share(
             "the same where both survive",
@@ -191,6 +196,28 @@ def sheet(rows: Sequence[Row], targets: Mapping[str, Any], seen: float) -> list[
         ),
         share("crashed", list(rows), lambda r: bool(r["crashed"]), 0.0, "most"),
     ]
+
+
+def intervals(
+    name: str, rows: Sequence[Row], when: str, targets: Mapping[str, Any] | None
+) -> list[dict[str, Any]]:
+    """Lines of the sheet: how often intervals of gains and of the delay hold those of the device; gains of
+    one campaign count as independent. Without `targets` the shares are reported only."""
+    out = []
+    for level, key in ((0.5, "intervals_50"), (0.9, "intervals_90")):
+        width = float(norm.ppf(0.5 + level / 2))
+        for kind in ("gain", "delay"):
+            values = [z for row in rows for what, z in row[when].items() if what.startswith(kind)]
+            out.append(
+                share(
+                    f"{100 * level:.0f} % intervals of the {kind}s, {name}",
+                    values,
+                    lambda z, width=width: abs(z) <= width,
+                    targets[key] if targets else 0.0,
+                    "within" if targets else "least",
+                )
+            )
+    return out
 
 
 def matrix(rows: Sequence[Row]) -> dict[str, dict[str, int]]:
