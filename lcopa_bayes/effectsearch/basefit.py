@@ -48,6 +48,12 @@ class BaseFit:
     """What limits the verdict."""
 
     @property
+    def smooth(self) -> bool:
+        """Whether the residual counts as too few independent samples to be judged: noise known from it alone
+        holds what is missing too."""
+        return self.optimum.converged and too_smooth(self.optimum)
+
+    @property
     def noise_samples(self) -> tuple[int, ...]:
         """Samples that the noise of each axis is known from, 0 where it was fitted jointly [-]."""
         return tuple(one.samples if one.known else 0 for one in self.noise)
@@ -138,10 +144,15 @@ def _alike(one: AxisNoise, other: AxisNoise) -> bool:
     return one.samples == other.samples and abs(one.law.sd / other.law.sd - 1) < 0.01
 
 
+def too_smooth(optimum: Optimum) -> bool:
+    """Whether a residual counts as fewer than three independent samples per parameter."""
+    return optimum.effective < _SPARE * optimum.x.size
+
+
 def _failure(model: ExtendedModel, optimum: Optimum) -> str:
     if not optimum.converged:
         return "the base fit did not converge within its steps"
-    if optimum.effective < _SPARE * optimum.x.size:
+    if too_smooth(optimum):
         return (
             f"the residual of the base fit is so smooth that its samples count as {optimum.effective:.0f} "
             f"independent ones, too few beside {optimum.x.size} parameters"

@@ -17,7 +17,7 @@ from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.requirements import not_at_rest, unmet_apart_from_rest
 from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.effectsearch.basefit import STARTS, BaseFit, base_fit
+from lcopa_bayes.effectsearch.basefit import STARTS, BaseFit, base_fit, too_smooth
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.refits import log_bayes_factor
 from lcopa_bayes.effectsearch.regression import Regression
@@ -44,6 +44,8 @@ class Mended(NamedTuple):
     study: Study
     sentence: str
     """What was changed."""
+    power: float = np.inf
+    """Squared residual that it leaves, where that was computed [response unit^2]."""
 
 
 def started(study: Study, fit: BaseFit) -> Mended | None:
@@ -83,6 +85,7 @@ def started(study: Study, fit: BaseFit) -> Mended | None:
         "No record shows the plant at rest, and it did not rest under the first row's drive: a drive before "
         f"the first row, the same for all records, was fitted ({levels}, worth {gain:.0f} nat); an early row "
         "with a drive and no response would state it.",
+        float(best.fun),
     )
 
 
@@ -161,6 +164,10 @@ def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: boo
     separate = _apart(study, base) if alone else (base, study)
     # paths that share too much look like a plant that did not rest
     mended = started(separate[1], separate[0].fit)
+    rival = np.inf  # a sensor that drifts looks like a plant that did not rest, or has a slow term
+    if mended is not None or separate[0].fit.smooth:
+        rival = _explained(separate[0], library, np.random.default_rng([study.seed, 14]), draws)
+        mended = mended if mended is None or mended.power < rival else None
     if mended is None:
         refuse_if(not_at_rest(study.fit, study.held_out))
     else:
@@ -179,6 +186,8 @@ def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: boo
         except (ArithmeticError, InputError):  # not simulated, or more parameters than samples
             break
         gain = _gain(base, wider)
+        if base.fit.smooth and rival < float(wider.fit.optimum.residual @ wider.fit.optimum.residual):
+            break
         if wider.fit.failed or not gain > _GAIN:
             if base.fit.failed:
                 continue
@@ -290,7 +299,18 @@ def _gain(base: Base, wider: Base) -> float:
 def _named(base: Base, library: Sequence[type[Effect]], rng: np.random.Generator, draws: int) -> float:
     """Log evidence that the best named effect adds to a base fit [nat]; 0 without one."""
     seen = trace(base.start, library, rng, noise_samples=base.fit.noise_samples, draws=draws)
-    return leading(base.start, seen) if seen.alarmed else 0.0
+    best = leading(base.start, seen) if seen.alarmed else None
+    return best.log_bayes_factor if best is not None else 0.0
+
+
+def _explained(base: Base, library: Sequence[type[Effect]], rng: np.random.Generator, draws: int) -> float:
+    """Squared residual that the best named effect leaves of a base fit [response unit^2]; infinite without
+    one that leaves noise."""
+    seen = trace(base.start, library, rng, noise_samples=base.fit.noise_samples, draws=draws)
+    best = leading(base.start, seen)
+    if best is None or too_smooth(best.optimum):
+        return np.inf
+    return float(best.optimum.residual @ best.optimum.residual)
 
 
 def _later(study: Study, fit: BaseFit) -> Mended | None:

@@ -52,7 +52,7 @@ def refitted(state: State, seen: Trace) -> tuple[list[Refit], list[str]]:
     near = [name for name in ranked if reached[name] > least][:_CANDIDATES]
     far = rough(seen)
     near = ranked if far else near
-    sizes = {name: worth[name].amplitude(seen.residual) for name in near}
+    sizes = {name: worth[name].amplitude(seen.residual, seen.scale) for name in near}
     if seen.alarmed and near:
         blind = [one for one in _blind(seen) if one.name not in near]
         worth |= {one.name: one.signature for one in blind}
@@ -61,7 +61,7 @@ def refitted(state: State, seen: Trace) -> tuple[list[Refit], list[str]]:
     for one in seen.traced if sizes or seen.alarmed else ():
         if one.card.dynamics and one.signatures and one.log_bayes_factor >= worthy:
             worth[one.name] = one.signature
-            sizes[one.name] = worth[one.name].amplitude(seen.residual)
+            sizes[one.name] = worth[one.name].amplitude(seen.residual, seen.scale)
     done: list[Refit] = []
     failures: list[str] = []
     for name, amplitude in sizes.items():
@@ -130,7 +130,7 @@ def _starts(state: State, signature: Signature, seen: Trace, *, forced: bool) ->
     """Coordinates to descend from: the linear estimate, and a prior sd to either side of none, there also
     with every order at the nearest integer."""
     model = state.model.having(*state.model.effects, signature.effect)
-    linear = signature.amplitude(seen.residual)
+    linear = signature.amplitude(seen.residual, seen.scale)
     unit = model.scale[-linear.size :]
     rows = model.posterior.table.rows
     straight = state.optimum.x.copy()

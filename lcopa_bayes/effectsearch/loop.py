@@ -14,7 +14,7 @@ from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.data.agreement import Disagreement, disagreements
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.bandwidening import Widening
-from lcopa_bayes.effectsearch.basefit import BaseFit
+from lcopa_bayes.effectsearch.basefit import BaseFit, too_smooth
 from lcopa_bayes.effectsearch.basemodel import fitted_base
 from lcopa_bayes.effectsearch.explained import coordinates_of, declarable, explained_draws, explained_study
 from lcopa_bayes.effectsearch.heldouteffects import missed, unseen_share
@@ -195,8 +195,13 @@ def _looped(
     before = _side(problem, start)
     contrary = disagreements((*study.fit, *study.held_out))
     cautions = (*(f"records disagree: {one}" for one in contrary), *base.caution, *_alone(study))
-    wrong = next((f"records disagree: {one}" for one in contrary if one.gross), base.failed)
-    if wrong:
+    alone = len(study.fit) == 1 and not study.held_out
+    searched, wrong = None, next((f"records disagree: {one}" for one in contrary if one.gross), base.failed)
+    if not wrong or (base.smooth and wrong == base.failed):
+        rng = np.random.default_rng([study.seed, 11])
+        searched = search(start, kinds, rng, noise_samples=base.noise_samples, draws=draws, alone=alone)
+    # of a residual too smooth to be judged an effect is only named where it leaves noise
+    if searched is None or (wrong and too_smooth(searched.state.optimum)):
         seen = missed(study, before.fit, before.unseen, start)
         but = f" What remains: {seen.said}." if seen is not None and seen.far else ""
         verdict = Verdict("unexplained", "tentative", f"No effect is named, because {wrong}.{but}")
@@ -205,9 +210,6 @@ def _looped(
             outliers=outliers,
             contrary=contrary,
         )
-    alone = len(study.fit) == 1 and not study.held_out
-    rng = np.random.default_rng([study.seed, 11])
-    searched = search(start, kinds, rng, noise_samples=base.noise_samples, draws=draws, alone=alone)
     reached = _side(problem, searched.state)
     verdict = decide(_findings(study, searched, before, reached, outliers=outliers, cautions=cautions))
     if outliers is not None:

@@ -24,6 +24,8 @@ from lcopa_bayes.inference.observations import Observed, PlausibleNoise, Samples
 
 FEWEST = 50
 """Fewer quiet samples than this know the noise scale to worse than a tenth [-]."""
+_KNOWN = 10
+"""Samples before the drive moves that say what is like them [-]."""
 _SAFE = 0.8
 """Share of the fitted delay inside which a response is surely at rest [-]."""
 _LAGS = 2000
@@ -186,6 +188,18 @@ def repeat_pieces(samples: Sequence[Samples], axis: int) -> list[Observed]:
     return [piece for piece in out if piece.values.size > 1]
 
 
+def _resting(samples: Sequence[Samples], axis: int, delay: float, scales: Scales) -> list[Observed]:
+    """Samples at rest, those inside the delay only where these are like the ones before the drive moves.
+
+    A fit that something else bends may find a delay in which the response has begun.
+    """
+    with_delay, before = (quiet_pieces(samples, axis, each) for each in (delay, 0.0))
+    usable = [piece for piece in before if np.ptp(piece.values) > 0]
+    if sum(piece.values.size - 1 for piece in usable) < _KNOWN:
+        return with_delay
+    return with_delay if _repeated(plausible(usable, scales), with_delay)[1] > _ALIKE else before
+
+
 def _repeats(one: Samples, other: Samples, axis: int) -> bool:
     first, second = one.record, other.record
     return (
@@ -204,7 +218,7 @@ def axis_noise(
     Repeats that differ by more than the quiet noise hold a disturbance from record to record (a trigger that
     jitters, a mount that shakes): then they are no measure of the noise, and the sentence says so.
     """
-    quiet, repeats = quiet_pieces(samples, axis, delay), repeat_pieces(samples, axis)
+    quiet, repeats = _resting(samples, axis, delay, scales), repeat_pieces(samples, axis)
     count = sum(piece.values.size - 1 for piece in quiet)
     again = sum(piece.values.size - 1 for piece in repeats)
     usable = [piece for piece in quiet if np.ptp(piece.values) > 0]

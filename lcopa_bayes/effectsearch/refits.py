@@ -17,7 +17,7 @@ from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.noise import quiet_samples
 from lcopa_bayes.effectsearch.regression import Optimum, Regression
 from lcopa_bayes.effectsearch.scores import State, groups, log_scores
-from lcopa_bayes.effectsearch.signature import Scale
+from lcopa_bayes.effectsearch.signature import COMMON, WIDER, Scale
 from lcopa_bayes.effectsearch.trace import LEVEL
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.effects import Placed
@@ -28,12 +28,8 @@ SIGNIFICANT = 2.7e-3
 """Two-sided p-value of three standard deviations [-]."""
 _FAR = 3.0
 """Coefficients beyond so many prior standard deviations widen their prior [-]."""
-_WIDER = 4.0
-"""Factor by which that prior is widened at a time [-]."""
 _STEPS = 4
 """How often it is widened at most [-]."""
-_COMMON = 10.0
-"""How many times more common effects within a prior are than within the next wider one [-]."""
 _PROCESSES = 400
 """Plausible noise processes over which a p-value is averaged [-]."""
 _NEAR = 0.5
@@ -229,6 +225,7 @@ def refit(
     extended = model.having(*model.effects, *(effect for effect, _ in added))
     size = sum(psi.size for _, psi in added)
     linear = np.concatenate([psi for _, psi in added]) * extended.scale[-size:]
+    extended, common = _widened(extended, added)
     low, high = extended.bounds
     starts = [np.concatenate([before.x, factor * linear]) for factor in (1.0, 0.3, 0.0)]
     if any(effect.card.place == "drive" for effect, _ in added):
@@ -243,8 +240,23 @@ def refit(
     extended, optimum, rare = _with_room(extended, optimum, whitening, names)
     sides = sum(one.coefficient.one_signed for one in extended.effected.coefficients[-size:])
     tried = sum(np.log(len(effect.grid(extended.effected.ranges))) for effect, _ in added)
-    paid = sides * float(np.log(2.0)) - float(tried) - rare
+    paid = sides * float(np.log(2.0)) - float(tried) - common - rare
     return Refit(extended, optimum, before, whitening, names, quiet, paid)
+
+
+def _widened(model: ExtendedModel, added: Sequence[tuple[Effect, Vector]]) -> tuple[ExtendedModel, float]:
+    """The model with priors that hold linear estimates of `added` effects, which narrow ones would keep a
+    descent from, and what the evidence pays for that [nat]."""
+    steps = {effect.name: _steps(psi) for effect, psi in added}
+    more = {name: WIDER**count for name, count in steps.items() if count}
+    paid = sum(steps.values()) * float(np.log(COMMON))
+    return (replace(model, wider={**model.wider, **more}), paid) if more else (model, 0.0)
+
+
+def _steps(psi: Vector) -> int:
+    """How often a prior is widened to hold coefficients over its sd [-]."""
+    apart = float(np.abs(psi).max(initial=0.0)) / _FAR
+    return min(int(np.ceil(np.log(apart) / np.log(WIDER))), _STEPS) if apart > 1 else 0
 
 
 def freed(
@@ -343,8 +355,8 @@ def _with_room(
         far = {model.effects[one.effect].name for one, size in placed if size > _FAR} & set(names)
         if not far:
             return model, optimum, rare
-        more = {name: _WIDER * model.wider.get(name, 1.0) for name in far}
-        model, rare = replace(model, wider={**model.wider, **more}), rare + len(far) * float(np.log(_COMMON))
+        more = {name: WIDER * model.wider.get(name, 1.0) for name in far}
+        model, rare = replace(model, wider={**model.wider, **more}), rare + len(far) * float(np.log(COMMON))
         optimum = Regression(model, whitening).descend(optimum.x, most=12, gain=0.02)
     return model, optimum, rare
 

@@ -132,10 +132,10 @@ def _gained(start: State, state: State, quiet: float) -> tuple[float, float]:
     return gained, plain.cost - state.optimum.cost
 
 
-def leading(start: State, seen: Trace) -> float:
-    """Largest log Bayes factor of a single named effect that would be accepted, 0 without any [nat]."""
+def leading(start: State, seen: Trace) -> Refit | None:
+    """The single named effect of most evidence that would be accepted; None without any."""
     likely = accepted(refitted(start, seen)[0], seen, seen.threshold)
-    return max((one.log_bayes_factor for one in likely if not one.dynamics), default=0.0)
+    return next((one for one in likely if not one.dynamics), None)
 
 
 def accepted(refits: Sequence[Refit], seen: Trace, bar: float) -> list[Refit]:

