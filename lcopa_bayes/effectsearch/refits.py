@@ -197,6 +197,14 @@ class Refit:
         placed, effects = self.model.effected.coefficients, self.model.effects
         return tuple(one for one in placed if effects[one.effect].name in self.added)
 
+    @property
+    def possible(self) -> bool:
+        """Whether no share of a new effect is above the whole of it by three standard deviations."""
+        size, sd = self.optimum.x[self.model.plant_size :], self.optimum.sd[self.model.plant_size :]
+        placed = self.model.effected.coefficients
+        over = [k for k, one in enumerate(placed) if one.coefficient.share and size[k] > 1 + 3 * sd[k]]
+        return not {self.model.effects[placed[k].effect].name for k in over} & set(self.added)
+
     @cached_property
     def significant(self) -> bool:
         """Whether all new effects are three standard deviations or more away from zero, or a single one is by
@@ -247,10 +255,16 @@ def refit(
 def _widened(model: ExtendedModel, added: Sequence[tuple[Effect, Vector]]) -> tuple[ExtendedModel, float]:
     """The model with priors that hold linear estimates of `added` effects, which narrow ones would keep a
     descent from, and what the evidence pays for that [nat]."""
-    steps = {effect.name: _steps(psi) for effect, psi in added}
+    shares = {model.effects[one.effect].name for one in _shares(model)}
+    steps = {effect.name: _steps(psi) for effect, psi in added if effect.name not in shares}
     more = {name: WIDER**count for name, count in steps.items() if count}
     paid = sum(steps.values()) * float(np.log(COMMON))
     return (replace(model, wider={**model.wider, **more}), paid) if more else (model, 0.0)
+
+
+def _shares(model: ExtendedModel) -> list[Placed]:
+    """Coefficients that say how much of an effect is there."""
+    return [one for one in model.effected.coefficients if one.coefficient.share]
 
 
 def _steps(psi: Vector) -> int:
@@ -352,7 +366,8 @@ def _with_room(
     for _ in range(_STEPS):
         apart = np.abs(optimum.x[model.plant_size :]) / model.scale
         placed = zip(model.effected.coefficients, apart, strict=True)
-        far = {model.effects[one.effect].name for one, size in placed if size > _FAR} & set(names)
+        beyond = (one for one, size in placed if size > _FAR and not one.coefficient.share)
+        far = {model.effects[one.effect].name for one in beyond} & set(names)
         if not far:
             return model, optimum, rare
         more = {name: WIDER * model.wider.get(name, 1.0) for name in far}

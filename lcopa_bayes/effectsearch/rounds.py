@@ -196,6 +196,7 @@ def _accepted(candidate: Refit, seen: Trace, bar: float) -> bool:
         and candidate.left_out > 0
         and candidate.significant
         and candidate.resting
+        and candidate.possible
     )
 
 

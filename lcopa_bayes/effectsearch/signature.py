@@ -8,7 +8,7 @@ freely are removed, those its priors hold are not.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import final
 
@@ -117,6 +117,8 @@ class Signature:
     """Share of the signature that is left [-]."""
     one_signed: bool
     """Whether its single coefficient cannot be negative."""
+    share: bool = False
+    """Whether a coefficient is a share, whose prior has one width."""
 
     @classmethod
     def of(cls, effect: Effect, columns: Matrix, survival: float, one_signed: bool) -> Signature:
@@ -143,12 +145,16 @@ class Signature:
         sign has a half-normal prior: the factor is 2 Phi(mean / sd) of the normal one.
         """
         each = self._by_width(inner, scale_of)
-        return np.asarray(logsumexp(each, axis=0) - logsumexp(_RARE))
+        return np.asarray(logsumexp(each, axis=0) - logsumexp(_RARE[: len(each)]))
 
     def _by_width(self, inner: Matrix, scale_of: Scale) -> Matrix:
         """Evidence within each width of the prior less what the width costs, (widths, draws) [nat]."""
-        each = [self._within(inner, scale_of, factor * self.scale) for factor in _FACTORS]
-        return np.asarray(np.stack(each) + _RARE[:, None])
+        each = [self._within(inner, scale_of, factor * self.scale) for factor in self._factors]
+        return np.asarray(np.stack(each) + _RARE[: len(each), None], dtype=float)
+
+    @property
+    def _factors(self) -> Vector:
+        return np.asarray(_FACTORS[:1] if self.share else _FACTORS, dtype=float)
 
     def _within(self, inner: Matrix, scale_of: Scale, scale: Vector) -> Vector:
         """The same where one prior sd of each direction has the length `scale`, (rank,) [-]."""
@@ -170,7 +176,7 @@ class Signature:
         """Posterior mean of the coefficients over their prior sd, under the likeliest width of the prior;
         the normal part of a one-signed one."""
         inner = self.span.T @ residual
-        factor = _FACTORS[self._by_width(inner[:, None], scale_of)[:, 0].argmax()]
+        factor = self._factors[self._by_width(inner[:, None], scale_of)[:, 0].argmax()]
         scale = factor * self.scale
         return np.asarray(factor * self.turned.T @ (scale / (1 + scale**2) * inner))
 
@@ -185,7 +191,8 @@ def signature_of(
     white = whitening(raw.T).T
     left = project(white)
     one_signed = len(placed) == 1 and placed[0].coefficient.one_signed
-    return Signature.of(effect, left, survival(white, left), one_signed)
+    share = any(one.coefficient.share for one in placed)
+    return replace(Signature.of(effect, left, survival(white, left), one_signed), share=share)
 
 
 def expected_margin(truth: Signature, amplitude: Vector, rival: Signature, scale: Scale) -> float:

@@ -136,6 +136,30 @@ def test_a_drift_far_beyond_its_prior_is_named_and_nothing_else(period, monkeypa
     assert held.names != ("pointing_drift",)
 
 
+def saturated() -> Study:
+    """A lag in a single record whose drive saturates: three levels, the largest less than stated."""
+    rng = np.random.default_rng(11)
+    t = np.arange(0.0, 400.0)
+    times, levels = (30.0, 120.0, 220.0, 300.0), (1.0, 3.0, 2.0, 0.0)
+    drive, y, last = np.zeros(t.size), np.zeros(t.size), 0.0
+    for time, level in zip(times, levels, strict=True):
+        drive[t >= time] = level
+        y -= 0.5 * (min(level, 2.2) - last) * np.expm1(-np.maximum(t - time - 4.0, 0.0) / 12.0)
+        last = min(level, 2.2)
+    y += 0.01 * rng.standard_normal(t.size)
+    record = Record("valve", t, drive[:, None], y[:, None], (Axis("v", "V"),), (Axis("i", "mA"),), "us")
+    return Study("saturated", None, "us", 0, (record,), model=ModelSettings(terms=1))
+
+
+def test_more_than_the_whole_of_an_effect_is_no_name(monkeypatch):
+    """Steps of the drive 2.7 times as uneven as its grey levels would make them follow any three levels."""
+    assert "grey_quantisation" not in loop(saturated(), sample=False, quick=True).names
+    monkeypatch.setattr(refits.Refit, "possible", True)
+    monkeypatch.setattr(refits, "_shares", lambda model: [])
+    monkeypatch.setattr(signature.Signature, "_factors", signature._FACTORS)
+    assert "grey_quantisation" in loop(saturated(), sample=False, quick=True).names
+
+
 def test_a_response_that_began_inside_the_fitted_delay_is_no_noise():
     """A delay of 7 s where 3 s are true: samples from there on are left out, those alike are kept."""
     samples = problem_of(drifting(3, 0.5)).posterior.samples

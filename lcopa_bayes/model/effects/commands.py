@@ -60,7 +60,7 @@ class RefreshHold(DriveEffect):
 
     units = MappingProxyType({"refresh": "time"})
     fractions = frozenset({"phase"})
-    estimated = single("w", 0.6, one_signed=True)
+    estimated = single("w", 0.6, share=True)
     card: ClassVar[Card] = Card(
         name="refresh_hold",
         place="drive",
@@ -108,7 +108,7 @@ class GreyQuantisation(DriveEffect):
     """Steps within the largest drive [-]."""
 
     linear = True
-    estimated = single("w", 0.6, one_signed=True)
+    estimated = single("w", 0.6, share=True)
     card: ClassVar[Card] = Card(
         name="grey_quantisation",
         place="drive",

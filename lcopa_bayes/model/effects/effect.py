@@ -82,6 +82,8 @@ class Coefficient:
     """Whether only values of 0 or more make sense."""
     axis: int | None = None
     """Response axis it acts on; None when it acts on several."""
+    share: bool = False
+    """Whether it says how much of the effect is there, 1 being all of it: larger values make no sense."""
 
 
 @final
@@ -324,9 +326,11 @@ class ScatterEffect(Effect):
     effect."""
 
 
-def single(name: str, scale: float, unit: str = "-", *, one_signed: bool = False) -> tuple[Coefficient, ...]:
-    """One coefficient."""
-    return (Coefficient(name, unit, scale, one_signed),)
+def single(
+    name: str, scale: float, unit: str = "-", *, one_signed: bool = False, share: bool = False
+) -> tuple[Coefficient, ...]:
+    """One coefficient; a share has one sign."""
+    return (Coefficient(name, unit, scale, one_signed or share, share=share),)
 
 
 def per_axis(ranges: Ranges, names: Sequence[str], part: float) -> tuple[Coefficient, ...]:

@@ -120,7 +120,7 @@ class Clipping(ReadoutEffect):
     the limit is measured in."""
 
     linear = True
-    estimated = single("c", 0.6, one_signed=True)
+    estimated = single("c", 0.6, share=True)
     card: ClassVar[Card] = Card(
         name="clipping",
         place="output",
