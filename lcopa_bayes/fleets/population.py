@@ -8,8 +8,8 @@ without a change of mean and variance (West 1993, J. R. Stat. Soc. B 55), so tha
 the distance of draws has a likelihood too; integrals over a device are then closed forms, and :math:`(\mu,
 \log\sigma, \epsilon)` is a grid. Other parameters of a device keep their own priors.
 
-Priors: :math:`\mu` flat; :math:`\sigma` half-Cauchy (Gelman 2006, Bayesian Analysis 1) with the scatter U of
-the devices as its scale; :math:`\epsilon` beta(1, 19); the broad normal has 10 U.
+Priors: :math:`\mu` flat; :math:`\sigma` half-Cauchy (Gelman 2006, Bayesian Analysis 1) with a scale U, the
+scatter of n devices times 1 + 4 / n; :math:`\epsilon` beta(1, 19); the broad normal has 10 U.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ _BROAD = 10.0
 """Standard deviation of devices that do not belong [scatter of the devices]."""
 _BETA = 19.0
 """Second parameter of the prior of their share, beta(1, .) [-]: one in twenty."""
+_FEW = 4.0
+"""Devices so few that the scatter between them counts twice [-]: that of a few may be small by chance."""
 _SHARES = 20
 """Values of that share on the grid."""
 _COARSE, _FINE, _ACROSS = 72, 48, 33
@@ -110,9 +112,15 @@ class _Nodes:
 
     def log_likelihood(self, mean: Vector, variance: Vector) -> Matrix:
         """Log likelihood of each device under each of these populations, (populations, devices)."""
-        step = max(1, 2_000_000 // self.weight.size)
-        parts = [slice(k, k + step) for k in range(0, mean.size, step)]
-        return np.concatenate([logsumexp(self.log_terms(mean[k], variance[k]), axis=-1) for k in parts])
+        out = np.empty((mean.size, self.weight.shape[0]))
+        for k in range(mean.size):
+            total = variance[k] + self.variance
+            away = (self.centre - mean[k]) ** 2 / total
+            least = away.min(axis=1)
+            away -= least[:, None]
+            density = self.weight / np.sqrt(2 * np.pi * total) * np.exp(-0.5 * away)
+            out[k] = np.log(density.sum(axis=1)) - 0.5 * least
+        return out
 
 
 def _mixture(draws: Vector, log_prior: Vector, as_normal: bool) -> Matrix:
@@ -122,16 +130,15 @@ def _mixture(draws: Vector, log_prior: Vector, as_normal: bool) -> Matrix:
     x, w = draws[order], np.exp(log_weight[order])
     mean = float(w @ x)
     variance = float(w @ (x - mean) ** 2)
-    if not np.ptp(draws) > 0:
-        raise ValueError("draws that do not vary have no likelihood")
+    if draws.size < _NODES or not np.ptp(draws) > 0:
+        raise ValueError(f"a likelihood needs {_NODES} draws or more that vary; got {draws.size}")
     if as_normal:
         return np.stack([np.eye(1, _NODES)[0], np.full(_NODES, mean), np.full(_NODES, variance)])
     width = 1.06**2 * effective(log_weight) ** -0.4  # of a kernel, in the variance: Silverman's rule
-    group = np.minimum((np.cumsum(w) * _NODES).astype(int), _NODES - 1)
+    group = np.arange(x.size) * _NODES // x.size
     weight = np.bincount(group, w, _NODES)
-    filled = np.where(weight > 0, weight, 1.0)
-    centre = np.bincount(group, w * x, _NODES) / filled
-    within = np.bincount(group, w * (x - centre[group]) ** 2, _NODES) / filled
+    centre = np.bincount(group, w * x, _NODES) / weight
+    within = np.bincount(group, w * (x - centre[group]) ** 2, _NODES) / weight
     return np.stack(
         [weight, mean + np.sqrt(1 - width) * (centre - mean), (1 - width) * within + width * variance]
     )
@@ -144,7 +151,7 @@ def population_of(
 
     `draws` are each device's posterior draws of the parameter on its sampled scale, `log_prior` the log
     density there of the prior they were drawn under, up to a constant. ValueError for fewer than two devices,
-    and for draws that do not vary.
+    and for draws that are few or do not vary.
 
     Where weights fail by their Pareto k, the likelihood of a device is a normal with the moments of its
     draws. Accuracy: for normal posteriors exact but for the grid and the Monte Carlo error of 4000 draws.
@@ -167,6 +174,7 @@ def _estimated(
     centre, variance = nodes.moments()
     middle = float(np.median(centre))
     unit = float(np.sqrt(median_abs_deviation(centre, scale="normal") ** 2 + np.median(variance)))
+    unit *= 1 + _FEW / len(draws)
     broad = np.array([middle]), np.array([(_BROAD * unit) ** 2])
     outside = nodes.log_likelihood(*broad)[0]
     root = (np.arange(_SHARES) + 0.5) / _SHARES  # cubed, for the share of a large fleet may be small

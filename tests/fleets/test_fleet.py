@@ -2,10 +2,13 @@
 
 import json
 import math
+import os
+import signal
 import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
+from threading import Timer
 
 import numpy as np
 import pandas as pd
@@ -112,6 +115,25 @@ def test_finished_devices_are_kept_until_their_study_changes(devices, out, fleet
     assert after.to_json() != fleet.to_json()
     assert not origin.exists()
     assert [one.name for one in studies] == list(GAINS)
+
+
+def without_times(fleet: lb.FleetResult) -> dict:
+    return {key: value for key, value in fleet.to_json().items() if key != "seconds"}
+
+
+def test_a_dask_cluster_that_loses_a_worker_gives_the_same_table(fleet, devices, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=":0", memory_limit=0
+    ) as cluster:
+        pid = next(iter(cluster.workers.values())).pid
+        Timer(2.0, os.kill, (pid, signal.SIGKILL)).start()
+        lost = lb.fleet(devices, dask=cluster.scheduler_address, folder=tmp_path)
+    assert without_times(lost) == without_times(fleet)
+
+
+def test_processes_change_no_number(fleet, devices):
+    assert without_times(lb.fleet(devices)) == without_times(fleet)
 
 
 def test_a_population_is_the_prior_of_the_next_study(fleet, out, devices, tmp_path):
