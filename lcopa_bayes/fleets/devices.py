@@ -82,7 +82,7 @@ def row_of(verb: str, values: Mapping[str, Any], fit: Predictive | None) -> dict
             "probability": best[0]["probability"] if best else None,
         }
     elif verb == "loop":
-        row |= {"verdict": values["verdict"], **attributes_of(values, "confidence", "sentence")}
+        row |= {key: values[key] for key in ("verdict", "confidence", "sentence")}
         row["effects"] = "; ".join(effect["name"] for effect in values["effects"])
     elif verb == "audit":
         verdicts: dict[str, list[str]] = {}
@@ -102,11 +102,6 @@ def row_of(verb: str, values: Mapping[str, Any], fit: Predictive | None) -> dict
     return row
 
 
-def attributes_of(values: Mapping[str, Any], *keys: str) -> dict[str, Any]:
-    """Some entries of a mapping."""
-    return {key: values[key] for key in keys}
-
-
 def plant_of(fit: Predictive) -> tuple[dict[str, Any], Matrix]:
     """Axes and shared parameters of a device, and its draws: the parameters on the scale they are sampled on,
     then the log density of the prior of each there, (draws, 2 parameters)."""
@@ -122,15 +117,17 @@ def plant_of(fit: Predictive) -> tuple[dict[str, Any], Matrix]:
             attributes(table.rows[k], "name", "unit") | {"log": table.rows[k].log_scale} for k in kept
         ],
     }
-    return axes, np.stack([*coordinates, *densities], axis=1)
+    columns = np.stack([*coordinates, *densities], axis=1)
+    return axes, columns[np.isfinite(columns).all(axis=1)]  # rounding may lead out of a prior's support
 
 
 def curve_of(fit: Predictive | None) -> dict[str, Any] | None:
     """Response, 90 % bands with noise and residual of the record and axis that are followed worst; None where
     a fit was not made just now or its records are short."""
-    if not (isinstance(fit, Fit) and fit.residuals):
+    tested = [one for one in fit.residuals if not one.held_out] if isinstance(fit, Fit) else []
+    if not (isinstance(fit, Fit) and tested):
         return None
-    worst = min((one for one in fit.residuals if not one.held_out), key=lambda one: one.p_white)
+    worst = min(tested, key=lambda one: one.p_white)
     band = next(one for one in fit.bands if (one.record, one.axis) == (worst.record, worst.axis))
     at = np.unique(np.linspace(0, band.time.size - 1, _POINTS).astype(int))
     columns = {

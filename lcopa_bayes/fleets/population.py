@@ -130,7 +130,7 @@ def _mixture(draws: Vector, log_prior: Vector, as_normal: bool) -> Matrix:
     x, w = draws[order], np.exp(log_weight[order])
     mean = float(w @ x)
     variance = float(w @ (x - mean) ** 2)
-    if draws.size < _NODES or not np.ptp(draws) > 0:
+    if not has_likelihood(draws[:, None]):
         raise ValueError(f"a likelihood needs {_NODES} draws or more that vary; got {draws.size}")
     if as_normal:
         return np.stack([np.eye(1, _NODES)[0], np.full(_NODES, mean), np.full(_NODES, variance)])
@@ -142,6 +142,11 @@ def _mixture(draws: Vector, log_prior: Vector, as_normal: bool) -> Matrix:
     return np.stack(
         [weight, mean + np.sqrt(1 - width) * (centre - mean), (1 - width) * within + width * variance]
     )
+
+
+def has_likelihood(draws: Matrix) -> bool:
+    """Whether draws of a device, (draws, parameters), are enough and vary."""
+    return draws.shape[0] >= _NODES and bool((np.ptp(draws, axis=0) > 0).all())
 
 
 def population_of(

@@ -12,7 +12,7 @@ from scipy.stats import beta
 
 from lcopa_bayes.core.arrays import Array, Matrix
 from lcopa_bayes.core.estimate import LEVEL, plain
-from lcopa_bayes.fleets.population import LEVELS, Population, population_of
+from lcopa_bayes.fleets.population import LEVELS, Population, has_likelihood, population_of
 from lcopa_bayes.sampling.importanceweights import LARGEST_K
 
 _ODD = 0.5
@@ -78,17 +78,18 @@ def _groups(outcomes: Iterable[Mapping[str, Any]]) -> list[list[Mapping[str, Any
 
 def _group(number: int, members: Sequence[Mapping[str, Any]], draws: Mapping[str, Matrix]) -> dict[str, Any]:
     plant = members[0]["plant"]
-    used = [one["row"]["device"] for one in members if one["row"]["grade"] != "unusable"]
+    count, parameters = len(plant["parameters"]), []
+    names = [one["row"]["device"] for one in members]
+    unusable = {one["row"]["device"] for one in members if one["row"]["grade"] == "unusable"}
+    unusable |= {one for one in names if not has_likelihood(draws[one][:, :count])}
+    used = [one for one in names if one not in unusable]
     sure = sum(one["row"]["grade"] == "reliable" for one in members) / len(members)
-    left_out = [one["row"]["device"] for one in members if one["row"]["grade"] == "unusable"]
-    parameters = []
     for k, row in enumerate(plant["parameters"] if len(used) > 1 else ()):
-        count = len(plant["parameters"])
         columns = [draws[device][:, k] for device in used]
         priors = [draws[device][:, count + k] for device in used]
         population = population_of(columns, priors, np.random.default_rng([number, k]))
         parameters.append(_parameter(row, used, columns, population, sure))
-    about = f"{', '.join(plant['drives'])} to {', '.join(plant['responses'])}"
+    about = f"{', '.join(plant['drives'])} to {', '.join(plant['responses'])}, times in {plant['time_unit']}"
     sentence = ""
     if len(used) < 2:
         sentence = f"{used[0] if used else 'No device'} stands alone: a population needs two devices or more."
@@ -97,7 +98,7 @@ def _group(number: int, members: Sequence[Mapping[str, Any]], draws: Mapping[str
         "about": f"{about}; {', '.join(row['name'] for row in plant['parameters'])}",
         "time_unit": plant["time_unit"],
         "devices": used,
-        "left_out": left_out,
+        "left_out": [one for one in names if one in unusable],
         "sentence": sentence,
         "parameters": parameters,
     }
@@ -128,7 +129,7 @@ def _parameter(
             names, columns, of.shrunk, of.odd, of.pareto_k, of.failed, strict=True
         )
     ]
-    grade, reason = _trusted(len(names), float(of.failed[of.odd <= _ODD].mean()), sure)
+    grade, reason = _trusted(len(names), float(np.mean(of.failed & (of.odd <= _ODD))), sure)
     return {
         **row,
         "mean": _interval(unit(of.mean)),

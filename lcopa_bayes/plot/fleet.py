@@ -16,6 +16,10 @@ _NAMED = 4
 """Most devices that are named in a panel."""
 
 
+_MOST_LINES = 200
+"""Devices beyond which their intervals are drawn as one band."""
+
+
 def population_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Every device by itself and shrunk, in the order of its own median, one panel per parameter; behind them
     where 50 and 90 % of the next devices lie."""
@@ -33,7 +37,10 @@ def population_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
         for chosen, colour in ((~odd, BAND), (odd, HELD_OUT)):
             own = [one["own"] for one, wanted in zip(devices, chosen, strict=True) if wanted]
             low, high = ([one[end] for one in own] for end in ("lower", "upper"))
-            panel.vlines(at[chosen], low, high, color=colour, lw=0.9, alpha=0.7)
+            if len(low) > _MOST_LINES:
+                panel.fill_between(at[chosen], low, high, color=colour, alpha=0.5, lw=0)
+            else:
+                panel.vlines(at[chosen], low, high, color=colour, lw=0.9, alpha=0.7)
         shrunk = [one["shrunk"]["value"] for one in devices]
         panel.plot(at, shrunk, ".", ms=3, color=INK)
         for k in np.flatnonzero(odd)[:_NAMED]:

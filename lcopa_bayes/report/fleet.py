@@ -13,6 +13,8 @@ from lcopa_bayes.report.svg import drawing, paged
 
 _PER_FIGURE = 12
 """Most devices on one figure of responses."""
+_MOST_ROWS = 400
+"""Most rows of the table of all devices and parameters."""
 _FITTED = (
     ("differs in:code", "differs_in", str),
     ("outlier, p:number", "p_odd", lambda p: figures(p, 2)),
@@ -72,13 +74,13 @@ def drawn(folder: Path, values: Mapping[str, Any]) -> Drawings:
             for row in values["devices"]
         ],
         "populations": populations,
-        "odd": sorted(
+        "most": _MOST_ROWS,
+        "pairs": sorted(
             (
                 (one, row)
                 for group in values["groups"]
                 for row in group["parameters"]
                 for one in row["devices"]
-                if one["p_odd"] > 0.5
             ),
             key=lambda pair: -float(pair[0]["p_odd"]),
         ),

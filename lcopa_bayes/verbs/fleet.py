@@ -43,7 +43,8 @@ _VERBS: Mapping[str, Callable[..., Result]] = {"fit": fit, "audit": audit, "loop
 _DEVICES, _DONE, _DRAWS, _ERROR = "devices", "device.json", "device.npy", "error.txt"
 """Folder of the run folders of devices, and files in each of these: what the fleet needs of it, its draws,
 the trace of an unforeseen error."""
-_TABLE = "tables/fleet"
+_TABLE, _EACH = "tables/fleet", "tables/devices.csv"
+"""The table of the fleet, and that of every device and parameter by itself and given the others."""
 _TOLD, _MOST_TOLD = ("device", "grade", "differs_in", "p_odd", "verdict", "effects", "preferred"), 20
 """Columns and most rows of the table that is printed; the whole one is a file."""
 
@@ -53,7 +54,7 @@ _TOLD, _MOST_TOLD = ("device", "grade", "differs_in", "p_odd", "verdict", "effec
 class FleetResult(StoredResult):
     """A table of devices, and the population of their parameters."""
 
-    verb, file, beside = "fleet", "fleet.json", (f"{_TABLE}.csv",)
+    verb, file, beside = "fleet", "fleet.json", (f"{_TABLE}.csv", _EACH)
 
     def summary(self) -> pd.DataFrame:
         """One row per device, the worst first: grade and its reason, what the verb says of it, median and
@@ -95,7 +96,8 @@ class FleetResult(StoredResult):
         `StoredResult.save`."""
         with opened(folder, self.origin) as path:
             super().save(path)
-            write_whole(path / f"{_TABLE}.parquet", partial(self.summary().to_parquet, index=False))
+            table = writable_folder((path / _TABLE).parent) / f"{Path(_TABLE).name}.parquet"
+            write_whole(table, partial(self.summary().to_parquet, index=False))
         return path
 
 
@@ -134,6 +136,7 @@ class _Work:
         began, mark = time.process_time(), {"basis": basis(study, self.verb, quick=self.quick)}
         save_json(mark, place / _DONE)
         more = {} if self.verb == "loop" else {"resume": self.resume}
+        more |= {"compact": True} if self.verb == "fit" else {}
         result = _VERBS[self.verb](study, folder=place, quick=self.quick, **more)
         fitted = result if isinstance(result, Predictive) else getattr(result, "fit", None)
         plant = None
@@ -233,8 +236,26 @@ def fleet(
             )
         outcomes.sort(key=lambda one: str(one["row"]["device"]))
         values = results(name, verb, outcomes, work.draws(outcomes))
-        table = pd.DataFrame(values["devices"]).to_csv(index=False)
-        return FleetResult(values, origin, {f"{_TABLE}.csv": table}).kept(folder)
+        texts = {f"{_TABLE}.csv": pd.DataFrame(values["devices"]).to_csv(index=False)}
+        return FleetResult(values, origin, texts | {_EACH: _each(values).to_csv(index=False)}).kept(folder)
+
+
+def _each(values: Mapping[str, Any]) -> pd.DataFrame:
+    """One row per device and parameter: by itself, and given the others."""
+    return pd.DataFrame(
+        [
+            {"device": one["device"], "parameter": row["name"], "unit": row["unit"]}
+            | {
+                f"{key}_{end}": one[key][end]
+                for key in ("own", "shrunk")
+                for end in ("value", "lower", "upper")
+            }
+            | {key: one[key] for key in ("p_odd", "pareto_k", "weights")}
+            for group in values["groups"]
+            for row in group["parameters"]
+            for one in row["devices"]
+        ]
+    )
 
 
 def _members(sources: Sequence[StudyLike]) -> tuple[list[dict[str, Any]], list[tuple[str, Study]]]:

@@ -83,7 +83,11 @@ def test_a_fleet_is_one_table_and_its_population(fleet, out):
     assert "Failed: broken" in fleet.verdict
     read = pd.read_parquet(out / "tables" / "fleet.parquet")
     pd.testing.assert_frame_equal(read, fleet.summary(), check_dtype=False)
-    assert lb.load_result(out / "devices" / "a").verb == "fit"
+    kept = lb.load_result(out / "devices" / "a")
+    assert kept.verb == "fit"
+    tree = kept.to_datatree()  # of all draws, but few of what has a number for each sample
+    assert tree["posterior_predictive"].sizes["draw"] * 4 <= 400 < kept.draws.log_density.size
+    assert tree["posterior"].sizes["draw"] == kept.draws.log_density.shape[1]
 
 
 def test_the_page_of_a_fleet_stands_alone(fleet, out):
