@@ -18,6 +18,7 @@ from small import ONE, check_page, path, record
 import lcopa_bayes as lb
 from lcopa_bayes.cli import main
 from lcopa_bayes.data.studywriter import write_folder
+from lcopa_bayes.fleets.devices import row_of
 from lcopa_bayes.fleets.summary import _shares, results
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.verbs import fleet as verb
@@ -312,3 +313,23 @@ def test_the_bench_makes_a_fleet_of_a_known_population_with_odd_devices(tmp_path
     study = lb.load_study(tmp_path / "device-001")
     assert study.fit[0].time.size == 250
     assert tomllib.loads((tmp_path / "device-001" / "study.toml").read_text())["model"] == {"terms": 1}
+
+
+def test_a_fleet_by_loop_tells_its_effects(devices, tmp_path):
+    found = lb.fleet([lb.load_study(devices / "a")], "loop", quick=True, folder=tmp_path)
+    (row,) = found.summary().to_dict("records")
+    own = lb.load_result(tmp_path / "devices" / "a", "loop")
+    assert (row["verdict"], row["confidence"]) == (own.values["verdict"], own.values["confidence"])
+    assert row["effects"] == "; ".join(own.study.effects.use)
+    assert [one["name"] for one in found.to_json()["shares"]] == (row["effects"] or "none").split("; ")
+    assert found.to_json()["groups"] == []
+    check_page(found.report(tmp_path))
+
+
+def test_a_device_of_a_comparison_tells_what_it_prefers():
+    values = lb.load_result(Path(__file__).parents[2] / "reports" / "paper-step", "compare").to_json()
+    row = row_of("compare", values, None)
+    (preferred,) = (one for one in values["models"] if one["name"] == "fractional-2")
+    assert (row["preferred"], row["grade"]) == ("fractional-2", preferred["grade"])
+    assert row["probability"] == preferred["probability"]
+    assert row_of("compare", values | {"preferred": None}, None)["grade"] == "unusable"
