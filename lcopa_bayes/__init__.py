@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from lcopa_bayes.verbs.design import design as design
     from lcopa_bayes.verbs.explain import explain as explain
     from lcopa_bayes.verbs.fit import fit as fit
+    from lcopa_bayes.verbs.fleet import FleetResult as FleetResult
+    from lcopa_bayes.verbs.fleet import fleet as fleet
     from lcopa_bayes.verbs.look import LookResult as LookResult
     from lcopa_bayes.verbs.look import look as look
     from lcopa_bayes.verbs.loop import LoopResult as LoopResult
@@ -63,6 +65,7 @@ _PLACES = {
     "verbs.design": ("DesignResult", "design"),
     "verbs.explain": ("explain",),
     "verbs.fit": ("fit",),
+    "verbs.fleet": ("FleetResult", "fleet"),
     "verbs.look": ("LookResult", "look"),
     "verbs.loop": ("LoopResult", "loop"),
     "verbs.new": ("NewStudy", "new"),

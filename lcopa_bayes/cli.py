@@ -242,6 +242,13 @@ def _explain(options: argparse.Namespace) -> Outcome:
     return {"term": term, "text": text}, text
 
 
+def _fleet(options: argparse.Namespace) -> Outcome:
+    jobs, keys = _jobs(options), (*_SAMPLING, "dask")
+    folder = options.out or RUNS / options.folder.resolve().name
+    doing = {"verb": options.of, "folder": folder, "jobs": jobs}
+    return _reported(lcopa_bayes.fleet(options.folder, **doing, **_given(options, *keys)), folder, jobs)
+
+
 def _predict(options: argparse.Namespace) -> Outcome:
     from lcopa_bayes.results.savedfit import load_fit
 
@@ -330,6 +337,7 @@ VERBS: Mapping[str, Callable[[argparse.Namespace], Outcome]] = {
         anew=True,
         truth=_truth,
     ),
+    "fleet": _fleet,
     "predict": _predict,
     "identify": _on_study("identify", "posterior", "quiet", module="papers", scan=_scan),
     "optics": _optics,

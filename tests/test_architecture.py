@@ -18,7 +18,7 @@ ORDER = (
     ("inference",),
     ("sampling",),
     ("results",),
-    ("identifiability", "effectsearch", "calibration"),
+    ("identifiability", "effectsearch", "calibration", "fleets"),
     ("experiments", "comparison"),
     ("paper",),
     ("plot",),

@@ -78,12 +78,18 @@ def calibration() -> lb.CalibrationResult:
 
 
 @pytest.fixture(scope="module")
+def fleet() -> lb.FleetResult:
+    one = {"terms": 1, "noise": NOISE, "priors": FIXED, "seed": 5}
+    return lb.fleet([lb.Study("a", fit=[ON], **one), lb.Study("b", fit=[OFF], **one)])
+
+
+@pytest.fixture(scope="module")
 def prediction(fit) -> lb.Prediction:
     return fit.predict(lb.Drive.steps(u=[(0, 1.0), (5, 0.0)]))
 
 
 RESULTS = (
-    *("fit", "audit", "comparison", "design", "loop", "prediction"),
+    *("fit", "audit", "comparison", "design", "loop", "prediction", "fleet"),
     pytest.param("calibration", marks=pytest.mark.slow),
 )
 
@@ -444,7 +450,7 @@ def public() -> dict[str, object]:
 
 def test_the_names_are_those_that_were_promised():
     promised = {"load_study", "Study", "Record", "Drive", "fit", "audit", "compare", "loop", "design"}
-    promised |= {"calibrate", "simulate", "load_result"}
+    promised |= {"calibrate", "fleet", "simulate", "load_result"}
     assert promised <= set(lb.__all__)
     assert set(lb.__all__) <= set(dir(lb))
     with pytest.raises(AttributeError, match="no attribute 'fitt'"):

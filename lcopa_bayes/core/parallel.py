@@ -175,11 +175,18 @@ def _cluster(shared: S, address: str) -> Iterator[Workers[S]]:
             # sent once; a worker that needs it takes it from another
             held = client.submit(_same, shared, pure=False)
             yield Workers(
-                lambda task, one: client.submit(task, held, one, pure=False),
+                lambda task, one: client.submit(_on_cluster, task, held, one, pure=False),
                 partial(distributed.as_completed, loop=client.loop),
             )
     except distributed.client.FutureCancelledError as error:
         raise InputError(f"--dask {address}: the scheduler was lost ({error}); {_ADVICE}") from None
+
+
+def _on_cluster(task: Callable[[S, T], R], shared: S, one: T) -> R:
+    """A task on a worker of a cluster. It gives no work to the cluster itself, so that xarray takes no lock
+    of the scheduler for a file in memory, which that has no name for."""
+    with import_module("dask").config.set(scheduler="synchronous"):
+        return task(shared, one)
 
 
 def _alone(function: Callable[[T], R], shared: object, one: T) -> R:

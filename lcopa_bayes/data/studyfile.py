@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
-from lcopa_bayes.core.errors import InputError, refuse_if
-from lcopa_bayes.core.files import read_tables
+from lcopa_bayes.core.errors import InputError, gathered, refuse_if
+from lcopa_bayes.core.files import read_json, read_tables
 from lcopa_bayes.data.cells import SUFFIXES
 from lcopa_bayes.data.record import Record, load_record
 from lcopa_bayes.data.settings import CandidateSettings, CompareSettings, HeadingSettings, RecordsSettings
 from lcopa_bayes.data.study import Study, together
-from lcopa_bayes.data.tables import TABLES, candidate_settings, settings_from, study_settings
+from lcopa_bayes.data.tables import (
+    TABLES,
+    candidate_settings,
+    population_priors,
+    settings_from,
+    study_settings,
+)
 
 _TABLES = ("study", "records", "priors", "stages", "candidates", *TABLES)
 """Tables of a study file."""
@@ -44,6 +50,24 @@ def _hashes(paths: Iterable[Path]) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
 
 
+def _population(priors: Mapping[str, Any], folder: Path, time_unit: str) -> tuple[Path, dict[str, Any]]:
+    """File that ``from`` of ``[priors]`` names, and the stated priors with those of its fleet for the others.
+
+    InputError when it cannot be used for a study in this time unit.
+    """
+    name, _, number = str(priors["from"]).partition("#")
+    path, group = folder / name, int(number) if number.isdecimal() else 1
+    values = read_json(path, "give the fleet.json that `fleet` wrote")
+    taken = population_priors(values, group, str(path))
+    if not number and len(values["groups"]) > 1:
+        about = "; ".join(f'"{name}#{one["number"]}" ({one["about"]})' for one in values["groups"])
+        raise InputError(f"{path}: holds several groups of devices; name one: {about}")
+    unit = values["groups"][group - 1]["time_unit"]
+    if unit != time_unit:
+        raise InputError(f"{path}: is in {unit}, this study is in {time_unit}; state time_unit in [study]")
+    return path, taken | {key: value for key, value in priors.items() if key != "from"}
+
+
 @final
 class BrokenStudyError(InputError):
     """A study file with problems whose plant and records can be used: more may be wrong with these."""
@@ -61,7 +85,6 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
 
     heading = settings_from(HeadingSettings, document.get("study", {}), where("study"), problems)
     named = settings_from(RecordsSettings, document.get("records", {}), where("records"), problems)
-    settings = study_settings(document, where, problems)
     heading, fit, apart = heading or HeadingSettings(), [], held_out
     if named:
         apart = [*(folder / name for name in named.held_out), *held_out]
@@ -72,10 +95,19 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
             problems.append(
                 f"{where('records')}: no record to fit; name one, or put one beside the study file"
             )
-    before = len(problems)
-    records = _read(fit, apart, heading.time_unit, problems)
+    of_records: list[str] = []
+    records = _read(fit, apart, heading.time_unit, of_records)
+    priors, used = document.get("priors"), [path]
+    if isinstance(priors, Mapping) and "from" in priors:
+        unit = records["fit"][0].time_unit if records["fit"] else heading.time_unit or ""
+        document["priors"] = {key: value for key, value in priors.items() if key != "from"}
+        with gathered(problems, f"{where('priors')}: from: "):
+            population, document["priors"] = _population(priors, folder, unit)
+            used.append(population)
+    settings = study_settings(document, where, problems)
+    problems += of_records
     plant = all(settings[key] is not None for key in ("model", "noise", "effects"))
-    if problems and not (plant and records["fit"] and before == len(problems)):
+    if problems and not (plant and records["fit"] and not of_records):
         raise InputError(problems)
     study = Study(
         heading.name or folder.resolve().name,
@@ -84,7 +116,7 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
         heading.seed,
         tuple(records["fit"]),
         tuple(records["held_out"]),
-        inputs=_hashes([path, *fit, *apart]),
+        inputs=_hashes([*used, *fit, *apart]),
         **settings | ({} if settings["stages"] else {"stages": None}),
     )
     if problems:

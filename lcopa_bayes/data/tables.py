@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, TypeVar
 
-from lcopa_bayes.core.errors import gathered, nearest
+from lcopa_bayes.core.errors import InputError, gathered, nearest
 from lcopa_bayes.core.rules import FLAG, Ruled
 from lcopa_bayes.data.settings import (
     STAGES,
@@ -66,6 +66,22 @@ def prior_settings(
         for name, prior in wrong.items()
     ]
     return {name: prior for name, prior in priors.items() if name not in wrong}
+
+
+def population_priors(values: Mapping[str, Any], group: int, where: str) -> dict[str, dict[str, Any]]:
+    """Priors of the next device of a group of a fleet, by parameter name, from what `fleet` wrote; InputError
+    after `where` when it holds no such group, or no population of it."""
+    groups = values.get("groups")
+    if not isinstance(groups, list):
+        raise InputError(f"{where}: holds no fleet; give the fleet.json that `fleet` wrote")
+    if not 1 <= group <= len(groups):
+        raise InputError(f"{where}: holds {len(groups)} groups of devices, none of the number {group}")
+    rows = groups[group - 1]["parameters"]
+    unusable = [row["grade_reason"] for row in rows if row["grade"] == "unusable"]
+    if unusable or not rows:
+        reason = unusable[0] if unusable else groups[group - 1]["sentence"] or "it has no draws"
+        raise InputError(f"{where}: group {group} has no population to take priors from: {reason}")
+    return {row["name"]: dict(row["prior"]) for row in rows}
 
 
 def candidate_settings(rows: object, where: str, problems: list[str]) -> tuple[CandidateSettings, ...]:

@@ -9,6 +9,7 @@ from lcopa_bayes.plot.figures import director as director
 from lcopa_bayes.plot.figures import drive as drive
 from lcopa_bayes.plot.figures import evidence as evidence
 from lcopa_bayes.plot.figures import far_field as far_field
+from lcopa_bayes.plot.figures import fleet as fleet
 from lcopa_bayes.plot.figures import forest as forest
 from lcopa_bayes.plot.figures import prediction as prediction
 from lcopa_bayes.plot.figures import profiles as profiles

@@ -16,6 +16,7 @@ from lcopa_bayes.plot.audit import profiles_figure
 from lcopa_bayes.plot.comparison import evidence_figure
 from lcopa_bayes.plot.designs import drive_figure, precision_figure
 from lcopa_bayes.plot.draws import IN_CORNER, corner_figure, forest_figure, ranked
+from lcopa_bayes.plot.fleet import population_figure
 from lcopa_bayes.plot.loop import before_after_figure
 from lcopa_bayes.plot.optics import director_figure, far_field_figure
 from lcopa_bayes.plot.records import prediction_figure, residual_figure, response_figure
@@ -119,6 +120,19 @@ def before_after(loop: StoredResult, record: str | None = None, axis: str | None
 def design(design: StoredResult) -> Figure:
     """Precision of every parameter against bench time, after the best drive and after the plain step."""
     return precision_figure(_values(design, "design"))
+
+
+@_styled
+def fleet(fleet: StoredResult, parameters: Sequence[str] = (), group: int = 1) -> Figure:
+    """`parameters` of the devices of a `group`, by default of all and of the largest, against their
+    population."""
+    groups = {one["number"]: one for one in _values(fleet, "fleet")["groups"] if one["parameters"]}
+    if group not in groups:
+        raise InputError(
+            f"no group {group} with a population; there are: {', '.join(map(str, groups)) or 'none'}"
+        )
+    rows = {row["name"]: row for row in groups[group]["parameters"]}
+    return population_figure([rows[name] for name in _known(parameters, rows) or rows])
 
 
 @_styled

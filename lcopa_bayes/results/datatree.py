@@ -72,7 +72,7 @@ def posterior_draws(path: Path) -> dict[str, Matrix]:
         }
 
 
-def posterior_tree(fit: Fit) -> DataTree:
+def posterior_tree(fit: Fit, *, compact: bool = False) -> DataTree:
     """Draws of a fit with its data and prior in the ArviZ groups.
 
     `posterior`, `prior` and `log_prior` hold one variable per free parameter, with its name and unit as
@@ -82,11 +82,11 @@ def posterior_tree(fit: Fit) -> DataTree:
     Their dimension is `<record>_<axis>_time` with the times as coordinate. Drives are in the constant data
     by `<record>_drive_time` and `drive`, the axes' names; `record` lists the records.
 
-    Of long records, `log_likelihood` and `posterior_predictive` hold every k-th draw, as their coordinate
-    `draw` says. The priors of single parameters add up to that of all but for a constant, the attribute
-    `joint_support` of `log_prior`: decreasing orders and resolved terms hold a part of the mass. A slash in a
-    name, which netCDF keeps for groups, is written as a vertical bar; names that would be the same get a
-    number (`variable_names`).
+    Of long records, and of all where it shall be `compact`, `log_likelihood` and `posterior_predictive` hold
+    every k-th draw, as their coordinate `draw` says. The priors of single parameters add up to that of all
+    but for a constant, the attribute `joint_support` of `log_prior`: decreasing orders and resolved terms
+    hold a part of the mass. A slash in a name, which netCDF keeps for groups, is written as a vertical bar;
+    names that would be the same get a number (`variable_names`).
     """
     draws, problem = fit.draws, fit.problem
     posterior, table, study = problem.posterior, draws.table, fit.study
@@ -97,7 +97,8 @@ def posterior_tree(fit: Fit) -> DataTree:
     prior = table.draw(count, np.random.default_rng([study.seed, 9]))
     fitted = _Series.of(posterior.samples)
     shape = draws.values.shape[:2]
-    some = slice(None, None, _step(shape, sum(each.size for each in fitted.observed.values())))
+    cells = 0 if compact else _CELLS
+    some = slice(None, None, _step(shape, sum(each.size for each in fitted.observed.values()), cells))
     kept = draws.values[:, some]
     flat = kept.reshape(-1, kept.shape[2])
     likelihood, predictive = _predicted(fit, fitted, flat, rng, likelihood=True)
@@ -141,9 +142,10 @@ def posterior_tree(fit: Fit) -> DataTree:
     return tree
 
 
-def _step(draws: tuple[int, ...], samples: int) -> int:
-    """Every so many draws of (chains, draws) are kept of what has one number for each sample."""
-    fits = max(_CELLS // max(samples, 1), _FEWEST)
+def _step(draws: tuple[int, ...], samples: int, cells: int) -> int:
+    """Every so many draws of (chains, draws) are kept of what has one number for each sample, for so many
+    numbers or the fewest draws."""
+    fits = max(cells // max(samples, 1), _FEWEST)
     return max(1, min(prod(draws) // fits, draws[1]))
 
 

@@ -113,17 +113,20 @@ class Fit(Predictive):
         """Draws, data and prior in the ArviZ groups; see `datatree`."""
         return posterior_tree(self)
 
-    def save(self, folder: Path | str) -> Path:
+    def save(self, folder: Path | str, *, compact: bool = False) -> Path:
         """Write draws, numbers and tables into a run folder, which `load_result` reads; returns the folder.
 
-        InputError naming the first file that cannot be written, and as `Result.save`.
+        Where it shall be `compact`, what has one number for each sample is kept for fewer draws. InputError
+        naming the first file that cannot be written, and as `Result.save`.
         """
         origin = provenance(self.study, self.verb)
         with opened(folder, origin) as path:
             writable_folder(path / "tables")
             for name, table in tables(self).items():
                 save_table(table, path / "tables" / f"{name}.csv")
-            write_whole(path / POSTERIOR, lambda beside: save_tree(self.to_datatree(), beside))
+            write_whole(
+                path / POSTERIOR, lambda beside: save_tree(posterior_tree(self, compact=compact), beside)
+            )
             text = json.dumps(fit_to_json(self.problem, self.draws), allow_nan=False)
             write_text(path / SAVED, f"{text}\n")
             add_origin(path, self.verb, origin)

@@ -101,9 +101,9 @@ def _number(name: str, words: str, **how: Any) -> Option:
     return _option(name, words, **{"type": float, "default": argparse.SUPPRESS} | how)
 
 
-def _choice(name: str, words: str, *known: str) -> Option:
+def _choice(name: str, words: str, *known: str, **how: Any) -> Option:
     """One of several words, the first by default."""
-    return _option(name, words, choices=known, default=known[0])
+    return _option(name, words, choices=known, default=known[0], **how)
 
 
 def _whole(least: int) -> Callable[[str], int]:
@@ -120,6 +120,7 @@ def _whole(least: int) -> Callable[[str], int]:
 _ENDS: Mapping[str, Any] = {"nargs": 2, "metavar": ("LOW", "HIGH"), "default": None}
 _COLUMN = "by header or number, perhaps with a new name: 'heater [%%]=Column B'"
 _QUICK = _flag("--quick", "a quarter of the steps or replicas: to see that it runs")
+_JOBS = _option("--jobs", "processes, at most one per core (default: all cores)", type=_whole(1))
 _OVERWRITE = _flag("--overwrite", "replace files that are there")
 
 
@@ -135,8 +136,7 @@ def _about(out: str = "runs/<study>") -> tuple[Option, ...]:
 
 def _parallel(out: str = "runs/<study>") -> tuple[Option, ...]:
     """Options of verbs about a study that use several processes."""
-    jobs = _option("--jobs", "processes, at most one per core (default: all cores)", type=_whole(1))
-    return (*_about(out), jobs)
+    return (*_about(out), _JOBS)
 
 
 def _sampled(out: str = "runs/<study>") -> tuple[Option, ...]:
@@ -244,6 +244,19 @@ USAGES: Mapping[str, Usage] = {
                 "sampling",
             ),
             _option("--dask", "scheduler of a Dask cluster that does the replicas", metavar="ADDRESS"),
+        ),
+    ),
+    "fleet": Usage(
+        "one verb over the studies of many devices, and the population they come from",
+        "devices --jobs 2",
+        (
+            _path("folder", "folder with a study of each device"),
+            _choice("--verb", "what is done with every device", "fit", "audit", "loop", "compare", dest="of"),
+            _path("--out", "run folder (default: runs/<folder>); devices finished there are kept"),
+            _JOBS,
+            _option("--dask", "scheduler of a Dask cluster that does the devices", metavar="ADDRESS"),
+            _flag("--resume", "go on within devices that were interrupted"),
+            _QUICK,
         ),
     ),
     "predict": Usage(

@@ -30,6 +30,7 @@ def fit(
     quick: bool = False,
     cross_check: bool = False,
     rival: bool = False,
+    compact: bool = False,
     quiet: bool = True,
 ) -> Fit:
     """Sample the posterior of a study and derive what it predicts.
@@ -37,8 +38,9 @@ def fit(
     Parameters: `study`, or where it is described; `jobs`, processes to use, which change no number; `folder`,
     a run folder in which draws are kept while they are made, so that `resume` goes on from them, and the
     result afterwards; `quick`, a quarter of the steps; `cross_check`, sample by nested sampling too; `rival`,
-    fit the study with integer orders too and compare what both predict of the held-out records; `quiet`, no
-    progress bar, and no first look (`look`) in the folder meanwhile.
+    fit the study with integer orders too and compare what both predict of the held-out records; `compact`,
+    keep what has one number for each sample for fewer draws in the folder; `quiet`, no progress bar, and no
+    first look (`look`) in the folder meanwhile.
 
     The same study gives the same draws. InputError when the study cannot be used, or the folder cannot be
     written to, holds another study's results, or is being written by another run; then nothing is written.
@@ -69,7 +71,7 @@ def fit(
         if structure:
             fitted = with_alternatives(replace(fitted, structure=structure))
         if place is not None:
-            fitted.save(place)
+            fitted.save(place, compact=compact)
     return fitted
 
 

@@ -20,6 +20,7 @@ from lcopa_bayes.verbs.calibrate import CalibrationResult
 from lcopa_bayes.verbs.check import CheckResult
 from lcopa_bayes.verbs.compare import Comparison
 from lcopa_bayes.verbs.design import DesignResult
+from lcopa_bayes.verbs.fleet import FleetResult
 from lcopa_bayes.verbs.look import LookResult
 from lcopa_bayes.verbs.loop import LoopResult
 from lcopa_bayes.verbs.papers import ClaimsResult, IdentifyResult, OpticsResult
@@ -41,7 +42,7 @@ _KINDS: Mapping[str, type[StoredResult]] = {
     kind.verb: kind
     for kind in (
         *(CheckResult, LookResult),
-        *(AuditResult, DesignResult, Comparison, LoopResult, CalibrationResult, SavedPrediction),
+        *(AuditResult, DesignResult, Comparison, LoopResult, CalibrationResult, FleetResult, SavedPrediction),
         *(OpticsResult, IdentifyResult, ClaimsResult),
     )
 }

@@ -40,8 +40,9 @@ REPLICAS = {True: "2", False: "20"}
 SAMPLES = 1000
 """Bench time of `design` [sampling periods]."""
 WITHOUT_STUDY = ("optics", "claims")
-APART = ("run", "new", "explain")
-"""Verbs that are not measured: `fit` with what a study adds to it, and two that calculate nothing."""
+APART = ("run", "fleet", "new", "explain")
+"""Verbs that are not measured: `fit` with what a study adds to it or of many studies, and two that calculate
+nothing."""
 ON_FIT = ("report", "predict", "audit", "design")
 """Verbs that take the run folder of a fit."""
 

@@ -1,0 +1,1 @@
+"""Devices that are alike but not equal: what they share, how far they differ, which do not belong."""
