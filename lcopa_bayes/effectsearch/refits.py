@@ -15,9 +15,10 @@ from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.effectsearch.basefit import renewed
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.noise import quiet_samples
+from lcopa_bayes.effectsearch.priorwidth import widened, with_room
 from lcopa_bayes.effectsearch.regression import Optimum, Regression
 from lcopa_bayes.effectsearch.scores import State, groups, log_scores
-from lcopa_bayes.effectsearch.signature import COMMON, WIDER, Scale
+from lcopa_bayes.effectsearch.signature import Scale
 from lcopa_bayes.effectsearch.trace import LEVEL
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.inference.effects import Placed
@@ -26,10 +27,6 @@ from lcopa_bayes.model.effects.effect import Effect, Ranges
 
 SIGNIFICANT = 2.7e-3
 """Two-sided p-value of three standard deviations [-]."""
-_FAR = 3.0
-"""Coefficients beyond so many prior standard deviations widen their prior [-]."""
-_STEPS = 4
-"""How often it is widened at most [-]."""
 _PROCESSES = 400
 """Plausible noise processes over which a p-value is averaged [-]."""
 _NEAR = 0.5
@@ -136,7 +133,7 @@ class Refit:
         before = Regression(plain, whitening).descend(self.before.x, most=12, gain=_NEAR)
         optimum = Regression(self.model, whitening).descend(self.optimum.x, most=12, gain=_NEAR)
         optimum = _no_worse(self.model, whitening, optimum, before)
-        model, optimum, rare = _with_room(self.model, optimum, whitening, self.added)
+        model, optimum, rare = with_room(self.model, optimum, whitening, self.added)
         paid = self.paid - rare
         return replace(self, model=model, optimum=optimum, before=before, whitening=whitening, paid=paid)
 
@@ -233,7 +230,7 @@ def refit(
     extended = model.having(*model.effects, *(effect for effect, _ in added))
     size = sum(psi.size for _, psi in added)
     linear = np.concatenate([psi for _, psi in added]) * extended.scale[-size:]
-    extended, common = _widened(extended, added)
+    extended, common = widened(extended, added)
     low, high = extended.bounds
     starts = [np.concatenate([before.x, factor * linear]) for factor in (1.0, 0.3, 0.0)]
     if any(effect.card.place == "drive" for effect, _ in added):
@@ -245,32 +242,11 @@ def refit(
     optimum = Regression(extended, whitening).descend(start, most=12, gain=0.02)
     optimum = _no_worse(extended, whitening, optimum, before)
     names = tuple(effect.name for effect, _ in added)
-    extended, optimum, rare = _with_room(extended, optimum, whitening, names)
+    extended, optimum, rare = with_room(extended, optimum, whitening, names)
     sides = sum(one.coefficient.one_signed for one in extended.effected.coefficients[-size:])
     tried = sum(np.log(len(effect.grid(extended.effected.ranges))) for effect, _ in added)
     paid = sides * float(np.log(2.0)) - float(tried) - common - rare
     return Refit(extended, optimum, before, whitening, names, quiet, paid)
-
-
-def _widened(model: ExtendedModel, added: Sequence[tuple[Effect, Vector]]) -> tuple[ExtendedModel, float]:
-    """The model with priors that hold linear estimates of `added` effects, which narrow ones would keep a
-    descent from, and what the evidence pays for that [nat]."""
-    shares = {model.effects[one.effect].name for one in _shares(model)}
-    steps = {effect.name: _steps(psi) for effect, psi in added if effect.name not in shares}
-    more = {name: WIDER**count for name, count in steps.items() if count}
-    paid = sum(steps.values()) * float(np.log(COMMON))
-    return (replace(model, wider={**model.wider, **more}), paid) if more else (model, 0.0)
-
-
-def _shares(model: ExtendedModel) -> list[Placed]:
-    """Coefficients that say how much of an effect is there."""
-    return [one for one in model.effected.coefficients if one.coefficient.share]
-
-
-def _steps(psi: Vector) -> int:
-    """How often a prior is widened to hold coefficients over its sd [-]."""
-    apart = float(np.abs(psi).max(initial=0.0)) / _FAR
-    return min(int(np.ceil(np.log(apart) / np.log(WIDER))), _STEPS) if apart > 1 else 0
 
 
 def freed(
@@ -350,30 +326,6 @@ def _replaced(model: ExtendedModel, effect: int, constants: Mapping[str, float])
     effects: list[Any] = list(model.effects)
     effects[effect] = replace(effects[effect], **constants)
     return model.having(*effects)
-
-
-def _with_room(
-    model: ExtendedModel, optimum: Optimum, whitening: Whitening, names: Sequence[str]
-) -> tuple[ExtendedModel, Optimum, float]:
-    """Model and optimum with priors of the effects `names` so wide that these do not pull their coefficients
-    back, and what the evidence pays for that [nat].
-
-    A prior a normal law's tail away from the data biases the coefficient, and what it takes away would look
-    like a further effect. Scales four times as large are a tenth as common: together a prior with the tails
-    of a Student law of 1.7 degrees of freedom.
-    """
-    rare = 0.0
-    for _ in range(_STEPS):
-        apart = np.abs(optimum.x[model.plant_size :]) / model.scale
-        placed = zip(model.effected.coefficients, apart, strict=True)
-        beyond = (one for one, size in placed if size > _FAR and not one.coefficient.share)
-        far = {model.effects[one.effect].name for one in beyond} & set(names)
-        if not far:
-            return model, optimum, rare
-        more = {name: WIDER * model.wider.get(name, 1.0) for name in far}
-        model, rare = replace(model, wider={**model.wider, **more}), rare + len(far) * float(np.log(COMMON))
-        optimum = Regression(model, whitening).descend(optimum.x, most=12, gain=0.02)
-    return model, optimum, rare
 
 
 def _no_worse(model: ExtendedModel, whitening: Whitening, reached: Optimum, before: Optimum) -> Optimum:

@@ -17,16 +17,10 @@ from scipy.special import log_ndtr, logsumexp
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
+from lcopa_bayes.effectsearch.priorwidth import FACTORS, RARE
 from lcopa_bayes.effectsearch.whitening import Whitening
 from lcopa_bayes.model.effects.effect import Effect
 
-WIDER = 4.0
-"""Factor from one width of the prior of coefficients to the next [-]."""
-COMMON = 10.0
-"""How many times more common effects within a prior are than within the next wider one [-]."""
-_FACTORS = WIDER ** np.arange(4)
-"""Widths of that prior tried: an effect may be some hundred times as large as expected [-]."""
-_RARE = -np.log(COMMON) * np.arange(_FACTORS.size)
 _LEAST_POWER = 1e-10
 """Power of a direction of a signature at one prior sd below which it is nothing [-]."""
 _RANK = 1e-9
@@ -145,16 +139,16 @@ class Signature:
         sign has a half-normal prior: the factor is 2 Phi(mean / sd) of the normal one.
         """
         each = self._by_width(inner, scale_of)
-        return np.asarray(logsumexp(each, axis=0) - logsumexp(_RARE[: len(each)]))
+        return np.asarray(logsumexp(each, axis=0) - logsumexp(RARE[: len(each)]))
 
     def _by_width(self, inner: Matrix, scale_of: Scale) -> Matrix:
         """Evidence within each width of the prior less what the width costs, (widths, draws) [nat]."""
         each = [self._within(inner, scale_of, factor * self.scale) for factor in self._factors]
-        return np.asarray(np.stack(each) + _RARE[: len(each), None], dtype=float)
+        return np.asarray(np.stack(each) + RARE[: len(each), None], dtype=float)
 
     @property
     def _factors(self) -> Vector:
-        return np.asarray(_FACTORS[:1] if self.share else _FACTORS, dtype=float)
+        return np.asarray(FACTORS[:1] if self.share else FACTORS, dtype=float)
 
     def _within(self, inner: Matrix, scale_of: Scale, scale: Vector) -> Vector:
         """The same where one prior sd of each direction has the length `scale`, (rank,) [-]."""

@@ -11,7 +11,7 @@ from test_loop import LIBRARY, study
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.effectsearch import basemodel, noise, refits, signature
+from lcopa_bayes.effectsearch import basemodel, noise, priorwidth, refits, signature
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.loop import Loop, loop
 from lcopa_bayes.effectsearch.refits import refit
@@ -61,7 +61,7 @@ def test_a_large_effect_is_estimated_without_bias(monkeypatch):
     errors = np.array([error(one) for one in found])
     assert np.abs(errors).max() < 3.0
     assert abs(errors.mean()) < 3.0 / np.sqrt(len(seeds))
-    monkeypatch.setattr(refits, "_FAR", np.inf)
+    monkeypatch.setattr(priorwidth, "_FAR", np.inf)
     held = np.array([error(looped(seed)) for seed in seeds[:2]])
     assert held.max() < -3.0
     for one in found:
@@ -98,7 +98,7 @@ def test_what_a_narrow_prior_takes_away_is_no_further_effect(seed, monkeypatch):
     k = state.model.plant_size
     truth = CUBE * state.model.effected.ranges.response[0] ** 2
     assert abs(state.optimum.x[k] - truth) < 3.5 * state.optimum.sd[k]
-    monkeypatch.setattr(refits, "_FAR", np.inf)
+    monkeypatch.setattr(priorwidth, "_FAR", np.inf)
     held = loop(made, sample=False, quick=True, as_stated=True)
     assert held.names != ("odd_curvature",)
 
@@ -127,8 +127,8 @@ def test_a_drift_far_beyond_its_prior_is_named_and_nothing_else(period, monkeypa
     assert found.verdict.kind == "disturbance"
     assert found.enlarged == ""
     if period < 1.0:
-        monkeypatch.setattr(signature, "_FACTORS", np.ones(1))
-        monkeypatch.setattr(signature, "_RARE", np.zeros(1))
+        monkeypatch.setattr(signature, "FACTORS", np.ones(1))
+        monkeypatch.setattr(signature, "RARE", np.zeros(1))
     else:
         assert found.base.smooth
         monkeypatch.setattr(basemodel, "_explained", lambda *given: np.inf)
@@ -155,8 +155,8 @@ def test_more_than_the_whole_of_an_effect_is_no_name(monkeypatch):
     """Steps of the drive 2.7 times as uneven as its grey levels would make them follow any three levels."""
     assert "grey_quantisation" not in loop(saturated(), sample=False, quick=True).names
     monkeypatch.setattr(refits.Refit, "possible", True)
-    monkeypatch.setattr(refits, "_shares", lambda model: [])
-    monkeypatch.setattr(signature.Signature, "_factors", signature._FACTORS)
+    monkeypatch.setattr(priorwidth, "_shares", lambda model: [])
+    monkeypatch.setattr(signature.Signature, "_factors", signature.FACTORS)
     assert "grey_quantisation" in loop(saturated(), sample=False, quick=True).names
 
 
@@ -186,7 +186,7 @@ def test_the_evidence_of_a_wider_prior_is_that_of_the_integral():
     effect = state.model.effects[0]
     made = refit(start.model, start.optimum, start.whitening, [(effect, np.ones(1))], 1e9)
     assert made.model.wider == {"odd_curvature": 4.0}
-    assert made.paid == pytest.approx(-np.log(signature.COMMON) - np.log(len(effect.grid(None))))
+    assert made.paid == pytest.approx(-np.log(priorwidth.COMMON) - np.log(len(effect.grid(None))))
     k = made.model.plant_size
     sd = made.model.scale[0]
     grid = made.optimum.x[k] + np.linspace(-6, 6, 61) * made.optimum.sd[k]
