@@ -57,9 +57,10 @@ class Verdict:
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Verdict:
-        """Verdict of a result; the reason is not repeated."""
-        sentence, reason = str(values["verdict"]), str(values["grade_reason"])
-        return cls(str(values["grade"]), formatting.stopped(sentence), "" if reason in sentence else reason)
+        """Verdict of a result; grade and reason are not repeated."""
+        grade, sentence, reason = (str(values[key]) for key in ("grade", "verdict", "grade_reason"))
+        sentence = sentence.removeprefix(f"Grade {grade}: {reason}. ")
+        return cls(grade, formatting.stopped(sentence), "" if reason in sentence else reason)
 
 
 @final

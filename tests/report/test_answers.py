@@ -96,6 +96,7 @@ VALUES: dict[str, dict[str, Any]] = {
         "records": [
             {"record": "on", "held_out": False, "responses": [AT_REST]},
             {"record": "off", "held_out": True, "responses": []},
+            {"record": "b", "held_out": False, "responses": [AT_REST | {"scatter": 0.002, "onset": 4.0}]},
         ],
         "parameters": [row("gain", **{"from": "default"}), row("order")],
         "problems": [],
@@ -180,8 +181,8 @@ SAID = [
      "draws are reliable."),
     ("predict", ("outside",), [1, 2], "What next?", "Record a response to such a drive before relying on it."),
     ("check", (), None, "How good", "At rest samples scatter by up to 1.0 % of the range of the response (on/x)."),
-    ("check", ("records", 0, "responses", 0, "scatter"), None, "How good", "No record has samples at rest that "
-     "show the noise."),
+    ("check", ("records", 0, "responses", 0, "scatter"), None, "How good", "At rest samples scatter by up to 0.20 % of the "
+     "range of the response (b/x)."),
     ("check", (), None, "Is there a delay?", "x of on moves first, 3.00 ms after a drive."),
     ("check", (), None, "What is assumed?", "1 of 2 priors come from the records by rule."),
     ("check", ("records", 1, "held_out"), False, "What is missing?", "No record is held out to test the prediction."),
