@@ -205,6 +205,13 @@ def _distinct(names: Sequence[str]) -> list[str]:
 
 
 _PLAIN = re.compile(r"[+-]?[\d.,]*\d[\d.,]*(e[+-]?\d+)?", re.IGNORECASE)
+_WRITTEN = {
+    sign: re.compile(
+        rf"[+-]?(\d{{1,3}}(\{group}\d{{2,3}})*\{group}\d{{3}}|\d*)(\{sign}\d*)?(e[+-]?\d+)?", re.IGNORECASE
+    )
+    for sign, group in (".,", ",.")
+}
+"""Numbers by their decimal sign: the other one stands between groups of digits alone."""
 _SPACES = re.compile(r"[\s\u00a0\u202f']")
 _DATES = ("%Y-%m-%d", "%Y/%m/%d", "%d.%m.%Y", "%d.%m.%y", "%d/%m/%Y", "%m/%d/%Y", "%d-%m-%Y")
 _CLOCKS = ("%H:%M:%S.%f", "%H:%M", "%I:%M:%S.%f %p", "%I:%M %p")
@@ -245,7 +252,7 @@ def numbers(cells: Sequence[str], sign: str) -> Vector:
 
 def _number(cell: str, sign: str) -> float:
     text = _SPACES.sub("", cell).replace("\u2212", "-").removesuffix("%")
-    if not _PLAIN.fullmatch(text):
+    if not (_PLAIN.fullmatch(text) and _WRITTEN[sign].fullmatch(text)):
         return np.nan
     text = text.replace(".", "").replace(",", ".") if sign == "," else text.replace(",", "")
     try:

@@ -189,6 +189,10 @@ def test_numbers_in_foreign_notation():
         numbers(["1.234,5", "\u22122", "3 000", "x", "", "5%"], ","), [1234.5, -2, 3000, np.nan, np.nan, 5]
     )
     assert_array_equal(numbers(["1,234.5", "1e-3", "inf", "nan"], "."), [1234.5, 1e-3, np.nan, np.nan])
+    assert_array_equal(
+        numbers(["2.5", "1.234.567", "1.23.456", ".5"], ","), [np.nan, 1234567, 123456, np.nan]
+    )
+    assert_array_equal(numbers(["2,5", "12,34,567", ".5", "+7."], "."), [np.nan, 1234567, 0.5, 7])
 
 
 def test_roles_follow_words_then_data_and_may_be_stated(tmp_path):
@@ -238,6 +242,7 @@ BROKEN = {
     "Time [fortnight],u,y\n1,0,0\n2,1,1\n3,1,2": "'fortnight', which is not known",
     "Time [s],u [%],u (%),y\n0,0,1,1\n1,1,2,2\n2,1,1,4": "would both be the drive 'u'",
     "Time [s],u,y\n0,1,0,2,0,3\n0,2,0,2,0,3\n0,3,0,2,0,3": r"decimals are written with commas.*in all 3 rows",
+    "Time [s];u;y\n0;0;1,5\n1;1;2.5\n2;1;3,5": "line 3, column 'y': '2.5' is not a number of y",
     "Time [s],y\n0,1.2\n1,1.3\n2,1.1\n3,1.2\n4,1.9": "no column is recognised as a drive",
     "Time [s],u,y\n0,0,1\n1,1,2\n1,1,3": "does not come after",
     "Time [s],u,y\n0,0,1\n1,1,2\n2,1,oops\n3,1,4": "line 4, column 'y': 'oops' is not a number of y",
