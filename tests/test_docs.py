@@ -1,14 +1,16 @@
 """The documentation says what the code does: keys, defaults, limits of grades, verbs, examples and links."""
 
 import dataclasses
+import inspect
 import re
+import shlex
 import tomllib
 from pathlib import Path
 
 import pytest
 
 import lcopa_bayes
-from lcopa_bayes.cli import main
+from lcopa_bayes.cli import _parser, main
 from lcopa_bayes.comparison.candidates import KNOWN, VARIANTS
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.record import load_record
@@ -32,6 +34,7 @@ from lcopa_bayes.sampling import convergence, evidence
 from lcopa_bayes.sampling.sampler import SamplePlan
 
 ROOT = Path(__file__).parents[1]
+FIGURES = {name for name, one in vars(lcopa_bayes.plot).items() if inspect.isfunction(one)}
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 TABLES = {
     "study": HeadingSettings,
@@ -246,6 +249,28 @@ def test_every_page_is_reached_from_the_readme_and_names_files_that_exist():
             r"`(?:python )?((?:reports|studies|tests)/[\w./-]+)", page.read_text("utf-8")
         ):
             assert (ROOT / named).exists(), f"{page.name}: {named}"
+
+
+def test_every_command_of_the_documentation_is_one_that_the_command_line_takes():
+    shown = [line for page in PAGES for block in blocks(page, "sh") for line in re.split("\n|&&", block)]
+    found = [shlex.split(line, comments=True) for line in shown]
+    commands = [words[1:] for words in found if words and Path(words[0]).name == "lcopa-bayes"]
+    assert len(commands) > 15
+    for words in commands:
+        _parser(words).parse_args(words)
+    with pytest.raises(SystemExit):
+        _parser([]).parse_args(["audit", "study", "--benchtime", "3"])
+
+
+def test_the_gallery_shows_every_figure_and_pictures_are_small_and_described():
+    shown = rows((ROOT / "docs" / "gallery.md").read_text("utf-8"), "function")
+    assert {name.partition("(")[0] for name in shown} == FIGURES
+    pictures = set((ROOT / "docs" / "pictures").iterdir())
+    text = "".join(page.read_text("utf-8") for page in PAGES)
+    named = re.findall(r"!\[([^\]]*)\]\((pictures/[^)]+)\)", text)
+    assert {ROOT / "docs" / path for _, path in named} == pictures
+    assert all(1_000 < path.stat().st_size < 100_000 for path in pictures)
+    assert all(words for words, _ in named)
 
 
 def test_readme_figure_is_small():

@@ -103,7 +103,10 @@ def read_cells(path: Path) -> CellTable:
             beside = (f for f in path.parent.glob("[!.]*") if f.is_dir() or f.suffix.lower() in SUFFIXES)
             refuse(path, f"no such file{nearest(path.name, (f.name for f in beside))}")
         if path.suffix.lower() not in SUFFIXES or not path.is_file():
-            refuse(path, f"is not a record; expected a file ending in {' or '.join(SUFFIXES)}")
+            ends = " or ".join(SUFFIXES)
+            refuse(
+                path, f"is not a record; expected a file ending in {ends}; `lcopa-bayes new` converts others"
+            )
         return _csv_cells(path) if path.suffix.lower() == ".csv" else frame_cells(pd.read_parquet(path), path)
     except InputError:
         raise

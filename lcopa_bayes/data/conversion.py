@@ -155,8 +155,11 @@ def convert(tables: Sequence[CellTable], mapped: Mapped) -> tuple[list[Record], 
 
 
 def axis_of(header: str) -> Axis:
-    """Name and unit of a header such as ``Heater [%]``, ``T1 (°C)``, ``Druck in bar`` or ``force / N``."""
-    pattern = r"^(?P<name>.*?)\s*(?:\[(?P<a>[^\]]*)\]|\((?P<b>[^)]*)\)|\s+in\s+(?P<c>\S+)|\s*/\s*(?P<d>\S+))$"
+    """Name and unit of a header: ``Heater [%]``, ``T1 (°C)``, ``valve %``, ``p in bar``, ``force / N``."""
+    pattern = (
+        r"^(?P<name>.*?)\s*(?:\[(?P<a>[^\]]*)\]|\((?P<b>[^)]*)\)|\s+in\s+(?P<c>\S+)|\s*/\s*(?P<d>\S+)"
+        r"|\s+(?P<e>%|°\s?\w+))$"
+    )
     match = re.match(pattern, header.strip())
     name, unit = header, ""
     if match and match["name"].strip():
@@ -264,7 +267,7 @@ def _roles(
     """Headers of drives and responses by their axes."""
     problems: list[str] = []
     stated = {
-        role: _stated(table, given, columns, problems)
+        role: _stated(table, role, given, columns, problems)
         for role, given in (("drive", mapped.drives), ("response", mapped.responses))
     }
     refuse_if(problems)
@@ -282,11 +285,13 @@ def _roles(
             if stated[role]:  # what is stated of a role is all of it
                 notes.append(f"{name!r} is left out: the {role}s are stated.")
                 continue
-            roles[role][column.axis] = name
-            notes.append(f"{name!r} is a {role}, in {column.axis.unit} ({why}).")
+            if not _taken(table, role, column.axis, name, roles[role], problems):
+                roles[role][column.axis] = name
+                notes.append(f"{name!r} is a {role}, in {column.axis.unit} ({why}).")
     lacking = [role for role, each in roles.items() if not each]
     refuse_if(
-        [
+        problems
+        + [
             f"{table.path}: no column is recognised as a {role}; name one with --{role}, one of "
             + ", ".join(repr(name) for name in columns if name not in taken)
             for role in lacking
@@ -305,7 +310,7 @@ def _role(column: _Column) -> tuple[str, str]:
 
 
 def _stated(
-    table: CellTable, given: Sequence[str], columns: Mapping[str, _Column], problems: list[str]
+    table: CellTable, role: str, given: Sequence[str], columns: Mapping[str, _Column], problems: list[str]
 ) -> dict[Axis, str]:
     out: dict[Axis, str] = {}
     for one in given:
@@ -318,8 +323,22 @@ def _stated(
         unit = axis.unit if axis.unit != UNKNOWN else columns[name].axis.unit
         if not columns[name].numeric:
             problems.append(f"{table.path}: the column {name!r} holds no numbers")
-        out[Axis(axis.name, unit)] = name
+        if not _taken(table, role, axis, name, out, problems):
+            out[Axis(axis.name, unit)] = name
     return out
+
+
+def _taken(
+    table: CellTable, role: str, axis: Axis, name: str, own: Mapping[Axis, str], problems: list[str]
+) -> bool:
+    """Whether another column of a role has the name of this axis; then `problems` say so."""
+    other = next((header for known, header in own.items() if known.name == axis.name), "")
+    if other:
+        problems.append(
+            f"{table.path}: the columns {other!r} and {name!r} would both be the {role} {axis.name!r}; give "
+            f"one another name, such as --{role} {other!r} '{axis.name}_2={name}', or state one alone"
+        )
+    return bool(other)
 
 
 def _unreadable(table: CellTable, name: str, values: Vector, called: str, *, empty: bool = False) -> None:

@@ -122,7 +122,10 @@ def _workbook(path: Path, sheet: str | None) -> CellTable:
         widths = Counter(len([cell for cell in cells if cell]) for _, cells in rows)
         if rows and max(widths) > 1:
             return _tabled(path, rows, max(len(cells) for _, cells in rows))
-    raise InputError(f"{path}: holds no table; expected a header and rows of numbers")
+    where = f"{path}, sheet {sheet!r}" if sheet is not None else f"{path}"
+    others = ", ".join(repr(name) for name in values.sheetnames if name != sheet)
+    more = f"; the other sheets are {others}" if sheet is not None and others else ""
+    raise InputError(f"{where}: holds no table; expected a header and rows of numbers{more}")
 
 
 def _cell(value: object) -> str:
@@ -163,6 +166,8 @@ def _tabled(path: Path, rows: Sequence[tuple[int, list[str]]], width: int) -> Ce
             continue
         kept.append([padded[k] for k in used])
         lines.append(number)
+    if ragged and not kept:  # the same fault throughout
+        ragged = [f"{ragged[0].replace(f', line {rows[first][0]}', '')} (so in all {len(ragged)} rows)"]
     table = CellTable(path, names, lines, list(zip(*kept, strict=True)) if kept else [()] * len(names), [])
     table.add(ragged, str(path))
     refuse_if(table.problems)
@@ -189,14 +194,24 @@ def _filled(cells: Sequence[str]) -> int:
 
 
 def _distinct(names: Sequence[str]) -> list[str]:
-    """Names of which the repeated ones are numbered."""
+    """Names of which the repeated ones are numbered, before their unit."""
     out: list[str] = []
     for name in names:
-        out.append(next(one for k in count(1) if (one := name if k == 1 else f"{name} ({k})") not in out))
+        bare = re.sub(r"\s*[\[(][^\[(]*[\])]$", "", name)
+        unit = name.removeprefix(bare)
+        numbered = (f"{bare} ({k}){unit}" if k > 1 else name for k in count(1))
+        out.append(next(one for one in numbered if one not in out))
     return out
 
 
 _PLAIN = re.compile(r"[+-]?[\d.,]*\d[\d.,]*(e[+-]?\d+)?", re.IGNORECASE)
+_WRITTEN = {
+    sign: re.compile(
+        rf"[+-]?(\d{{1,3}}(\{group}\d{{2,3}})*\{group}\d{{3}}|\d*)(\{sign}\d*)?(e[+-]?\d+)?", re.IGNORECASE
+    )
+    for sign, group in (".,", ",.")
+}
+"""Numbers by their decimal sign: the other one stands between groups of digits alone."""
 _SPACES = re.compile(r"[\s\u00a0\u202f']")
 _DATES = ("%Y-%m-%d", "%Y/%m/%d", "%d.%m.%Y", "%d.%m.%y", "%d/%m/%Y", "%m/%d/%Y", "%d-%m-%Y")
 _CLOCKS = ("%H:%M:%S.%f", "%H:%M", "%I:%M:%S.%f %p", "%I:%M %p")
@@ -237,7 +252,7 @@ def numbers(cells: Sequence[str], sign: str) -> Vector:
 
 def _number(cell: str, sign: str) -> float:
     text = _SPACES.sub("", cell).replace("\u2212", "-").removesuffix("%")
-    if not _PLAIN.fullmatch(text):
+    if not (_PLAIN.fullmatch(text) and _WRITTEN[sign].fullmatch(text)):
         return np.nan
     text = text.replace(".", "").replace(",", ".") if sign == "," else text.replace(",", "")
     try:

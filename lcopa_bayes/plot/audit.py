@@ -54,7 +54,10 @@ def spectrum_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
     for place, row in enumerate(rows):
         value = max(row["eigenvalue"], floor)  # what is drawn; the table of numbers is in audit.json
         panel.plot([value], [place], "o", color=BAND if row["eigenvalue"] >= 1 else HELD_OUT, markersize=4)
-        parts = ", ".join(f"{weight:+.2f} {name}" for name, weight in list(row["direction"].items())[:4])
+        parts = ", ".join(
+            f"{weight:+.2f}".replace("-", "\u2212") + f" {name}"
+            for name, weight in list(row["direction"].items())[:4]
+        )
         panel.annotate(
             plain(parts), (1.01, place), xycoords=("axes fraction", "data"), va="center", fontsize=7
         )

@@ -21,9 +21,6 @@ from lcopa_bayes.plot.theme import (
     plain,
 )
 
-NEAR = 60.0
-"""Log evidence below the best that is still shown [nat]."""
-
 
 def candidates_figure(
     results: Mapping[str, Any], parts: Mapping[str, pd.DataFrame], record: str, axis: str, *, held: bool
@@ -85,8 +82,7 @@ def evidence_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
                 panel.plot(
                     [at], [width["log_evidence"] - best], mark, mfc="none", mec=colour, ms=5, ls="none"
                 )
-    low = min(row["log_evidence"] - best for row in rows)
-    panel.set_ylim(bottom=max(1.1 * low, -NEAR) - 3)
+    panel.set_yscale("symlog", linthresh=10)
     panel.axhline(0.0, color=NOISE, lw=0.7)
     panel.set(xlabel="viscous terms [-]", ylabel="log evidence less the best [nat]")
     terms = sorted(beside)

@@ -13,6 +13,11 @@ from lcopa_bayes.data.drive import Drive
 from lcopa_bayes.plot.records import draw_drives
 from lcopa_bayes.plot.theme import BAND, HELD_OUT, INK, blank, grid, label, plain
 
+_CROWDED = 100
+"""Changes of a drive beyond which its beginning is drawn too [-]."""
+_BEGINNING = 20
+"""Changes that are drawn of it [-]."""
+
 
 def precision_figure(results: Mapping[str, Any]) -> Figure:
     """Expected relative sd of every parameter after the best drive and after the plain step."""
@@ -33,7 +38,7 @@ def precision_figure(results: Mapping[str, Any]) -> Figure:
 
 
 def drive_figure(drive: Drive) -> Figure:
-    """A drive over time, a panel for each unit."""
+    """A drive over time, a panel for each unit; beside one of many changes its beginning."""
     frames = [
         pd.DataFrame({"axis": axis, "unit": unit or "-", "time": drive.time, "drive": values})
         for axis, unit, values in zip(drive.axes, drive.units, drive.values.T, strict=True)
@@ -41,8 +46,14 @@ def drive_figure(drive: Drive) -> Figure:
     rows = pd.concat(frames)
     units = list(dict.fromkeys(rows["unit"]))
     figure = blank(0.5 + 1.3 * len(units))
-    panels = figure.subplots(len(units), 1, sharex=True, squeeze=False)[:, 0]
-    for panel, unit in zip(panels, units, strict=True):
-        draw_drives(panel, rows[rows["unit"] == unit], unit, until=float(drive.time[-1]))
-    panels[-1].set_xlabel(label("time", drive.time_unit or "-"))
+    changes = drive.time[1:][np.any(np.diff(drive.drive, axis=0) != 0, axis=1)]
+    ends = [float(drive.time[-1]), *([float(changes[_BEGINNING])] if changes.size > _CROWDED else [])]
+    panels = figure.subplots(len(units), len(ends), sharex="col", sharey="row", squeeze=False)
+    for column, end in zip(panels.T, ends, strict=True):
+        for panel, unit in zip(column, units, strict=True):
+            draw_drives(panel, rows[rows["unit"] == unit], unit, until=end)
+        column[-1].set_xlabel(label("time", drive.time_unit or "-"))
+    for panel in panels[:, 1:].flat:
+        panel.set_xlim(float(drive.time[0]), ends[-1])
+        panel.set_ylabel("")
     return figure

@@ -57,8 +57,10 @@ def view_figure(before: Mapping[str, Any], after: Mapping[str, Any]) -> Figure:
         panel.errorbar(x, y, yerr=1.645 * error, fmt=".-", ms=3, lw=0.8, elinewidth=0.6, color=BAND)
         if view["name"] == "spectrum" and x.size:
             panel.set(xscale="log", yscale="log")
-        panel.set(
-            title=plain(f"{view['axis']}, {view['name']}: {when}"), xlabel=plain(str(view["across"]))[:70]
-        )
+        panel.set(title=plain(f"{view['axis']}, {view['name']}: {when}"))
+        across, _, names = str(view["across"]).partition(": ")
+        panel.set_xlabel(plain(across))
+        if names:  # of the places, each behind its number
+            panel.set_xticks(x, [plain(name.split(" ", 1)[1]) for name in names.split(", ")], rotation=90)
     panels[0].set_ylabel(plain(str(before["along"])))
     return figure

@@ -8,7 +8,7 @@ from typing import Any
 
 from lcopa_bayes.plot.audit import pairs_figure, profiles_figure, spectrum_figure
 from lcopa_bayes.plot.rundata import RunData, load_run
-from lcopa_bayes.report.page import Drawings
+from lcopa_bayes.report.page import Drawings, Verdict
 from lcopa_bayes.report.svg import Drawing, drawing, paged
 
 _PER_FIGURE = 12
@@ -22,11 +22,17 @@ def drawn(folder: Path, values: Mapping[str, Any]) -> Drawings:
         "Line: fall of twice the log likelihood along the profile, its 90 % level dashed, an open side "
         "where the line stays below to the end. Filled: marginal posterior on the scale of the axis."
     )
-    rows = values["parameters"]
+    rows = sorted(values["parameters"], key=lambda row: row["verdict"] == "identified")
     profiles = paged(
         "profiles", rows, _PER_FIGURE, lambda part: profiles_figure(part, run), caption, "audit.json"
     )
-    return {"profiles": profiles, "spectrum": _spectrum(values["spectrum"]), "pairs": _pairs(values, run)}
+    verdict = Verdict(str(values["grade"]), "", str(values["grade_reason"]))  # the answers say the rest
+    return {
+        "verdict": verdict,
+        "profiles": profiles,
+        "spectrum": _spectrum(values["spectrum"]),
+        "pairs": _pairs(values, run),
+    }
 
 
 def _spectrum(rows: Sequence[Mapping[str, Any]]) -> tuple[Drawing, ...]:

@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from lcopa_bayes.comparison.compare import folder_name
-from lcopa_bayes.plot.comparison import NEAR, candidates_figure, evidence_figure
+from lcopa_bayes.plot.comparison import candidates_figure, evidence_figure
 from lcopa_bayes.plot.rundata import read_tables
 from lcopa_bayes.report.formatting import figures
 from lcopa_bayes.report.page import Drawings, Verdict
@@ -42,14 +42,11 @@ def _evidence(results: Mapping[str, Any]) -> list[Drawing]:
     rows = [row for row in results["models"] if row["usable"] and row["log_evidence"] is not None]
     if len(rows) < 2:
         return []
-    best = max(row["log_evidence"] for row in rows)
-    below = [row["name"] for row in rows if row["log_evidence"] - best < -NEAR - 3]
     caption = (
         "Log evidence against the number of terms: circles free orders, squares integer orders, bars two "
-        "standard errors; open triangles the same under priors half (down) and twice (up) as wide."
+        "standard errors; open triangles the same under priors half (down) and twice (up) as wide. Linear "
+        "within 10 nat of the best, logarithmic beyond."
     )
-    if below:
-        caption += f" Below the figure: {', '.join(below)}."
     return [drawing("compare_evidence", evidence_figure(rows), caption, data="compare.json")]
 
 

@@ -24,7 +24,11 @@ def drawn(folder: Path, values: Mapping[str, Any]) -> Drawings:
     if values["curve"][0]["best"]:
         curve = [drawing("design_curve", precision_figure(values), _CURVE, data="design.json")]
     if values["template"] is not None:
-        text = "The drive to play next; its rows are in " + str(values["template"]) + "."
+        text = (
+            "The drive to play next, one of many changes with its beginning; its rows are in "
+            + str(values["template"])
+            + "."
+        )
         figure = drive_figure(drive_of(load_columns(folder / values["template"], responses=False)))
         drive = [drawing("design_drive", figure, text, data=values["template"])]
     ranked = sorted(values["table"], key=lambda row: -(row["factor_over_step"] or 0.0))

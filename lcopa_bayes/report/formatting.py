@@ -58,9 +58,11 @@ def ends(row: Mapping[str, Any]) -> str:
     return interval(lower, upper, None if lower is None or upper is None else abs(upper - lower) / 3.29)
 
 
-def percent(share: float | None) -> str:
-    """A share [-] as a percentage."""
-    return NONE if share is None else f"{100 * share:.0f} %"
+def percent(share: float | None, digits: int | None = None) -> str:
+    """A share [-] as a percentage, in whole per cent unless to so many significant digits."""
+    if share is None:
+        return NONE
+    return f"{figures(100 * share, digits) if digits else f'{100 * share:.0f}'} %"
 
 
 def probability(p: float) -> str:
@@ -73,6 +75,9 @@ def with_error(value: float | None, error: float | None, places: int = 2, *, bar
     `bare`."""
     if value is None or (error is None and not bare):
         return NONE
+    size = max(abs(value), error or 0.0)
+    if size < 0.5 * 10.0**-places:
+        return figures(value, 1)
     return f"{value:.{places}f}" if error is None else f"{value:.{places}f} ± {error:.{places}f}"
 
 

@@ -49,10 +49,9 @@ def _bars(results: Mapping[str, Any]) -> tuple[Drawing, ...]:
 
 def _residuals(results: Mapping[str, Any], curves: Sequence[Mapping[str, Any]]) -> list[Drawing]:
     drawings = []
-    held = [curve for curve in curves if curve["held_out"]]
-    chosen = [*held[: _MOST_CURVES // 2], *[curve for curve in curves if not curve["held_out"]]][
-        :_MOST_CURVES
-    ]
+    worst = sorted(curves, key=lambda curve: -_rmse(results["after"], curve) / (curve["noise_sd"] or 1.0))
+    held, fitted = ([curve for curve in worst if curve["held_out"] == kind] for kind in (True, False))
+    chosen = [*held[: _MOST_CURVES // 2], *fitted][:_MOST_CURVES]
     for number, curve in enumerate(chosen, start=1):
         before, after = (_rmse(results[when], curve) for when in ("before", "after"))
         caption = (

@@ -30,6 +30,7 @@ _KINDS = ("text", "number", "grade", "code", "interval", "prose")
 UNFOLDED = 4
 """Figures of a series that are shown at once."""
 _CODE = re.compile(r"`([^`\n]+)`")
+_POWER = re.compile(r"\^([-\u2212]?\d[\d.]*\d|[-\u2212]?\d)")
 _PRINTED = ("figures", "percent", "ends", "sentence", "stopped", "probability")
 """Functions of `formatting` that are filters; a template calls the others."""
 _CALLED = ("interval", "to_spread", "with_error", "NONE", "OPEN")
@@ -56,9 +57,10 @@ class Verdict:
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Verdict:
-        """Verdict of a result; the reason is not repeated."""
-        sentence, reason = str(values["verdict"]), str(values["grade_reason"])
-        return cls(str(values["grade"]), formatting.stopped(sentence), "" if reason in sentence else reason)
+        """Verdict of a result; grade and reason are not repeated."""
+        grade, sentence, reason = (str(values[key]) for key in ("grade", "verdict", "grade_reason"))
+        sentence = sentence.removeprefix(f"Grade {grade}: {reason}. ")
+        return cls(grade, formatting.stopped(sentence), "" if reason in sentence else reason)
 
 
 @final
@@ -123,10 +125,10 @@ class Page:
         row = Markup("").join(map(_cell, self._kinds, values))
         return Markup(str(row).replace("<td", '<th scope="row"', 1).replace("</td>", "</th>", 1))
 
-    def figures(self, drawings: Iterable[Drawing]) -> Markup:
+    def figures(self, drawings: Iterable[Drawing], unfolded: int = UNFOLDED) -> Markup:
         """Figures with their captions; of many alike all but the first few are folded."""
         shown = [self._figure(one) for one in drawings]
-        first, rest = shown[:UNFOLDED], shown[UNFOLDED:]
+        first, rest = shown[:unfolded], shown[unfolded:]
         out = Markup("").join(first)
         if rest:
             more = "<details>\n<summary>{} more</summary>\n{}</details>\n"
@@ -157,7 +159,9 @@ class Page:
 def _cell(kind: str, value: object) -> Markup:
     number = kind == "number" and isinstance(value, float)
     text = formatting.figures(value) if value is None or number else value  # type: ignore[arg-type]
-    if kind not in ("code", "grade"):
+    if kind == "prose":
+        text = tied(str(text))
+    elif kind not in ("code", "grade"):
         text = formatting.signed(str(text))
     return Markup('<td class="{}">{}</td>').format(f"{kind} {text}" if kind == "grade" else kind, text)
 
@@ -176,13 +180,13 @@ def tied(text: str) -> Markup:
     """A paragraph with true minus signs, without line breaks in percentages and p-values."""
     words = formatting.signed(re.sub(r"[ \n]+", " ", escape(text)).strip())
     words = words.replace(" %", "\u00a0%").replace("p = ", "p\u00a0=\u00a0")
-    return Markup(_CODE.sub(r"<code>\1</code>", words))
+    return Markup(_POWER.sub(r"<sup>\1</sup>", _CODE.sub(r"<code>\1</code>", words)))
 
 
 def equation(lines: Sequence[str]) -> Markup:
     """Lines of a transfer function with raised exponents."""
     text = escape(formatting.signed("\n".join(lines)))
-    return Markup(re.sub(r"\^([\d.]+\d)", r"<sup>\1</sup>", str(text)))
+    return Markup(_POWER.sub(r"<sup>\1</sup>", str(text)))
 
 
 def _script(name: str) -> Markup:
@@ -197,11 +201,14 @@ def write_page(
     drawn: Drawings,
     *,
     verdict: Verdict | None = None,
+    overview: Mapping[str, Any] | None = None,
     name: str | None = None,
 ) -> Path:
     """Write a page and its figures; returns the path of the page, by default named as the template.
 
     The template, the package's by its name or a file, sees `values` as `v`, and the figures as `drawn`.
+    Before it stands an `overview`: lines of `plant` and `answers` with their sections. ValueError where such
+    a section is not on the page.
     """
     page, template = Page(folder), Path(template)
     environment = Environment(
@@ -220,7 +227,12 @@ def write_page(
     environment.globals |= {key: getattr(page, key) for key in ("section", "p", "table", "cells", "figures")}
     environment.globals |= {"each": each, "pairs": zip, "product": product}
     environment.globals |= {"POINTWISE": POINTWISE, "SIMULTANEOUS": SIMULTANEOUS}
-    body = environment.get_template(template.name).render(v=values, drawn=drawn)
+    shown = {"v": values, "drawn": drawn, "overview": overview}
+    first = environment.get_template("summary.html").render(shown) if overview else ""
+    body = first + environment.get_template(template.name).render(shown)
+    linked = re.findall(r'href="#([^"]+)">', first)
+    if lost := set(linked) - set(map(anchor, page.titles)):
+        raise ValueError(f"the overview names sections that the page lacks: {', '.join(sorted(lost))}")
     whole = environment.get_template("page.html")
     explored = any(one.series for one in page.drawings)
     text = whole.render(

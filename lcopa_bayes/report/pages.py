@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -30,6 +30,7 @@ from lcopa_bayes.report import (
     records,
     responses,
 )
+from lcopa_bayes.report.answers import answers
 from lcopa_bayes.report.page import Drawings, Verdict, write_page
 from lcopa_bayes.results.stored import stored_values
 
@@ -99,6 +100,14 @@ def write_page_of(verb: str, folder: Path, *, jobs: int = 1) -> Path:
     return _written(folder, verb, title, values, draw)
 
 
+def _plant(folder: Path) -> Sequence[str]:
+    """Equation of the fit beside a result; none where there is no fit."""
+    if not (folder / "results.json").is_file():
+        return ()
+    fitted = stored_values(folder, "fit", (), file="results.json")
+    return list(fitted["overview"]["plant"]) if "overview" in fitted else ()
+
+
 def _written(folder: Path, verb: str, title: str, values: Mapping[str, Any], draw: Draw) -> Path:
     """Write a page by the template of its verb, with the verdict that is drawn, else that of the values."""
     name, file = ("report.html", "results.json") if verb in _REPORTS else (f"{verb}.html", f"{verb}.json")
@@ -107,6 +116,9 @@ def _written(folder: Path, verb: str, title: str, values: Mapping[str, Any], dra
             shown = draw(folder, values)
         verdict = shown["verdict"] if "verdict" in shown else Verdict.of(values)
         titled = ": ".join(filter(None, (values.get("study"), title.format_map(values))))
-        return write_page(folder, f"{verb}.html", titled, values, shown, verdict=verdict, name=name)
+        overview = values.get("overview") or {"plant": _plant(folder), "answers": answers(verb, values)}
+        return write_page(
+            folder, f"{verb}.html", titled, values, shown, verdict=verdict, overview=overview, name=name
+        )
     except (KeyError, UndefinedError) as error:
         raise InputError(f"{folder / file}: lacks {error}; run `{verb}` again") from error

@@ -5,7 +5,7 @@ What a reader asks a fit first: the plant, how well it follows the records, what
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -35,6 +35,7 @@ def overview(fit: Fit) -> dict[str, Any]:
     Medians of a posterior with several modes make a plant that no record supports.
     """
     draws = fit.draws
+    graded = [(one.name, one.grade) for one in draws.estimates()]
     return {
         "plant": plant(draws.table, draws.flat[int(draws.log_density.argmax())]),
         "answers": [
@@ -42,7 +43,7 @@ def overview(fit: Fit) -> dict[str, Any]:
             for question, answer, section in (
                 ("How good is the fit?", _fitted(fit), "Residuals"),
                 ("Does it predict?", _predicted(fit), "Data and bands"),
-                ("Which numbers can be trusted?", _trusted(fit), "Parameters"),
+                ("Which numbers can be trusted?", grouped(graded), "Parameters"),
                 ("What is missing?", _missing(fit), "Residuals"),
                 ("What next?", _next(fit), ""),
             )
@@ -111,15 +112,16 @@ def _predicted(fit: Fit) -> str:
     )
 
 
-def _trusted(fit: Fit) -> str:
+def grouped(graded: Iterable[tuple[str, str]]) -> str:
+    """Names by their grade, the best first, as a sentence; empty without any."""
     by_grade: dict[str, list[str]] = {"reliable": [], "tentative": [], "unusable": []}
-    for one in fit.draws.estimates():
-        by_grade[one.grade].append(one.name)
+    for name, grade in graded:
+        by_grade[grade].append(name)
     shown = {grade: names for grade, names in by_grade.items() if names}
     if len(shown) == 1:
         ((grade, names),) = shown.items()
-        return f"All {len(names)} parameters are {grade}."
-    return "; ".join(f"{grade}: {listed(names)}" for grade, names in shown.items()) + "."
+        return f"All {len(names)} are {grade}." if len(names) > 1 else f"{names[0]} is {grade}."
+    return joined([f"{grade}: {listed(names)}" for grade, names in shown.items()])
 
 
 def listed(names: Sequence[str], most: int = _NAMED) -> str:
@@ -135,7 +137,7 @@ def _missing(fit: Fit) -> str:
         reasons.append(f"the records leave several modes, of {names}")
     if not reasons:
         return "Nothing that the checks of the model against its records could see."
-    return _joined(reasons)
+    return joined(reasons)
 
 
 def _next(fit: Fit) -> str:
@@ -143,13 +145,13 @@ def _next(fit: Fit) -> str:
     if not fit.study.held_out:
         remedies.append("hold out a record (--held-out) to test the prediction")
     remedies.append("`audit` says what the records determine, `loop` what the model lacks")
-    return _joined(remedies)
+    return joined(remedies)
 
 
-def _joined(clauses: Sequence[str]) -> str:
-    """Clauses as one sentence, each once."""
+def joined(clauses: Iterable[str]) -> str:
+    """Clauses as one sentence, each once; empty without any."""
     text = "; ".join(dict.fromkeys(clauses))
-    return f"{text[0].upper()}{text[1:]}."
+    return f"{text[0].upper()}{text[1:]}." if text else ""
 
 
 IMPORTANCE = "importance draws"

@@ -177,9 +177,11 @@ def _sentences(one: dict[str, Any], unit: str) -> list[str]:
         if drive["first_change"] is None:
             out.append(f"{drive['axis']} stays at {drive['rest']:.4g} {drive['unit']}.")
         else:
-            often = _counted(drive["changes"], "time")
+            at = f"{drive['first_change']:.4g} {unit}"
+            many = drive["changes"] != 1
+            often = f"{drive['changes']} times from {at} on" if many else f"once, at {at}"
             out.append(
-                f"{drive['axis']} changes {often} from {drive['first_change']:.4g} {unit} on, between "
+                f"{drive['axis']} changes {often}, between "
                 f"{drive['lowest']:.4g} and {drive['highest']:.4g} {drive['unit']}; longest hold "
                 f"{drive['longest_hold']:.4g} {unit}."
             )

@@ -24,7 +24,9 @@ def explain(term: str, *, runs: Path | str = "runs") -> str:
     names = {word.casefold(): name for name, one in glossary.items() for word in (name, *one["words"])}
     wanted = term.casefold().strip()
     if wanted not in names:
-        raise InputError(f"{term!r} is not a known term{nearest(wanted, names)}")
+        hint = nearest(wanted, names)
+        hint = hint if "did you mean" in hint else nearest(wanted, glossary)
+        raise InputError(f"{term!r} is not a known term{hint}")
     entry = glossary[names[wanted]]
     parts = [f"{names[wanted]}: {entry['text'].strip()}", _example(entry["example"], Path(runs))]
     return "\n".join(part for part in parts if part)

@@ -147,6 +147,8 @@ def test_date_and_time_of_day_may_stand_in_two_columns(tmp_path):
         ("Druck in bar", Axis("Druck", "bar")),
         ("force / N", Axis("force", "N")),
         ("plain name", Axis("plain_name", "-")),
+        ("valve %", Axis("valve", "%")),
+        ("T1 °C", Axis("T1", "°C")),
         ("angle [deg_C]", Axis("angle", "degC")),
         ("1", Axis("1", "-")),
     ],
@@ -187,6 +189,10 @@ def test_numbers_in_foreign_notation():
         numbers(["1.234,5", "\u22122", "3 000", "x", "", "5%"], ","), [1234.5, -2, 3000, np.nan, np.nan, 5]
     )
     assert_array_equal(numbers(["1,234.5", "1e-3", "inf", "nan"], "."), [1234.5, 1e-3, np.nan, np.nan])
+    assert_array_equal(
+        numbers(["2.5", "1.234.567", "1.23.456", ".5"], ","), [np.nan, 1234567, 123456, np.nan]
+    )
+    assert_array_equal(numbers(["2,5", "12,34,567", ".5", "+7."], "."), [np.nan, 1234567, 0.5, 7])
 
 
 def test_roles_follow_words_then_data_and_may_be_stated(tmp_path):
@@ -234,7 +240,9 @@ BROKEN = {
     "a,u,y\n3,0,0\n2,1,1\n3,1,0": "no column increases from row to row",
     "Time,u,y\n1,0,0\n2,1,1\n3,1,2": "has no unit; state it with --time-unit",
     "Time [fortnight],u,y\n1,0,0\n2,1,1\n3,1,2": "'fortnight', which is not known",
-    "Time [s],u,y\n0,1,0,2,0,3\n0,2,0,2,0,3\n0,3,0,2,0,3": "decimals are written with commas",
+    "Time [s],u [%],u (%),y\n0,0,1,1\n1,1,2,2\n2,1,1,4": "would both be the drive 'u'",
+    "Time [s],u,y\n0,1,0,2,0,3\n0,2,0,2,0,3\n0,3,0,2,0,3": r"decimals are written with commas.*in all 3 rows",
+    "Time [s];u;y\n0;0;1,5\n1;1;2.5\n2;1;3,5": "line 3, column 'y': '2.5' is not a number of y",
     "Time [s],y\n0,1.2\n1,1.3\n2,1.1\n3,1.2\n4,1.9": "no column is recognised as a drive",
     "Time [s],u,y\n0,0,1\n1,1,2\n1,1,3": "does not come after",
     "Time [s],u,y\n0,0,1\n1,1,2\n2,1,oops\n3,1,4": "line 4, column 'y': 'oops' is not a number of y",
@@ -251,6 +259,28 @@ def test_what_is_ambiguous_is_asked_for(text, message, tmp_path):
     (tmp_path / "x.csv").write_text(text)
     with pytest.raises(InputError, match=message):
         read(tmp_path / "x.csv")
+
+
+def test_headers_alike_are_numbered_before_their_unit_and_may_be_named(tmp_path):
+    (tmp_path / "x.csv").write_text("Time [s],u,Temp [C],Temp [C]\n0,0,1,5\n1,1,2,6.5\n2,1,4,7")
+    assert read(tmp_path / "x.csv").response_axes == (Axis("Temp", "C"), Axis("Temp_2", "C"))
+    (tmp_path / "y.csv").write_text("Time [s],u [%],u (%),y\n0,0,1,1\n1,1,2,2\n2,1,1,4")
+    named = read(tmp_path / "y.csv", drives=("u [%]", "v=u (%)"))
+    assert named.drive_axes == (Axis("u", "%"), Axis("v", "%"))
+    assert_array_equal(named.drive[:, 1], [1, 2, 1])
+    with pytest.raises(InputError, match="would both be the drive 'u'"):
+        read(tmp_path / "y.csv", drives=("u [%]", "u (%)"))
+
+
+def test_a_sheet_that_is_absent_or_empty_is_named_with_the_others(tmp_path):
+    workbook = Workbook()
+    workbook.active.title = "Data"
+    workbook.create_sheet("Notes")
+    workbook.save(tmp_path / "x.xlsx")
+    with pytest.raises(InputError, match="has no sheet 'Dato'; did you mean 'Data'"):
+        read_spreadsheet(tmp_path / "x.xlsx", sheet="Dato")
+    with pytest.raises(InputError, match=r"sheet 'Notes': holds no table.*the other sheets are 'Data'"):
+        read_spreadsheet(tmp_path / "x.xlsx", sheet="Notes")
 
 
 def test_what_is_asked_for_can_be_stated(tmp_path):

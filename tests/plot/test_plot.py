@@ -179,3 +179,11 @@ def test_figures_are_reached_without_loading_matplotlib():
         "lb.plot.bands; assert 'matplotlib' in sys.modules"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_drive_of_many_changes_is_drawn_with_its_beginning():
+    few, many = (lb.Drive.steps(x=[(float(t), t % 2) for t in range(n)], until=float(n)) for n in (9, 300))
+    assert len(lb.plot.drive(few).axes) == 1
+    whole, beginning = lb.plot.drive(many).axes
+    assert whole.get_xlim()[1] >= 300
+    assert beginning.get_xlim() == pytest.approx((0, 21))

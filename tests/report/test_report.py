@@ -260,6 +260,13 @@ def test_captions_carry_scores_and_mark_held_out_records(html):
     assert any("p\u00a0=\u00a03.2×10⁻⁷, not white" in c for c in captions)  # noqa: RUF001
 
 
+def test_a_grade_and_its_reason_are_said_once(tmp_path):
+    text = page_with(tmp_path, verdict="Grade tentative: too few draws of time_1. More was learned.")
+    box = text[text.index('<div class="verdict') : text.index("<nav ")]
+    assert box.count("too few draws of time_1") == box.count("entative") - 2 == 1
+    assert "<p>More was learned.</p>" in box
+
+
 def test_default_priors_are_explained_in_the_words_of_their_module(html):
     assert inspect.cleandoc(defaultpriors.__doc__) in unescape(html)
 

@@ -63,8 +63,13 @@ def test_fit_prints_one_json_object_and_writes_the_run_folder(record, tmp_path, 
     assert abs(gain["mean"] - 2.0) < 5 * gain["sd"]
     for name in ("report.html", "results.json", "posterior.nc", "chain.h5", "provenance.json"):
         assert (out / name).stat().st_size > 0
-    verdict = json.loads((out / "results.json").read_text())["verdict"]
-    assert tied(verdict) in (out / "report.html").read_text(encoding="utf-8")
+    stored = json.loads((out / "results.json").read_text())
+    page = (out / "report.html").read_text(encoding="utf-8")
+    opening = f"Grade {stored['grade']}: {stored['grade_reason']}. "
+    assert stored["verdict"].startswith(opening)
+    assert all(
+        tied(part) in page for part in (stored["grade_reason"], stored["verdict"].removeprefix(opening))
+    )
     code, printed, _ = run(capsys, "report", out, "--json")
     assert code == 0
     assert json.loads(printed)["report"] == str(out / "report.html")

@@ -12,6 +12,7 @@ import pytest
 
 import lcopa_bayes as lb
 from lcopa_bayes.cli import VERBS, _parser, main
+from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.verbs.commandline import USAGES
 
 TERMS = tomllib.loads(files("lcopa_bayes.verbs").joinpath("glossary.toml").read_text(encoding="utf-8"))
@@ -78,6 +79,14 @@ def test_a_term_is_explained_in_three_lines(term, tmp_path):
     assert 2 <= len(text.splitlines()) <= 3
     for word in TERMS[term]["words"]:
         assert lb.explain(word.upper(), runs=tmp_path) == text
+
+
+def test_an_unknown_term_is_answered_by_the_nearest_or_by_the_terms_there_are(tmp_path):
+    with pytest.raises(InputError, match="'survivel' is not a known term; did you mean 'survival'"):
+        lb.explain("survivel", runs=tmp_path)
+    with pytest.raises(InputError) as refused:
+        lb.explain("zzzzqq", runs=tmp_path)
+    assert str(refused.value).endswith(f"known: {', '.join(sorted(TERMS))}")
 
 
 def test_a_word_means_one_term():

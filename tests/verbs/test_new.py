@@ -33,7 +33,7 @@ def test_a_spreadsheet_becomes_a_study_that_is_checked_and_looked_at(oven, tmp_p
     assert "# - 'Heater [%]' is a drive" in (folder / "study.toml").read_text()
     assert main(["check", str(folder), "--out", str(run)]) == 0
     said = capsys.readouterr().out
-    assert "Heater changes 1 time from 2 min on, between 0 and 40 %" in said
+    assert "Heater changes once, at 2 min, between 0 and 40 %" in said
     assert "The records can be fitted." in said
     assert (run / "check.html").stat().st_size > 10_000
     page = (run / "check.html").read_bytes()

@@ -1,0 +1,161 @@
+"""Pages in a real browser: no fault of accessibility, no error, and everything that folds, sorts, zooms does.
+
+Needs Playwright, the axe-core that `axe-playwright-python` brings with it, and a Chromium of the system;
+skipped, with the reason, where one of them is missing.
+"""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from small import record, study
+from test_report import run_folder
+
+import lcopa_bayes as lb
+from lcopa_bayes.bench.command import on_off
+from lcopa_bayes.cli import main
+from lcopa_bayes.report import write_report
+from lcopa_bayes.report.pages import write_page_of
+
+playwright = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
+axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe-core is not installed")
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed on this system")
+
+TINY = {"ensembles": 2, "walkers": 16, "steps": 60, "thin": 1, "target_ess": 50}
+PHONE = {"width": 390, "height": 844}
+REPORTS = Path(__file__).parents[2] / "reports"
+CANDIDATES = ["fractional-1", "first-order"]
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with playwright.sync_playwright() as started:
+        one = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-quic"])
+        yield one
+        one.close()
+
+
+def pages_of(place: Path) -> dict[str, Path]:
+    """The page of every verb that can be had in seconds."""
+    off = record(2, command=on_off(-0.7, hold=4.0, at=1.3), camera=0.5, name="off")
+    small = study(record(1, camera=0.5, name="on"), held_out=[off], priors={"delay": 0.73}, sampler=TINY)
+    fit = lb.fit(small, folder=place / "audit")
+    lb.audit(fit, folder=place / "audit")
+    fit.predict(off).save(place / "predict")
+    lb.check(small, folder=place / "check")
+    lb.compare(small, CANDIDATES, folder=place / "compare")
+    lb.loop(small, folder=place / "loop")
+    (place / "calibrate").mkdir()
+    shutil.copy(REPORTS / "calibration" / "one-term" / "results.json", place / "calibrate")
+    for verb in ("claims", "optics"):
+        assert main([verb, "--out", str(place / verb), "--quiet"]) == 0
+    verbs = ("audit", "predict", "check", "compare", "loop", "calibrate", "claims", "optics")
+    return {verb: write_page_of(verb, place / verb) for verb in verbs}
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory) -> Path:
+    return write_report(run_folder(tmp_path_factory.mktemp("reports") / "bench"))
+
+
+def opened(browser, path: Path, **settings):
+    """A page, and the errors that it reports."""
+    page, errors = browser.new_page(**settings), []
+    page.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.goto(path.as_uri())
+    return page, errors
+
+
+def faults(browser, path: Path, scheme: str) -> list[object]:
+    """What axe-core finds with every section unfolded, errors, and tables or figures cut without a hint."""
+    page, out = opened(browser, path, viewport=PHONE, color_scheme=scheme)
+    page.evaluate("for (const part of document.querySelectorAll('details')) part.open = true")
+    found = axe.Axe().run(page).response["violations"]
+    out += [(one["id"], one["impact"], one["nodes"][0]["html"][:200]) for one in found]
+    width = page.evaluate("document.documentElement.scrollWidth")
+    out += [f"{width} px wide"] if width > PHONE["width"] else []
+    cut = "e => e.scrollWidth > e.clientWidth + 16 && !e.classList.contains('scrolls')"
+    out += page.evaluate(
+        f"[...document.querySelectorAll('.wide')].filter({cut}).map(e => e.outerHTML.slice(0, 99))"
+    )
+    page.close()
+    return out
+
+
+def test_no_page_has_a_fault_or_an_error_and_each_fits_a_phone(browser, report, tmp_path):
+    pages = pages_of(tmp_path) | {"fit": report}
+    found = {(v, s): faults(browser, path, s) for v, path in pages.items() for s in ("light", "dark")}
+    assert {key: one for key, one in found.items() if one} == {}
+
+
+def test_the_rules_see_a_fault(browser, tmp_path):
+    path = tmp_path / "bad.html"
+    path.write_text(
+        '<!DOCTYPE html><title>t</title><main><h1>t</h1><img src="data:,">'
+        '<p style="width: 900px">wide</p></main><script>missing()</script>',
+        encoding="utf-8",
+    )
+    text = str(faults(browser, path, "light"))
+    assert all(rule in text for rule in ("image-alt", "html-has-lang", "px wide", "missing is not defined"))
+
+
+def test_sections_fold_and_open_where_a_link_leads(browser, report):
+    page, _ = opened(browser, report)
+    traces, summary = page.locator("#traces > details"), page.locator("#summary > details")
+    assert traces.get_attribute("open") is None
+    assert summary.get_attribute("open") is not None
+    page.click("nav a[href='#traces']")
+    assert traces.get_attribute("open") is not None
+    page.click("#summary > details > summary")
+    assert summary.get_attribute("open") is None
+    page.close()
+
+
+def test_a_table_sorts_by_its_numbers_both_ways(browser, tmp_path):
+    assert main(["optics", "--out", str(tmp_path), "--quiet"]) == 0
+    page, _ = opened(browser, tmp_path / "optics.html")
+    table = page.locator("table").nth(1)
+    head = table.locator("thead button", has_text="angle")
+
+    def column() -> list[float]:
+        cells = table.locator("tbody tr > :nth-child(3)").all_inner_texts()
+        return [float(text.replace("\u2212", "-")) for text in cells]
+
+    before = column()
+    head.click()
+    assert column() == sorted(before) != before
+    head.click()
+    assert column() == sorted(before, reverse=True)
+    page.close()
+
+
+def test_a_zoom_is_shared_and_values_follow_the_cursor(browser, report):
+    page, errors = opened(browser, report, viewport={"width": 1300, "height": 2000})
+    part = page.locator("details.explore").first
+    part.locator("summary").click()
+    charts = part.locator(".u-over")
+    charts.nth(2).wait_for()
+    assert charts.count() == 3
+    part.scroll_into_view_if_needed()
+    ticks = "e => [...e.querySelectorAll('.u-legend .u-value')].map(v => v.textContent)"
+    area = charts.first.bounding_box()
+    y = area["y"] + area["height"] / 2
+    page.mouse.move(area["x"] + 0.5 * area["width"], y)
+    middle = part.evaluate(ticks)
+    assert any(value not in ("", "--") for value in middle)
+    page.mouse.move(area["x"] + 0.4 * area["width"], y)
+    page.mouse.down()
+    page.mouse.move(area["x"] + 0.6 * area["width"], y)
+    page.mouse.up()
+    page.mouse.move(area["x"] + 0.01 * area["width"], y)
+    span = 25.0
+    assert 0.35 * span < float(part.evaluate(ticks)[0]) < 0.45 * span  # the left end after the zoom
+    box = charts.nth(2).bounding_box()
+    page.mouse.move(box["x"] + 0.99 * box["width"], box["y"] + box["height"] / 2)
+    assert 0.55 * span < float(part.evaluate(ticks)[0]) < 0.65 * span  # in another panel too
+    assert errors == []
+    page.close()
