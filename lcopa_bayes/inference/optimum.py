@@ -16,8 +16,8 @@ from lcopa_bayes.inference.poles import regressed
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.effects.effect import UnstableError
 
-_SCREENED = 1024
-"""Prior draws whose misfit is looked at."""
+_SCREENED, _FEWER = 1024, 512
+"""Prior draws whose misfit is looked at, and of them beside starts that are known."""
 _SAME = 1e-2
 """Optima closer than this in every sampled coordinate are one [natural log, or sd of the prior]."""
 _WEIGHTLESS = 30.0
@@ -32,6 +32,9 @@ _TRIED = 48
 """Sets of internal constants whose slopes are compared [-]."""
 _KEPT = 3
 """Sets of them that are descended from [-]."""
+_DESCENT, _LAST = ((15, 1e-2), (60, 1e-4)), (200, 1e-8)
+"""Most responses of each round of a descent, and relative gain of the sum of squares that ends it [-]; of the
+last one, which the best optimum alone has: what a start leads to shows long before its digits do."""
 _HARDLY = 1e-2
 """Size of a coefficient that cannot be negative where it should vanish [prior scale]."""
 
@@ -63,7 +66,7 @@ def find_optima(
     if posterior.simulation is not None:
         alone = find_optima(posterior.without_effects, rng, starts=starts)
         return _kept(posterior, _descended(posterior, _near(posterior, effect_starts(posterior, alone, rng))))
-    drawn = table.draw(_SCREENED, rng)
+    drawn = table.draw(_FEWER if len(near) else _SCREENED, rng)
     drawn = np.vstack([regressed(posterior, drawn), drawn, *near])
     for axis, scale in enumerate(spread_of(posterior)):
         for name, value in posterior.noise.nearly_white(0.05 * scale).items():
@@ -105,16 +108,23 @@ def _near(posterior: Posterior, starts: Sequence[Vector]) -> list[Vector]:
 
 
 def _descended(posterior: Posterior, starts: Sequence[Vector], *, rounds: int = 2) -> list[Optimum]:
-    """Optima from table values; a start from which effects leave no bounded response gives none."""
-    problem, optima = LeastSquares(posterior), []
+    """Optima from table values, the best of them to its digits; a start from which effects leave no bounded
+    response gives none."""
+    problem, reached = LeastSquares(posterior), list[tuple[float, Vector]]()
     for values in starts:
         values = posterior.complete(posterior.coordinates(values[None]), None)[0]
         try:
-            for _ in range(rounds):
-                values, _ = problem.solve(values)
-                values = problem.with_noise(values)
+            for evaluations, enough in _DESCENT[-rounds:]:
+                values = problem.with_noise(problem.solve(values, evaluations=evaluations, enough=enough)[0])
         except UnstableError:
             continue
+        reached.append((float(posterior.log_density(posterior.coordinates(values[None]))[0]), values))
+    reached.sort(key=lambda one: -one[0])
+    optima = list[Optimum]()
+    for _, values in reached:
+        if not optima and posterior.simulation is None:
+            evaluations, enough = _LAST
+            values = problem.with_noise(problem.solve(values, evaluations=evaluations, enough=enough)[0])
         # at the solution itself: its terms may stand in another order than the search left them in, and the
         # noise is that of its own residual
         _, jacobian = problem.residual(problem.coordinates(values), values)
