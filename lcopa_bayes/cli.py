@@ -50,10 +50,16 @@ Outcome = tuple[Mapping[str, Any], str]
 """What a verb prints: values with ``--json``, a text for a reader."""
 
 
+def keep_one_thread() -> None:
+    """Let this process and those it starts keep linear algebra to one thread, unless the environment states
+    otherwise: work is shared out to processes, whose threads would wait for each other."""
+    for library in ("OMP", "OPENBLAS", "MKL"):
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb; returns the exit code."""
-    for library in ("OMP", "OPENBLAS", "MKL"):  # work is shared out to processes: threads would only wait
-        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+    keep_one_thread()
     given = list(sys.argv[1:] if arguments is None else arguments)
     options = _parser(given).parse_args(given)
     gc.set_threshold(*_COLLECTED)

@@ -1,15 +1,14 @@
 """Fixtures of all tests."""
 
-import os
-
 import numpy as np
 import pytest
+
+from lcopa_bayes.cli import keep_one_thread
 
 
 def pytest_configure() -> None:
     """Workers of pytest-xdist inherit one thread each: with more they wait for each other."""
-    for library in ("OMP", "OPENBLAS", "MKL"):
-        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+    keep_one_thread()
 
 
 @pytest.fixture

@@ -101,7 +101,8 @@ def workers(shared: S, *, jobs: int = 1, dask: str | None = None) -> Iterator[Wo
     else:
         pool = _pool(jobs, shared)
         try:
-            yield Workers(lambda task, one: pool.submit(_perform, task, one), as_completed)
+            with threadpool_limits(1):  # threads of this process would take the cores of the workers
+                yield Workers(lambda task, one: pool.submit(_perform, task, one), as_completed)
         except BrokenProcessPool:
             raise InputError(
                 f"a worker process ended, perhaps for want of memory, or because it was given what the main "

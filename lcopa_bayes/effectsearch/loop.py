@@ -20,7 +20,7 @@ from lcopa_bayes.effectsearch.explained import coordinates_of, declarable, expla
 from lcopa_bayes.effectsearch.heldouteffects import missed, unseen_share
 from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
 from lcopa_bayes.effectsearch.outliers import Outlying, outlying, without_outliers
-from lcopa_bayes.effectsearch.rounds import CLEAR, SINGLE, Round, search
+from lcopa_bayes.effectsearch.rounds import CLEAR, SINGLE, Round, Search, search
 from lcopa_bayes.effectsearch.scores import (
     WIDTH,
     Score,
@@ -208,75 +208,37 @@ def _looped(
     alone = len(study.fit) == 1 and not study.held_out
     rng = np.random.default_rng([study.seed, 11])
     searched = search(start, kinds, rng, noise_samples=base.noise_samples, draws=draws, alone=alone)
-    first, last = searched.rounds[0].trace, searched.rounds[-1].trace
-    generic = max(
-        (one for one in first.traced if one.card.place == "generic"),
-        key=lambda one: one.log_bayes_factor,
-        default=None,
-    )
     reached = _side(problem, searched.state)
-    added = searched.state.model.effects
-    names = tuple(effect.name for effect in added if not effect.card.dynamics)
-    apart = bool(added) and all(effect.card.per_record for effect in added)
-    # a model of the rest is not judged by samples that the noise throws anywhere
-    was, now = before.unseen, reached.unseen
-    if outliers is not None:
-        was, now = without_outliers(was, now)
-    verdict = decide(
-        Findings(
-            cautions=cautions,
-            alarmed=first.alarmed or bool(added),
-            largest=first.largest,
-            threshold=first.threshold,
-            effects=names,
-            dynamics=len(names) < len(added),
-            apart=searched.apart,
-            disturbances=tuple(e.name for e in added if e.card.disturbance),
-            gained=searched.gained,
-            generic=generic.log_bayes_factor if generic else -np.inf,
-            generic_name=generic.name if generic else "",
-            remaining=last.largest,
-            remaining_threshold=last.threshold,
-            remaining_name=last.leader.name if last.leader else "",
-            share=searched.share,
-            excess=start.whitening.excess(start.optimum.residual),
-            enough=ALONE if alone else EXPLAINED,
-            scatter=first.scatter,
-            missed=None if apart else missed(study, reached.fit, now, searched.state),
-            unseen=unseen_share(study, was, now, searched.state) if study.held_out else np.nan,
-            risen=risen(was, now) if study.held_out else np.nan,
-            reached=np.nan if apart else over_noise(reached.fit, now, clear=not last.alarmed),
-        )
-    )
+    verdict = decide(_findings(study, searched, before, reached, outliers=outliers, cautions=cautions))
     if outliers is not None:
         verdict = beside(verdict, outliers.sentence)
     named = verdict.kind in ("explained", "partly explained", "disturbance")
-    last_state, sampled = searched.state if named else start, None
-    wider = last_state.model.wider
-    verdict = widened(verdict, {name: wider[name] for name in names if named and name in wider})
-    if verdict.kind in ("unexplained", "partly explained") or last.alarmed:  # something significant remains
-        white, residual = last_state.whitening, last_state.optimum.residual
-        last_state = replace(last_state, widening=Widening.of(white.samples, residual, white.noise))
-    if sample and declarable(study, last_state.model.effects):
-        explained = explained_study(problem.study, last_state.model, outliers)
-        sampled = explained_draws(explained, jobs=jobs, quick=quick)
     after = reached if named else before
-    if last_state is not (searched.state if named else start) and sampled is None:
-        after = _side(problem, last_state)
+    state, wider = after.state, after.state.model.wider
+    if named:
+        verdict = widened(verdict, {name: wider[name] for name in _names(state) if name in wider})
+    if verdict.kind in ("unexplained", "partly explained") or searched.rounds[-1].trace.alarmed:
+        white = state.whitening  # something significant remains, which bands have to hold
+        state = replace(state, widening=Widening.of(white.samples, state.optimum.residual, white.noise))
+    sampled = None
+    if sample and declarable(study, state.model.effects):
+        explained = explained_study(problem.study, state.model, outliers)
+        sampled = explained_draws(explained, jobs=jobs, quick=quick)
     if sampled is not None:
-        covariance = np.asarray(np.cov(coordinates_of(last_state.model, sampled[0]).T))
-        drawn = _side(problem, replace(last_state, spread=covariance, sampled=sampled))
+        covariance = np.asarray(np.cov(coordinates_of(state.model, sampled[0]).T))
+        drawn = _side(problem, replace(state, spread=covariance, sampled=sampled))
         if study.held_out and risen(after.unseen, drawn.unseen) > RISEN:
             cautions, sampled = (*cautions, _ASTRAY), None
-            after = _side(problem, last_state)
         else:
             after = drawn
+    if sampled is None and state is not after.state:
+        after = _side(problem, state)
     return Loop(
         problem,
         base,
         enlarged,
         searched.rounds,
-        last_state.model.effects,
+        state.model.effects,
         searched.groups if named else (),
         verdict,
         before,
@@ -286,6 +248,55 @@ def _looped(
         sampled[0] if sampled is not None else None,
         outliers,
         contrary,
+    )
+
+
+def _names(state: State) -> tuple[str, ...]:
+    """Effects of a model that have a name."""
+    return tuple(effect.name for effect in state.model.effects if not effect.card.dynamics)
+
+
+def _findings(
+    study: Study,
+    searched: Search,
+    before: Side,
+    after: Side,
+    *,
+    outliers: Outlying | None,
+    cautions: tuple[str, ...],
+) -> Findings:
+    """What a search found, `before` without its effects and `after` with them."""
+    first, last = searched.rounds[0].trace, searched.rounds[-1].trace
+    generics = (one for one in first.traced if one.card.place == "generic")
+    generic = max(generics, key=lambda one: one.log_bayes_factor, default=None)
+    added, names = searched.state.model.effects, _names(searched.state)
+    by_record = bool(added) and all(effect.card.per_record for effect in added)
+    was, now = before.unseen, after.unseen
+    if outliers is not None:  # a model of the rest is not judged by samples that the noise throws anywhere
+        was, now = without_outliers(was, now)
+    return Findings(
+        cautions=cautions,
+        alarmed=first.alarmed or bool(added),
+        largest=first.largest,
+        threshold=first.threshold,
+        effects=names,
+        dynamics=len(names) < len(added),
+        apart=searched.apart,
+        disturbances=tuple(effect.name for effect in added if effect.card.disturbance),
+        gained=searched.gained,
+        generic=generic.log_bayes_factor if generic else -np.inf,
+        generic_name=generic.name if generic else "",
+        remaining=last.largest,
+        remaining_threshold=last.threshold,
+        remaining_name=last.leader.name if last.leader else "",
+        share=searched.share,
+        excess=before.state.whitening.excess(before.state.optimum.residual),
+        enough=ALONE if len(study.fit) == 1 and not study.held_out else EXPLAINED,
+        scatter=first.scatter,
+        missed=None if by_record else missed(study, after.fit, now, searched.state),
+        unseen=unseen_share(study, was, now, searched.state) if study.held_out else np.nan,
+        risen=risen(was, now) if study.held_out else np.nan,
+        reached=np.nan if by_record else over_noise(after.fit, now, clear=not last.alarmed),
     )
 
 

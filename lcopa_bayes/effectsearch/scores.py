@@ -193,13 +193,14 @@ def left_out_scores(state: State) -> list[Score]:
     """On the fit records, each left out in turn (one Gauss-Newton step away from the fit of all)."""
     chosen, several = groups(state.whitening), len(state.whitening.samples) > 1
     mean, rng = state.fitted, np.random.default_rng(_SEED)
-    variance, draws = np.zeros_like(mean), np.zeros((_DRAWS, mean.size))
+    variance, draws = np.zeros_like(mean), np.zeros((_DRAWS if several else 0, mean.size))
     for rows, (shift, covariance) in zip(chosen, shifts(state.optimum, chosen), strict=True):
         tangents = state.optimum.tangents[rows]
         mean[rows] += tangents @ shift
         variance[rows] = np.einsum("nk,kl,nl->n", tangents, covariance, tangents, optimize=True)
-        apart = rng.standard_normal((_DRAWS, len(shift))) @ root_of(covariance).T
-        draws[:, rows] = apart @ tangents.T
+        if several:
+            apart = rng.standard_normal((_DRAWS, len(shift))) @ root_of(covariance).T
+            draws[:, rows] = apart @ tangents.T
     own = several and _own_levels(state)
     scores = _scores(state, mean, variance, "the other records", own_levels=own)
     if not several:  # parts of a record are beside what was fitted, and say nothing of another one

@@ -67,11 +67,7 @@ def find_optima(
         alone = find_optima(posterior.without_effects, rng, starts=starts)
         return _kept(posterior, _descended(posterior, _near(posterior, effect_starts(posterior, alone, rng))))
     drawn = table.draw(_FEWER if len(near) else _SCREENED, rng)
-    drawn = np.vstack([regressed(posterior, drawn), drawn, *near])
-    for axis, scale in enumerate(spread_of(posterior)):
-        for name, value in posterior.noise.nearly_white(0.05 * scale).items():
-            if table.rows[table.at(name, axis)].free:
-                drawn[:, table.at(name, axis)] = value
+    drawn = nearly_white(posterior, np.vstack([regressed(posterior, drawn), drawn, *near]))
     likelihood = posterior.log_likelihood(drawn)
     if np.isnan(likelihood).any():
         posterior.log_density(posterior.coordinates(drawn[np.isnan(likelihood)]))  # raises and says where
@@ -150,11 +146,17 @@ def _apart(posterior: Posterior, one: Vector, other: Vector) -> float:
     return float((np.abs(first - second) / np.array(sizes)).max(initial=0.0))
 
 
-def spread_of(posterior: Posterior) -> list[float]:
-    """Standard deviation of each response axis [response unit]."""
-    axes = range(len(posterior.table.layout.responses))
-    pooled = [np.concatenate([s.axes[axis].values for s in posterior.samples]) for axis in axes]
-    return [(float(values.std()) if values.size else 0.0) or 1.0 for values in pooled]
+def nearly_white(posterior: Posterior, values: Matrix) -> Matrix:
+    """Table values (batch, rows) with nearly white noise of a twentieth of the responses' standard deviation
+    where the noise is free."""
+    table, out = posterior.table, values.copy()
+    for axis in range(len(table.layout.responses)):
+        pooled = np.concatenate([one.axes[axis].values for one in posterior.samples])
+        spread = (float(pooled.std()) if pooled.size else 0.0) or 1.0
+        for name, value in posterior.noise.nearly_white(0.05 * spread).items():
+            if table.rows[table.at(name, axis)].free:
+                out[:, table.at(name, axis)] = value
+    return out
 
 
 def _distinct(posterior: Posterior, ranked: Matrix, count: int) -> list[Vector]:

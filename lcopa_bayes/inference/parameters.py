@@ -85,6 +85,14 @@ class ParameterTable:
             for e, slot in enumerate(self.layout.elements)
         )
 
+    def acting_on(self, k: int) -> tuple[int, ...]:
+        """Response axes that the parameter of row `k` acts on; several where paths share it."""
+        row, layout = self.rows[k], self.layout
+        slots = {"time": layout.element_of, "order": layout.element_of, "delay": layout.delay_of}
+        if row.kind not in slots:
+            return (row.response,)
+        return tuple(axis for axis, own in enumerate(slots[row.kind]) if row.place.first in own)
+
     def shaping(self, unit: int) -> list[int]:
         """Positions of what shapes a unit response, in the order of its slopes (`ForwardModel.unit_slopes`):
         times and orders of its element, and its delay."""

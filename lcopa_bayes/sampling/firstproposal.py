@@ -11,8 +11,7 @@ from scipy.spatial import cKDTree
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
 from lcopa_bayes.inference.conditional import Conditional
 from lcopa_bayes.inference.leastsquares import LeastSquares
-from lcopa_bayes.inference.optimum import Optimum, again, find_optima, spread_of
-from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.inference.optimum import Optimum, again, find_optima, nearly_white
 from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.outer import Optima, Outer, PriorOrders
 from lcopa_bayes.sampling.proposal import Blend, Product, Proposal, tempered, weighty
@@ -43,7 +42,7 @@ def first_proposal(
     least-squares optima; table values of points to start from; and these optima. `done` performs a task at
     table values from others; `known` are optima that are known already."""
     posterior = outer.posterior
-    values = _nearly_white(posterior, posterior.table.draw(_PILOT, rng))
+    values = nearly_white(posterior, posterior.table.draw(_PILOT, rng))
     pilot = Optima(pilot=True)
     values, objective, _ = done(pilot, values, None)
     if outer.orders.any():
@@ -108,16 +107,6 @@ def _rest(
         np.concatenate([[np.diag(one) for one in width], [np.diag(spread)]]),
     )
     return rest, chosen
-
-
-def _nearly_white(posterior: Posterior, values: Matrix) -> Matrix:
-    """With noise of a twentieth of the responses' spread where it is free."""
-    table, out = posterior.table, values.copy()
-    for axis, spread in enumerate(spread_of(posterior)):
-        for name, value in posterior.noise.nearly_white(0.05 * spread).items():
-            if table.rows[table.at(name, axis)].free:
-                out[:, table.at(name, axis)] = value
-    return out
 
 
 def _with_noise(outer: Outer, values: Matrix) -> tuple[Matrix, Matrix]:

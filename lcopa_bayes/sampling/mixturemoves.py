@@ -41,15 +41,12 @@ def _sharing(posterior: Posterior) -> Iterator[tuple[tuple[int, ...], tuple[str,
     """Of each sampled coordinate the response axes it acts on, and the element, noise or slot it is of."""
     table = posterior.table
     for k in posterior.sampled:
-        row, first = table.rows[k], table.rows[k].place.first
-        slots = {
-            "time": table.layout.element_of,
-            "order": table.layout.element_of,
-            "delay": table.layout.delay_of,
-        }
-        axes = [i for i, own in enumerate(slots.get(row.kind, ())) if first in own] or [row.response]
+        row = table.rows[k]
         element = row.kind in ("time", "order")
-        yield tuple(axes), ("element" if element else "noise" if row.noise else row.kind, first)
+        yield (
+            table.acting_on(k),
+            ("element" if element else "noise" if row.noise else row.kind, row.place.first),
+        )
 
 
 @final

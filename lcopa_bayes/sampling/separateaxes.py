@@ -15,7 +15,6 @@ import numpy as np
 from lcopa_bayes.core.arrays import Index, Vector
 from lcopa_bayes.inference.observations import Observed, Samples
 from lcopa_bayes.inference.optimum import Optimum
-from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.weighted import BATCHES, Weighted
 
@@ -58,36 +57,21 @@ def separated(posterior: Posterior, values: Vector) -> tuple[Posterior, ...]:
     not depend on, and their samples are left out.
     """
     table = posterior.table
-    owners = _owners(table)
+    acting = [table.acting_on(k) for k in range(len(table.rows))]
     axes = range(len(table.layout.responses))
+    shared = any(row.free and len(own) != 1 for row, own in zip(table.rows, acting, strict=True))
     seen = all(any(one.axes[axis].values.size for one in posterior.samples) for axis in axes)
-    if posterior.simulation is not None or owners is None or not seen or len(axes) == 1:
+    if posterior.simulation is not None or shared or not seen or len(axes) == 1:
         return ()
     out = []
     for axis in axes:
         rows = tuple(
-            row if owner in (axis, None) else replace(row, prior=None, value=float(value))
-            for row, owner, value in zip(table.rows, owners, values, strict=True)
+            replace(row, prior=None, value=float(value)) if row.free and axis not in own else row
+            for row, own, value in zip(table.rows, acting, values, strict=True)
         )
         samples = tuple(_of_axis(one, axis) for one in posterior.samples)
         out.append(replace(posterior, table=replace(table, rows=rows), samples=samples))
     return tuple(out)
-
-
-def _owners(table: ParameterTable) -> list[int | None] | None:
-    """Response axis of each free row, None for what is fixed; None altogether where one belongs to two."""
-    layout, out = table.layout, []
-    for row in table.rows:
-        if row.kind in ("time", "order"):
-            of = {i for i, line in enumerate(layout.element_of) if row.place.first in line}
-        elif row.kind == "delay":
-            of = {i for i, line in enumerate(layout.delay_of) if row.place.first in line}
-        else:
-            of = {row.place.first}
-        if row.free and len(of) != 1:
-            return None
-        out.append(of.pop() if row.free else None)
-    return out
 
 
 def _of_axis(samples: Samples, axis: int) -> Samples:

@@ -7,6 +7,7 @@ every average follows from the weights themselves (Owen 2013, Monte Carlo theory
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from math import sqrt
@@ -116,16 +117,11 @@ class Weighted:
     ) -> Weighted:
         """Draws (draws, dimension) of equal weight of a product of factors; `raw`, (draws,), is the log
         evidence of the batch that each is in [nat]."""
-        drawn = cls.of(posterior, coordinates, log_density, np.zeros(len(raw)), len(raw), smooth=False)
         parts = [one for one, _ in factors]
-        return replace(
-            drawn,
-            raw=raw,
-            pareto_k=max(one.pareto_k for one in parts),
-            log_evidence=sum(one.log_evidence for one in parts),
-            log_evidence_sd=float(np.hypot.reduce([one.log_evidence_sd for one in parts])),
-            factors=factors,
-        )
+        log_evidence = sum(one.log_evidence for one in parts)
+        error = float(np.hypot.reduce([one.log_evidence_sd for one in parts]))
+        drawn = cls.equal(posterior, coordinates, log_density, log_evidence, error)
+        return replace(drawn, raw=raw, pareto_k=max(one.pareto_k for one in parts), factors=factors)
 
     @property
     def batch_evidence(self) -> Vector:
@@ -133,11 +129,11 @@ class Weighted:
         size = self.count / BATCHES
         return np.array([logsumexp(self.raw[part]) - np.log(size) for part in self.parts])
 
-    def _of_factors(self, name: str) -> Vector:
-        """A property of every sampled parameter, from its factor, (parameters,)."""
+    def _of_factors(self, each: Callable[[Weighted], Vector]) -> Vector:
+        """A number of every sampled parameter, from its factor, (parameters,)."""
         out = np.empty(self.sampled.shape[1])
         for one, own in self.factors:
-            out[own] = getattr(one, name)
+            out[own] = each(one)
         return out
 
     @cached_property
@@ -151,7 +147,7 @@ class Weighted:
     def centre_ess(self) -> Vector:
         """Effective sample size for the mean of each sampled parameter's normal scores, (parameters,)."""
         if self.factors:
-            return self._of_factors("centre_ess")
+            return self._of_factors(lambda one: one.centre_ess)
         weights, out = self._weights, []
         for column in self.sampled.T:
             rank = np.argsort(column, kind="stable")
@@ -164,7 +160,7 @@ class Weighted:
     def tail_ess(self) -> Vector:
         """The smaller effective sample size of the 5 and the 95 % quantile, (parameters,)."""
         if self.factors:
-            return self._of_factors("tail_ess")
+            return self._of_factors(lambda one: one.tail_ess)
         weights, out = self._weights, []
         for column in self.sampled.T:
             rank = np.argsort(column, kind="stable")
