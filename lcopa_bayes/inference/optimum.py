@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -35,6 +35,12 @@ _KEPT = 3
 _DESCENT, _LAST = ((15, 1e-2), (60, 1e-4)), (200, 1e-8)
 """Most responses of each round of a descent, and relative gain of the sum of squares that ends it [-]; of the
 last one, which the best optimum alone has: what a start leads to shows long before its digits do."""
+_FIRST, _FURTHER, _FINE = 1.5, 1.5, 1e-3
+"""First step along an order [linearised sd], factor from one to the next [-], and least distance of an order
+from the ends of its prior, and sd [-]."""
+_SECTION, _WITHIN = (15, 1e-4), 10.0
+"""Limits of a descent at a held order, as of `_DESCENT`, and log density below the best that ends them [nat].
+"""
 _HARDLY = 1e-2
 """Size of a coefficient that cannot be negative where it should vanish [prior scale]."""
 
@@ -84,6 +90,37 @@ def again(posterior: Posterior, optima: Sequence[Optimum]) -> tuple[Optimum, ...
     best = max(one.log_density for one in optima)
     near = [one.values for one in optima if one.log_density > best - _WEIGHTLESS]
     return _kept(posterior, _descended(posterior, near, rounds=1))
+
+
+def along_orders(posterior: Posterior, best: Optimum) -> list[Optimum]:
+    """Optima of everything else where one order after another is held, ever further to both sides of the
+    best one: a posterior that is curved along its orders has long arms, which a Gaussian at its optimum does
+    not reach. They end at the prior's, or where hardly a posterior mass is beyond."""
+    problem, out = LeastSquares(posterior), list[Optimum]()
+    for position, k in enumerate(posterior.sampled):
+        row = posterior.table.rows[k]
+        low, high = row.sampled_domain
+        first = _FIRST * max(float(np.sqrt(best.covariance[position, position])), _FINE)
+        for side in (1.0, -1.0) if row.kind == "order" else ():
+            values, z, step = best.values, float(row.coordinate(best.values[k])), side * first
+            while low + _FINE < z + step < high - _FINE:
+                z, step = z + step, _FURTHER * step
+                rows = list(posterior.table.rows)
+                rows[k] = replace(row, prior=None, value=float(row.value_at(z)))
+                held = replace(posterior, table=replace(posterior.table, rows=tuple(rows)))
+                values = values.copy()
+                values[k] = rows[k].value
+                others = LeastSquares(held)
+                if not np.less(*others.bounds_around(values)).all():  # no room between orders beside it
+                    break
+                reached = others.solve(values, evaluations=_SECTION[0], enough=_SECTION[1])[0]
+                values = posterior.table.canonical(problem.with_noise(reached)[None])[0]
+                _, jacobian = problem.residual(problem.coordinates(values), values)
+                there = _describe(posterior, problem, values, jacobian)
+                if not there.log_density > best.log_density - _WITHIN:
+                    break
+                out.append(there)
+    return out
 
 
 def _near(posterior: Posterior, starts: Sequence[Vector]) -> list[Vector]:
