@@ -38,6 +38,8 @@ last one, which the best optimum alone has: what a start leads to shows long bef
 _FIRST, _FURTHER, _FINE = 1.5, 1.5, 1e-3
 """First step along an order [linearised sd], factor from one to the next [-], and least distance of an order
 from the ends of its prior, and sd [-]."""
+_SHORTER, _LEAST_FIRST = 0.25, 0.1
+"""Factor on a first step that leads too far down, and least of it that is tried [-]."""
 _SECTION, _WITHIN = (15, 1e-4), 10.0
 """Limits of a descent at a held order, as of `_DESCENT`, and log density below the best that ends them [nat].
 """
@@ -102,25 +104,31 @@ def along_orders(posterior: Posterior, best: Optimum) -> list[Optimum]:
         low, high = row.sampled_domain
         first = _FIRST * max(float(np.sqrt(best.covariance[position, position])), _FINE)
         for side in (1.0, -1.0) if row.kind == "order" else ():
-            values, z, step = best.values, float(row.coordinate(best.values[k])), side * first
+            values, z, step, begun = best.values, float(row.coordinate(best.values[k])), side * first, False
             while low + _FINE < z + step < high - _FINE:
-                z, step = z + step, _FURTHER * step
-                rows = list(posterior.table.rows)
-                rows[k] = replace(row, prior=None, value=float(row.value_at(z)))
-                held = replace(posterior, table=replace(posterior.table, rows=tuple(rows)))
-                values = values.copy()
-                values[k] = rows[k].value
-                others = LeastSquares(held)
-                if not np.less(*others.bounds_around(values)).all():  # no room between orders beside it
+                there = _held_at(posterior, problem, k, float(row.value_at(z + step)), values)
+                if there is not None and there.log_density > best.log_density - _WITHIN:
+                    values, z, step, begun = there.values, z + step, _FURTHER * step, True
+                    out.append(there)
+                elif begun or abs(step) < _LEAST_FIRST * first:
                     break
-                reached = others.solve(values, evaluations=_SECTION[0], enough=_SECTION[1])[0]
-                values = posterior.table.canonical(problem.with_noise(reached)[None])[0]
-                _, jacobian = problem.residual(problem.coordinates(values), values)
-                there = _describe(posterior, problem, values, jacobian)
-                if not there.log_density > best.log_density - _WITHIN:
-                    break
-                out.append(there)
+                else:
+                    step *= _SHORTER
     return out
+
+
+def _held_at(
+    posterior: Posterior, problem: LeastSquares, k: int, value: float, values: Vector
+) -> Optimum | None:
+    """Optimum of everything beside table row `k`; None without room between the orders beside it."""
+    rows, start = list(posterior.table.rows), values.copy()
+    rows[k], start[k] = replace(rows[k], prior=None, value=value), value
+    held = LeastSquares(replace(posterior, table=replace(posterior.table, rows=tuple(rows))))
+    if not np.less(*held.bounds_around(start)).all():
+        return None
+    reached = held.solve(start, evaluations=_SECTION[0], enough=_SECTION[1])[0]
+    there = posterior.table.canonical(problem.with_noise(reached)[None])[0]
+    return _describe(posterior, problem, there, problem.residual(problem.coordinates(there), there)[1])
 
 
 def _near(posterior: Posterior, starts: Sequence[Vector]) -> list[Vector]:
