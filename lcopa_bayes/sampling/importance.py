@@ -44,9 +44,9 @@ rest."""
 _CALM, _LONGER, _SPARE = 0.5, 3.0, 1.1
 """Pareto k up to which a proposal that gave too few draws gives more, how many times as many at most, and
 factor on the number that is estimated to be lacking [-]."""
-_LIGHT, _HEAVY = 0.2, 0.9
+_LIGHT, _HEAVY, _CLOSE = 0.2, 0.9, 0.3
 """Pareto k at which the proposal is fitted no further, if it is efficient, and from which a third attempt has
-little hope [-]."""
+little hope; effective draws per draw at which one is that need not be close to the posterior [-]."""
 
 
 @final
@@ -156,7 +156,8 @@ def importance(
                 proposal = Blend(Product(groups, tuple(fits[1:])), fits[0], _JOINT)
             else:
                 cores, proposal = _learned(cores, groups, points, log_weights)
-            if (k <= _LIGHT and worth > LEAST_EFFICIENCY) or late():
+            close = LEAST_EFFICIENCY if plan.efficient else _CLOSE
+            if (k <= _LIGHT and worth > close) or late():
                 break
         last = worth < plan.promising or late()
         y, density = np.empty((0, posterior.dimension)), np.empty(0)
