@@ -231,26 +231,30 @@ class LeastSquares:
 
     def _prior_rows(self, raw: Vector) -> tuple[Matrix, Vector]:
         """Standardised normal priors as residual rows."""
-        table = self.posterior.table
-        rows, prior = [], []
-        for k in self.columns:
-            row = table.rows[k]
-            normal = row.prior.normal if row.prior is not None and not row.log_scale else None
-            if normal is not None:
-                mean, sd = normal
-                unit = np.zeros(len(table.rows))
-                unit[k] = 1 / sd
-                rows.append(unit)
-                prior.append((raw[k] - mean) / sd)
-        return np.array(rows).reshape(-1, len(table.rows)), np.array(prior)
+        rows, prior = np.zeros((len(self._normal), raw.size)), np.zeros(len(self._normal))
+        for number, (k, mean, sd) in enumerate(self._normal):
+            rows[number, k] = 1 / sd
+            prior[number] = (raw[k] - mean) / sd
+        return rows, prior
 
-    def solve(self, values: Vector) -> tuple[Vector, Matrix]:
-        """From a start to a local minimum: table values and the Jacobian there.
+    @cached_property
+    def _normal(self) -> list[tuple[int, float, float]]:
+        """Table position, mean and standard deviation of what has a normal prior in search coordinates."""
+        rows = self.posterior.table.rows
+        laws = [(k, rows[k].prior) for k in self.columns if not rows[k].log_scale]
+        found = [(k, law.normal) for k, law in laws if law is not None]
+        return [(k, *normal) for k, normal in found if normal is not None]
+
+    def solve(
+        self, values: Vector, *, evaluations: int | None = None, enough: float | None = None
+    ) -> tuple[Vector, Matrix]:
+        """From a start to a local minimum: table values and the Jacobian there; limits as `search`.
 
         UnstableError where effects leave no bounded response at the start.
         """
         bounds = self.bounds_around(values)
-        optimum = self.search(np.clip(self.coordinates(values), *bounds), values, bounds)
+        start = np.clip(self.coordinates(values), *bounds)
+        optimum = self.search(start, values, bounds, evaluations=evaluations, enough=enough)
         solution = self.posterior.table.canonical(self.values(optimum.x, values)[None])[0]
         return solution, np.asarray(optimum.jac)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
@@ -16,8 +16,8 @@ from lcopa_bayes.inference.poles import regressed
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.effects.effect import UnstableError
 
-_SCREENED = 1024
-"""Prior draws whose misfit is looked at."""
+_SCREENED, _FEWER = 1024, 512
+"""Prior draws whose misfit is looked at, and of them beside starts that are known."""
 _SAME = 1e-2
 """Optima closer than this in every sampled coordinate are one [natural log, or sd of the prior]."""
 _WEIGHTLESS = 30.0
@@ -32,6 +32,17 @@ _TRIED = 48
 """Sets of internal constants whose slopes are compared [-]."""
 _KEPT = 3
 """Sets of them that are descended from [-]."""
+_DESCENT, _LAST = ((15, 1e-2), (60, 1e-4)), (200, 1e-8)
+"""Most responses of each round of a descent, and relative gain of the sum of squares that ends it [-]; of the
+last one, which the best optimum alone has: what a start leads to shows long before its digits do."""
+_FIRST, _FURTHER, _FINE = 1.5, 1.5, 1e-3
+"""First step along an order [linearised sd], factor from one to the next [-], and least distance of an order
+from the ends of its prior, and sd [-]."""
+_SHORTER, _LEAST_FIRST = 0.25, 0.1
+"""Factor on a first step that leads too far down, and least of it that is tried [-]."""
+_SECTION, _WITHIN = (15, 1e-4), 10.0
+"""Limits of a descent at a held order, as of `_DESCENT`, and log density below the best that ends them [nat].
+"""
 _HARDLY = 1e-2
 """Size of a coefficient that cannot be negative where it should vanish [prior scale]."""
 
@@ -63,7 +74,7 @@ def find_optima(
     if posterior.simulation is not None:
         alone = find_optima(posterior.without_effects, rng, starts=starts)
         return _kept(posterior, _descended(posterior, _near(posterior, effect_starts(posterior, alone, rng))))
-    drawn = table.draw(_SCREENED, rng)
+    drawn = table.draw(_FEWER if len(near) else _SCREENED, rng)
     drawn = nearly_white(posterior, np.vstack([regressed(posterior, drawn), drawn, *near]))
     likelihood = posterior.log_likelihood(drawn)
     if np.isnan(likelihood).any():
@@ -81,6 +92,43 @@ def again(posterior: Posterior, optima: Sequence[Optimum]) -> tuple[Optimum, ...
     best = max(one.log_density for one in optima)
     near = [one.values for one in optima if one.log_density > best - _WEIGHTLESS]
     return _kept(posterior, _descended(posterior, near, rounds=1))
+
+
+def along_orders(posterior: Posterior, best: Optimum) -> list[Optimum]:
+    """Optima of everything else where one order after another is held, ever further to both sides of the
+    best one: a posterior that is curved along its orders has long arms, which a Gaussian at its optimum does
+    not reach. They end at the prior's, or where hardly a posterior mass is beyond."""
+    problem, out = LeastSquares(posterior), list[Optimum]()
+    for position, k in enumerate(posterior.sampled):
+        row = posterior.table.rows[k]
+        low, high = row.sampled_domain
+        first = _FIRST * max(float(np.sqrt(best.covariance[position, position])), _FINE)
+        for side in (1.0, -1.0) if row.kind == "order" else ():
+            values, z, step, begun = best.values, float(row.coordinate(best.values[k])), side * first, False
+            while low + _FINE < z + step < high - _FINE:
+                there = _held_at(posterior, problem, k, float(row.value_at(z + step)), values)
+                if there is not None and there.log_density > best.log_density - _WITHIN:
+                    values, z, step, begun = there.values, z + step, _FURTHER * step, True
+                    out.append(there)
+                elif begun or abs(step) < _LEAST_FIRST * first:
+                    break
+                else:
+                    step *= _SHORTER
+    return out
+
+
+def _held_at(
+    posterior: Posterior, problem: LeastSquares, k: int, value: float, values: Vector
+) -> Optimum | None:
+    """Optimum of everything beside table row `k`; None without room between the orders beside it."""
+    rows, start = list(posterior.table.rows), values.copy()
+    rows[k], start[k] = replace(rows[k], prior=None, value=value), value
+    held = LeastSquares(replace(posterior, table=replace(posterior.table, rows=tuple(rows))))
+    if not np.less(*held.bounds_around(start)).all():
+        return None
+    reached = held.solve(start, evaluations=_SECTION[0], enough=_SECTION[1])[0]
+    there = posterior.table.canonical(problem.with_noise(reached)[None])[0]
+    return _describe(posterior, problem, there, problem.residual(problem.coordinates(there), there)[1])
 
 
 def _near(posterior: Posterior, starts: Sequence[Vector]) -> list[Vector]:
@@ -101,16 +149,23 @@ def _near(posterior: Posterior, starts: Sequence[Vector]) -> list[Vector]:
 
 
 def _descended(posterior: Posterior, starts: Sequence[Vector], *, rounds: int = 2) -> list[Optimum]:
-    """Optima from table values; a start from which effects leave no bounded response gives none."""
-    problem, optima = LeastSquares(posterior), []
+    """Optima from table values, the best of them to its digits; a start from which effects leave no bounded
+    response gives none."""
+    problem, reached = LeastSquares(posterior), list[tuple[float, Vector]]()
     for values in starts:
         values = posterior.complete(posterior.coordinates(values[None]), None)[0]
         try:
-            for _ in range(rounds):
-                values, _ = problem.solve(values)
-                values = problem.with_noise(values)
+            for evaluations, enough in _DESCENT[-rounds:]:
+                values = problem.with_noise(problem.solve(values, evaluations=evaluations, enough=enough)[0])
         except UnstableError:
             continue
+        reached.append((float(posterior.log_density(posterior.coordinates(values[None]))[0]), values))
+    reached.sort(key=lambda one: -one[0])
+    optima = list[Optimum]()
+    for _, values in reached:
+        if not optima and posterior.simulation is None:
+            evaluations, enough = _LAST
+            values = problem.with_noise(problem.solve(values, evaluations=evaluations, enough=enough)[0])
         # at the solution itself: its terms may stand in another order than the search left them in, and the
         # noise is that of its own residual
         _, jacobian = problem.residual(problem.coordinates(values), values)

@@ -45,12 +45,15 @@ def _series_coefficients(q: Vector) -> Matrix:
 
 def _series_coefficient_slopes(q: Vector) -> Matrix:
     """Derivatives of `_series_coefficients` in q; same shape."""
-    value, slope, slopes = np.ones_like(q), np.zeros_like(q), []
-    for j in range(2 * _SERIES_TERMS):
-        slope = (slope * (q - j) + value) / (j + 1)
-        value = value * (q - j) / (j + 1)
-        slopes.append(2 * slope)
-    return np.stack(slopes[1::2], axis=-1)
+    j = np.arange(2 * _SERIES_TERMS)
+    factors = (q[:, None] - j) / (j + 1)
+    # of a product the sum over its factors of the products before and after each, none of them divided by
+    value, slope, slopes = np.ones_like(q), np.zeros_like(q), np.empty(factors.shape)
+    for k, factor in enumerate(factors.T):
+        slope = slope * factor + value / (k + 1)
+        value = value * factor
+        slopes[:, k] = slope
+    return 2 * slopes[:, 1::2]
 
 
 def integration_weights(orders: Vector, n: int, step: float) -> Matrix:

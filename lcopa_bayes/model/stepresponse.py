@@ -77,9 +77,6 @@ def transfer_slopes(
     value = top / denominator
     scale = _scale(times, orders, step)
 
-    def slope(order: Vector) -> Spectrum:
-        return _differenced(integration_weights_slope(order, circle.n, 1.0), circle)
-
     by_time = tuple(
         -value * (orders[:, i, None] * scale[i]) * integral / denominator
         for i, integral in enumerate(integrals)
@@ -89,9 +86,12 @@ def transfer_slopes(
     logs = np.log(times / step)
     log_times = [logs[..., i, None] for i in range(orders.shape[1])]
     by_order = []
-    leading = slope(orders[:, 0]) * (1.0 - value) - value * scale[0] * log_times[0] * integrals[0]
+    integrated = np.concatenate((orders[:, :1], orders[:, :1] - orders[:, 1:]), axis=1)
+    weights = integration_weights_slope(integrated.ravel(), circle.n, 1.0)
+    slopes = _differenced(weights, circle).reshape(*orders.shape, -1)
+    leading = slopes[:, 0] * (1.0 - value) - value * scale[0] * log_times[0] * integrals[0]
     for i in range(1, orders.shape[1]):
-        bent = slope(orders[:, 0] - orders[:, i])
+        bent = slopes[:, i]
         leading = leading - value * scale[i] * bent
         by_order.append(-value * scale[i] * (log_times[i] * integrals[i] - bent) / denominator)
     return value, TransferSlopes(by_time, (leading / denominator, *by_order))
@@ -168,13 +168,11 @@ def taps(theta: Array, kind: Kind) -> Array:
     `theta` is the distance from the block's left edge in blocks.
     """
     coefficients = _TAPS[kind]
-    out = np.empty((coefficients.shape[0], *theta.shape))
-    for row, polynomial in zip(out, coefficients, strict=True):
-        row[...] = polynomial[-1]
-        for coefficient in polynomial[-2::-1]:
-            row *= theta
-            row += coefficient
-    return out
+    powers = np.empty((coefficients.shape[1], theta.size))
+    powers[0] = 1.0
+    for power, lower in zip(powers[1:], powers, strict=False):
+        np.multiply(lower, theta.ravel(), out=power)
+    return np.asarray((coefficients @ powers).reshape(len(coefficients), *theta.shape))
 
 
 @final
@@ -229,20 +227,26 @@ class StepResponse:
 
         Zero before the onset. Positions go up to n - 3.
         """
-        block = np.clip(np.floor(x).astype(int), _SIDE, self.coarse.shape[2] - _SIDE - 1)
-        weights = taps(x - block, kind)
         out = np.zeros((self.coarse.shape[0], *x.shape))
-        elements = np.arange(x.shape[0])[:, None]
-        for weight, shift in zip(weights, range(-_SIDE, _SIDE + 1), strict=True):
-            out += weight * self.coarse[:, elements, block + shift]
-        if kind == "integral":
-            out += self._sums[:, elements, block]
         after = x > 0.0
-        out *= after
+        begun = after.any(axis=0)
+        if not begun.any():
+            return out
+        first = int(np.argmax(begun))
+        x, after, inner = x[:, first:], after[:, first:], out[:, :, first:]
+        n = self.coarse.shape[2]
+        block = np.clip(np.floor(x).astype(int), _SIDE, n - _SIDE - 1)
+        weights = taps(x - block, kind)
+        flat, place = self.coarse.reshape(len(out), -1), block + n * np.arange(len(x))[:, None]
+        for weight, shift in zip(weights, range(-_SIDE, _SIDE + 1), strict=True):
+            inner += weight * flat.take(place + shift, axis=1)
+        if kind == "integral":
+            inner += self._sums.reshape(len(out), -1).take(place, axis=1)
+        inner *= after
         if self.fine.shape[1] == 0:
             return out
         near = (after & (x < _NEAR)).nonzero()
-        out[:, near[0], near[1]] = self._read_fine(near[0], x[near], kind)
+        inner[:, near[0], near[1]] = self._read_fine(near[0], x[near], kind)
         return out
 
     @cached_property

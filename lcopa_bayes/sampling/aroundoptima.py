@@ -16,15 +16,21 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.parallel import Workers
-from lcopa_bayes.inference.optimum import Optimum
+from lcopa_bayes.inference.optimum import Optimum, along_orders
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.coordinates import Chart, charted_density
 from lcopa_bayes.sampling.importance import Effort, ImportancePlan, importance
 from lcopa_bayes.sampling.weighted import Weighted
 
 _PLAN = ImportancePlan(
-    (Effort(3_000, 1_000, 6), Effort(4_000, 2_000, 6), Effort(8_000, 3_000, 4)), promising=0.05
+    (Effort(4_000, 2_000, 8), Effort(4_000, 2_000, 3), Effort(8_000, 3_000, 3)),
+    promising=0.05,
+    efficient=False,
+    straightened=True,
 )
+_LEAST = 0.1
+"""Effective draws per draw from which a proposal that began all along the orders covers what it does not
+miss far from there, which points of the whole prior show [-]."""
 _ATTEMPTS, _STRAY = 2, 3
 """Attempts, and points that the second one begins at, the heaviest that the first does not cover [-]."""
 _SPARSE, _NEGLIGIBLE = 30.0, 0.01
@@ -56,6 +62,7 @@ def around_optima(
     drawn = np.isfinite(log_weights)
     z, density, log_weights = z[drawn], density[drawn], log_weights[drawn]
     y, log_volume = chart.charted(z)
+    optima = [*optima, *along_orders(posterior, optima[0])]
     explored = np.zeros(len(y), dtype=bool)
     for _ in range(_ATTEMPTS):
         tried = importance(
@@ -70,7 +77,7 @@ def around_optima(
         if tried is None:
             return False, None
         weighted = tried.weighted
-        if not tried.good(wanted):
+        if not tried.good(wanted, efficient=False) or weighted.ess < _LEAST * weighted.count:
             break
         log_ratio = density + posterior.table.log_permutations - log_volume - weighted.log_evidence
         sparse = (log_ratio - tried.proposal.log_density(y) > np.log(_SPARSE)) & ~explored

@@ -28,6 +28,7 @@ from lcopa_bayes.sampling.coordinates import Chart, Mapped, charted_density
 from lcopa_bayes.sampling.importanceweights import effective, usable_k
 from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.proposal import Blend, Product, Proposal, Seen, around, fitted, split, weighty
+from lcopa_bayes.sampling.straightened import Straightened
 from lcopa_bayes.sampling.weighted import Weighted, tail_smoothed
 
 LEAST_EFFICIENCY = 0.4
@@ -43,9 +44,9 @@ rest."""
 _CALM, _LONGER, _SPARE = 0.5, 3.0, 1.1
 """Pareto k up to which a proposal that gave too few draws gives more, how many times as many at most, and
 factor on the number that is estimated to be lacking [-]."""
-_LIGHT, _HEAVY = 0.2, 0.6
+_LIGHT, _HEAVY, _CLOSE = 0.2, 0.9, 0.3
 """Pareto k at which the proposal is fitted no further, if it is efficient, and from which a third attempt has
-little hope [-]."""
+little hope; effective draws per draw at which one is that need not be close to the posterior [-]."""
 
 
 @final
@@ -74,6 +75,8 @@ class ImportancePlan:
     """Effective draws of a good attempt."""
     efficient: bool = True
     """Whether a good attempt is close to the posterior."""
+    straightened: bool = False
+    """Whether the proposal follows a curve along the orders, that of other parameters given these."""
     promising: float = 0.0
     """Effective draws per draw of the last proposal that was learned from, below which no further attempt is
     made [-]; above 0 a third one is made only after one with a Pareto k below `_HEAVY`."""
@@ -126,6 +129,8 @@ def importance(
     cores = [first, *(first.marginal(own) for own in groups if len(groups) > 1)]
     proposal: Proposal = first
     rough = rough or partial(charted_density, posterior, chart, mapped=mapped)
+    rows = [posterior.table.rows[k] for k in posterior.sampled]
+    orders = np.flatnonzero([row.kind == "order" for row in rows])
     seen = Seen()
     for number, effort in enumerate(plan.efforts, start=1):
         if seen.proposals and len(cores[0].means) < _MOST:
@@ -139,8 +144,20 @@ def importance(
                 break
             own, k = tail_smoothed(seen.last_weights())
             worth = effective(own) / len(y)
-            cores, proposal = _learned(cores, groups, np.concatenate(seen.points), log_weights)
-            if (k <= _LIGHT and worth > LEAST_EFFICIENCY) or late():
+            points = np.concatenate(seen.points)
+            if plan.straightened:
+                every = np.arange(posterior.dimension)
+                fits = [
+                    Straightened.fitted(
+                        points[:, own], log_weights, np.flatnonzero(np.isin(own, orders)), rng
+                    )
+                    for own in (every, *groups)
+                ]
+                proposal = Blend(Product(groups, tuple(fits[1:])), fits[0], _JOINT)
+            else:
+                cores, proposal = _learned(cores, groups, points, log_weights)
+            close = LEAST_EFFICIENCY if plan.efficient else _CLOSE
+            if (k <= _LIGHT and worth > close) or late():
                 break
         last = worth < plan.promising or late()
         y, density = np.empty((0, posterior.dimension)), np.empty(0)
@@ -150,7 +167,7 @@ def importance(
             y = np.concatenate([y, more])
             density = np.append(density, charted_density(posterior, chart, more, mapped))
             weighted = _weighted(posterior, chart, y, density, density - proposal.log_density(y))
-            count = 0 if last else _lacking(weighted, plan.wanted, _LONGER * effort.draws)
+            count = 0 if last else _lacking(weighted, plan, _LONGER * effort.draws)
         spent = sum(map(len, seen.points)) + len(y)
         result = Importance(weighted, proposal, len(chosen), spent)
         last |= number == 2 and plan.promising > 0 and weighted.pareto_k > _HEAVY
@@ -160,11 +177,12 @@ def importance(
     return result
 
 
-def _lacking(weighted: Weighted, wanted: float, most: float) -> int:
+def _lacking(weighted: Weighted, plan: ImportancePlan, most: float) -> int:
     """Further draws of a proposal that is good and has given too few: none where it would be `most`."""
-    if weighted.pareto_k > _CALM or weighted.ess < LEAST_EFFICIENCY * weighted.count:
+    least = LEAST_EFFICIENCY if plan.efficient else 0.0
+    if weighted.pareto_k > _CALM or weighted.ess < least * weighted.count:
         return 0
-    needed = _SURPLUS * wanted / weighted.smallest_ess
+    needed = _SURPLUS * plan.wanted / weighted.smallest_ess
     return ceil(_SPARE * (needed - 1.0) * weighted.count) if 1.0 < needed < most / weighted.count else 0
 
 

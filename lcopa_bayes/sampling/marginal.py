@@ -55,8 +55,9 @@ _TRIES = (64, 256)
 """Draws of the rest per point, least and most: more where few of them count."""
 _EFFECTIVE_TRIES = 5.0
 """Effective draws among them that are aimed at."""
-_PATIENCE, _ROUNDS = 12, 18
-"""Rounds that improve the proposal after which few effective draws show that there is no hope, and most."""
+_TRIAL, _PATIENCE, _ROUNDS = 4, 12, 18
+"""Rounds that improve the proposal after which hardly an effective draw, and after which few of them, show
+that there is no hope, and most: draws of proposals that near a posterior soon multiply."""
 _FEWEST = 2.0
 """Effective draws with which a search ends that has no time left [-]."""
 _FEW, _SINGLE = 20.0, (0.2, 0.6)
@@ -75,8 +76,9 @@ _LEARNED = 0.15
 """Share of the last of these in proposals whose draws count: wider than they are [-]."""
 _LOST = 0.03
 """Effective draws per draw below which a few are of a region that proposals did not cover [-]."""
-_MOST, _MOST_DRAWN = 4, 80.0
-"""Most draws of a round over the least, and of all that count over the effective draws wanted [-]."""
+_MOST, _MOST_DRAWN, _JUDGED = 4, 80.0, 10.0
+"""Most draws of a round over the least, of all that count over the effective draws wanted, and so many of
+these that they show whether the most would be enough [-]."""
 _VISITED = 6_000
 """Most points that a first proposal is learned from."""
 _WALKING, _BEGINNING, _TEACHING = 3, 200.0, 3_000
@@ -208,7 +210,7 @@ class Search:
             agree = abs(level - before[0]) <= _AGREE / np.sqrt(max(before[1], 1.0)) and reached > before[1]
             if expected > _HELPFUL and reached > _SETTLED and (agree or number + 1 >= _PATIENCE):
                 return self._last(first, proposal, seen, wanted, expected)
-            if number + 1 >= _PATIENCE and reached < _FEW:
+            if number + 1 >= _TRIAL and reached < _FEW * min((number + 1) / _PATIENCE, 1.0) ** 2:
                 return None
         return None
 
@@ -253,6 +255,8 @@ class Search:
                 since, worth = len(halves[0].counts), 0.0
             elif weighted.ess < _LOST * weighted.count:
                 since, worth = len(halves[0].counts), 0.0  # a region met for the first time is learned
+            if drawn > _JUDGED * wanted and worth * _MOST_DRAWN < drawn:
+                break
             if self._late(_LEARNING):
                 self.unfinished = True
                 return weighted if weighted.ess >= _FEW else self._unfinished(seen)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from math import ceil, inf
 from pathlib import Path
 from time import monotonic
@@ -27,7 +27,7 @@ from lcopa_bayes.sampling.marginal import Search
 from lcopa_bayes.sampling.modes import Modes, modes_of
 from lcopa_bayes.sampling.outer import Outer, applies
 from lcopa_bayes.sampling.proposal import weighty
-from lcopa_bayes.sampling.separateaxes import by_axis
+from lcopa_bayes.sampling.separateaxes import Drawn, by_axis
 from lcopa_bayes.sampling.weighted import BATCHES, CHAIN, Weighted
 
 _ROUND = 20
@@ -57,6 +57,8 @@ more: they are tempered as one population, by ..."""
 _NEAR_SWEEPS, _NEAR_THIN, _NEAR_ROUNDS = 10, 2, 10
 """... so many moves at each temperature, and take so many steps per kept draw and rounds at most: few walkers
 that go far, since those that remember their start say nothing."""
+_AXIS_STEPS = 1_500
+"""Most steps of an ensemble of one axis of several: it begins at points of a search, or around optima."""
 _TRAIL = 1_500
 """Draws per ensemble that the first mixture is learned from, where a search gave them."""
 _DELIVERED = 500
@@ -190,7 +192,8 @@ def sample(
     tempered from the prior begin where no search is possible or the plan asks for ensembles.
 
     The draws depend on the arguments alone, not on `jobs` nor on interruptions: with `resume`, a run killed
-    at any moment continues from the last complete round in `chain_file`. `starts`, table values (starts,
+    at any moment continues from the last complete round in `chain_file`, or, of axes sampled apart, from the
+    files beside it that end in their numbers. `starts`, table values (starts,
     rows), are modes known from elsewhere, which moves propose too (`knownmodes`); InputError when none lies
     inside the prior. With a budget of `plan.seconds` they depend on the speed of the machine too, and
     sampling goes on, resumed, for as long again. `optima` are least-squares optima that a search begins with,
@@ -214,18 +217,25 @@ def sample(
     wanted = SURPLUS * plan.target_ess
     searched = plan.method == "auto" and applies(posterior)
 
-    def of_axis(factor: Posterior, own: Sequence[Optimum], seed: int) -> tuple[Weighted | None, bool]:
-        if len(Outer(factor).columns) > _MAPPED:
-            return None, False
-        with workers(factor, jobs=jobs) as crew, _points(quiet) as bar:
-            search = Search(factor, seed, crew, bar, own, left)
-            return search.run(wanted), search.unfinished
+    runs = list[Run]()
+
+    def of_axis(factor: Posterior, own: Sequence[Optimum], seed: int, share: float) -> Drawn:
+        alone = replace(plan, seed=seed, seconds=None if plan.seconds is None else share * left())
+        few = max(_NEAR_WALKERS, _NEAR_PER_DIMENSION * factor.dimension + 2)
+        alone = replace(alone, walkers=min(plan.walkers, few), steps=min(plan.steps, _AXIS_STEPS))
+        number = len(runs) + 1
+        place = chain_file and chain_file.with_stem(f"{chain_file.stem}_{number}")
+        go = partial(sample, jobs=jobs, resume=resume, quiet=quiet, optima=own)
+        runs.append(go(factor, alone, chain_file=place, fingerprint=f"{fingerprint} {number}"))
+        return runs[-1].ensembles, runs[-1].weighted
 
     if searched and known is None and not ensembles:
         separate = by_axis(posterior, optima, of_axis, plan.delivered, plan.seed)
         if separate is not None:
-            stopped = monotonic() - begin if separate[1] else None
-            return Run((), plan, separate[0], stopped_after=stopped)
+            late = any(run.stopped_after is not None for run in runs)
+            unconfirmed = tuple(name for run in runs for name in run.unconfirmed)
+            stopped = monotonic() - begin if late else None
+            return Run(separate[0], plan, separate[1], unconfirmed, stopped_after=stopped)
     with workers(posterior, jobs=jobs) as crew:
         seeds = np.random.SeedSequence(plan.seed).spawn(plan.ensembles)
         mapped = searched and len(Outer(posterior).columns) <= _MAPPED

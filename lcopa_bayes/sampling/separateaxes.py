@@ -1,14 +1,15 @@
 """Posteriors of plants whose response axes share nothing: a product with a factor for each axis.
 
 Where no element, delay, offset or noise parameter belongs to paths of two response axes, the joint posterior
-of all axes is the product of theirs. Each is sampled by itself, in a fraction of the dimensions, and
-independent draws of all of them are draws of the whole; log evidences add up.
+of all axes is the product of theirs. Each is sampled by itself, in a fraction of the dimensions and by what
+suits it, and independent draws of all of them are draws of the whole; log evidences add up.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -16,38 +17,43 @@ from lcopa_bayes.core.arrays import Index, Vector
 from lcopa_bayes.inference.observations import Observed, Samples
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
-from lcopa_bayes.sampling.weighted import BATCHES, Weighted
+from lcopa_bayes.sampling.coordinates import spread
+from lcopa_bayes.sampling.ensemble import Ensemble
+from lcopa_bayes.sampling.weighted import BATCHES, Weighted, resampled
 
-_PORTION = 256
-"""Draws whose density is computed at once [-]."""
 _NOTHING = Observed(np.empty(0, dtype=int), np.empty(0), np.empty(0))
+
+
+Drawn: TypeAlias = tuple[tuple[Ensemble, ...], Weighted | None]
+"""Ensembles of a posterior, and importance draws, which stand for it where there are any."""
 
 
 def by_axis(
     posterior: Posterior,
     optima: Sequence[Optimum],
-    sampled: Callable[[Posterior, Sequence[Optimum], int], tuple[Weighted | None, bool]],
+    sampled: Callable[[Posterior, Sequence[Optimum], int, float], Drawn],
     count: int,
     seed: int,
-) -> tuple[Weighted, bool] | None:
-    """Importance draws, `count` of each batch, and whether a budget ended any of them; None where axes share
-    something, or one has no importance draws.
+) -> Drawn | None:
+    """Draws of all axes: importance draws, `count` of each batch, where every axis has some, or ensembles;
+    None where axes share something.
 
-    Parameters: `optima` of the posterior, best first; `sampled` gives the same of a factor from its optima
-    and a seed.
+    Parameters: `optima` of the posterior, best first; `sampled` gives draws of a factor from its optima, a
+    seed, and its share of the time that is left.
     """
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1_002,)))
     values = optima[0].values if optima else posterior.table.draw(1, rng)[0]
-    factors, drawn, unfinished = separated(posterior, values), list[Weighted](), False
-    for factor in factors:
-        own, stopped = sampled(factor, of_factor(factor, posterior, optima), int(rng.integers(2**31)))
-        if own is None:
-            return None
-        drawn.append(own)
-        unfinished |= stopped
+    factors = separated(posterior, values)
     if not factors:
         return None
-    return joined(posterior, factors, drawn, count, rng), unfinished
+    drawn, weighted = list[Drawn](), list[Weighted]()
+    for number, factor in enumerate(factors):
+        own, share = of_factor(factor, posterior, optima), 1 / (len(factors) - number)
+        drawn.append(sampled(factor, own, int(rng.integers(2**31)), share))
+        weighted += [one for one in drawn[-1][1:] if one is not None]
+    if len(weighted) == len(factors):
+        return (), joined(posterior, factors, weighted, count, rng)
+    return side_by_side(posterior, factors, drawn, rng), None
 
 
 def separated(posterior: Posterior, values: Vector) -> tuple[Posterior, ...]:
@@ -114,6 +120,36 @@ def joined(
         chosen = one.batches(count, rng)
         coordinates[:, own] = one.coordinates[chosen.ravel()]
         raw += np.repeat(one.batch_evidence, count)
-    portions = np.array_split(coordinates, max(1, len(raw) // _PORTION))
-    density = np.concatenate([whole.log_density(part) for part in portions])
+    density = spread(whole, coordinates, map)
     return Weighted.product(whole, coordinates, density, raw, tuple(zip(drawn, columns, strict=True)))
+
+
+def side_by_side(
+    whole: Posterior, factors: Sequence[Posterior], drawn: Sequence[Drawn], rng: np.random.Generator
+) -> tuple[Ensemble, ...]:
+    """Ensembles of the whole: walkers of independent factors side by side are walkers of their product.
+
+    Importance draws of a factor take the places of walkers that stay so long at each of them that they are
+    worth no more than before.
+    """
+    held = [ensembles for ensembles, weighted in drawn if weighted is None]
+    length, walkers = (min(one.chain.shape[k] for own in held for one in own) for k in (0, 1))
+    out = []
+    for number, alike in enumerate(zip(*held, strict=True)):
+        chain = np.empty((length, walkers, whole.dimension))
+        for factor, (ensembles, weighted) in zip(factors, drawn, strict=True):
+            if weighted is None:
+                own = ensembles[number].chain[-length:, :walkers]
+            else:
+                part = weighted.parts[number % BATCHES]
+                stays = int(np.clip(weighted.smallest_ess / BATCHES / walkers, 1, length))
+                chosen = resampled(weighted.log_weights[part], stays * walkers, rng).reshape(stays, walkers)
+                own = weighted.coordinates[part.start + chosen[np.arange(length) * stays // length]]
+            chain[..., _columns(factor, whole)] = own
+        density = spread(whole, chain.reshape(-1, whole.dimension), map).reshape(length, walkers)
+        accepted = np.full(walkers, length * float(np.mean([one.acceptance for one in alike])))
+        joint = replace(alike[0], chain=chain, log_density=density, accepted=accepted, trail=chain[-1])
+        longest = max(one.tempering_moves for one in alike)
+        last = replace(joint, position=chain[-1], position_log_density=density[-1], tempering_moves=longest)
+        out.append(replace(last, near=any(one.near for one in alike)))
+    return tuple(out)

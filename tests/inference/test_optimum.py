@@ -11,7 +11,7 @@ from lcopa_bayes.bench.command import prbs
 from lcopa_bayes.bench.device import Device
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.inference.leastsquares import LeastSquares
-from lcopa_bayes.inference.optimum import find_optima
+from lcopa_bayes.inference.optimum import along_orders, find_optima
 from lcopa_bayes.inference.posterior import Posterior
 
 SHORT = record(camera=0.6)
@@ -216,3 +216,25 @@ def test_noise_is_estimated_from_the_residual():
 def test_a_nearly_noise_free_record_keeps_its_small_noise():
     found = best(made(record(camera=0.05, noise_sd=1e-4), blocks=2000), starts=3)
     assert found["sigma"] < 3e-4
+
+
+def test_along_an_order_everything_else_is_at_its_optimum():
+    """To both sides and as far as the log density falls by ten; no small change of the rest is better."""
+    posterior = made(SHORT, terms=2)
+    best = find_optima(posterior, np.random.default_rng(1), starts=3)[0]
+    found, rows = along_orders(posterior, best), posterior.table.rows
+    assert len(found) > 4
+    assert all(best.log_density - 10.0 < one.log_density <= best.log_density + 1e-3 for one in found)
+    orders = [k for k in posterior.sampled if rows[k].kind == "order"]
+    for k in orders:
+        reached, (low, high) = [one.values[k] for one in found], rows[k].domain
+        assert min(reached) < best.values[k] or best.values[k] < low + 0.01
+        assert max(reached) > best.values[k] or best.values[k] > high - 0.01
+    rest = [p for p, k in enumerate(posterior.sampled) if rows[k].kind not in ("order", "time")]
+    for one in found:
+        z = posterior.coordinates(one.values[None])
+        for position in rest:
+            size = 0.3 * np.sqrt(one.covariance[position, position])
+            shifts = np.zeros((2, z.shape[1]))
+            shifts[:, position] = size, -size
+            assert posterior.log_density(z + shifts).max() < one.log_density + 0.2

@@ -14,6 +14,7 @@ from small import Toy, problem, record, same_quantiles
 
 from lcopa_bayes.inference.optimum import Optimum, find_optima
 from lcopa_bayes.results.fit import plan_of
+from lcopa_bayes.sampling.aroundoptima import _PLAN
 from lcopa_bayes.sampling.coordinates import Chart, charted_density
 from lcopa_bayes.sampling.draws import gather, weighted_draws
 from lcopa_bayes.sampling.evidence import evidence
@@ -24,7 +25,7 @@ from lcopa_bayes.sampling.importance import (
     importance,
 )
 from lcopa_bayes.sampling.sampler import sample
-from lcopa_bayes.sampling.weighted import Weighted, resampled, tail_smoothed
+from lcopa_bayes.sampling.weighted import Weighted, error_of, resampled, tail_smoothed
 
 WIDE = ("norm", {"loc": 0.0, "scale": 10.0})
 
@@ -246,3 +247,57 @@ def test_the_same_randomness_gives_the_same_draws():
     assert one.good(400)
     assert not replace(one, weighted=replace(own, count=round(own.ess / 0.39))).good(400)
     assert not replace(one, weighted=replace(own, pareto_k=0.71)).good(400)
+
+
+# -- a posterior with a long arm along its orders --------------------------------------------------
+
+_BODY, _ARM = stats.norm(0.85, 0.1), stats.uniform(0.15, 0.5)
+_SHARE = 0.08
+
+
+def _follow(order):
+    """Where the higher order, a delay and a time go along the lower order."""
+    return np.stack([1.3 + 0.3 * order**4, 2.0 - np.exp(-3.0 * order), 1.0 / (0.3 + order)], axis=-1)
+
+
+def armed() -> Toy:
+    """Two orders and three others that follow the lower one closely; 8 % of the mass is in an arm that a
+    Gaussian at the optimum does not reach."""
+    unit = stats.norm()
+
+    def log_likelihood(z):
+        middle = np.logaddexp(
+            np.log1p(-_SHARE) + _BODY.logpdf(z[:, 1]), np.log(_SHARE) + _ARM.logpdf(z[:, 1])
+        )
+        apart = (z[:, [0, 2, 3]] - _follow(z[:, 1])) / (0.03, 0.02, 0.03)
+        prior = stats.norm(0.0, 10.0).logpdf(z[:, [2, 3]]).sum(axis=1)
+        return middle + unit.logpdf(apart).sum(axis=1) + unit.logpdf(z[:, 4]) - prior
+
+    order = ("uniform", {"loc": 0.0, "scale": 2.0})
+    toy = Toy(log_likelihood, {"upper": order, "lower": order, "delay": WIDE, "time": WIDE, "noise": WIDE})
+    toy.rows = tuple(replace(row, kind="order") if k < 2 else row for k, row in enumerate(toy.rows))
+    toy.table.rows = toy.rows
+    return toy
+
+
+def along(at) -> Optimum:
+    """A place on the ridge."""
+    upper, delay, time = _follow(np.array(at))
+    return optimum([upper, at, delay, time, 0.0], [0.05, 0.05, 0.05, 0.05, 1.0])
+
+
+def test_the_share_of_a_long_arm_scatters_as_told():
+    """Started along it; the exact share is known in closed form."""
+    toy, plan = armed(), replace(_PLAN, wanted=400.0)
+    exact = (1 - _SHARE) * _BODY.cdf(0.6) + _SHARE * _ARM.cdf(0.6)
+    apart = []
+    for seed in range(6):
+        starts = [along(at) for at in (0.85, 1.0, 0.7, 0.6, 0.45, 0.2)]
+        found = importance(toy, starts, np.random.default_rng(seed), plan)
+        assert found.good(400, efficient=False)
+        weights = np.exp(found.weighted.log_weights)
+        inside = (found.weighted.sampled[:, 1] < 0.6).astype(float)
+        told = error_of(weights, inside)
+        assert told < 0.3 * exact
+        apart.append((weights @ inside - exact) / told)
+    assert np.sqrt(np.mean(np.square(apart))) < 1.4

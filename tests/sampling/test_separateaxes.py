@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from small import path, record, study
 
 from lcopa_bayes.bench.command import on_off
 from lcopa_bayes.bench.device import Device
+from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling import sampler
 from lcopa_bayes.sampling.draws import gather
 from lcopa_bayes.sampling.evidence import evidence_of
+from lcopa_bayes.sampling.marginal import Search
 from lcopa_bayes.sampling.sampler import Run, SamplePlan, sample
 from lcopa_bayes.sampling.separateaxes import separated
+from lcopa_bayes.sampling.weighted import Weighted
 
 PAIR = Device(
     ((path(1.0, 0.3, (1.2,), (0.9,)),), (path(0.5, 0.8, (2.5,), (1.0,)),)),
@@ -89,6 +95,64 @@ def test_draws_of_the_axes_are_those_of_the_whole(
     error = np.hypot(evidences[0].sd, evidences[1].sd)
     assert evidences[0].value == pytest.approx(evidences[1].value, abs=4 * error)
     assert error < 0.2
+
+
+def test_a_killed_run_goes_on_from_the_axes_it_has(
+    whole: Posterior, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed while the second axis is searched: the first one is stored, and not searched again."""
+    searched, search = list[str](), Search.run
+
+    def killed(self: Search, wanted: float, **options: bool) -> Weighted | None:
+        searched.append(self.posterior.table.names[self.posterior.sampled[0]])
+        if len(searched) == 2:
+            raise KeyboardInterrupt
+        return search(self, wanted, **options)
+
+    def go(*, resume: bool) -> Run:
+        return sample(whole, plan(), chain_file=tmp_path / "chain.h5", fingerprint="it", resume=resume)
+
+    monkeypatch.setattr(Search, "run", killed)
+    with pytest.raises(KeyboardInterrupt):
+        go(resume=False)
+    resumed = go(resume=True)
+    assert len(searched) == 3
+    assert searched[1] == searched[2] != searched[0]
+    again = go(resume=True)
+    assert len(searched) == 3
+    for one in (resumed, again):
+        assert one.weighted is not None
+        assert run.weighted is not None
+        np.testing.assert_array_equal(one.weighted.coordinates, run.weighted.coordinates)
+        np.testing.assert_array_equal(one.weighted.centre_ess, run.weighted.centre_ess)
+    with pytest.raises(InputError, match="other records"):
+        sample(whole, plan(), chain_file=tmp_path / "chain.h5", fingerprint="other", resume=True)
+
+
+def test_ensembles_of_an_axis_stand_beside_the_draws_of_another(
+    whole: Posterior, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where a search of one axis gives none: means are those of both searches, and no draw counts twice."""
+    second = separated(whole, whole.table.draw(1, np.random.default_rng(0))[0])[1].sampled
+    search = Search.run
+
+    def half(self: Search, wanted: float, **options: bool) -> Weighted | None:
+        return None if self.posterior.sampled == second else search(self, wanted, **options)
+
+    monkeypatch.setattr(Search, "run", half)
+    mixed = sample(whole, replace(plan(), target_ess=200.0))
+    assert mixed.weighted is None
+    assert len(mixed.ensembles) == 4
+    one = mixed.ensembles[0]
+    np.testing.assert_allclose(one.log_density[3], whole.log_density(one.chain[3]), rtol=1e-9)
+    ours, theirs = gather(whole, mixed), gather(whole, run)
+    for k in whole.sampled:
+        first, other = ours.column(whole.table.names[k]), theirs.column(whole.table.names[k])
+        error = float(other.std()) * np.sqrt(1 / ours.ess + 1 / theirs.ess)
+        assert first.mean() == pytest.approx(other.mean(), abs=4 * error)
+    stays = np.array([k for k, row in enumerate(whole.sampled) if row not in second])
+    places = {tuple(point) for point in one.chain[..., stays].reshape(-1, stays.size)}
+    assert len(places) < one.chain.shape[0] * one.chain.shape[1]
 
 
 def test_effective_sizes_are_those_of_the_axis(whole: Posterior, run: Run) -> None:
