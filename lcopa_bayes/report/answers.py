@@ -292,7 +292,7 @@ def _fleet(v: Values) -> _Answers:
     yield "How did the devices end?", f"{len(devices)} by `{v['of']}`: {ended}.", "Devices"
     rows = [row for group in v["groups"][:1] for row in group["parameters"]]
     each = [
-        f"{row['name']} {figures(row['mean']['value'])} {row['unit']}, "
+        f"{' '.join([row['name'], figures(row['mean']['value']), row['unit']]).removesuffix(' -')}, "
         f"spread {figures(row['spread']['value'], 2)}"
         for row in rows
     ]
