@@ -20,6 +20,8 @@ from lcopa_bayes.inference.posterior import Posterior
 
 _SPLIT = (0.3, 0.7)
 """Smallest and largest share of a term that is split in two [-]."""
+_LEAST_SPLIT = 0.1
+"""Order above which a term is split [-]: parts of one of lower order are faster by ever more decades."""
 _ORDERS_APART = 0.02
 """Relative distance of the orders of a term that is split [-]: equal ones are a singular point."""
 _HARDLY = 0.1
@@ -194,10 +196,10 @@ class _Lift:
             share = self.rng.uniform(*_SPLIT, n)
             apart = np.exp(-_ORDERS_APART * self.rng.random((2, n))) * order
             strength = times[rows, term] ** order
-            split: Flags = np.asarray(self.rng.random(n) < 0.5)
-            fast = self._fast(element, count, n)
-            own = np.where(split, (strength * share) ** (1 / order), times[rows, term])
-            new = np.where(split, (strength * (1 - share)) ** (1 / order), fast)
+            split: Flags = np.asarray((self.rng.random(n) < 0.5) & (order > _LEAST_SPLIT))
+            power = 1 / np.maximum(order, _LEAST_SPLIT)
+            own = np.where(split, (strength * share) ** power, times[rows, term])
+            new = np.where(split, (strength * (1 - share)) ** power, self._fast(element, count, n))
             times, orders = times.copy(), orders.copy()
             times[rows, term], orders[rows, term] = own, np.where(split, apart[0], order)
             another = np.where(split, apart[1], self.rng.uniform(*_FAST_ORDERS, n))

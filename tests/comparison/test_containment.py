@@ -77,6 +77,14 @@ def test_terms_that_are_added_hardly_change_the_likelihood(large):
     assert target.table.supported(found).mean() > 0.3
 
 
+def test_a_term_of_hardly_any_order_is_not_split_into_parts_that_vanish():
+    """A share of 0.3 to the power of 1 / order would be 0."""
+    source, target = single("fractional-1"), single("fractional-2")
+    values = np.repeat(row_values(source.table, TRUE | {"order_1": 1e-4})[None], 40, axis=0)
+    found = lifted(values, source, target, np.random.default_rng(3))
+    assert (found[:, target.table.of_kind("time")] > 0).all()
+
+
 @pytest.mark.parametrize(
     ("noise", "small", "loss"),
     [
