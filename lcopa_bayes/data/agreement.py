@@ -32,6 +32,9 @@ _AHEAD = 2.0
 """Residual variance with delays over that with advances from which a response runs ahead [-]."""
 _OTHER_UNIT = 30.0
 """Ratio of two records from which they are in different units [-]."""
+_REVERSED = 3.0
+"""Size up to which a negative ratio, or its reciprocal, is a reversed sign [-]: a twelfth of what is predicted
+with the other sign is a prediction from drives that do not show the plant."""
 _CONTRADICTION, _SLIGHT = 20.0, 0.05
 """Difference of two records that is a contradiction [standard errors], and least such difference [-]."""
 _EXCHANGED = 5.0
@@ -161,7 +164,7 @@ class _Ratio:
             return ""
         if not 1 / _OTHER_UNIT < abs(self.value) < _OTHER_UNIT:
             return _UNIT
-        if self.value < 0.0:
+        if 1 / _REVERSED < -self.value < _REVERSED:
             return _SIGN
         apart = abs(self.value - 1) > max(_CONTRADICTION * self.sd, _SLIGHT)
         return _PLANT if apart and self.misfit <= 1 - _CLOSELY else ""

@@ -13,7 +13,7 @@ from small import TWO, record, study
 
 from lcopa_bayes.bench.command import on_off, step
 from lcopa_bayes.core.arrays import Matrix
-from lcopa_bayes.data.agreement import disagreements
+from lcopa_bayes.data.agreement import _SIGN, _Ratio, disagreements
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.results.firstlook import first_look
 from lcopa_bayes.verbs.check import check
@@ -63,6 +63,16 @@ def test_a_reversed_connection_is_recognised() -> None:
     (one,) = disagreements((on, changed(half, -half.response)))
     assert one.gross
     assert "signs" in one.remedy
+
+
+@pytest.mark.parametrize(
+    ("ratio", "reversed_sign"), [(-1.2, True), (-0.4, True), (-0.08, False), (-11.0, False)]
+)
+def test_a_reversed_sign_has_about_the_size_that_is_predicted(ratio: float, reversed_sign: bool) -> None:
+    """A twelfth of it with the other sign is a prediction from drives that do not show the plant."""
+    seen = _Ratio(0, ratio, 0.01, misfit=0.2, size=1.0, missed=1.0)
+    assert (seen.remedy == _SIGN) is reversed_sign
+    assert bool(seen.remedy) is reversed_sign
 
 
 def test_two_plants_are_a_contradiction_and_chance_is_not() -> None:
