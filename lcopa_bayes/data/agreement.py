@@ -33,8 +33,8 @@ _AHEAD = 2.0
 _OTHER_UNIT = 30.0
 """Ratio of two records from which they are in different units [-]."""
 _REVERSED = 3.0
-"""Size up to which a negative ratio, or its reciprocal, is a reversed sign [-]: a twelfth of what is predicted
-with the other sign is a prediction from drives that do not show the plant."""
+"""Size up to which a negative ratio, or its reciprocal, is a reversed sign [-]: a twelfth of what is
+predicted with the other sign is a prediction from drives that do not show the plant."""
 _CONTRADICTION, _SLIGHT = 20.0, 0.05
 """Difference of two records that is a contradiction [standard errors], and least such difference [-]."""
 _EXCHANGED = 5.0
