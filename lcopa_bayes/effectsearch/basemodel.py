@@ -72,8 +72,7 @@ def started(study: Study, fit: BaseFit) -> Mended | None:
     if not np.isfinite(best.fun):
         return None
     count = fit.optimum.effective
-    power = float(fit.optimum.residual @ fit.optimum.residual)
-    gain = 0.5 * count * np.log(power / best.fun) - 0.5 * first.size * np.log(count)
+    gain = 0.5 * count * np.log(fit.optimum.power / best.fun) - 0.5 * first.size * np.log(count)
     if not gain > MARGIN:
         return None
     levels = " and ".join(
@@ -186,7 +185,7 @@ def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: boo
         except (ArithmeticError, InputError):  # not simulated, or more parameters than samples
             break
         gain = _gain(base, wider)
-        if base.fit.smooth and rival < float(wider.fit.optimum.residual @ wider.fit.optimum.residual):
+        if base.fit.smooth and rival < wider.fit.optimum.power:
             break
         if wider.fit.failed or not gain > _GAIN:
             if base.fit.failed:
@@ -308,9 +307,7 @@ def _explained(base: Base, library: Sequence[type[Effect]], rng: np.random.Gener
     one that leaves noise."""
     seen = trace(base.start, library, rng, noise_samples=base.fit.noise_samples, draws=draws)
     best = leading(base.start, seen)
-    if best is None or too_smooth(best.optimum):
-        return np.inf
-    return float(best.optimum.residual @ best.optimum.residual)
+    return np.inf if best is None or too_smooth(best.optimum) else best.optimum.power
 
 
 def _later(study: Study, fit: BaseFit) -> Mended | None:

@@ -211,7 +211,10 @@ def _looped(
             contrary=contrary,
         )
     reached = _side(problem, searched.state)
-    verdict = decide(_findings(study, searched, before, reached, outliers=outliers, cautions=cautions))
+    enough = ALONE if alone else EXPLAINED
+    verdict = decide(
+        _findings(study, searched, before, reached, outliers=outliers, cautions=cautions, enough=enough)
+    )
     if outliers is not None:
         verdict = beside(verdict, outliers.sentence)
     named = verdict.kind in ("explained", "partly explained", "disturbance")
@@ -266,6 +269,7 @@ def _findings(
     *,
     outliers: Outlying | None,
     cautions: tuple[str, ...],
+    enough: float,
 ) -> Findings:
     """What a search found, `before` without its effects and `after` with them."""
     first, last = searched.rounds[0].trace, searched.rounds[-1].trace
@@ -293,7 +297,7 @@ def _findings(
         remaining_name=last.leader.name if last.leader else "",
         share=searched.share,
         excess=before.state.whitening.excess(before.state.optimum.residual),
-        enough=ALONE if len(study.fit) == 1 and not study.held_out else EXPLAINED,
+        enough=enough,
         scatter=first.scatter,
         missed=None if by_record else missed(study, after.fit, now, searched.state),
         unseen=unseen_share(study, was, now, searched.state) if study.held_out else np.nan,

@@ -60,6 +60,11 @@ class Optimum:
     """Coordinates held by an end of their support against the data, (k,)."""
 
     @property
+    def power(self) -> float:
+        """Squared residual [response unit^2]."""
+        return float(self.residual @ self.residual)
+
+    @property
     def moving(self) -> Matrix:
         """The whitened tangents, zero for coordinates that are stuck, (n, k)."""
         return np.where(self.stuck, 0.0, self.jacobian)
