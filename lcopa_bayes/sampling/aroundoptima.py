@@ -23,7 +23,7 @@ from lcopa_bayes.sampling.importance import Effort, ImportancePlan, importance
 from lcopa_bayes.sampling.weighted import Weighted
 
 _PLAN = ImportancePlan(
-    (Effort(4_000, 2_000, 8), Effort(4_000, 2_000, 3), Effort(8_000, 3_000, 3)),
+    (Effort(2_000, 2_000, 8), Effort(4_000, 2_000, 3), Effort(8_000, 3_000, 3)),
     promising=0.05,
     efficient=False,
     straightened=True,

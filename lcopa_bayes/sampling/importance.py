@@ -41,12 +41,13 @@ _JOINT = 0.3
 _SURPLUS = 1.25
 """Effective draws for every centre, tail and share of a mode over those wanted [-]: resampling costs the
 rest."""
-_CALM, _LONGER, _SPARE = 0.5, 3.0, 1.1
-"""Pareto k up to which a proposal that gave too few draws gives more, how many times as many at most, and
-factor on the number that is estimated to be lacking [-]."""
-_LIGHT, _HEAVY, _CLOSE = 0.2, 0.9, 0.3
-"""Pareto k at which the proposal is fitted no further, if it is efficient, and from which a third attempt has
-little hope; effective draws per draw at which one is that need not be close to the posterior [-]."""
+_LONGER, _SPARE = 6.0, 1.1
+"""How many times as many draws a good proposal that gave too few gives at most, and factor on the number that
+is estimated to be lacking [-]."""
+_LIGHT, _HEAVY, _CLOSE = 0.4, 0.9, 0.3
+"""Pareto k up to which a proposal gives more draws rather than being fitted further, if it is efficient, and
+from which a third attempt has little hope; effective draws per draw at which one is that need not be close
+to the posterior [-]."""
 
 
 @final
@@ -180,7 +181,7 @@ def importance(
 def _lacking(weighted: Weighted, plan: ImportancePlan, most: float) -> int:
     """Further draws of a proposal that is good and has given too few: none where it would be `most`."""
     least = LEAST_EFFICIENCY if plan.efficient else 0.0
-    if weighted.pareto_k > _CALM or weighted.ess < least * weighted.count:
+    if weighted.pareto_k > _LIGHT or weighted.ess < least * weighted.count:
         return 0
     needed = _SURPLUS * plan.wanted / weighted.smallest_ess
     return ceil(_SPARE * (needed - 1.0) * weighted.count) if 1.0 < needed < most / weighted.count else 0

@@ -32,7 +32,7 @@ from lcopa_bayes.core.parallel import Progress, Workers
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.aroundoptima import around_optima
-from lcopa_bayes.sampling.firstproposal import NEIGHBOURS, best_near, first_proposal, nearest
+from lcopa_bayes.sampling.firstproposal import HOPELESS, NEIGHBOURS, best_near, first_proposal, nearest
 from lcopa_bayes.sampling.importanceweights import effective, usable_k
 from lcopa_bayes.sampling.mixture import spread_evenly
 from lcopa_bayes.sampling.mixturemoves import learned
@@ -367,7 +367,9 @@ class Search:
         return bool(mean > np.log(_HEAVIER / expected))
 
     def _evaluated(self, y: Matrix, values: Matrix, starts: Matrix | None) -> _Point:
-        """Optima and draws at points; the first of a search twice, the second time from their neighbours."""
+        """Optima and draws at points; the first of a search twice, the second time from their neighbours,
+        unless these are hopeless too."""
+        hoped = np.ones(len(y), dtype=bool)
         if starts is None:
             known = np.concatenate([point.y for point in self._points])
             optima = np.concatenate([point.values for point in self._points])
@@ -376,10 +378,16 @@ class Search:
         else:
             begin = starts[nearest(y, self.outer.y(starts), 1)[:, 0]]
             begin, objective, _ = self._done(Optima(), values, begin)
-            begin = begin[best_near(y, y, objective)]
-        efficiency = [float(np.median(point.efficiency)) for point in self._points[-1:]]
+            best = best_near(y, y, objective)
+            begin, hoped = begin[best], objective[best] > objective.max() - HOPELESS
+        efficiency = [float(np.nanmedian(point.efficiency)) for point in self._points[-1:]]
         tries = int(np.clip(_EFFECTIVE_TRIES / max(*efficiency, 1e-3), *_TRIES)) if efficiency else _TRIES[0]
-        optimum, level, z, density, marginal, share = self._done(Draw(tries), values, begin)
+        optimum, level = begin.copy(), np.full(len(y), -np.inf)
+        z, density, marginal = self.posterior.coordinates(begin), level.copy(), level.copy()
+        share = np.full(len(y), np.nan)
+        drawn = self._done(Draw(tries), values[hoped], begin[hoped])
+        for whole, part in zip((optimum, level, z, density, marginal, share), drawn, strict=True):
+            whole[hoped] = part
         marginal += self.posterior.table.log_permutations
         return _Point(y, optimum, level, z, density, marginal, share)
 

@@ -21,8 +21,9 @@ _FITTED = 6_000
 """Most points a mixture is fitted to."""
 FREEDOM = 5.0
 """Degrees of freedom of the components: tails heavy enough to cover what the fit does not include [-]."""
-_ROUNDS = 60
-"""Most rounds of expectation maximisation: a good cover is wanted, not the maximum."""
+_ROUNDS, _GAIN = 60, 1e-2
+"""Most rounds of expectation maximisation, and gain per point below which they end [nat]: a good cover is
+wanted, not the maximum."""
 _RIDGE = 1e-6
 """Added to the variance of every direction, relative to the draws' own [-]."""
 
@@ -52,7 +53,7 @@ class Mixture:
         shift, spread = points.mean(axis=0), points.std(axis=0)
         spread = np.where(spread > 0, spread, 1.0)
         random = np.random.RandomState(np.random.MT19937(np.random.SeedSequence(seed)))
-        fit = GaussianMixture(components, max_iter=_ROUNDS, reg_covar=_RIDGE, random_state=random)
+        fit = GaussianMixture(components, tol=_GAIN, max_iter=_ROUNDS, reg_covar=_RIDGE, random_state=random)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ConvergenceWarning)
             fit.fit((points - shift) / spread)
