@@ -14,7 +14,7 @@ from lcopa_bayes.core.estimate import attributes
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.noise import GaussianNoise, Noise
-from lcopa_bayes.inference.observations import Observed, Samples
+from lcopa_bayes.inference.observations import BEFORE_DRIVE, Observed, Samples
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.simulation import Simulation
 from lcopa_bayes.model.forward import ForwardModel, deflections
@@ -28,6 +28,8 @@ _FEWEST = 200
 """Draws behind a band at least."""
 _WITH_EFFECTS = 400
 """Draws behind a band at most where the plant has effects, which take a simulation each."""
+_MOVED = 1e-9
+"""Change of the response that shows that the drive acts [share of the largest]."""
 _SWEEPS = 20
 """Sweeps after which a Gibbs chain of a level has forgotten its start [-]: 1e-6 of it remains at nu = 1."""
 
@@ -265,6 +267,9 @@ def offset_draws(
     if not held_out:
         return values[:, places[r]], "fitted", 0
     used, source = record.level_samples(axis)
+    if source == BEFORE_DRIVE:  # nor has it acted while it is delayed, whichever draw is right
+        moved = np.abs(response - response[:, :1]).max(axis=0) > _MOVED * np.abs(response).max()
+        used |= ~np.logical_or.accumulate(moved)
     offset = _given(record.axes[axis], used, response, noise, table, values, axis, rng)
     return offset, source, int(used.sum())
 

@@ -27,8 +27,9 @@ _SPREAD = 2.0
 """Width of the first proposal over that of the conditional posterior [-]."""
 _OVERALL = 0.3
 """Share of the first proposal that spans all points picked [-]."""
-_OPTIMA, _AGAIN = 4, 4
-"""Further starts of the search for optima, and descents from those that have a mass."""
+_OPTIMA, _AGAIN, _STILL = 4, 4, 0.1
+"""Further starts of the search for optima, most descents from those that have a mass, and change of the log
+density that ends these [nat]."""
 _AROUND, _WIDER = 0.3, 2.5
 """Share of the first proposal around optima, and widening of half of it [-]."""
 NEIGHBOURS = 6
@@ -57,7 +58,10 @@ def first_proposal(
         [*known, *find_optima(posterior, rng, starts=_OPTIMA, near=list(values))]
     )
     for _ in range(_AGAIN):  # plant and correlated noise, found in turn, draw each other along
+        before = [one.log_density for one in optima]
         optima = again(posterior, optima)
+        if np.allclose(sorted(before)[-len(optima) :], sorted(one.log_density for one in optima), 0, _STILL):
+            break
     at = np.array([one.values for one in optima]).reshape(-1, values.shape[1])
     shapes = np.array([one.covariance[np.ix_(outer.places, outer.places)] for one in optima])
     parts = list[Proposal]()

@@ -109,11 +109,11 @@ def test_an_offset_is_read_from_samples_before_the_drive_acts():
     held = record(2, device=device, command=step(1.0, at=4.05), name="held")
     (band,) = predicted(held, count=2000)
     assert band.offset_from == "samples before the drive acts"
-    quiet_samples = band.observed[band.time <= 4.05]
-    assert quiet_samples.size == band.offset_samples == 21
+    quiet_samples = band.observed[band.time <= 4.05 + TRUTH["delay"]]  # nor does it while it is delayed
+    assert quiet_samples.size == band.offset_samples == 24
     assert not band.own_offset
     drawn = band.plant[:, 0]  # at rest under zero drive the plant shows its offset alone
-    error = TRUTH["sigma"] / np.sqrt(21)
+    error = TRUTH["sigma"] / np.sqrt(24)
     assert drawn[2] == pytest.approx(quiet_samples.mean(), abs=4 * 1.25 * error / np.sqrt(2000))
     assert drawn[4] - drawn[0] == pytest.approx(2 * 1.645 * error, rel=0.15)
 
