@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of
+from lcopa_bayes.core.parallel import Workers
 from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.poles import regressed
@@ -61,10 +63,16 @@ class Optimum:
 
 
 def find_optima(
-    posterior: Posterior, rng: np.random.Generator, *, starts: int = 12, near: Sequence[Vector] = ()
+    posterior: Posterior,
+    rng: np.random.Generator,
+    *,
+    starts: int = 12,
+    near: Sequence[Vector] = (),
+    crew: Workers[Posterior] | None = None,
 ) -> tuple[Optimum, ...]:
     """Local optima from the best of many prior draws and of poles from a regression, best first, duplicates
-    removed; the likeliest of further table values `near`, (rows,), is a start of its own.
+    removed; the likeliest of further table values `near`, (rows,), is a start of its own. A `crew` that
+    shares the posterior descends from several starts at once.
 
     Screening and a first solve treat the residual as nearly white; a second solve uses the noise model with
     its parameters estimated from the first residual. With effects the plant alone is searched first, and its
@@ -83,15 +91,17 @@ def find_optima(
     begun = _distinct(posterior, drawn[np.argsort(-likelihood[:own], kind="stable")], starts)
     if len(near):
         begun.append(drawn[own + int(likelihood[own:].argmax())])
-    return _kept(posterior, _descended(posterior, begun))
+    return _kept(posterior, _descended(posterior, begun, crew=crew))
 
 
-def again(posterior: Posterior, optima: Sequence[Optimum]) -> tuple[Optimum, ...]:
+def again(
+    posterior: Posterior, optima: Sequence[Optimum], crew: Workers[Posterior] | None = None
+) -> tuple[Optimum, ...]:
     """Optima of a posterior that hardly differs from the one whose `optima` are given, as on other blocks;
     without those of no weight."""
     best = max(one.log_density for one in optima)
     near = [one.values for one in optima if one.log_density > best - _WEIGHTLESS]
-    return _kept(posterior, _descended(posterior, near, rounds=1))
+    return _kept(posterior, _descended(posterior, near, rounds=1, crew=crew))
 
 
 def along_orders(posterior: Posterior, best: Optimum) -> list[Optimum]:
@@ -148,19 +158,18 @@ def _near(posterior: Posterior, starts: Sequence[Vector]) -> list[Vector]:
     return [v for v, level in zip(kept, density, strict=True) if level >= best - _HOPELESS]
 
 
-def _descended(posterior: Posterior, starts: Sequence[Vector], *, rounds: int = 2) -> list[Optimum]:
+def _descended(
+    posterior: Posterior,
+    starts: Sequence[Vector],
+    *,
+    rounds: int = 2,
+    crew: Workers[Posterior] | None = None,
+) -> list[Optimum]:
     """Optima from table values, the best of them to its digits; a start from which effects leave no bounded
     response gives none."""
-    problem, reached = LeastSquares(posterior), list[tuple[float, Vector]]()
-    for values in starts:
-        values = posterior.complete(posterior.coordinates(values[None]), None)[0]
-        try:
-            for evaluations, enough in _DESCENT[-rounds:]:
-                values = problem.with_noise(problem.solve(values, evaluations=evaluations, enough=enough)[0])
-        except UnstableError:
-            continue
-        reached.append((float(posterior.log_density(posterior.coordinates(values[None]))[0]), values))
-    reached.sort(key=lambda one: -one[0])
+    descend, problem = partial(_descent, rounds), LeastSquares(posterior)
+    ends = map(partial(descend, posterior), starts) if crew is None else crew.each(descend, starts)
+    reached = sorted((end for end in ends if end is not None), key=lambda end: -end[0])
     optima = list[Optimum]()
     for _, values in reached:
         if not optima and posterior.simulation is None:
@@ -171,6 +180,19 @@ def _descended(posterior: Posterior, starts: Sequence[Vector], *, rounds: int = 
         _, jacobian = problem.residual(problem.coordinates(values), values)
         optima.append(_describe(posterior, problem, values, jacobian))
     return optima
+
+
+def _descent(rounds: int, posterior: Posterior, values: Vector) -> tuple[float, Vector] | None:
+    """Log density [nat] and table values where a descent from others ends; None where there is no bounded
+    response."""
+    problem = LeastSquares(posterior)
+    values = posterior.complete(posterior.coordinates(values[None]), None)[0]
+    try:
+        for evaluations, enough in _DESCENT[-rounds:]:
+            values = problem.with_noise(problem.solve(values, evaluations=evaluations, enough=enough)[0])
+    except UnstableError:
+        return None
+    return float(posterior.log_density(posterior.coordinates(values[None]))[0]), values
 
 
 def _kept(posterior: Posterior, optima: list[Optimum]) -> tuple[Optimum, ...]:

@@ -133,12 +133,15 @@ def resolved(problem: Problem, optima: Sequence[Optimum] | None = None) -> Probl
         return narrowed(problem, lambda each: optimum_shift(each, best))
 
 
-def optima_of(problem: Problem, *, starts: int = _STARTS, near: Sequence[Vector] = ()) -> tuple[Optimum, ...]:
+def optima_of(
+    problem: Problem, *, starts: int = _STARTS, near: Sequence[Vector] = (), jobs: int = 1
+) -> tuple[Optimum, ...]:
     """Least-squares optima of a study, best first: what the first look, the width of the blocks and sampling
-    begin with; `near` as `find_optima`. The same problem gives the same optima."""
-    with threadpool_limits(1):
-        rng = np.random.default_rng([problem.study.seed, 6])
-        return find_optima(problem.posterior, rng, starts=starts, near=near)
+    begin with; `near` as `find_optima`. The same problem gives the same optima, whatever the number of
+    processes, `jobs`."""
+    rng = np.random.default_rng([problem.study.seed, 6])
+    with workers(problem.posterior, jobs=jobs if problem.posterior.simulation is None else 1) as crew:
+        return find_optima(problem.posterior, rng, starts=starts, near=near, crew=crew)
 
 
 def resolved_optima(problem: Problem, optima: Sequence[Optimum]) -> tuple[Problem, tuple[Optimum, ...]]:

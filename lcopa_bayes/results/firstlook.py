@@ -157,7 +157,7 @@ def first_look(study: Study) -> FirstLook:
 
 
 def searched(
-    study: Study, others: Sequence[tuple[Posterior, Optimum]] = ()
+    study: Study, others: Sequence[tuple[Posterior, Optimum]] = (), *, jobs: int = 1
 ) -> tuple[Problem, tuple[Optimum, ...]]:
     """A study prepared for inference and its least-squares optima, best first; InputError as `first_look`.
 
@@ -172,7 +172,7 @@ def searched(
         for source, optimum in others
     )
     near = next((added for added in lifts if added is not None), ())
-    optima = optima_of(problem, near=list(near))
+    optima = optima_of(problem, near=list(near), jobs=jobs)
     if not optima:
         raise InputError(
             f"{study.name}: no least-squares search leads to a plant inside the priors; widen them or "

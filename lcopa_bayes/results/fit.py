@@ -23,7 +23,6 @@ from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.results.adequacy import limitations
 from lcopa_bayes.results.datatree import POSTERIOR, posterior_tree, save_tree
 from lcopa_bayes.results.discretisation import Discretisation, discretisation, optima_of, resolved_optima
-from lcopa_bayes.results.firstlook import FirstLook
 from lcopa_bayes.results.frequency import FrequencyResponse
 from lcopa_bayes.results.nearby import surrogate_about
 from lcopa_bayes.results.prediction import Band, study_bands
@@ -144,15 +143,15 @@ def fit(
     cross_check: bool = False,
     quiet: bool = True,
     starts: Matrix | None = None,
-    look: FirstLook | None = None,
+    searched: tuple[Problem, tuple[Optimum, ...]] | None = None,
     around_optima: bool = False,
 ) -> Fit:
     """Sample the posterior of a study and derive what it predicts.
 
     `starts`, table values (starts, rows), are modes known from elsewhere that sampling proposes too. A plant
     with effects where the method is "auto", and any `around_optima`, is sampled by importance around its
-    optima (`weightedrun`), which searches for no other modes, where its weights hold. A first `look` of the
-    study spares the search for optima, and changes no number.
+    optima (`weightedrun`), which searches for no other modes, where its weights hold. The study prepared and
+    its optima, where it has been `searched` (`firstlook`) or its structure chosen, spare that search.
 
     With `folder`, sampling is stored there in `chain.h5` and `resume` goes on from it; the result is
     the same as without interruption. With `cross_check` the posterior is also sampled by nested sampling,
@@ -164,16 +163,16 @@ def fit(
     """
     if study.model.terms == "auto":
         raise ValueError("the number of terms is not settled yet")
-    if look is None:
+    if searched is None:
         refuse_if(unmet(study))
-    problem = look.problem if look else problem_of(study)
+    problem = searched[0] if searched else problem_of(study)
     if folder:
         writable_folder(folder)
     plan, weighted_result, optima = plan_of(problem, quick=quick), None, tuple[Optimum, ...]()
     if around_optima or (problem.posterior.simulation is not None and plan.method == "auto"):
         problem, weighted_result = weighted_fit(problem, plan, jobs=jobs, quick=quick)
     else:
-        problem, optima = resolved_optima(problem, look.optima if look else optima_of(problem))
+        problem, optima = resolved_optima(problem, searched[1] if searched else optima_of(problem))
     if weighted_result is not None:
         run, draws = weighted_result
     else:

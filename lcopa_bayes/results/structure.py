@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import log
+from time import monotonic
 from typing import Any, final
 
 from lcopa_bayes.core.errors import InputError
@@ -26,6 +27,8 @@ from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.model.layout import Layout
 from lcopa_bayes.results.firstlook import FirstLook, look_at, searched
 
+_WORTHWHILE = 2.0
+"""Time that the first structure takes from which processes share the search of others [s]."""
 _MOST = 4
 """Most terms that are looked at."""
 
@@ -104,15 +107,17 @@ class Structure:
         return plain({"chosen": self.chosen.name, "candidates": rows, "sentence": self.sentence})
 
 
-def structure_of(study: Study) -> Structure | None:
+def structure_of(study: Study, *, jobs: int = 1) -> Structure | None:
     """The structure of a study whose terms are "auto"; None where it states them.
 
     InputError as `first_look` of the fewest terms, and for priors that no number of terms has a use for.
     """
     if study.model.terms != "auto":
         return None
-    least = with_least_terms(study)
+    least, begin = with_least_terms(study), monotonic()
     looked = [Looked(*searched(least))]
+    if monotonic() - begin < _WORTHWHILE:
+        jobs = 1
     tried = [least.model]
     while True:
         best = Structure(tuple(looked)).chosen.study.model
@@ -120,7 +125,7 @@ def structure_of(study: Study) -> Structure | None:
         if model is None:
             return Structure(tuple(looked))
         tried.append(model)
-        more = _if_possible(replace(least, model=model), looked)
+        more = _if_possible(replace(least, model=model), looked, jobs)
         if more is not None:
             looked.append(more)
 
@@ -139,9 +144,9 @@ def _beside(model: ModelSettings, least: Study) -> Iterator[ModelSettings]:
         yield replace(model, terms=terms - 1)
 
 
-def settled(study: Study) -> Study:
+def settled(study: Study, *, jobs: int = 1) -> Study:
     """The study itself, or where its terms are "auto" with the structure that its records chose."""
-    structure = structure_of(study)
+    structure = structure_of(study, jobs=jobs)
     return study if structure is None else structure.chosen.study
 
 
@@ -170,10 +175,11 @@ def _table(study: Study) -> ParameterTable:
     return table_of(study, layout, Scales.of(study.fit))[2]
 
 
-def _if_possible(study: Study, looked: Sequence[Looked]) -> Looked | None:
+def _if_possible(study: Study, looked: Sequence[Looked], jobs: int) -> Looked | None:
     """None where the records cannot determine so many parameters, or priors are of other parameters."""
     likeliest = sorted(looked, key=lambda one: one.max_log_likelihood, reverse=True)
     try:
-        return Looked(*searched(study, [(one.problem.posterior, one.optima[0]) for one in likeliest]))
+        others = [(one.problem.posterior, one.optima[0]) for one in likeliest]
+        return Looked(*searched(study, others, jobs=jobs))
     except InputError:
         return None

@@ -9,9 +9,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
+from lcopa_bayes.core.parallel import Workers
 from lcopa_bayes.inference.conditional import Conditional
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.optimum import Optimum, again, find_optima, nearly_white
+from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.mixture import Mixture
 from lcopa_bayes.sampling.outer import Optima, Outer, PriorOrders
 from lcopa_bayes.sampling.proposal import Blend, Product, Proposal, tempered, weighty
@@ -37,11 +39,16 @@ NEIGHBOURS = 6
 
 
 def first_proposal(
-    outer: Outer, rng: np.random.Generator, done: Done, known: Sequence[Optimum] = ()
+    outer: Outer,
+    rng: np.random.Generator,
+    done: Done,
+    crew: Workers[Posterior],
+    known: Sequence[Optimum] = (),
 ) -> tuple[Product, Matrix, Sequence[Optimum]]:
     """A proposal from the prior of the orders and estimates of delays and noise, in part around
     least-squares optima; table values of points to start from; and these optima. `done` performs a task at
-    table values from others; `known` are optima that are known already."""
+    table values from others, as the `crew` that shares the posterior does; `known` are optima that are
+    known already."""
     posterior = outer.posterior
     values = nearly_white(posterior, posterior.table.draw(_PILOT, rng))
     pilot = Optima(pilot=True)
@@ -55,11 +62,11 @@ def first_proposal(
         rest, chosen = _rest(outer, rng, done, values, objective)
         values = np.concatenate([values, chosen])
     optima: Sequence[Optimum] = weighty(
-        [*known, *find_optima(posterior, rng, starts=_OPTIMA, near=list(values))]
+        [*known, *find_optima(posterior, rng, starts=_OPTIMA, near=list(values), crew=crew)]
     )
     for _ in range(_AGAIN):  # plant and correlated noise, found in turn, draw each other along
         before = [one.log_density for one in optima]
-        optima = again(posterior, optima)
+        optima = again(posterior, optima, crew)
         if np.allclose(sorted(before)[-len(optima) :], sorted(one.log_density for one in optima), 0, _STILL):
             break
     at = np.array([one.values for one in optima]).reshape(-1, values.shape[1])

@@ -155,7 +155,7 @@ class Search:
         modes of every sampled parameter, from a search of the whole prior; None where no number of draws in
         reach gives them: ensembles may then start from the `population`. Not of optima alone unless
         `direct`."""
-        first, starts, optima = first_proposal(self.outer, self._rng, self._done, self._optima)
+        first, starts, optima = first_proposal(self.outer, self._rng, self._done, self._crew, self._optima)
         return self._improved(first, starts, wanted, optima if direct else ())
 
     def around(self, z: Matrix, wanted: float) -> Weighted | None:

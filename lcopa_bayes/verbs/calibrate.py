@@ -290,7 +290,7 @@ def calibrate(
     InputError for input that cannot be used, when a worker is lost, when not one replica could be done, and
     for a folder as `fit`.
     """
-    wanted = settled(study_of(study))
+    wanted = settled(study_of(study), jobs=jobs)
     origin = plain(provenance(wanted, "calibrate"))
     with opened(folder, origin) as place:
         calibration = calibrated(

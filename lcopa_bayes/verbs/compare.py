@@ -89,7 +89,7 @@ def compare(
     else:
         named = isinstance(described, Path | str)
         chosen, more = load_candidates(Path(described)) if named else (None, described)  # type: ignore[arg-type]
-        single = settled(study_of(study))  # type: ignore[arg-type]
+        single = settled(study_of(study), jobs=jobs)  # type: ignore[arg-type]
         if single.effects.use:  # its candidates have them or not, but never without their priors
             problem_of(single)
         models = candidates_of(single, more, candidates or chosen)  # type: ignore[arg-type]

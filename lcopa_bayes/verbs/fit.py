@@ -9,7 +9,7 @@ from pathlib import Path
 
 from lcopa_bayes.core.parallel import meanwhile
 from lcopa_bayes.results.alternatives import with_alternatives
-from lcopa_bayes.results.firstlook import FirstLook, first_look
+from lcopa_bayes.results.firstlook import first_look
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.fit import fit as sampled
 from lcopa_bayes.results.integerrival import integer_rival
@@ -46,13 +46,14 @@ def fit(
     written to, holds another study's results, or is being written by another run; then nothing is written.
     """
     wanted = study_of(study)
-    structure = structure_of(wanted)
+    structure = structure_of(wanted, jobs=jobs)
     wanted = structure.chosen.study if structure else wanted
+    searched = (structure.chosen.problem, structure.chosen.optima) if structure else None
     with opened(folder, provenance(wanted, "fit")) as place:
-        seen: FirstLook | None = None
         drawn: AbstractContextManager[None] = nullcontext()
         if place is not None and not (quiet or resume or wanted.effects.use):
             seen = structure.look if structure else first_look(wanted)
+            searched = seen.problem, seen.optima
             look_result(seen).save(place)
             drawn = meanwhile(write_page, ("look", place, 1), _announced, jobs=jobs)
         with drawn:
@@ -64,7 +65,7 @@ def fit(
                 quick=quick,
                 cross_check=cross_check,
                 quiet=quiet,
-                look=seen,
+                searched=searched,
             )
         if rival:
             fitted = replace(fitted, rival=integer_rival(fitted, jobs=jobs, quick=quick, quiet=quiet))

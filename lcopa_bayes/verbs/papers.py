@@ -107,7 +107,7 @@ def identify(
     whose intervals are shown too; `folder`, a run folder to write into; `jobs`, processes to use; `quiet`, no
     progress bar. InputError when records, intervals or folders cannot be used.
     """
-    wanted, plan = settled(study_of(study)), scan or Scan()
+    wanted, plan = settled(study_of(study), jobs=jobs), scan or Scan()
     beside = None if posterior is None else load_posterior(Path(posterior), wanted)
     scannable(wanted, plan)
     if folder is not None:

@@ -28,6 +28,7 @@ import page  # noqa: E402
 import plots  # noqa: E402
 import probe  # noqa: E402
 import samplers  # noqa: E402
+import scatter  # noqa: E402
 import verbs  # noqa: E402
 from comparison import Estimate, Reference, Spread  # noqa: E402
 
@@ -376,3 +377,29 @@ def test_page_and_figures_show_every_row(result, compared, tmp_path):
     for name in ("forward", "samplers", "verbs"):
         getattr(plots, name)(results[name], tmp_path / f"{name}.svg")
         assert "</svg>" in (tmp_path / f"{name}.svg").read_text()
+
+
+@pytest.mark.parametrize("overstated", [1.0, 4.0])
+def test_the_scatter_of_fits_shows_what_their_stated_errors_are_worth(overstated, rng, tmp_path):
+    """Fits of 400 independent draws, a fifth of them in a second mode, that state so many times as many."""
+    fits = []
+    for _ in range(200):
+        second = rng.random(400) < 0.2
+        draws = rng.normal(np.where(second, 8.0, 0.0), 1.0)[:, None]
+        share = np.array([(~second).mean(), second.mean()])
+        errors = np.sqrt(share * (1 - share) / (400 * overstated))
+        modes = {"a": {"boundaries": [4.0], "shares": share.tolist(), "errors": errors.tolist()}}
+        worth = np.array([400.0 * overstated])
+        fits.append({"names": ["a"], "draws": draws, "bulk": worth, "tail": worth, "modes": modes})
+    rows = scatter.scattered(fits)
+    assert [row["quantity"] for row in rows] == [
+        "5 %",
+        "50 %",
+        "95 %",
+        "mean",
+        "share of mode 1",
+        "share of mode 2",
+    ]
+    assert_allclose([row["ratio"] for row in rows], np.sqrt(overstated), rtol=4 / np.sqrt(2 * 200))
+    scatter.drawn({"a": {"rows": rows, "fits": 200}}, tmp_path / "scatter.svg")
+    assert "share" in (tmp_path / "scatter.svg").read_text()
