@@ -49,7 +49,7 @@ def test_predicts_the_record_it_never_saw(fitted):
 
 def test_scores_say_what_kind_of_band_and_from_how_many_samples_the_offset_comes(fitted):
     (told,) = results(fitted)["held_out"]
-    assert (told["bands"], told["offset_samples"]) == ("pointwise", 7)  # samples until 1.3, one per 0.2
+    assert (told["bands"], told["offset_samples"]) == ("pointwise", 10)  # one per 0.2 until 1.3 and the delay
     assert "pointwise 90 % band" in verdict(fitted)
     assert "constant error" not in verdict(fitted)
     alone = [replace(b, offset_samples=b.time.size) if b.held_out else b for b in fitted.bands]
