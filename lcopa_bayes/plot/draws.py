@@ -1,4 +1,4 @@
-"""Draws of a posterior: pairs, intervals, traces, and marginals beside priors or a second method."""
+"""Draws of a posterior: intervals, traces, and marginals beside priors or a second method."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import cycle
 from typing import Any
 
-import corner
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -16,8 +15,8 @@ from lcopa_bayes.plot.theme import (
     BAND,
     CYCLE,
     HELD_OUT,
-    StyledFigure,
     blank,
+    extremes,
     grid,
     label,
     legend_above,
@@ -27,12 +26,6 @@ from lcopa_bayes.plot.theme import (
 _KINDS = ("time", "order", "delay", "gain")
 """Kinds of parameters that are shown first; of the rest, noise and offsets come last."""
 _LAST = ("offset", "sigma", "rho", "nu")
-IN_CORNER = 10
-"""Most parameters on one corner plot."""
-_LABELS = 0.47
-"""Distance of an axis label from its panel [in]."""
-MIDDLE = 0.995
-"""Share of the draws that each axis of the corner plot spans [-]."""
 
 
 def ranked(names: Iterable[str]) -> list[str]:
@@ -47,46 +40,8 @@ def ranked(names: Iterable[str]) -> list[str]:
     return sorted(names, key=rank)
 
 
-def corner_figure(run: RunData, names: Sequence[str]) -> Figure:
-    """Marginals and pairs of parameters."""
-    values = np.stack([run.draws[name].ravel() for name in names], axis=1)
-    scales = ["log" if run.spans_decades(name) else "linear" for name in names]
-    side = min(9.6, max(3.4, 1.15 * len(names) + 0.9))
-    figure = StyledFigure(figsize=(side, side))
-    small = len(names) > 5
-    corner.corner(
-        values,
-        fig=figure,
-        range=[MIDDLE] * len(names),
-        axes_scale=scales,
-        bins=24,
-        smooth=1.0,
-        levels=(0.5, 0.9),
-        quantiles=(0.05, 0.5, 0.95),
-        color=BAND,
-        labels=[f"{plain(name)}\n[{plain(run.units[name])}]" for name in names],
-        label_kwargs={"fontsize": 7.5 if small else 8.5},
-        labelpad=max(0.05, _LABELS * len(names) / (side - 1.0) - 0.3),
-        max_n_ticks=3 if small else 4,
-        plot_density=False,
-        data_kwargs={"ms": 1.2, "alpha": 0.25},
-        hist_kwargs={"lw": 0.9},
-        contour_kwargs={"linewidths": 0.9},
-    )
-    for k, panel in enumerate(figure.axes):
-        row, column = divmod(k, len(names))
-        if column < row or row == column == len(names) - 1:
-            panel.tick_params(labelrotation=45)
-        panel.tick_params(labelsize=6.5 if small else 7.5, length=2)
-        for line in panel.lines:
-            line.set_linewidth(0.8)
-    figure.align_labels()
-    room = 0.95 / side
-    figure.subplots_adjust(left=room, bottom=room, right=0.99, top=0.99)
-    return figure
-
-
-_BINS = 30
+_BINS, _TRACE = 30, 300
+"""Bins of a marginal, and points of a trace [-]."""
 
 
 def traces_figure(run: RunData, names: Sequence[str]) -> Figure:
@@ -95,8 +50,8 @@ def traces_figure(run: RunData, names: Sequence[str]) -> Figure:
     figure, panels = grid(len(names), columns=2, height=1.15)
     for panel, name in zip(panels, names, strict=True):
         for chain, colour in zip(run.draws[name], cycle(CYCLE), strict=False):
-            panel.plot(np.arange(chain.size), chain, color=colour, lw=0.4, alpha=0.8)
-        panel.set_rasterization_zorder(2.01)  # one picture of all lines
+            at = extremes(chain, most=_TRACE)
+            panel.plot(at, chain[at], color=colour, lw=0.4, alpha=0.8)
         if run.spans_decades(name):
             panel.set_yscale("log")
         shown = "not defined" if rhat[name] is None else f"{rhat[name]:.3f}"

@@ -15,10 +15,11 @@ from lcopa_bayes.paper.staticoptics import OpticsPlan, StaticOptics, static_opti
 from lcopa_bayes.plot.audit import profiles_figure
 from lcopa_bayes.plot.comparison import evidence_figure
 from lcopa_bayes.plot.designs import drive_figure, precision_figure
-from lcopa_bayes.plot.draws import IN_CORNER, corner_figure, forest_figure, ranked
+from lcopa_bayes.plot.draws import forest_figure, ranked
 from lcopa_bayes.plot.fleet import population_figure
 from lcopa_bayes.plot.loop import before_after_figure
 from lcopa_bayes.plot.optics import director_figure, far_field_figure
+from lcopa_bayes.plot.pairs import IN_CORNER, corner_figure
 from lcopa_bayes.plot.records import prediction_figure, residual_figure, response_figure
 from lcopa_bayes.plot.responses import bode_figure, steps_figure
 from lcopa_bayes.plot.rundata import fit_of, run_of

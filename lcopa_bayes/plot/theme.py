@@ -6,7 +6,7 @@ Fewer points for the same picture: long curves are drawn through the extremes of
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from math import log10
 from typing import Any, final
@@ -18,7 +18,15 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backend_bases import RendererBase
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
+from matplotlib.ticker import (
+    FuncFormatter,
+    Locator,
+    LogFormatter,
+    LogLocator,
+    MaxNLocator,
+    NullFormatter,
+    NullLocator,
+)
 
 from lcopa_bayes.core.arrays import Index, Vector
 
@@ -116,15 +124,20 @@ def grid(count: int, *, columns: int, height: float) -> tuple[Figure, Sequence[A
 def _log_ticks(axis: Axis) -> None:
     """Ticks of a logarithmic axis: round numbers when it spans few decades, else powers of ten."""
     low, high = axis.get_view_interval()
-    few = high < _DECADES * low
-    if few:
-        wide = high > 5.0 * low
-        axis.set_major_locator(LogLocator(subs=(1, 2, 5)) if wide else MaxNLocator(4, steps=[1, 2, 5, 10]))
+    locator, word = log_locator(low, high)
+    axis.set_major_locator(locator)
+    if high < _DECADES * low:
         axis.set_minor_locator(NullLocator())
-    else:
-        axis.set_major_locator(LogLocator(numticks=4))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}" if few else _power(value)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: word(value)))
     axis.set_minor_formatter(NullFormatter())
+
+
+def log_locator(low: float, high: float) -> tuple[Locator, Callable[[float], str]]:
+    """What finds the ticks of a logarithmic axis between two ends, and what writes them."""
+    if high >= _DECADES * low:
+        return LogLocator(numticks=4), _power
+    few = LogLocator(subs=(1, 2, 5)) if high > 5.0 * low else MaxNLocator(4, steps=[1, 2, 5, 10])
+    return few, "{:g}".format
 
 
 def _power(value: float) -> str:

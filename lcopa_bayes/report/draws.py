@@ -6,9 +6,6 @@ import shlex
 from typing import Any
 
 from lcopa_bayes.plot.draws import (
-    IN_CORNER,
-    MIDDLE,
-    corner_figure,
     draw_methods,
     draw_prior,
     forest_figure,
@@ -16,6 +13,7 @@ from lcopa_bayes.plot.draws import (
     ranked,
     traces_figure,
 )
+from lcopa_bayes.plot.pairs import IN_CORNER, MIDDLE, corner_figure
 from lcopa_bayes.plot.rundata import RunData
 from lcopa_bayes.report.formatting import NONE, figures
 from lcopa_bayes.report.page import Drawings

@@ -12,6 +12,8 @@ from small import record, study
 import lcopa_bayes as lb
 from lcopa_bayes.bench.command import on_off
 from lcopa_bayes.paper.staticoptics import OpticsPlan
+from lcopa_bayes.plot.draws import ranked
+from lcopa_bayes.plot.pairs import _pair
 from lcopa_bayes.plot.theme import BAND, StyledFigure
 from lcopa_bayes.report.svg import svg_of
 from lcopa_bayes.verbs.papers import optics
@@ -84,8 +86,21 @@ def test_a_forest_has_a_row_for_every_parameter_at_its_interval(fit):
 
 
 def test_a_corner_shows_the_parameters_that_are_asked_for(fit):
-    assert len(lb.plot.corner(fit, ["gain", "time_1"]).axes) == 4
-    assert len(lb.plot.corner(fit).axes) == len(fit.summary()) ** 2
+    for asked in (["gain", "time_1"], ranked(fit.summary()["parameter"])):
+        (panel,) = lb.plot.corner(fit, asked).axes
+        named = [one.get_text().partition("\n")[0] for one in panel.texts]
+        assert named == [*asked, *asked[1:]]
+
+
+def test_contours_of_a_pair_hold_their_share_of_a_normal_distribution():
+    """Half of it within a circle of radius sd sqrt(2 log 2), nine tenths within one of sd sqrt(2 log 10)."""
+    draws = 0.5 + 0.1 * np.random.default_rng(3).standard_normal((2, 200_000))
+    lines, beyond = _pair(*draws)
+    radii = sorted(float(np.hypot(*(line - 0.5).T).mean()) for line in lines)
+    expected = [0.1 * np.sqrt(2 * np.log(1 / (1 - share))) for share in (0.5, 0.9)]
+    np.testing.assert_allclose(radii, expected, rtol=0.12)  # wider by the smoothing, 0.04
+    assert len(beyond) == pytest.approx(200_000 * np.exp(-50 * radii[1] ** 2), rel=0.25)
+    assert np.hypot(*(beyond - 0.5).T).min() > radii[1] - 2 / 24
 
 
 def test_a_bode_plot_falls_by_the_median_of_the_fit(fit):
