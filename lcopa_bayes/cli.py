@@ -136,9 +136,9 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     return parser
 
 
-def _reported(result: Result, folder: Path, jobs: int = 1) -> Outcome:
-    """What a verb prints of a result, with the page it wrote in `jobs` processes."""
-    page = result.report(folder, jobs=jobs)
+def _reported(result: Result, folder: Path, jobs: int = 1, page: Path | None = None) -> Outcome:
+    """What a verb prints of a result, with its page, written in `jobs` processes where it is not there."""
+    page = page or result.report(folder, jobs=jobs)
     return result.to_json() | {"report": str(page)}, f"{result}\n\nreport: {page}"
 
 
@@ -206,8 +206,10 @@ def _on_study(
         function = getattr(import_module(f"lcopa_bayes.verbs.{module}") if module else lcopa_bayes, verb)
         given = _given(options, *keys) | {key: of(options, source) for key, of in derived.items()}
         given |= {"jobs": jobs} if hasattr(options, "jobs") else {}
+        given |= {"page": True} if verb == "fit" else {}
         folder = _folder(options, source, *filter(None, [inside]))
-        return _reported(function(source, folder=folder, **given), folder, jobs)
+        result = function(source, folder=folder, **given)
+        return _reported(result, folder, jobs, folder / "report.html" if verb == "fit" else None)
 
     return perform
 

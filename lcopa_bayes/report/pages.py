@@ -32,6 +32,7 @@ from lcopa_bayes.report import (
 )
 from lcopa_bayes.report.answers import answers
 from lcopa_bayes.report.page import Drawings, Verdict, write_page
+from lcopa_bayes.results.result import Fresh
 from lcopa_bayes.results.stored import stored_values
 
 Draw: TypeAlias = Callable[[Path, Mapping[str, Any]], Drawings]
@@ -48,13 +49,14 @@ _PARTS: tuple[Part, ...] = (
 """What draws the page of a fit."""
 
 
-def write_report(folder: Path, *, jobs: int = 1) -> Path:
+def write_report(folder: Path, *, jobs: int = 1, fresh: Fresh | None = None) -> Path:
     """Draw the report of a run folder: `figures/*.svg` and `report.html`, whose path is returned.
 
-    Reads only the folder and calculates nothing; the same folder gives the same bytes, whatever `jobs`
-    [processes]. InputError when a file of the folder is missing or cannot be used.
+    Reads only the folder, and values and draws that are to be there where they are `fresh`, and calculates
+    nothing; the same folder gives the same bytes, whatever `jobs` [processes]. InputError when a file of the
+    folder is missing or cannot be used.
     """
-    run = load_run(folder)
+    run = load_run(folder, fresh)
     with workers(run, jobs=jobs) as crew:
         parts = list(crew.each(_drawn, _PARTS))
     rules = inspect.cleandoc(defaultpriors.__doc__ or "")

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 import pandas as pd
 
+from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.parallel import meanwhile
 
@@ -53,7 +55,7 @@ class Result(ABC):
         if not self.is_in(folder):
             self.save(folder)
         written: list[Path] = []
-        with meanwhile(write_page, (self.verb, folder, jobs), written.append, jobs=jobs):
+        with meanwhile(write_page, (self.verb, folder, jobs, None), written.append, jobs=jobs):
             pass
         return written[0]
 
@@ -76,14 +78,24 @@ class Result(ABC):
         return f"<p>{escape(self.verdict)}</p>" + (notebook_table(table) if len(table) else "")
 
 
-def write_page(wanted: tuple[str, Path, int]) -> Path:
-    """Write the page of a verb's result into its run folder in so many processes; returns its path.
+Fresh: TypeAlias = tuple[Mapping[str, Any], Mapping[str, Matrix]]
+"""Values of a fit and its draws by parameter, (ensembles, draws), as its run folder will hold them."""
+
+
+def write_page(wanted: tuple[str, Path, int, Fresh | None]) -> Path:
+    """Write the page of a verb's result into its run folder in so many processes, that of a fit before its
+    values and draws are there where these are given; returns its path.
 
     Pages read results, and results import no page: it is looked up when wanted, and where a process of its
     own writes it this one need not load what draws figures.
     """
-    verb, folder, jobs = wanted
-    page: Path = import_module("lcopa_bayes.report.pages").write_page_of(verb, folder, jobs=jobs)
+    verb, folder, jobs, fresh = wanted
+    pages = import_module("lcopa_bayes.report.pages")
+    page: Path = (
+        pages.write_report(folder, jobs=jobs, fresh=fresh)
+        if fresh
+        else pages.write_page_of(verb, folder, jobs=jobs)
+    )
     return page
 
 
