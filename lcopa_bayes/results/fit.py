@@ -125,8 +125,8 @@ class Fit(Predictive):
         """Write draws, numbers and tables into a run folder, which `load_result` reads; returns the folder.
 
         Where it shall be `compact`, what has one number for each sample is kept for fewer draws. With `page`
-        that is drawn too; draws, tables and page at the same time in `jobs` processes. InputError naming a
-        file that cannot be written, and as `Result.save`.
+        that is drawn too; draws, tables and page at the same time where there are several `jobs`. InputError
+        naming a file that cannot be written, and as `Result.save`.
         """
         origin = provenance(self.study, self.verb)
         with opened(folder, origin) as path:
@@ -140,7 +140,7 @@ class Fit(Predictive):
                 add_origin(path, self.verb, origin)
                 if page:
                     fresh = (values, self.by_name)
-                    with meanwhile(write_page, (self.verb, path, jobs, fresh), lambda _: None, jobs=jobs):
+                    with meanwhile(write_page, (self.verb, path, fresh), lambda _: None, jobs=jobs):
                         pass
             save_json(values, path / self.file)
         return path

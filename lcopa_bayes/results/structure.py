@@ -17,6 +17,7 @@ from typing import Any, final
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import attributes, plain
+from lcopa_bayes.core.parallel import Progress
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, table_of
@@ -104,25 +105,27 @@ class Structure:
         return plain({"chosen": self.chosen.name, "candidates": rows, "sentence": self.sentence})
 
 
-def structure_of(study: Study) -> Structure | None:
-    """The structure of a study whose terms are "auto"; None where it states them.
+def structure_of(study: Study, *, quiet: bool = True) -> Structure | None:
+    """The structure of a study whose terms are "auto"; None where it states them. Unless `quiet`, it is said
+    what is looked at.
 
     InputError as `first_look` of the fewest terms, and for priors that no number of terms has a use for.
     """
     if study.model.terms != "auto":
         return None
     least = with_least_terms(study)
-    looked = [Looked(*searched(least))]
-    tried = [least.model]
-    while True:
-        best = Structure(tuple(looked)).chosen.study.model
-        model = next((one for one in _beside(best, least) if one not in tried), None)
-        if model is None:
-            return Structure(tuple(looked))
-        tried.append(model)
-        more = _if_possible(replace(least, model=model), looked)
-        if more is not None:
-            looked.append(more)
+    looked, tried = list[Looked](), list[ModelSettings]()
+    model: ModelSettings | None = least.model
+    with Progress(desc="choosing how many terms, by least squares", unit="structure", quiet=quiet) as bar:
+        while model is not None:
+            tried.append(model)
+            first = not looked
+            more = Looked(*searched(least)) if first else _if_possible(replace(least, model=model), looked)
+            looked += [] if more is None else [more]
+            best = Structure(tuple(looked)).chosen.study.model
+            model = next((one for one in _beside(best, least) if one not in tried), None)
+            bar.update()
+    return Structure(tuple(looked))
 
 
 def _beside(model: ModelSettings, least: Study) -> Iterator[ModelSettings]:

@@ -41,14 +41,14 @@ def fit(
     result afterwards; `quick`, a quarter of the steps; `cross_check`, sample by nested sampling too; `rival`,
     fit the study with integer orders too and compare what both predict of the held-out records; `compact`,
     keep what has one number for each sample for fewer draws in the folder; `page`, draw the page there too,
-    at the same time as the rest is written; `quiet`, no progress bar, and no first look (`look`) in the folder
-    meanwhile.
+    at the same time as the rest is written; `quiet`, no progress bar, and no first look (`look`) in the
+    folder meanwhile.
 
     The same study gives the same draws. InputError when the study cannot be used, or the folder cannot be
     written to, holds another study's results, or is being written by another run; then nothing is written.
     """
     wanted = study_of(study)
-    structure = structure_of(wanted)
+    structure = structure_of(wanted, quiet=quiet)
     wanted = structure.chosen.study if structure else wanted
     with opened(folder, provenance(wanted, "fit")) as place:
         seen: FirstLook | None = None
@@ -56,7 +56,7 @@ def fit(
         if place is not None and not (quiet or resume or wanted.effects.use):
             seen = structure.look if structure else first_look(wanted)
             look_result(seen).save(place)
-            drawn = meanwhile(write_page, ("look", place, 1, None), _announced, jobs=jobs)
+            drawn = meanwhile(write_page, ("look", place, None), _announced, jobs=jobs)
         with drawn:
             fitted = sampled(
                 wanted,
