@@ -190,14 +190,12 @@ class LagFit:
         return covariance_of(self.jacobian.T @ self.jacobian)
 
 
-def lag_fits(table: LagTable, near: Sequence[LagFit] = ()) -> tuple[LagFit, ...]:
-    """The best for each number of lags, 1 to `MOST`: of one search from those of another table, `near`, else
-    of a few, in which a further lag begins where it alone explains most of what the others leave."""
+def lag_fits(table: LagTable) -> tuple[LagFit, ...]:
+    """The best of a few searches for each number of lags, 1 to `MOST`: a further lag begins where it alone
+    explains most of what the others leave."""
     fits: list[LagFit] = []
     for lags in range(1, MOST + 1):
-        fewer = fits[-1] if fits else None
-        starts = [near[lags - 1].coordinates] if near else _starts(table, fewer)
-        tried = [_descended(table, lags, start) for start in starts]
+        tried = [_descended(table, lags, start) for start in _starts(table, fits[-1] if fits else None)]
         fits.append(min(tried, key=lambda one: one.square))
     return tuple(fits)
 

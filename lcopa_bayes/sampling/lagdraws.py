@@ -67,8 +67,6 @@ class LagSearch:
     """Ends between which delays are uniform, (paths, 2) [time unit]."""
     near: Matrix
     """Those between which they are tabulated, (paths, 2) [time unit]."""
-    coarse: tuple[LagFit, ...] = ()
-    """The best with each number of lags of all delays; the search begins anew without."""
 
     @classmethod
     def over(
@@ -76,8 +74,7 @@ class LagSearch:
     ) -> LagSearch:
         """A search over all delays between their ends (paths, 2) [time unit], and again where they are."""
         table = lag_table(problem, axis, drives, noise, _nodes(delays, _COARSE))
-        fits = lag_fits(table)
-        return cls(problem, axis, tuple(drives), noise, delays, _near(table, fits, delays), fits)
+        return cls(problem, axis, tuple(drives), noise, delays, _near(table, lag_fits(table), delays))
 
     @cached_property
     def table(self) -> LagTable:
@@ -87,7 +84,7 @@ class LagSearch:
     @cached_property
     def fits(self) -> tuple[LagFit, ...]:
         """The best with each number of lags."""
-        return lag_fits(self.table, self.coarse)
+        return lag_fits(self.table)
 
     @property
     def best(self) -> LagFit:
