@@ -42,6 +42,10 @@ BUNDLED = ("paper-step-x", "paper-step")
 """Studies of records like the paper's, whose run folders hold evidence on its claims."""
 
 
+_MODULES = {"run": "fit", "identify": "papers"}
+"""Modules of verbs that have another name."""
+
+
 Derived = Callable[[argparse.Namespace, Any], object]
 """An argument of a public function from the options and the study or fit."""
 
@@ -100,6 +104,14 @@ def _details(command: Sequence[str]) -> str:
 
 
 def _outcome(options: argparse.Namespace, command: Sequence[str]) -> Outcome:
+    if hasattr(options, "jobs"):  # libraries take seconds to load: workers load them meanwhile
+        from lcopa_bayes.core.parallel import imported_ahead
+
+        if not (options.quiet or options.json):
+            print(f"{options.verb}: loading", file=sys.stderr, flush=True)
+        if _jobs(options) > 1:
+            module = _MODULES.get(options.verb, options.verb)
+            imported_ahead(f"lcopa_bayes.verbs.{module}", "lcopa_bayes.report.pages")
     from lcopa_bayes.results.runfolder import commanded
 
     with commanded(command):
@@ -136,9 +148,9 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     return parser
 
 
-def _reported(result: Result, folder: Path, jobs: int = 1) -> Outcome:
-    """What a verb prints of a result, with the page it wrote in `jobs` processes."""
-    page = result.report(folder, jobs=jobs)
+def _reported(result: Result, folder: Path, jobs: int = 1, page: Path | None = None) -> Outcome:
+    """What a verb prints of a result, with its page, written where it is not there."""
+    page = page or result.report(folder, jobs=jobs)
     return result.to_json() | {"report": str(page)}, f"{result}\n\nreport: {page}"
 
 
@@ -194,20 +206,18 @@ def _on_study(
     """
 
     def perform(options: argparse.Namespace) -> Outcome:
-        from lcopa_bayes.core.parallel import imported_ahead
-
-        jobs = _jobs(options) if hasattr(options, "jobs") else 1
-        if jobs > 1:
-            imported_ahead(f"lcopa_bayes.verbs.{module or verb}", "lcopa_bayes.report.pages")
         from lcopa_bayes.verbs.sources import study_of
 
+        jobs = _jobs(options) if hasattr(options, "jobs") else 1
         source = _source(options)
         source = study_of(source) if anew else source
         function = getattr(import_module(f"lcopa_bayes.verbs.{module}") if module else lcopa_bayes, verb)
         given = _given(options, *keys) | {key: of(options, source) for key, of in derived.items()}
         given |= {"jobs": jobs} if hasattr(options, "jobs") else {}
+        given |= {"page": True} if verb == "fit" else {}
         folder = _folder(options, source, *filter(None, [inside]))
-        return _reported(function(source, folder=folder, **given), folder, jobs)
+        result = function(source, folder=folder, **given)
+        return _reported(result, folder, jobs, folder / "report.html" if verb == "fit" else None)
 
     return perform
 

@@ -22,6 +22,7 @@ from typing import final
 import numpy as np
 from scipy.linalg import eigh, orth
 from scipy.optimize import least_squares
+from scipy.sparse import csr_array
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of
@@ -49,6 +50,8 @@ _APART = 0.7
 """Least distance of the time constants a search starts from [-, natural logarithm]."""
 _STARTS = 3
 """Places where a further lag is tried."""
+_STEP = 1e-7
+"""Step of a difference quotient, over the range of its coordinate [-]."""
 
 
 @final
@@ -94,13 +97,16 @@ class LagTable:
         first = np.clip(np.floor(at).astype(int) - 1, 0, self.log_times.size - 4)
         along = (delays - self.delays[:, 0]) / (self.delays[:, 1] - self.delays[:, 0])
         before = np.clip(np.floor(along).astype(int), 0, self.delays.shape[1] - 2)[..., None]
-        share = (along[..., None] - before)[..., None]
-        path = np.arange(self.paths)[:, None]
-        out = np.zeros((*first.shape, self.target.size))
-        for step, weight in enumerate(_cubic(at - first)):
-            near, far = (self.responses[path, first + step, before + later] for later in (0, 1))
-            out += weight[..., None] * ((1 - share) * near + share * far)
-        return out.reshape(len(coordinates), -1, self.target.size)
+        share = along[..., None] - before
+        tabulated = self.responses.shape[:3]
+        place = tabulated[2] * (tabulated[1] * np.arange(self.paths)[:, None] + first) + before
+        around = tabulated[2] * np.arange(4)[:, None] + np.arange(2)
+        weights = np.stack(_cubic(at - first), axis=-1)[..., None]
+        weights = weights * np.stack([1 - share, share], axis=-1)[..., None, :]
+        nodes, each = (place[..., None, None] + around).ravel(), np.arange(place.size + 1) * around.size
+        by_node = csr_array((weights.ravel(), nodes, each), shape=(place.size, np.prod(tabulated)))
+        out = by_node @ self.responses.reshape(-1, self.target.size)  # nothing is copied for a node
+        return np.asarray(out).reshape(len(coordinates), -1, self.target.size)
 
     def conditional(self, coordinates: Matrix) -> Conditional:
         """Distribution of the weights at coordinates (batch, dimension)."""
@@ -119,12 +125,14 @@ class LagTable:
             out[inside] = self.conditional(coordinates[inside]).log_marginal
         return out
 
-    def residual(self, coordinates: Vector) -> Vector:
-        """What the most probable weights leave, and what their prior adds to the cost."""
-        columns = self.columns(coordinates[None])[0]
-        precision = columns @ columns.T + np.eye(len(columns)) / WEIGHT**2
-        weights = np.linalg.solve(precision, columns @ self.target)
-        return np.concatenate([self.target - weights @ columns, weights / WEIGHT])
+    def residuals(self, coordinates: Matrix) -> Matrix:
+        """What the most probable weights leave at coordinates (batch, dimension), and what their prior adds
+        to the cost, (batch, directions + weights)."""
+        columns = self.columns(coordinates)
+        precision = columns @ columns.swapaxes(1, 2) + np.eye(columns.shape[1]) / WEIGHT**2
+        weights = np.linalg.solve(precision, (columns @ self.target)[..., None])
+        left = self.target - (columns.swapaxes(1, 2) @ weights)[..., 0]
+        return np.concatenate([left, weights[..., 0] / WEIGHT], axis=1)
 
 
 @final
@@ -221,8 +229,23 @@ def _starts(table: LagTable, fewer: LagFit | None) -> list[Vector]:
 
 def _descended(table: LagTable, lags: int, start: Vector) -> LagFit:
     low, high = table.ends(lags)
+    steps = _STEP * (high - low)
+
+    def residual(x: Vector) -> Vector:
+        return np.asarray(table.residuals(x[None])[0])
+
+    def slopes(x: Vector) -> Matrix:
+        own = np.where(x + steps > high, -steps, steps)
+        values = table.residuals(np.concatenate([x[None], x + np.diag(own)]))
+        return np.asarray((values[1:] - values[0]).T / own)
+
     optimum = least_squares(
-        table.residual, np.clip(start, low, high), bounds=(low, high), x_scale=high - low, max_nfev=40
+        residual,
+        np.clip(start, low, high),
+        slopes,
+        bounds=(low, high),
+        x_scale=high - low,
+        max_nfev=40,
     )
     square = 2 * float(optimum.cost) + table.remainder
     return LagFit(lags, optimum.x, np.asarray(optimum.jac), square, table.size)

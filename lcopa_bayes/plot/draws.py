@@ -18,6 +18,7 @@ from lcopa_bayes.plot.theme import (
     HELD_OUT,
     StyledFigure,
     blank,
+    extremes,
     grid,
     label,
     legend_above,
@@ -86,7 +87,8 @@ def corner_figure(run: RunData, names: Sequence[str]) -> Figure:
     return figure
 
 
-_BINS = 30
+_BINS, _TRACE = 30, 300
+"""Bins of a marginal, and points of a trace [-]."""
 
 
 def traces_figure(run: RunData, names: Sequence[str]) -> Figure:
@@ -95,8 +97,8 @@ def traces_figure(run: RunData, names: Sequence[str]) -> Figure:
     figure, panels = grid(len(names), columns=2, height=1.15)
     for panel, name in zip(panels, names, strict=True):
         for chain, colour in zip(run.draws[name], cycle(CYCLE), strict=False):
-            panel.plot(np.arange(chain.size), chain, color=colour, lw=0.4, alpha=0.8)
-        panel.set_rasterization_zorder(2.01)  # one picture of all lines
+            at = extremes(chain, most=_TRACE)
+            panel.plot(at, chain[at], color=colour, lw=0.4, alpha=0.8)
         if run.spans_decades(name):
             panel.set_yscale("log")
         shown = "not defined" if rhat[name] is None else f"{rhat[name]:.3f}"

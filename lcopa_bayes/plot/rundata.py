@@ -16,9 +16,9 @@ import pandas as pd
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.results.bands import POINTWISE, QUANTILE_NAMES, SIMULTANEOUS
-from lcopa_bayes.results.datatree import posterior_draws
+from lcopa_bayes.results.datatree import POSTERIOR, posterior_draws
 from lcopa_bayes.results.fit import Fit
-from lcopa_bayes.results.result import Result
+from lcopa_bayes.results.result import Fresh, Result
 from lcopa_bayes.results.runfolder import ORIGINS
 from lcopa_bayes.results.savedfit import SavedFit
 from lcopa_bayes.results.summary import IMPORTANCE
@@ -130,28 +130,32 @@ def run_of(result: Result) -> RunData:
     if isinstance(fit, SavedFit):
         return load_run(fit.folder)
     if fit not in _COMPUTED:
-        rows, (sets, _) = fit.draws.table.rows, fit.draws.log_density.shape
-        draws = {row.name: fit.draws.column(row.name).reshape(sets, -1) for row in rows if row.free}
-        _COMPUTED[fit] = RunData(fit.to_json(), {}, computed(fit), draws)
+        _COMPUTED[fit] = RunData(fit.to_json(), {}, computed(fit), fit.by_name)
     return _COMPUTED[fit]
 
 
-def load_run(folder: Path) -> RunData:
-    """Read a run folder; InputError names every file that is missing or cannot be used."""
+def load_run(folder: Path, fresh: Fresh | None = None) -> RunData:
+    """Read a run folder, all of it but values and draws that are `fresh`; InputError names every file that is
+    missing or cannot be used."""
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such run folder; give the folder `fit` wrote")
     problems: list[str] = []
-    results = read_part(folder / "results.json", read_json, problems) or {}
+    results: Mapping[str, Any]
+    draws: Mapping[str, Matrix]
+    if fresh:
+        results, draws = fresh
+    else:
+        results = read_part(folder / "results.json", read_json, problems) or {}
+        draws = read_part(folder / POSTERIOR, posterior_draws, problems) or {}
     origin = (read_part(folder / ORIGINS, read_json, problems) or {}).get("fit", {})
     wanted = {**TABLES, **(_CHECK_TABLES if results.get("cross_check") else {})}
     tables = {
         name: read_table(folder / "tables" / f"{name}.csv", problems, needs, "fit")
         for name, needs in wanted.items()
     }
-    draws = read_part(folder / "posterior.nc", posterior_draws, problems) or {}
     if not problems:
         problems += [
-            f"{folder / 'posterior.nc'}: no draws of {row['name']!r}, which results.json lists; "
+            f"{folder / POSTERIOR}: no draws of {row['name']!r}, which results.json lists; "
             "both must come from the same run, so run `fit` again"
             for row in results["parameters"]
             if row["name"] not in draws

@@ -22,6 +22,7 @@ from lcopa_bayes.core.files import writable_folder, write_text
 from lcopa_bayes.report import formatting
 from lcopa_bayes.report.svg import COLOURS, Drawing, inlined
 from lcopa_bayes.results.bands import POINTWISE, SIMULTANEOUS
+from lcopa_bayes.results.datatree import POSTERIOR
 
 Drawings: TypeAlias = Mapping[str, Any]
 """Figures by the name under which a template places them, and what else it shows as it is."""
@@ -139,7 +140,7 @@ class Page:
         self.drawings.append(one)
         mark = Markup('<span class="mark">{}</span>').format(one.mark) if one.mark else ""
         data = ""
-        if one.data and (self.folder / one.data).is_file():
+        if one.data == POSTERIOR or (one.data and (self.folder / one.data).is_file()):  # the first may follow
             data = Markup(' <a href="{0}">Numbers: {0}</a>').format(one.data)
         values = ""
         if one.series:

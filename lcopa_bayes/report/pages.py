@@ -10,7 +10,6 @@ from typing import Any, TypeAlias
 from jinja2 import UndefinedError
 
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.inference import defaultpriors
 from lcopa_bayes.plot.rundata import RunData, load_run
 from lcopa_bayes.plot.theme import look
@@ -32,6 +31,7 @@ from lcopa_bayes.report import (
 )
 from lcopa_bayes.report.answers import answers
 from lcopa_bayes.report.page import Drawings, Verdict, write_page
+from lcopa_bayes.results.result import Fresh
 from lcopa_bayes.results.stored import stored_values
 
 Draw: TypeAlias = Callable[[Path, Mapping[str, Any]], Drawings]
@@ -48,24 +48,20 @@ _PARTS: tuple[Part, ...] = (
 """What draws the page of a fit."""
 
 
-def write_report(folder: Path, *, jobs: int = 1) -> Path:
+def write_report(folder: Path, fresh: Fresh | None = None) -> Path:
     """Draw the report of a run folder: `figures/*.svg` and `report.html`, whose path is returned.
 
-    Reads only the folder and calculates nothing; the same folder gives the same bytes, whatever `jobs`
-    [processes]. InputError when a file of the folder is missing or cannot be used.
+    Reads only the folder, and values and draws that are to be there where they are `fresh`, and calculates
+    nothing; the same folder gives the same bytes. InputError when a file of the folder is missing or cannot
+    be used.
     """
-    run = load_run(folder)
-    with workers(run, jobs=jobs) as crew:
-        parts = list(crew.each(_drawn, _PARTS))
+    run = load_run(folder, fresh)
     rules = inspect.cleandoc(defaultpriors.__doc__ or "")
-    shown = {key: one for part in parts for key, one in part.items()} | {"run": run, "rules": rules}
-    return _written(folder, "fit", "", run.results, lambda *_: shown)
 
+    def drawn(*_: object) -> Drawings:
+        return {key: one for part in _PARTS for key, one in part(run).items()} | {"run": run, "rules": rules}
 
-def _drawn(run: RunData, part: Part) -> Drawings:
-    """A part of the report."""
-    with look():
-        return part(run)
+    return _written(folder, "fit", "", run.results, drawn)
 
 
 _PAGES: Mapping[str, tuple[str, Draw]] = {
@@ -87,14 +83,13 @@ _REPORTS = ("fit", "calibrate")
 """Verbs whose values and page are called results and report."""
 
 
-def write_page_of(verb: str, folder: Path, *, jobs: int = 1) -> Path:
+def write_page_of(verb: str, folder: Path) -> Path:
     """Draw the page of a verb's result from the files of its run folder alone; returns its path.
 
-    The figures of a fit, the most of any page, are drawn in `jobs` processes.
     InputError when a file is missing or cannot be used.
     """
     if verb == "fit":
-        return write_report(folder, jobs=jobs)
+        return write_report(folder)
     title, draw = _PAGES[verb]
     values = stored_values(folder, verb, (), file="results.json" if verb in _REPORTS else None)
     return _written(folder, verb, title, values, draw)

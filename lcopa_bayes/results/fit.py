@@ -15,6 +15,7 @@ from lcopa_bayes.core.arrays import Matrix, digest_of
 from lcopa_bayes.core.errors import refuse_if
 from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.core.files import save_json, save_table, writable_folder, write_text, write_whole
+from lcopa_bayes.core.parallel import meanwhile
 from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
@@ -28,6 +29,7 @@ from lcopa_bayes.results.nearby import surrogate_about
 from lcopa_bayes.results.prediction import Band, study_bands
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.residuals import Residual, residuals
+from lcopa_bayes.results.result import write_page
 from lcopa_bayes.results.runfolder import add_origin, fingerprint, opened, provenance
 from lcopa_bayes.results.savedfit import NAME as SAVED
 from lcopa_bayes.results.savedfit import fit_to_json
@@ -89,6 +91,12 @@ class Fit(Predictive):
         """The posterior, with effects by what the draws were made with: a response costs a hundredth."""
         return replace(self.problem.posterior, surrogate=self.run.surrogate)
 
+    @property
+    def by_name(self) -> dict[str, Matrix]:
+        """Draws of every free parameter, (ensembles, draws) [its unit]."""
+        rows = self.draws.table.rows
+        return {row.name: self.draws.values[..., k] for k, row in enumerate(rows) if row.free}
+
     @cached_property
     def sensitivity(self) -> tuple[Sensitivity, ...]:
         """How far each parameter's median moves with the power of prior or likelihood [posterior sd]."""
@@ -112,25 +120,35 @@ class Fit(Predictive):
         """Draws, data and prior in the ArviZ groups; see `datatree`."""
         return posterior_tree(self)
 
-    def save(self, folder: Path | str, *, compact: bool = False) -> Path:
+    def save(self, folder: Path | str, *, compact: bool = False, jobs: int = 1, page: bool = False) -> Path:
         """Write draws, numbers and tables into a run folder, which `load_result` reads; returns the folder.
 
-        Where it shall be `compact`, what has one number for each sample is kept for fewer draws. InputError
-        naming the first file that cannot be written, and as `Result.save`.
+        Where it shall be `compact`, what has one number for each sample is kept for fewer draws. With `page`
+        that is drawn too; draws, tables and page at the same time where there are several `jobs`. InputError
+        naming a file that cannot be written, and as `Result.save`.
         """
         origin = provenance(self.study, self.verb)
         with opened(folder, origin) as path:
             writable_folder(path / "tables")
-            for name, table in tables(self).items():
-                save_table(table, path / "tables" / f"{name}.csv")
-            write_whole(
-                path / POSTERIOR, lambda beside: save_tree(posterior_tree(self, compact=compact), beside)
-            )
-            text = json.dumps(fit_to_json(self.problem, self.draws), allow_nan=False)
-            write_text(path / SAVED, f"{text}\n")
-            add_origin(path, self.verb, origin)
-            save_json(self.to_json(), path / self.file)
+            with meanwhile(_write_draws, (self, path, compact), lambda _: None, jobs=jobs):
+                values = self.to_json()
+                for name, table in tables(self).items():
+                    save_table(table, path / "tables" / f"{name}.csv")
+                text = json.dumps(fit_to_json(self.problem, self.draws), allow_nan=False)
+                write_text(path / SAVED, f"{text}\n")
+                add_origin(path, self.verb, origin)
+                if page:
+                    fresh = (values, self.by_name)
+                    with meanwhile(write_page, (self.verb, path, fresh), lambda _: None, jobs=jobs):
+                        pass
+            save_json(values, path / self.file)
         return path
+
+
+def _write_draws(wanted: tuple[Fit, Path, bool]) -> None:
+    """Write the draws of a fit into its run folder, as a task of a process of its own."""
+    fitted, path, compact = wanted
+    write_whole(path / POSTERIOR, lambda beside: save_tree(posterior_tree(fitted, compact=compact), beside))
 
 
 def fit(

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 import pandas as pd
 
+from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.parallel import meanwhile
 
@@ -48,12 +50,13 @@ class Result(ABC):
 
     def report(self, folder: Path | str, *, jobs: int = 1) -> Path:
         """Write the page of the result into a run folder, saving the result there first if it is not there
-        yet, its figures in `jobs` processes; returns the path of the page. InputError as `save`."""
+        yet, in a process of its own where `jobs` allows one; returns the path of the page. InputError as
+        `save`."""
         folder = Path(folder)
         if not self.is_in(folder):
             self.save(folder)
         written: list[Path] = []
-        with meanwhile(write_page, (self.verb, folder, jobs), written.append, jobs=jobs):
+        with meanwhile(write_page, (self.verb, folder, None), written.append, jobs=jobs):
             pass
         return written[0]
 
@@ -76,14 +79,20 @@ class Result(ABC):
         return f"<p>{escape(self.verdict)}</p>" + (notebook_table(table) if len(table) else "")
 
 
-def write_page(wanted: tuple[str, Path, int]) -> Path:
-    """Write the page of a verb's result into its run folder in so many processes; returns its path.
+Fresh: TypeAlias = tuple[Mapping[str, Any], Mapping[str, Matrix]]
+"""Values of a fit and its draws by parameter, (ensembles, draws), as its run folder will hold them."""
+
+
+def write_page(wanted: tuple[str, Path, Fresh | None]) -> Path:
+    """Write the page of a verb's result into its run folder, that of a fit before its values and draws are
+    there where these are given; returns its path.
 
     Pages read results, and results import no page: it is looked up when wanted, and where a process of its
     own writes it this one need not load what draws figures.
     """
-    verb, folder, jobs = wanted
-    page: Path = import_module("lcopa_bayes.report.pages").write_page_of(verb, folder, jobs=jobs)
+    verb, folder, fresh = wanted
+    pages = import_module("lcopa_bayes.report.pages")
+    page: Path = pages.write_report(folder, fresh) if fresh else pages.write_page_of(verb, folder)
     return page
 
 

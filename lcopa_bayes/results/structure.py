@@ -18,6 +18,7 @@ from typing import Any, final
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import attributes, plain
+from lcopa_bayes.core.parallel import Progress
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, table_of
@@ -107,27 +108,28 @@ class Structure:
         return plain({"chosen": self.chosen.name, "candidates": rows, "sentence": self.sentence})
 
 
-def structure_of(study: Study, *, jobs: int = 1) -> Structure | None:
-    """The structure of a study whose terms are "auto"; None where it states them.
+def structure_of(study: Study, *, jobs: int = 1, quiet: bool = True) -> Structure | None:
+    """The structure of a study whose terms are "auto"; None where it states them. Unless `quiet`, it is said
+    what is looked at.
 
     InputError as `first_look` of the fewest terms, and for priors that no number of terms has a use for.
     """
     if study.model.terms != "auto":
         return None
     least, begin = with_least_terms(study), monotonic()
-    looked = [Looked(*searched(least))]
-    if monotonic() - begin < _WORTHWHILE:
-        jobs = 1
-    tried = [least.model]
-    while True:
-        best = Structure(tuple(looked)).chosen.study.model
-        model = next((one for one in _beside(best, least) if one not in tried), None)
-        if model is None:
-            return Structure(tuple(looked))
-        tried.append(model)
-        more = _if_possible(replace(least, model=model), looked, jobs)
-        if more is not None:
-            looked.append(more)
+    with Progress(desc="choosing how many terms, by least squares", unit="structure", quiet=quiet) as bar:
+        looked, tried = [Looked(*searched(least))], [least.model]
+        if monotonic() - begin < _WORTHWHILE:
+            jobs = 1
+        while True:
+            bar.update()
+            best = Structure(tuple(looked)).chosen.study.model
+            model = next((one for one in _beside(best, least) if one not in tried), None)
+            if model is None:
+                return Structure(tuple(looked))
+            tried.append(model)
+            more = _if_possible(replace(least, model=model), looked, jobs)
+            looked += [] if more is None else [more]
 
 
 def _beside(model: ModelSettings, least: Study) -> Iterator[ModelSettings]:

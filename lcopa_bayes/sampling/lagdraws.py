@@ -1,8 +1,13 @@
-"""Draws of the sums of lags that a response axis may be: time constants and delays by emcee, weights exactly.
+"""Draws of the sums of lags that a response axis may be: times and delays, and exactly their weights.
 
 The number of lags is the best by BIC and one more, which the records need not show: what it leaves open of a
 number is part of that number's interval. Delays are tabulated over all that is asked first and then where
 they are.
+
+One path has so few coordinates that importance sampling from a mixture holds, which is fitted to the draws of
+all its forerunners; these are fitted to powers of the density that rise to 1, so that ridges are followed to
+their ends (Cappé, Guillin, Marin and Robert 2004, J. Comput. Graph. Stat. 13). Several paths, and one where
+it does not hold, are sampled by emcee.
 """
 
 from __future__ import annotations
@@ -17,9 +22,12 @@ import numpy as np
 from arviz_stats.base import array_stats  # type: ignore[attr-defined]
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
-from lcopa_bayes.core.covariance import root_of
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.lagsum import MOST, LagFit, LagTable, best_of, lag_fits, lag_table
+from lcopa_bayes.sampling.importanceweights import usable_k
+from lcopa_bayes.sampling.mixture import Mixture
+from lcopa_bayes.sampling.proposal import Seen, adapted
+from lcopa_bayes.sampling.weighted import resampled, tail_smoothed
 
 _COARSE, _FINE = 17, 33
 """Delays tabulated over all that is asked, and where they are."""
@@ -27,9 +35,16 @@ _NEAR = 20.0
 """BIC above the least of a number of lags whose delay is still looked at [-]."""
 _REACH = 10.0
 """Standard deviations of a delay that are tabulated on either side [-]."""
-_WALKERS, _STEPS, _THIN = 48, 1_000, 10
-_ROUNDS = 4
-"""Most times that many steps are made; the first are left out."""
+_POWERS = (0.05, 0.1, 0.3, 1.0, 1.0)
+"""Of the density, to which each mixture but the first is fitted [-]."""
+_DRAWN = 2_000
+"""Draws of each mixture."""
+_SPARE, _LOOSE = 16, 0.1
+"""Components of the first mixture with a spare lag anywhere, and the largest standard deviation of the first
+components, over the range of a coordinate [-]."""
+_WALKERS, _STEPS, _THIN = 96, 500, 10
+_ROUNDS = 8
+"""Most times that many steps are made; the first two are left out."""
 _WANTED = 200.0
 """Effective draws that end them."""
 _KEPT = 1_000
@@ -94,7 +109,7 @@ class LagDraws:
     delays: Matrix
     """(draws, paths) [time unit]."""
     ess: float
-    """Smallest effective sample size of a steady value or delay [draws]."""
+    """Effective sample size, by emcee the smallest of a steady value or delay [draws]."""
 
     @property
     def gains(self) -> Matrix:
@@ -113,14 +128,12 @@ class LagDraws:
 def lag_draws(search: LagSearch, seed: int) -> LagDraws:
     """Draws about the optima of a search, tabulated farther out where they stand beside an end."""
     rng = np.random.default_rng(seed)
-    chain, ess = _sampled(search, rng)
-    wider = _wider(search, chain)
+    kept, ess = _sampled(search, rng)
+    wider = _wider(search, kept)
     while (wider != search.near).any():
         search = replace(search, near=wider)
-        chain, ess = _sampled(search, rng)
-        wider = _wider(search, chain)
-    kept = chain.reshape(-1, chain.shape[-1])
-    kept = kept[rng.choice(len(kept), min(_KEPT, len(kept)), replace=False)]
+        kept, ess = _sampled(search, rng)
+        wider = _wider(search, kept)
     log_times, own = search.table.parts(kept)
     scales = search.problem.scales
     units = scales.amplitude[search.axis] / scales.excursion[list(search.drives)]
@@ -140,10 +153,10 @@ def _near(table: LagTable, fits: Sequence[LagFit], delays: Matrix) -> Matrix:
     return np.stack([low, np.minimum(places.max(axis=0) + reach, delays[:, 1])], axis=1)
 
 
-def _wider(search: LagSearch, chain: Array) -> Matrix:
+def _wider(search: LagSearch, draws: Matrix) -> Matrix:
     """The ends of the tabulated delays, farther out where draws stand beside them."""
     near, delays, paths = search.near, search.delays, len(search.drives)
-    own, width = chain[..., -paths:].reshape(-1, paths), near[:, 1] - near[:, 0]
+    own, width = draws[:, -paths:], near[:, 1] - near[:, 0]
     edge = width / (_FINE - 1)
     below = (own < near[:, 0] + edge).mean(axis=0) > _AT_END
     above = (own > near[:, 1] - edge).mean(axis=0) > _AT_END
@@ -151,14 +164,49 @@ def _wider(search: LagSearch, chain: Array) -> Matrix:
     return np.stack([low, np.where(above, np.minimum(near[:, 1] + width, delays[:, 1]), near[:, 1])], axis=1)
 
 
-def _sampled(search: LagSearch, rng: np.random.Generator) -> tuple[Array, float]:
-    """Coordinates of draws, (walkers, draws, dimension), and their effective number."""
-    table = search.table
-    position = _begun(search, rng)
+def _sampled(search: LagSearch, rng: np.random.Generator) -> tuple[Matrix, float]:
+    """Coordinates of equally probable draws, (draws, dimension), and their effective number."""
+    begun = _begun(search, rng)
+    weighted = _weighted(search.table, begun, rng) if search.table.paths == 1 else None
+    return weighted or _walked(search.table, begun, rng)
+
+
+def _weighted(table: LagTable, proposal: Mixture, rng: np.random.Generator) -> tuple[Matrix, float] | None:
+    """By importance sampling, which a first proposal begins; None where it does not hold."""
+    seen = _joined(Seen(), table, proposal, rng)
+    for power in _POWERS:
+        density, log_weights = np.concatenate(seen.log_densities), seen.log_weights()
+        known = np.isfinite(density)
+        log_weights[known] -= (1 - power) * density[known]
+        proposal = adapted(np.concatenate(seen.points), log_weights, int(rng.integers(2**31)))
+        seen = _joined(seen, table, proposal, rng)
+    log_weights = seen.log_weights()
+    smooth, k = tail_smoothed(log_weights)
+    ess = _DRAWN * seen.efficiency(proposal, log_weights)  # of the last alone, by what all have met
+    if ess < _WANTED or k > usable_k(log_weights.size):
+        return None
+    return np.concatenate(seen.points)[resampled(smooth, _KEPT, rng)], 1 / (1 / ess + 1 / _KEPT)
+
+
+def _joined(seen: Seen, table: LagTable, proposal: Mixture, rng: np.random.Generator) -> Seen:
+    """With draws of a proposal. Lags have no names: those whose times do not increase have no density."""
+    y = proposal.draw(_DRAWN, rng)
+    ordered = (np.diff(table.parts(y)[0], axis=2) >= 0).all(axis=(1, 2))
+    density = np.full(len(y), -np.inf)
+    density[ordered] = table.log_density(y[ordered])
+    return seen.joined(proposal, len(y), y, density)
+
+
+def _walked(table: LagTable, begun: Mixture, rng: np.random.Generator) -> tuple[Matrix, float]:
+    """By emcee."""
+    low, high = table.ends((begun.dimension - table.paths) // table.paths)
+    position = begun.draw(max(_WALKERS, 4 * low.size), rng)
+    inside = (position > low) & (position < high)
+    position = np.where(inside, position, rng.uniform(low, high, position.shape))
     moves = [(emcee.moves.DEMove(), 0.8), (emcee.moves.StretchMove(), 0.2)]
     sampler = emcee.EnsembleSampler(*position.shape, table.log_density, vectorize=True, moves=moves)
     state = emcee.State(position, random_state=np.random.RandomState(rng.integers(2**32)).get_state())
-    state = sampler.run_mcmc(state, _STEPS, skip_initial_state_check=True)
+    state = sampler.run_mcmc(state, 2 * _STEPS, skip_initial_state_check=True)
     sampler.reset()
     for _ in range(_ROUNDS):
         state = sampler.run_mcmc(state, _STEPS)
@@ -166,7 +214,8 @@ def _sampled(search: LagSearch, rng: np.random.Generator) -> tuple[Array, float]
         ess = _ess(table, chain)
         if ess >= _WANTED:
             break
-    return chain, ess
+    kept = chain.reshape(-1, low.size)
+    return kept[rng.choice(len(kept), min(_KEPT, len(kept)), replace=False)], ess
 
 
 def _ess(table: LagTable, chain: Array) -> float:
@@ -180,23 +229,31 @@ def _ess(table: LagTable, chain: Array) -> float:
     return float(min(stats.ess(values[..., k], chain_axis=0, draw_axis=1) for k in range(values.shape[2])))
 
 
-def _begun(search: LagSearch, rng: np.random.Generator) -> Matrix:
-    """Walkers, (walkers, dimension): half near the optimum of so many lags, half with one lag anywhere."""
+def _begun(search: LagSearch, rng: np.random.Generator) -> Mixture:
+    """Components near the optimum of so many lags, and near the best with a spare lag anywhere."""
     table, best, lags = search.table, search.best, search.lags
-    richer = search.fits[lags - 1]
     low, high = table.ends(lags)
-    count = max(_WALKERS, 4 * low.size)
-    root = root_of(richer.covariance)
-    near = richer.coordinates + 0.3 * rng.standard_normal((count, low.size)) @ root.T
-    log_times, delays = table.parts(np.repeat(best.coordinates[None], count, axis=0))
+    widest = _LOOSE * (high - low)
+    centres, covariances = [search.fits[lags - 1].coordinates], [search.fits[lags - 1].covariance]
     if lags > best.lags:
-        anywhere = rng.uniform(table.log_times[0], table.log_times[-1], (count, table.paths, 1))
-        log_times = np.concatenate([log_times, anywhere], axis=2)
-    other = np.concatenate([log_times.reshape(count, -1), delays], axis=1)
-    other += 1e-3 * rng.standard_normal(other.shape) * (high - low)
-    mixed = np.where(rng.random((count, 1)) < 0.5, near, other)
-    inside = (mixed > low) & (mixed < high)
-    return np.where(inside, mixed, rng.uniform(low, high, mixed.shape))
+        spare = np.arange(table.paths) * lags + best.lags
+        own = np.setdiff1d(np.arange(low.size), spare)
+        for _ in range(_SPARE):
+            centre, covariance = np.empty(low.size), np.diag(widest**2)
+            centre[own], centre[spare] = best.coordinates, rng.uniform(low[spare], high[spare])
+            covariance[np.ix_(own, own)] = best.covariance
+            centres.append(centre)
+            covariances.append(covariance)
+    means, factors = [], []
+    for centre, covariance in zip(centres, covariances, strict=True):
+        log_times, delays = table.parts(np.arange(float(low.size))[None])
+        ranks = np.argsort(table.parts(centre[None])[0], axis=2)
+        order = np.append(np.take_along_axis(log_times, ranks, axis=2).ravel(), delays).astype(int)
+        shrunk = np.minimum(1.0, widest / np.maximum(np.sqrt(np.diag(covariance)), 1e-300))
+        covariance = covariance * np.outer(shrunk, shrunk) + np.diag((1e-2 * widest) ** 2)
+        means.append(centre[order])
+        factors.append(np.linalg.cholesky(covariance[np.ix_(order, order)]))
+    return Mixture(np.full(len(means), 1 / len(means)), np.array(means), np.array(factors))
 
 
 def _nodes(ends: Matrix, count: int) -> Matrix:

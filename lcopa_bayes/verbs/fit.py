@@ -31,6 +31,7 @@ def fit(
     cross_check: bool = False,
     rival: bool = False,
     compact: bool = False,
+    page: bool = False,
     quiet: bool = True,
 ) -> Fit:
     """Sample the posterior of a study and derive what it predicts.
@@ -39,14 +40,15 @@ def fit(
     a run folder in which draws are kept while they are made, so that `resume` goes on from them, and the
     result afterwards; `quick`, a quarter of the steps; `cross_check`, sample by nested sampling too; `rival`,
     fit the study with integer orders too and compare what both predict of the held-out records; `compact`,
-    keep what has one number for each sample for fewer draws in the folder; `quiet`, no progress bar, and no
-    first look (`look`) in the folder meanwhile.
+    keep what has one number for each sample for fewer draws in the folder; `page`, draw the page there too,
+    at the same time as the rest is written; `quiet`, no progress bar, and no first look (`look`) in the
+    folder meanwhile.
 
     The same study gives the same draws. InputError when the study cannot be used, or the folder cannot be
     written to, holds another study's results, or is being written by another run; then nothing is written.
     """
     wanted = study_of(study)
-    structure = structure_of(wanted, jobs=jobs)
+    structure = structure_of(wanted, jobs=jobs, quiet=quiet)
     wanted = structure.chosen.study if structure else wanted
     searched = (structure.chosen.problem, structure.chosen.optima) if structure else None
     with opened(folder, provenance(wanted, "fit")) as place:
@@ -55,7 +57,7 @@ def fit(
             seen = structure.look if structure else first_look(wanted)
             searched = seen.problem, seen.optima
             look_result(seen).save(place)
-            drawn = meanwhile(write_page, ("look", place, 1), _announced, jobs=jobs)
+            drawn = meanwhile(write_page, ("look", place, None), _announced, jobs=jobs)
         with drawn:
             fitted = sampled(
                 wanted,
@@ -72,7 +74,7 @@ def fit(
         if structure:
             fitted = with_alternatives(replace(fitted, structure=structure))
         if place is not None:
-            fitted.save(place, compact=compact)
+            fitted.save(place, compact=compact, jobs=jobs, page=page)
     return fitted
 
 

@@ -86,7 +86,7 @@ def test_the_cost_of_a_search_is_the_square_of_the_likelihood() -> None:
     at = np.array([np.log(0.5), np.log(2.0), 0.5])
     conditional = table.conditional(at[None])
     square = conditional.square - float(conditional.bent[0] @ conditional.bent[0])
-    assert float(np.sum(table.residual(at) ** 2)) + table.remainder == pytest.approx(square, rel=1e-9)
+    assert float(np.sum(table.residuals(at[None]) ** 2)) + table.remainder == pytest.approx(square, rel=1e-9)
 
 
 def test_least_squares_gives_back_what_made_the_records() -> None:

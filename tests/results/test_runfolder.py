@@ -23,6 +23,7 @@ from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.files import save_json, save_table
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.plot.rundata import load_run
+from lcopa_bayes.report import write_report
 from lcopa_bayes.results import datatree
 from lcopa_bayes.results.datatree import save_tree, variable_names
 from lcopa_bayes.results.fit import Fit, fit
@@ -44,6 +45,17 @@ def folder(fitted, tmp_path_factory):
     path = tmp_path_factory.mktemp("run")
     fitted.save(path)
     return path
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_page_drawn_while_the_rest_is_written_is_that_of_the_folder(fitted, tmp_path, jobs):
+    fitted.save(tmp_path, jobs=jobs, page=True)
+    page = tmp_path / "report.html"
+    before = page.read_bytes()
+    assert b'href="posterior.nc"' in before
+    assert len(list((tmp_path / "figures").iterdir())) >= 5
+    page.unlink()
+    assert write_report(tmp_path).read_bytes() == before
 
 
 def test_the_folder_holds_what_was_promised(fitted, folder):

@@ -36,6 +36,17 @@ def steps(device: Device, noise_sd: float = 0.01) -> Study:
     return study(on, half, terms="auto")
 
 
+def test_what_is_looked_at_is_said_unless_quiet(capsys: pytest.CaptureFixture[str]) -> None:
+    study = replace(steps(ONE), priors={"order_1": 1.0})
+    found = structure_of(study, quiet=False)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0].startswith("choosing how many terms, by least squares: 0 structures")
+    assert found is not None
+    assert f": {len(found.looked)} structures" in lines[-1]
+    structure_of(study)
+    assert capsys.readouterr().err == ""
+
+
 @pytest.mark.parametrize(("device", "terms"), [(ONE, 1), (LAGS, 2)])
 def test_the_terms_that_made_the_records_are_chosen(device: Device, terms: int) -> None:
     chosen = settled(steps(device))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from inference.test_lagsum import DELAY, GAINS, SD, lags, made
 
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.inference.lagsum import lag_problem
-from lcopa_bayes.sampling.lagdraws import LagDraws, LagSearch, _sampled, lag_draws
+from lcopa_bayes.sampling.lagdraws import LagDraws, LagSearch, _begun, _walked, _weighted, lag_draws
 
 ENDS = np.array([[0.0, 1.0]])
 
@@ -21,12 +23,15 @@ def searched(seed: int = 0, ends: Matrix = ENDS) -> LagSearch:
     return LagSearch.over(lag_problem(made(seed)), 0, [0], np.array([SD]), ends)
 
 
-def test_draws_agree_with_quadrature() -> None:
+@pytest.mark.parametrize("sampled", [_weighted, _walked])
+def test_draws_agree_with_quadrature(sampled: Callable[..., tuple[Matrix, float]]) -> None:
     """Of one lag and a spare one: three coordinates on a grid."""
     search = LagSearch(lag_problem(made()), 0, (0,), np.array([20 * SD]), ENDS, np.array([[0.1, 0.9]]))
     table = search.table
     assert search.best.lags == 1
-    chain, ess = _sampled(search, np.random.default_rng(1))
+    rng = np.random.default_rng(1)
+    draws, ess = sampled(table, _begun(search, rng), rng)
+    assert ess >= 160
     low, high = table.ends(2)
     axes = [np.linspace(low[k], high[k], 41)[:-1] + (high[k] - low[k]) / 80 for k in range(3)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -37,7 +42,7 @@ def test_draws_agree_with_quadrature() -> None:
         values = of(grid)
         mean = float(weight @ values)
         sd = float(np.sqrt(weight @ (values - mean) ** 2))
-        own = of(chain.reshape(-1, 3))
+        own = of(draws)
         assert own.mean() == pytest.approx(mean, abs=4 * sd / np.sqrt(ess))
         assert own.std() == pytest.approx(sd, rel=0.25)
 

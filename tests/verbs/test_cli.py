@@ -97,7 +97,7 @@ def test_a_bad_study_is_told_and_nothing_is_written(record, tmp_path, capsys, mo
     code, printed, told = run(capsys, "fit", study(record, more), "--out", out)
     assert code == 2
     assert printed == ""
-    assert told.startswith("error: ")
+    assert told.startswith("fit: loading\nerror: ")
     assert all(word in told for word in words)
     assert not out.exists()
 
