@@ -100,9 +100,10 @@ def _details(command: Sequence[str]) -> str:
 
 
 def _outcome(options: argparse.Namespace, command: Sequence[str]) -> Outcome:
+    from lcopa_bayes.core.files import trusting
     from lcopa_bayes.results.runfolder import commanded
 
-    with commanded(command):
+    with commanded(command), trusting(options.trust):
         return VERBS[options.verb](options)
 
 
@@ -131,6 +132,8 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
         parser.verbs = {**parser.verbs, name: own}
         own.add_argument("--quiet", action="store_true", help="no progress, no closing words")
         own.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+        trusted = "let studies run effects of their own and read files outside their folder"
+        own.add_argument("--trust", action="store_true", help=trusted)
         for option, how in usage.options:
             own.add_argument(option, **how)
     return parser

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import final
 
 
 class InputError(ValueError):
@@ -16,6 +17,11 @@ class InputError(ValueError):
     def __init__(self, problems: str | Sequence[str]) -> None:
         self.problems: tuple[str, ...] = (problems,) if isinstance(problems, str) else tuple(problems)
         super().__init__("\n".join(self.problems))
+
+
+@final
+class UntrustedError(InputError):
+    """Input that would run code of its author's."""
 
 
 def refuse_if(problems: Sequence[str]) -> None:

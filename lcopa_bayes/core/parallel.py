@@ -99,17 +99,8 @@ def workers(shared: S, *, jobs: int = 1, dask: str | None = None) -> Iterator[Wo
         with threadpool_limits(1):
             yield Workers(lambda task, one: _Later(task, shared, one), iter)
     else:
-        pool = _pool(jobs, shared)
-        try:
-            with threadpool_limits(1):  # threads of this process would take the cores of the workers
-                yield Workers(lambda task, one: pool.submit(_perform, task, one), as_completed)
-        except BrokenProcessPool:
-            raise InputError(
-                f"a worker process ended, perhaps for want of memory, or because it was given what the main "
-                f"script itself defines, which belongs in a module; {_ADVICE}"
-            ) from None
-        finally:
-            pool.shutdown(cancel_futures=True)
+        with _pool(jobs, shared) as pool, threadpool_limits(1):  # threads here would take the workers' cores
+            yield Workers(lambda task, one: pool.submit(_perform, task, one), as_completed)
 
 
 @contextmanager
@@ -129,11 +120,21 @@ def meanwhile(
         future.result()
 
 
-def _pool(jobs: int, shared: object) -> ProcessPoolExecutor:
-    """Processes of one thread each that share a value."""
+@contextmanager
+def _pool(jobs: int, shared: object) -> Iterator[ProcessPoolExecutor]:
+    """Processes of one thread each that share a value; InputError when one is lost."""
     package = __name__.partition(".")[0]
     imported_ahead(*(name for name in sys.modules if name.startswith(f"{package}.")))
-    return ProcessPoolExecutor(jobs, mp_context=_CONTEXT, initializer=_take_up, initargs=(shared,))
+    pool = ProcessPoolExecutor(jobs, mp_context=_CONTEXT, initializer=_take_up, initargs=(shared,))
+    try:
+        yield pool
+    except BrokenProcessPool:
+        raise InputError(
+            f"a worker process ended, perhaps for want of memory, or because it was given what the main "
+            f"script itself defines, which belongs in a module; {_ADVICE}"
+        ) from None
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def keep_freed_memory() -> None:

@@ -12,7 +12,7 @@ from typing import final
 import pandas as pd
 
 from lcopa_bayes.core.estimate import attributes, plain
-from lcopa_bayes.core.files import writable_folder
+from lcopa_bayes.core.files import csv_of, writable_folder
 from lcopa_bayes.paper.auditclaims import load_audit
 from lcopa_bayes.paper.claims import CLAIMS, judge
 from lcopa_bayes.paper.comparisonclaims import load_comparison
@@ -117,7 +117,7 @@ def identify(
     for number, (entry, samples) in enumerate(panels(wanted, models), start=1):
         stem = re.sub(r"[^A-Za-z0-9_-]+", "_", f"identify_{number:02d}_{entry['record']}_{entry['axis']}")
         shown.append(entry | {"samples": f"tables/{stem}.csv"})
-        texts[f"tables/{stem}.csv"] = str(samples.to_csv(index=False, float_format="%.9g"))
+        texts[f"tables/{stem}.csv"] = csv_of(samples, float_format="%.9g")
     table = step_table(wanted, models, posterior=beside)
     values = results(wanted, models, plan) | {"step_metrics": table, "records": shown}
     return IdentifyResult(values, provenance(wanted, "identify"), texts).kept(folder)
