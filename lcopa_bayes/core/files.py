@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import re
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lcopa_bayes.core.errors import InputError, UntrustedError, nearest
+from lcopa_bayes.core.errors import ELSEWHERE, REMEDIES, InputError, UntrustedError, nearest
 from lcopa_bayes.core.estimate import plain
 
 if TYPE_CHECKING:
@@ -27,18 +26,9 @@ UNFINISHED = ".part-"
 """How names of files begin that are being written."""
 _FORMULA = re.compile(r"'*(?:[=@\t\r]|[+-](?![\d.eE+-]*\Z))")
 """How a text begins that a spreadsheet takes for a formula, or that `csv_of` made of one."""
-_ELSEWHERE = "or choose another folder with --out"
-_REMEDIES = {
-    errno.ENOSPC: "free some space and give the same command again",
-    errno.EDQUOT: "free some of your quota and give the same command again",
-    errno.EFBIG: f"raise the limit on the size of files (ulimit -f) {_ELSEWHERE}",
-    errno.EACCES: f"allow writing there {_ELSEWHERE}",
-    errno.EPERM: f"allow writing there {_ELSEWHERE}",
-    errno.EROFS: f"allow writing there {_ELSEWHERE}",
-}
 _TRUSTED: ContextVar[bool] = ContextVar("_TRUSTED", default=False)
 _TRUST = "if you trust its author, allow this with --trust, from Python with `load_study(..., trust=True)`"
-_REMEDY = f"make it writable {_ELSEWHERE}"
+_REMEDY = f"make it writable {ELSEWHERE}"
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
@@ -100,7 +90,7 @@ def writing(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         reason = os.strerror(error.errno) if error.errno else str(error) or type(error).__name__
-        remedy = _REMEDIES.get(error.errno or 0, _REMEDY)
+        remedy = REMEDIES.get(error.errno or 0, _REMEDY)
         raise InputError(f"{path}: cannot be written ({reason}); {remedy}") from error
 
 

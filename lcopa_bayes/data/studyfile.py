@@ -47,7 +47,10 @@ def _read(
 
 
 def _hashes(paths: Iterable[Path]) -> dict[str, str]:
-    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
+    try:
+        return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
+    except OSError as error:  # it has vanished since
+        raise InputError(f"{error.filename}: cannot be read ({error.strerror})") from None
 
 
 def _population(priors: Mapping[str, Any], folder: Path, time_unit: str) -> tuple[Path, dict[str, Any]]:
