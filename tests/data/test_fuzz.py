@@ -351,6 +351,16 @@ def test_run_folders(run, tmp_path, name):
     read()
 
 
+@pytest.mark.parametrize("refinement", [0, 17, 10**7, 1.5, True, "2"])
+def test_a_fit_on_blocks_without_bound_is_refused(run, tmp_path, refinement):
+    """Ten million times narrower ones would take all memory there is."""
+    shutil.copytree(run, tmp_path, dirs_exist_ok=True)
+    values = json.loads((run / "fit.json").read_text()) | {"refinement": refinement}
+    (tmp_path / "fit.json").write_text(json.dumps(values))
+    with pytest.raises(InputError, match=r"does not hold a fit \(ValueError: refinement"):
+        load_result(tmp_path)
+
+
 @many(0.01)
 @given(data=st.data())
 def test_values_of_a_fit(run, place, data):

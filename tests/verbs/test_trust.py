@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
 import pytest
+from markupsafe import escape
 from small import check_page, record, study
 
 import lcopa_bayes as lb
@@ -162,10 +164,12 @@ def evil() -> Record:
 
 
 def test_names_are_text_on_pages_and_no_formulas_in_tables(tmp_path):
-    made = lb.fit(study(evil(), sampler=TINY, priors={"delay": 0.73, "order_1": 0.8}), folder=tmp_path)
+    task = study(evil(), sampler=TINY, priors={"delay": 0.73, "order_1": 0.8})
+    made = lb.fit(replace(task, name="<script>alert(1)<b>"), folder=tmp_path)
     page = check_page(made.report(tmp_path))
     allowed = re.sub(r"<script( type=\"application/json\")?>.*?</script>", "", page, flags=re.DOTALL)
     assert "<script" not in allowed
+    assert "<script>alert" not in page
     assert "<svg onload" not in page
     assert "<b>V" not in page
     for drawing in (tmp_path / "figures").glob("*.svg"):
@@ -176,10 +180,12 @@ def test_names_are_text_on_pages_and_no_formulas_in_tables(tmp_path):
     for name, each in cells.items():
         for cell in each:
             assert not re.match(r"[=@\t\r]|[+-](?![\d.e+-]*$|inf)", cell), (name, cell)
+    assert str(escape(f"={EVIL}")) in page
+    assert str(escape(f"'={EVIL}")) not in page  # names are read back as they were
     read = lb.load_result(tmp_path)
     assert read.study.fit[0].name == f"={EVIL}"
     shutil.rmtree(tmp_path / "figures")
-    assert read.report(tmp_path).read_text() == page  # names are read back as they were
+    assert read.report(tmp_path).read_text() == page
 
 
 def test_nothing_of_the_package_is_read_or_written_by_pickle():
