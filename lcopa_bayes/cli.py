@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import lcopa_bayes
 
 # verbs are imported when they run, so that help and refusals come at once
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.errors import InputError, refusal_of
 from lcopa_bayes.verbs.commandline import PROGRAM, RUNS, USAGES, CommandParser, Version, refused
 
 if TYPE_CHECKING:
@@ -69,11 +69,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     gc.set_threshold(*_COLLECTED)
     try:
         values, text = _outcome(options, [PROGRAM, *given])
-        if options.json:
-            print(json.dumps(values, allow_nan=False))
-        elif not options.quiet:
-            print(text)
-        sys.stdout.flush()
+        if options.json or not options.quiet:
+            _print(json.dumps(values, allow_nan=False) if options.json else text)
     except InputError as error:
         return refused(error.problems, as_json=options.json)
     except FloatingPointError as error:  # a prior that reaches where the model cannot be computed
@@ -86,21 +83,36 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"interrupted{resume}", file=sys.stderr)
         return INTERRUPTED
     except Exception as error:
-        said = f"unforeseen {type(error).__name__}: {error}; {_details([PROGRAM, *given])}"
-        refused([said], as_json=options.json)
+        said = refusal_of(error) or f"unforeseen {type(error).__name__}: {error}"
+        refused([f"{said}; {_details([PROGRAM, *given])}"], as_json=options.json)
         return FAILED
     return 0
+
+
+def _print(text: str) -> None:
+    """Print at once; InputError where there is no room for it."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is printed at the end
+        raise InputError(f"the output cannot be written ({error.strerror})") from None
 
 
 def _details(command: Sequence[str]) -> str:
     """Where the command, the versions and the trace of the exception at hand are written, in words."""
     from importlib.metadata import version
 
-    handle, path = tempfile.mkstemp(prefix=f"{PROGRAM}-", suffix=".txt")
-    with os.fdopen(handle, "w", encoding="utf-8") as file:
-        file.write(f"{' '.join(command)}\n{sys.version}\n{PROGRAM} {version(PROGRAM)}\n\n")
-        traceback.print_exc(file=file)
-    return f"details are in {path}, and what was finished before is kept"
+    kept = "what was finished before is kept"
+    try:
+        handle, path = tempfile.mkstemp(prefix=f"{PROGRAM}-", suffix=".txt")
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(f"{' '.join(command)}\n{sys.version}\n{PROGRAM} {version(PROGRAM)}\n\n")
+            traceback.print_exc(file=file)
+    except OSError:
+        return kept
+    return f"details are in {path}, and {kept}"
 
 
 def _outcome(options: argparse.Namespace, command: Sequence[str]) -> Outcome:
@@ -112,9 +124,10 @@ def _outcome(options: argparse.Namespace, command: Sequence[str]) -> Outcome:
         if _jobs(options) > 1:
             module = _MODULES.get(options.verb, options.verb)
             imported_ahead(f"lcopa_bayes.verbs.{module}", "lcopa_bayes.report.pages")
+    from lcopa_bayes.core.files import trusting
     from lcopa_bayes.results.runfolder import commanded
 
-    with commanded(command):
+    with commanded(command), trusting(options.trust):
         return VERBS[options.verb](options)
 
 
@@ -143,6 +156,8 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
         parser.verbs = {**parser.verbs, name: own}
         own.add_argument("--quiet", action="store_true", help="no progress, no closing words")
         own.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
+        trusted = "let studies run effects of their own and read files outside their folder"
+        own.add_argument("--trust", action="store_true", help=trusted)
         for option, how in usage.options:
             own.add_argument(option, **how)
     return parser

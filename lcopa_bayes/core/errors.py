@@ -3,8 +3,22 @@
 from __future__ import annotations
 
 import difflib
+import errno
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import final
+
+ELSEWHERE = "or choose another folder with --out"
+REMEDIES = {
+    errno.ENOSPC: "free some space and give the same command again",
+    errno.EDQUOT: "free some of your quota and give the same command again",
+    errno.EFBIG: f"raise the limit on the size of files (ulimit -f) {ELSEWHERE}",
+    errno.EACCES: f"allow writing there {ELSEWHERE}",
+    errno.EPERM: f"allow writing there {ELSEWHERE}",
+    errno.EROFS: f"allow writing there {ELSEWHERE}",
+}
+"""What to do about what the system refuses, by its error number."""
 
 
 class InputError(ValueError):
@@ -16,6 +30,19 @@ class InputError(ValueError):
     def __init__(self, problems: str | Sequence[str]) -> None:
         self.problems: tuple[str, ...] = (problems,) if isinstance(problems, str) else tuple(problems)
         super().__init__("\n".join(self.problems))
+
+
+@final
+class UntrustedError(InputError):
+    """Input that would run code of its author's."""
+
+
+def refusal_of(error: BaseException) -> str | None:
+    """What the system refused, where and why, with a remedy if one is known; None for another error."""
+    if not (isinstance(error, OSError) and error.errno in REMEDIES):
+        return None
+    where = f"{error.filename}: " if error.filename else ""
+    return f"{where}{os.strerror(error.errno)}; {REMEDIES[error.errno]}"
 
 
 def refuse_if(problems: Sequence[str]) -> None:

@@ -2,32 +2,33 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
+import re
+import shutil
 import tempfile
 import tomllib
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lcopa_bayes.core.errors import InputError, nearest
+import numpy as np
+
+from lcopa_bayes.core.errors import ELSEWHERE, REMEDIES, InputError, UntrustedError, nearest
 from lcopa_bayes.core.estimate import plain
 
 if TYPE_CHECKING:
     import pandas as pd
 
-_ELSEWHERE = "or choose another folder with --out"
-_REMEDIES = {
-    errno.ENOSPC: "free some space and give the same command again",
-    errno.EDQUOT: "free some of your quota and give the same command again",
-    errno.EFBIG: f"raise the limit on the size of files (ulimit -f) {_ELSEWHERE}",
-    errno.EACCES: f"allow writing there {_ELSEWHERE}",
-    errno.EPERM: f"allow writing there {_ELSEWHERE}",
-    errno.EROFS: f"allow writing there {_ELSEWHERE}",
-}
-_REMEDY = f"make it writable {_ELSEWHERE}"
+UNFINISHED = ".part-"
+"""How names of files begin that are being written."""
+_FORMULA = re.compile(r"'*(?:[=@\t\r]|[+-](?![\d.eE+-]*\Z))")
+"""How a text begins that a spreadsheet takes for a formula, or that `csv_of` made of one."""
+_TRUSTED: ContextVar[bool] = ContextVar("_TRUSTED", default=False)
+_TRUST = "if you trust its author, allow this with --trust, from Python with `load_study(..., trust=True)`"
+_REMEDY = f"make it writable {ELSEWHERE}"
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
@@ -37,7 +38,9 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     file too large); what else `write` raises passes through. No temporary file is left either way.
     """
     with writing(path):
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
+        handle, name = tempfile.mkstemp(
+            dir=path.parent, prefix=f"{UNFINISHED}{path.stem}-", suffix=path.suffix
+        )
         os.close(handle)
         beside = Path(name)
         try:
@@ -56,8 +59,23 @@ def write_text(path: Path, text: str) -> None:
 
 
 def save_table(table: pd.DataFrame, path: Path) -> None:
-    """Write a table as CSV."""
-    write_whole(path, lambda beside: table.to_csv(beside, index=False))
+    """Write a table as CSV; see `csv_of`."""
+    write_text(path, csv_of(table))
+
+
+def csv_of(table: pd.DataFrame, **how: Any) -> str:
+    """A table as CSV, which a spreadsheet takes for no formula whatever records and axes are called."""
+    safe = table.copy(deep=False)
+    for name in table.select_dtypes(exclude=["number", "bool"]):
+        taken = [isinstance(cell, str) and _FORMULA.match(cell) is not None for cell in table[name]]
+        if any(taken):
+            safe[name] = table[name].mask(np.array(taken), "'" + table[name].astype(str))
+    return str(safe.to_csv(index=False, **how))
+
+
+def as_named(cell: str) -> str:
+    """A text of `csv_of` as it was."""
+    return cell[1:] if cell[:1] == "'" and _FORMULA.match(cell) else cell
 
 
 def save_json(values: Mapping[str, Any], path: Path) -> None:
@@ -72,7 +90,7 @@ def writing(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         reason = os.strerror(error.errno) if error.errno else str(error) or type(error).__name__
-        remedy = _REMEDIES.get(error.errno or 0, _REMEDY)
+        remedy = REMEDIES.get(error.errno or 0, _REMEDY)
         raise InputError(f"{path}: cannot be written ({reason}); {remedy}") from error
 
 
@@ -80,7 +98,7 @@ def writable_folder(path: Path) -> Path:
     """`path` as a folder that can be written to, made if need be; InputError otherwise."""
     try:
         path.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path):
+        with tempfile.NamedTemporaryFile(dir=path, prefix=UNFINISHED):
             pass
     except OSError as error:
         raise InputError(
@@ -90,13 +108,47 @@ def writable_folder(path: Path) -> Path:
     return path
 
 
+@contextmanager
+def trusting(trust: bool) -> Iterator[None]:
+    """Within it, where `trust` is true, studies may name files outside their folder and code to run."""
+    before = _TRUSTED.set(trust or _TRUSTED.get())
+    try:
+        yield
+    finally:
+        _TRUSTED.reset(before)
+
+
+def outside(folder: Path, names: Iterable[str]) -> list[str]:
+    """What is wrong with files that the study in a folder names: absolute paths and those that lead out of
+    it, by links too; nothing where the study is trusted."""
+    home = os.path.realpath(folder)
+    return [
+        f"{name!r} is not inside the folder of the study; copy the file there, or {_TRUST}"
+        for name in ({}.fromkeys(names) if not _TRUSTED.get() else ())
+        if "\0" not in name
+        and (Path(name).is_absolute() or not Path(os.path.realpath(folder / name)).is_relative_to(home))
+    ]
+
+
+def refuse_code(where: str, names: Collection[str]) -> None:
+    """UntrustedError where a study that is not trusted names classes of its own."""
+    if names and not _TRUSTED.get():
+        raise UntrustedError(f"{where}: would run code, {', '.join(names)}; read it, and {_TRUST}")
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Remove what a killed process was about to write within a folder."""
+    for one in [*folder.rglob(f"{UNFINISHED}*")]:
+        shutil.rmtree(one) if one.is_dir() else one.unlink(missing_ok=True)
+
+
 def read_json(path: Path, remedy: str) -> dict[str, Any]:
     """The JSON object in a file; InputError with the `remedy` when it cannot be read."""
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(values, dict):
             raise ValueError("no JSON object")
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: cannot be read ({error}); {remedy}") from None
     return values
 
@@ -109,11 +161,11 @@ def read_tables(path: Path, known: Collection[str]) -> tuple[dict[str, Any], lis
     try:
         text = path.read_text(encoding="utf-8-sig")
         tables = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as UTF-8 text ({error})") from error
+    except (ValueError, RecursionError) as error:  # of a number of thousands of digits and deep brackets too
         end = f"at line {text.count(chr(10)) + 1}, the end of the file"
         why = str(error).replace("at end of document", end)
         raise InputError(f"{path}: is not valid TOML: {why}") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as UTF-8 text ({error})") from error
     wrong = [f"{path}: unknown table [{key}]{nearest(key, known)}" for key in tables if key not in known]
     return tables, wrong

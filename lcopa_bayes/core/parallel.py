@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import ctypes
 import os
+import platform
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import CancelledError, ProcessPoolExecutor, as_completed
+from concurrent.futures import CancelledError, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
+from importlib.metadata import version
 from multiprocessing import forkserver, parent_process
 from multiprocessing.context import BaseContext, SpawnContext, SpawnProcess
 from threading import Thread
@@ -34,6 +36,7 @@ _MMAP_THRESHOLD, _TRIM_THRESHOLD = (-3, 32 << 20), (-1, 256 << 20)
 come from the heap, and up to 256 MB at its end are kept when they are freed [byte]."""
 CONNECT = 5.0
 """Time a Dask scheduler has to answer [s]."""
+_ALIKE = "install the same versions on every worker"
 _ADVICE = "what was finished is stored; go on with --resume"
 
 
@@ -99,17 +102,8 @@ def workers(shared: S, *, jobs: int = 1, dask: str | None = None) -> Iterator[Wo
         with threadpool_limits(1):
             yield Workers(lambda task, one: _Later(task, shared, one), iter)
     else:
-        pool = _pool(jobs, shared)
-        try:
-            with threadpool_limits(1):  # threads of this process would take the cores of the workers
-                yield Workers(lambda task, one: pool.submit(_perform, task, one), as_completed)
-        except BrokenProcessPool:
-            raise InputError(
-                f"a worker process ended, perhaps for want of memory, or because it was given what the main "
-                f"script itself defines, which belongs in a module; {_ADVICE}"
-            ) from None
-        finally:
-            pool.shutdown(cancel_futures=True)
+        with _pool(jobs, shared) as pool, threadpool_limits(1):  # threads here would take the workers' cores
+            yield Workers(lambda task, one: pool.submit(_perform, task, one), as_completed)
 
 
 @contextmanager
@@ -129,11 +123,21 @@ def meanwhile(
         future.result()
 
 
-def _pool(jobs: int, shared: object) -> ProcessPoolExecutor:
-    """Processes of one thread each that share a value."""
+@contextmanager
+def _pool(jobs: int, shared: object) -> Iterator[ProcessPoolExecutor]:
+    """Processes of one thread each that share a value; InputError when one is lost."""
     package = __name__.partition(".")[0]
     imported_ahead(*(name for name in sys.modules if name.startswith(f"{package}.")))
-    return ProcessPoolExecutor(jobs, mp_context=_CONTEXT, initializer=_take_up, initargs=(shared,))
+    pool = ProcessPoolExecutor(jobs, mp_context=_CONTEXT, initializer=_take_up, initargs=(shared,))
+    try:
+        yield pool
+    except BrokenProcessPool:
+        raise InputError(
+            f"a worker process ended, perhaps for want of memory, or because it was given what the main "
+            f"script itself defines, which belongs in a module; {_ADVICE}"
+        ) from None
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def keep_freed_memory() -> None:
@@ -164,14 +168,17 @@ def _cluster(shared: S, address: str) -> Iterator[Workers[S]]:
     except ImportError:
         raise InputError("--dask needs the package distributed: pip install 'lcopa-bayes[dask]'") from None
     try:
+        with ThreadPoolExecutor(1) as beside:  # a notebook has a loop of its own here
+            beside.submit(_ask, distributed, address).result()
         client = distributed.Client(address, timeout=CONNECT, set_as_default=False)
-    except (OSError, ValueError) as error:
+    except Exception as error:  # whatever another service than a scheduler answers leads to
         raise InputError(
-            f"--dask {address}: no Dask scheduler answers there ({error}); "
+            f"--dask {address}: no Dask scheduler answers there ({str(error) or 'it says nothing'}); "
             "start one with `dask scheduler`, and give the address it prints, such as tcp://host:8786"
         ) from None
     try:
         with client:
+            _refuse_unlike(client, address)
             # sent once; a worker that needs it takes it from another
             held = client.submit(_same, shared, pure=False)
             yield Workers(
@@ -180,6 +187,47 @@ def _cluster(shared: S, address: str) -> Iterator[Workers[S]]:
             )
     except distributed.client.FutureCancelledError as error:
         raise InputError(f"--dask {address}: the scheduler was lost ({error}); {_ADVICE}") from None
+
+
+def _ask(distributed: Any, address: str) -> None:
+    """Wait for the answer of a scheduler, for which a client would wait without end."""
+    import asyncio  # loaded where a cluster is used
+
+    async def identity() -> None:
+        keys = distributed.Security().get_connection_args("client")
+        scheduler = distributed.rpc(address, timeout=CONNECT, connection_args=keys)
+        async with asyncio.timeout(CONNECT + 1), scheduler:
+            await scheduler.identity(n_workers=0)
+
+    asyncio.run(identity())
+
+
+def _refuse_unlike(client: Any, address: str) -> None:
+    """InputError where a cluster has no worker, or one whose versions would give other numbers or none."""
+    try:
+        client.wait_for_workers(1, timeout=CONNECT)
+    except TimeoutError:
+        raise InputError(
+            f"--dask {address}: the cluster has no worker; start some with `dask worker {address}`"
+        ) from None
+    own = _versions()
+    for worker, theirs in client.run(_versions, on_error="return").items():
+        if isinstance(theirs, Exception):
+            raise InputError(f"--dask {address}: the worker {worker} cannot take part ({theirs}); {_ALIKE}")
+        unlike = [
+            f"{name} {theirs.get(name)}, here {known}"
+            for name, known in own.items()
+            if theirs.get(name) != known
+        ]
+        if unlike:
+            raise InputError(f"--dask {address}: the worker {worker} has {'; '.join(unlike)}; {_ALIKE}")
+
+
+def _versions() -> dict[str, str]:
+    """Versions on which numbers and what is sent depend."""
+    major, minor, *_ = platform.python_version_tuple()
+    packages = ("lcopa-bayes", "numpy", "scipy", "distributed")
+    return {"Python": f"{major}.{minor}"} | {name: version(name) for name in packages}
 
 
 def _on_cluster(task: Callable[[S, T], R], shared: S, one: T) -> R:
@@ -236,9 +284,12 @@ if sys.platform == "linux":  # elsewhere system libraries do not outlast a fork
         """A process forked from one that has imported what it needs."""
 
         def start(self) -> None:
-            """Start it."""
+            """Start it; BrokenProcessPool where the process it is forked from has ended."""
             with _main_hidden():
-                super().start()
+                try:
+                    super().start()
+                except (EOFError, ConnectionError) as error:
+                    raise BrokenProcessPool(str(error)) from error
 
     @final
     class _ForkContext(ForkServerContext):

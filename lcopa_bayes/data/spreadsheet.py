@@ -16,7 +16,6 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from itertools import count, product, zip_longest
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import pandas as pd
@@ -99,7 +98,7 @@ def _workbook(path: Path, sheet: str | None) -> CellTable:
     try:
         values = load_workbook(path, data_only=True)
         formulas = load_workbook(path, data_only=False)
-    except (OSError, KeyError, ValueError, BadZipFile) as error:
+    except Exception as error:  # whatever a damaged file leads the library to
         raise InputError(f"{path}: cannot be read as a workbook ({error}); save it as xlsx or CSV") from None
     if sheet is not None and sheet not in values.sheetnames:
         raise InputError(f"{path}: has no sheet {sheet!r}{nearest(sheet, values.sheetnames)}")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, final
 
 from lcopa_bayes.core.errors import InputError, gathered, refuse_if
-from lcopa_bayes.core.files import read_json, read_tables
+from lcopa_bayes.core.files import outside, read_json, read_tables, refuse_code, trusting
 from lcopa_bayes.data.cells import SUFFIXES
 from lcopa_bayes.data.record import Record, load_record
 from lcopa_bayes.data.settings import CandidateSettings, CompareSettings, HeadingSettings, RecordsSettings
@@ -47,7 +47,10 @@ def _read(
 
 
 def _hashes(paths: Iterable[Path]) -> dict[str, str]:
-    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
+    try:
+        return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
+    except OSError as error:  # it has vanished since
+        raise InputError(f"{error.filename}: cannot be read ({error.strerror})") from None
 
 
 def _population(priors: Mapping[str, Any], folder: Path, time_unit: str) -> tuple[Path, dict[str, Any]]:
@@ -56,6 +59,7 @@ def _population(priors: Mapping[str, Any], folder: Path, time_unit: str) -> tupl
     InputError when it cannot be used for a study in this time unit.
     """
     name, _, number = str(priors["from"]).partition("#")
+    refuse_if(outside(folder, [name]))
     path, group = folder / name, int(number) if number.isdecimal() else 1
     values = read_json(path, "give the fleet.json that `fleet` wrote")
     taken = population_priors(values, group, str(path))
@@ -91,6 +95,8 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
         kept = {file.resolve() for file in apart}
         beside = [file for file in tables_in(folder) if file.resolve() not in kept]
         fit = [folder / k for k in named.fit or ()] or beside
+        names = [*(named.fit or [file.name for file in beside]), *named.held_out]
+        refuse_if([f"{where('records')}: {one}" for one in outside(folder, names)])
         if not fit:
             problems.append(
                 f"{where('records')}: no record to fit; name one, or put one beside the study file"
@@ -105,6 +111,8 @@ def _from_file(path: Path, held_out: list[Path]) -> Study:
             population, document["priors"] = _population(priors, folder, unit)
             used.append(population)
     settings = study_settings(document, where, problems)
+    if settings["effects"] is not None:
+        refuse_code(where("effects"), settings["effects"].add)
     problems += of_records
     plant = all(settings[key] is not None for key in ("model", "noise", "effects"))
     if problems and not (plant and records["fit"] and not of_records):
@@ -129,14 +137,20 @@ def tables_in(folder: Path) -> list[Path]:
     return [file for file in sorted(folder.glob("[!.]*")) if file.suffix.lower() in SUFFIXES]
 
 
-def load_study(source: Path | Sequence[Path], *, held_out: Sequence[Path] = ()) -> Study:
+def load_study(source: Path | Sequence[Path], *, held_out: Sequence[Path] = (), trust: bool = False) -> Study:
     """The study in the folder or study file `source`, or one of default settings made from record files.
 
     The time unit is the one the study file states, else that of the first fit record; records in other units
     are converted. A folder without a study file is a study of all records in it. From record files the name
-    is the first stems joined by ``-`` and the seed 0. `held_out` adds records to hold out. Raises InputError
-    with everything wrong in the study file and all its records together; nothing is written.
+    is the first stems joined by ``-`` and the seed 0. `held_out` adds records to hold out; `trust` lets the
+    study name files outside its folder and effects of its own, which are code. Raises InputError with
+    everything wrong in the study file and all its records together; nothing is written.
     """
+    with trusting(trust):
+        return _load(source, held_out)
+
+
+def _load(source: Path | Sequence[Path], held_out: Sequence[Path]) -> Study:
     sources = [Path(source)] if isinstance(source, (str, Path)) else [Path(path) for path in source]
     apart = [Path(path) for path in held_out]
     if len(sources) == 1 and sources[0].suffix.lower() == ".toml":
@@ -149,6 +163,7 @@ def load_study(source: Path | Sequence[Path], *, held_out: Sequence[Path] = ()) 
         own = {path.resolve() for path in apart}
         sources = [path for path in tables_in(folder) if path.resolve() not in own]
         name = folder.resolve().name
+        refuse_if([f"{folder}: {one}" for one in outside(folder, [path.name for path in sources])])
         if not sources:
             raise InputError(
                 f"{folder}: this folder holds neither a study.toml nor a record nor a finished fit; name a "

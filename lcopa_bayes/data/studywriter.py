@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from lcopa_bayes.core.errors import InputError, refuse_if
-from lcopa_bayes.core.files import writable_folder, write_text, writing
+from lcopa_bayes.core.files import UNFINISHED, refuse_code, writable_folder, write_text, writing
 from lcopa_bayes.core.rules import FOLDER
 from lcopa_bayes.data.record import Axis, Record, save_record
 from lcopa_bayes.data.settings import PriorSettings
@@ -87,7 +87,7 @@ def write_folder(
         lines.append('# held_out = ["another.csv"]  # only predicted: the best check of a model')
     text = "\n".join([*lines, "", settings.strip()]).strip()
     writable_folder(folder)
-    with writing(folder), tempfile.TemporaryDirectory(prefix=".study-", dir=folder) as beside:
+    with writing(folder), tempfile.TemporaryDirectory(prefix=UNFINISHED, dir=folder) as beside:
         try:
             for record, target in zip((*study.fit, *study.held_out), targets, strict=False):
                 save_record(record, Path(beside) / target.name)
@@ -118,6 +118,7 @@ def study_to_json(study: Study) -> dict[str, Any]:
 
 def study_from_json(values: Mapping[str, Any]) -> Study:
     """The study of `study_to_json`; KeyError, TypeError or ValueError (InputError too) for other values."""
+    refuse_code("effects of its own", values["effects"].get("add", ()))
     return Study(
         folder=None if values["folder"] is None else Path(values["folder"]),
         fit=[_record_of(record) for record in values["fit"]],

@@ -15,6 +15,7 @@ import pandas as pd
 
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.core.errors import InputError, refuse_if
+from lcopa_bayes.core.files import as_named
 from lcopa_bayes.results.bands import POINTWISE, QUANTILE_NAMES, SIMULTANEOUS
 from lcopa_bayes.results.datatree import POSTERIOR, posterior_draws
 from lcopa_bayes.results.fit import Fit
@@ -215,4 +216,7 @@ def _table(path: Path) -> pd.DataFrame:
     names = text.partition("\n")[0].strip().split(",")
     absent = {name: ["", "nan"] for name in names if name not in (*_WORDS, *_FLAGS)}
     words = dict.fromkeys(_WORDS, str)
-    return pd.read_csv(io.StringIO(text), dtype=words, keep_default_na=False, na_values=absent)
+    read = pd.read_csv(io.StringIO(text), dtype=words, keep_default_na=False, na_values=absent)
+    for name in read.columns.intersection([*_WORDS]):
+        read[name] = read[name].map(as_named)
+    return read

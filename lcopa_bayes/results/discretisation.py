@@ -36,7 +36,7 @@ FACTORS = (2, 4)
 """How many times narrower the blocks are on which shifts are measured."""
 _REST = 16 / 15
 """Shift to blocks without width over that to blocks four times narrower, at second order."""
-_FINEST = 16
+FINEST = 16
 """Most by which blocks are narrowed [-]."""
 _MOST_CELLS = 1 << 15
 """Blocks of all records together beyond which they are not narrowed: a fit takes as many times longer."""
@@ -158,10 +158,10 @@ def resolved_optima(problem: Problem, optima: Sequence[Optimum]) -> tuple[Proble
 def narrowed(problem: Problem, shift: Callable[[Problem], float]) -> Problem:
     """The problem on blocks halved while the `shift` measured on them is larger than `LARGEST` sd.
 
-    Not beyond `_FINEST` or `_MOST_CELLS`, where the measurement after sampling gives the remaining shift.
+    Not beyond `FINEST` or `_MOST_CELLS`, where the measurement after sampling gives the remaining shift.
     """
     while shift(problem) > LARGEST:
-        if problem.refinement >= _FINEST or 2 * _cells(problem) > _MOST_CELLS:
+        if problem.refinement >= FINEST or 2 * _cells(problem) > _MOST_CELLS:
             break
         problem = problem.refined(2)
     return problem

@@ -14,6 +14,7 @@ import pandas as pd
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.parallel import meanwhile
+from lcopa_bayes.results.runfolder import locked
 
 
 class Result(ABC):
@@ -56,7 +57,7 @@ class Result(ABC):
         if not self.is_in(folder):
             self.save(folder)
         written: list[Path] = []
-        with meanwhile(write_page, (self.verb, folder, None), written.append, jobs=jobs):
+        with locked(folder), meanwhile(write_page, (self.verb, folder, None), written.append, jobs=jobs):
             pass
         return written[0]
 

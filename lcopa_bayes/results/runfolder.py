@@ -21,7 +21,7 @@ import numpy as np
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import attributes, plain
-from lcopa_bayes.core.files import read_json, save_json, writable_folder, writing
+from lcopa_bayes.core.files import read_json, remove_unfinished, save_json, writable_folder, writing
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.sampling.sampler import SamplePlan
@@ -59,7 +59,7 @@ def opened(folder: Path | str | None, origin: Mapping[str, Any]) -> Iterator[Any
     refuse_other(path, origin)  # before anything is made
     made = [one for one in (path, *path.parents) if not one.exists()]
     try:
-        with _locked(writable_folder(path)):
+        with locked(writable_folder(path)):
             yield path
     except BaseException:
         for one in made:  # what was refused leaves no folder
@@ -102,8 +102,9 @@ def add_origin(folder: Path, verb: str, origin: Mapping[str, Any]) -> None:
 
 
 @contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """The lock of a folder, which ends with the process that holds it."""
+def locked(folder: Path) -> Iterator[None]:
+    """The lock of a folder, which ends with the process that holds it; what a killed one was about to write
+    is removed. InputError when another process holds it."""
     place = folder.resolve()
     if place in _held or fcntl is None:
         _held[place] = _held.get(place, 0) + 1
@@ -144,6 +145,9 @@ def _exclusive(path: Path, folder: Path) -> IO[str]:
         except OSError:  # a file system without locks
             return file
         if path.exists() and os.fstat(file.fileno()).st_ino == path.stat().st_ino:
+            file.seek(0)
+            if file.read():  # whoever held it did not remove it
+                remove_unfinished(folder)
             file.truncate(0)
             file.write(f"{os.getpid()}")
             file.flush()

@@ -18,13 +18,15 @@ import numpy as np
 import xarray as xr
 
 from lcopa_bayes.core.arrays import Array
-from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.errors import InputError, UntrustedError
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import read_json, writable_folder, write_whole
+from lcopa_bayes.core.rules import whole
 from lcopa_bayes.data.studywriter import study_from_json, study_to_json
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.results.datatree import POSTERIOR, load_tree, posterior_draws
+from lcopa_bayes.results.discretisation import FINEST
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.runfolder import add_origin, opened, origins, provenance
 from lcopa_bayes.sampling.convergence import Limitation, Quality
@@ -110,8 +112,11 @@ def load_fit(folder: Path | str) -> SavedFit:
     try:
         study = study_from_json(values["study"])
         problem = problem_of(study)
-        if values["refinement"] > 1:
-            problem = problem.refined(values["refinement"])
+        refinement = values["refinement"]
+        if not whole(1, FINEST).holds(refinement):
+            raise ValueError(f"refinement {refinement!r}")
+        if refinement > 1:
+            problem = problem.refined(refinement)
         parts = (
             tuple(Quality(**_numbers(one)) for one in values["qualities"]),
             float(values["target_ess"]),
@@ -121,7 +126,9 @@ def load_fit(folder: Path | str) -> SavedFit:
             ),
         )
         wanted = values["draws_sha256"]
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except UntrustedError as error:
+        raise InputError(f"{path}: {error}") from None
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise InputError(f"{path}: does not hold a fit ({type(error).__name__}: {error}); {_AGAIN}") from None
     drawn, density = _draws(folder / POSTERIOR, problem.posterior.table)
     read = Draws(problem.posterior.table, drawn, density, *parts)
@@ -138,7 +145,7 @@ def _draws(path: Path, table: ParameterTable) -> tuple[Array, Array]:
         columns_read = posterior_draws(path)
         with xr.open_dataset(path, group="sample_stats", engine="h5netcdf") as group:
             density = group["lp"].transpose("chain", "draw").to_numpy()
-    except (OSError, ValueError, KeyError, RuntimeError) as error:
+    except Exception as error:  # whatever a damaged file leads the library to
         raise InputError(f"{path}: cannot be read as draws ({error}); {_CUT}") from None
     absent = [row.name for row in table.rows if row.free and row.name not in columns_read]
     if absent:

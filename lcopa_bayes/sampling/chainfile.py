@@ -80,13 +80,7 @@ def load_chain(path: Path, fingerprint: str) -> Chain:
                 tuple(_ensemble(file[f"ensemble_{number}"]) for number in range(count)),
                 _read_weighted(file["weighted"]) if "weighted" in file else None,
             )
-    except (
-        OSError,
-        KeyError,
-        TypeError,
-        ValueError,
-        RuntimeError,
-    ) as error:  # raised by h5py for damaged files
+    except Exception as error:  # whatever a damaged file leads the library to
         raise InputError(f"{path}: not a chain this program wrote, or damaged ({error}); {advice}") from None
     if not own:
         raise InputError(f"{path}: written with other records, settings or seed; {advice}")

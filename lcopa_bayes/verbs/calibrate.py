@@ -20,6 +20,7 @@ from lcopa_bayes.calibration.ranks import LEVELS, SIMULTANEOUS, Coverage, bin_li
 from lcopa_bayes.calibration.replica import ENGINES, RANKED, Engine, Outcome, Quantity
 from lcopa_bayes.calibration.truths import Stated, Truths
 from lcopa_bayes.core.estimate import attributes, plain
+from lcopa_bayes.core.files import csv_of
 from lcopa_bayes.results.discretisation import LARGEST
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.runfolder import opened, provenance
@@ -306,7 +307,5 @@ def calibrate(
             quick=quick,
             quiet=quiet,
         )
-        texts = {
-            f"tables/{name}.csv": table.to_csv(index=False) for name, table in tables(calibration).items()
-        }
+        texts = {f"tables/{name}.csv": csv_of(table) for name, table in tables(calibration).items()}
         return CalibrationResult(results(calibration), origin, texts).kept(place)

@@ -15,6 +15,7 @@ import pandas as pd
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.files import csv_of
 from lcopa_bayes.data.agreement import disagreements
 from lcopa_bayes.data.drive import axis_drives, first_change
 from lcopa_bayes.data.record import Record
@@ -257,7 +258,7 @@ def check(study: StudyLike, *, folder: Path | str | None = None) -> CheckResult:
         ],
         ignore_index=True,
     )
-    texts = {"tables/check_records.csv": records.to_csv(index=False)}
+    texts = {"tables/check_records.csv": csv_of(records)}
     return CheckResult(inventory(wanted), provenance(wanted, "check"), texts).kept(folder)
 
 

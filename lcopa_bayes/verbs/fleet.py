@@ -20,7 +20,7 @@ import pandas as pd
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.estimate import plain
-from lcopa_bayes.core.files import read_json, save_json, writable_folder, write_text, write_whole
+from lcopa_bayes.core.files import csv_of, read_json, save_json, writable_folder, write_text, write_whole
 from lcopa_bayes.core.parallel import Progress, workers
 from lcopa_bayes.core.rules import word_of
 from lcopa_bayes.data.study import Study
@@ -236,8 +236,8 @@ def fleet(
             )
         outcomes.sort(key=lambda one: str(one["row"]["device"]))
         values = results(name, verb, outcomes, work.draws(outcomes))
-        texts = {f"{_TABLE}.csv": pd.DataFrame(values["devices"]).to_csv(index=False)}
-        return FleetResult(values, origin, texts | {_EACH: _each(values).to_csv(index=False)}).kept(folder)
+        texts = {f"{_TABLE}.csv": csv_of(pd.DataFrame(values["devices"]))}
+        return FleetResult(values, origin, texts | {_EACH: csv_of(_each(values))}).kept(folder)
 
 
 def _each(values: Mapping[str, Any]) -> pd.DataFrame:

@@ -8,6 +8,7 @@ from typing import final
 
 import pandas as pd
 
+from lcopa_bayes.core.files import csv_of
 from lcopa_bayes.results.firstlook import FirstLook, first_look
 from lcopa_bayes.results.runfolder import provenance
 from lcopa_bayes.results.stored import StoredResult
@@ -43,5 +44,5 @@ def look(study: StudyLike, *, folder: Path | str | None = None) -> LookResult:
 
 def look_result(seen: FirstLook) -> LookResult:
     """A first look as the result that is saved and shown."""
-    texts = {f"tables/look_{name}.csv": table.to_csv(index=False) for name, table in seen.tables().items()}
+    texts = {f"tables/look_{name}.csv": csv_of(table) for name, table in seen.tables().items()}
     return LookResult(seen.to_json(), provenance(seen.problem.study, "look"), texts)

@@ -12,7 +12,7 @@ from typing import final
 import pandas as pd
 
 from lcopa_bayes.core.estimate import attributes, plain
-from lcopa_bayes.core.files import writable_folder
+from lcopa_bayes.core.files import csv_of
 from lcopa_bayes.paper.auditclaims import load_audit
 from lcopa_bayes.paper.claims import CLAIMS, judge
 from lcopa_bayes.paper.comparisonclaims import load_comparison
@@ -22,7 +22,7 @@ from lcopa_bayes.paper.intervals import Scan
 from lcopa_bayes.paper.staticoptics import OpticsPlan, static_optics
 from lcopa_bayes.paper.steptable import load_posterior, panels, step_table
 from lcopa_bayes.paper.verdict import Evidence, Kind
-from lcopa_bayes.results.runfolder import provenance
+from lcopa_bayes.results.runfolder import opened, provenance
 from lcopa_bayes.results.stored import StoredResult
 from lcopa_bayes.results.structure import settled
 from lcopa_bayes.verbs.sources import FitLike, study_of
@@ -110,17 +110,17 @@ def identify(
     wanted, plan = settled(study_of(study), jobs=jobs), scan or Scan()
     beside = None if posterior is None else load_posterior(Path(posterior), wanted)
     scannable(wanted, plan)
-    if folder is not None:
-        writable_folder(Path(folder))
-    models = identified(wanted, plan=plan, quiet=quiet, jobs=jobs)
-    shown, texts = [], {}
-    for number, (entry, samples) in enumerate(panels(wanted, models), start=1):
-        stem = re.sub(r"[^A-Za-z0-9_-]+", "_", f"identify_{number:02d}_{entry['record']}_{entry['axis']}")
-        shown.append(entry | {"samples": f"tables/{stem}.csv"})
-        texts[f"tables/{stem}.csv"] = str(samples.to_csv(index=False, float_format="%.9g"))
-    table = step_table(wanted, models, posterior=beside)
-    values = results(wanted, models, plan) | {"step_metrics": table, "records": shown}
-    return IdentifyResult(values, provenance(wanted, "identify"), texts).kept(folder)
+    origin = provenance(wanted, "identify")
+    with opened(folder, origin):
+        models = identified(wanted, plan=plan, quiet=quiet, jobs=jobs)
+        shown, texts = [], {}
+        for number, (entry, samples) in enumerate(panels(wanted, models), start=1):
+            stem = re.sub(r"[^A-Za-z0-9_-]+", "_", f"identify_{number:02d}_{entry['record']}_{entry['axis']}")
+            shown.append(entry | {"samples": f"tables/{stem}.csv"})
+            texts[f"tables/{stem}.csv"] = csv_of(samples, float_format="%.9g")
+        table = step_table(wanted, models, posterior=beside)
+        values = results(wanted, models, plan) | {"step_metrics": table, "records": shown}
+        return IdentifyResult(values, origin, texts).kept(folder)
 
 
 def claims(*, audits: Sequence[Path | str] = (), comparison: Path | str | None = None) -> ClaimsResult:

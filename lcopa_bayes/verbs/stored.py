@@ -10,6 +10,7 @@ from typing import final
 import pandas as pd
 
 from lcopa_bayes.core.errors import InputError, nearest
+from lcopa_bayes.core.files import trusting
 from lcopa_bayes.results.newdrive import BANDS, DRIVES, NAME
 from lcopa_bayes.results.result import Result
 from lcopa_bayes.results.runfolder import origins
@@ -48,8 +49,9 @@ _KINDS: Mapping[str, type[StoredResult]] = {
 }
 
 
-def load_result(folder: Path | str, verb: str | None = None) -> Result:
-    """The result in the run folder `folder`: that of `verb`, by default the last one written there.
+def load_result(folder: Path | str, verb: str | None = None, *, trust: bool = False) -> Result:
+    """The result in the run folder `folder`: that of `verb`, by default the last one written there; `trust`
+    as in `load_study`.
 
     It has the table, values, draws and pages that it had when it was made. InputError when there is no such
     result, or its files are missing, cut short or of another version.
@@ -61,6 +63,7 @@ def load_result(folder: Path | str, verb: str | None = None) -> Result:
     if not there:
         raise InputError(f"{folder}: holds no result; give the folder that a verb wrote")
     wanted = verb or list(there)[-1]
-    if wanted not in there:
+    if wanted not in there or wanted not in ("fit", *_KINDS):
         raise InputError(f"{folder}: holds no result of {wanted!r}{nearest(wanted, there)}")
-    return load_fit(folder) if wanted == "fit" else _KINDS[wanted].load(folder)
+    with trusting(trust):
+        return load_fit(folder) if wanted == "fit" else _KINDS[wanted].load(folder)

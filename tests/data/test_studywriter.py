@@ -61,7 +61,7 @@ def test_effects_of_ones_own_are_found_from_the_new_folder(tmp_path: Path):
         study(record(1, duration=6.0)), folder=tmp_path / "a", effects=EffectsSettings(add=("own.py:Mine",))
     )
     write_study(made, tmp_path / "explained.toml")
-    assert load_study(tmp_path / "explained.toml").effects.add == ("a/own.py:Mine",)
+    assert load_study(tmp_path / "explained.toml", trust=True).effects.add == ("a/own.py:Mine",)
 
 
 def plain(*names: str, held_out: str = "", seed: int = 7):

@@ -151,10 +151,10 @@ def test_a_population_is_the_prior_of_the_next_study(fleet, out, devices, tmp_pa
     for quantile, end in ((-1.6448536269514722, low), (1.6448536269514722, high)):
         own = priors["time_1"]["scale"] * math.exp(quantile * priors["time_1"]["s"])
         assert own == pytest.approx(end, rel=0.15)  # of the interval's width, which is not symmetric
-    fleet.save(tmp_path)
+    fleet.save(tmp_path / "next")
     device("next", 2.0, tmp_path)
     study = tmp_path / "next" / "study.toml"
-    stated = study.read_text().replace("[priors]\n", '[priors]\nfrom = "../fleet.json"\ngain = 2.0\n')
+    stated = study.read_text().replace("[priors]\n", '[priors]\nfrom = "fleet.json"\ngain = 2.0\n')
     study.write_text(stated)
     read = lb.load_study(tmp_path / "next")
     assert read.priors["gain"].fixed == 2.0  # what is stated stands
@@ -167,14 +167,14 @@ def test_a_population_is_the_prior_of_the_next_study(fleet, out, devices, tmp_pa
         lb.load_study(tmp_path / "next")
     assert len(refused.value.problems) == 2
     assert "nothing.json" in str(refused.value)
-    values = json.loads((tmp_path / "fleet.json").read_text())
+    values = json.loads((tmp_path / "next" / "fleet.json").read_text())
     for change, words in (
         ({"groups": "none"}, "holds no fleet"),
         ({"groups": values["groups"] * 2}, "holds several groups of devices; name one"),
         ({"groups": [values["groups"][0] | {"time_unit": "s"}]}, "is in s, this study is in ms"),
         ({"groups": [values["groups"][0] | {"parameters": [], "sentence": ""}]}, "has no population"),
     ):
-        (tmp_path / "fleet.json").write_text(json.dumps(values | change))
+        (tmp_path / "next" / "fleet.json").write_text(json.dumps(values | change))
         study.write_text(stated)
         with pytest.raises(lb.InputError, match=words):
             lb.load_study(tmp_path / "next")
