@@ -297,8 +297,7 @@ def released(state: State) -> State:
     """The state at the likeliest internal constants of its effects, with what these leave open in the
     covariance of all other coordinates; as it is where a descent does not find any as likely."""
     model, whitening = state.model, state.whitening
-    timed = (effect for effect in model.effects if effect.card.place == "drive" and effect.fractions)
-    wide = _loosened(model, {effect.name for effect in model.effects} - {effect.name for effect in timed})
+    wide = _loosened(model, [effect.name for effect in model.effects if not effect.timed])
     if len(wide.columns) == len(model.columns):
         return state
     try:
