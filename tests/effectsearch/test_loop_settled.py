@@ -10,12 +10,14 @@ from test_loop import LIBRARY, records, study
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basemodel import fitted_base
+from lcopa_bayes.effectsearch.candidates import other_instance
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.refits import SIGNIFICANT, refit, released
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.rounds import _beside_others, search
 from lcopa_bayes.effectsearch.scores import State
-from lcopa_bayes.effectsearch.trace import trace
+from lcopa_bayes.effectsearch.signature import Scale, Signature
+from lcopa_bayes.effectsearch.trace import Trace, Traced, trace
 from lcopa_bayes.inference.noise import WhiteAR1
 from lcopa_bayes.model.effects.catalogue import catalogue
 
@@ -102,6 +104,22 @@ def test_each_of_two_effects_counts_by_what_it_brings_beside_the_other():
     assert of_odd == pytest.approx(two.log_bayes_factor - two.paid, abs=0.5)
     assert of_even < 5 < 30 < of_odd
     assert two.wald("even_curvature") > SIGNIFICANT
+
+
+def test_another_instance_is_one_of_another_signature():
+    """Of frames whose signatures lie at angles of 2, 60 and 90 degrees to that of the best."""
+    kind, angles = catalogue()["overdrive_pulse"], np.radians([0.0, 2.0, 60.0, 90.0])
+    signatures = tuple(
+        Signature.of(kind(1.0 + k), 10 * np.array([[np.cos(a)], [np.sin(a)], [0.0]]), 1.0, False)
+        for k, a in enumerate(angles)
+    )
+    residual = np.array([9.0, 7.0, 1.0])
+    known = Scale(1e6, 3.0, np.array([residual @ residual]))
+    traced = Traced(kind.card, signatures, 0.0, 0)
+    seen = Trace((traced,), 3.0, (3.0, 3.0), np.nan, 0, residual, known)
+    assert other_instance(seen, traced, 0.0) is signatures[2]
+    assert other_instance(seen, traced, 0.99 * seen.alone(signatures[2])) is signatures[2]
+    assert other_instance(seen, traced, 1.01 * seen.alone(signatures[2])) is None
 
 
 def test_names_are_firm_where_each_brought_enough_and_nothing_remains():
