@@ -59,7 +59,8 @@ def voltage_knee(rng: np.random.Generator) -> Hidden:
 def grey_quantisation(rng: np.random.Generator) -> Hidden:
     """Drive in a few grey levels."""
     levels = float(rng.choice((15, 16, 31, 32)))
-    curve = relevelled(lambda u, shot: shot.drive / levels * np.round(u * levels / shot.drive))
+    # commands half way between two levels go to the even one, whatever their rounding errors
+    curve = relevelled(lambda u, shot: shot.drive / levels * np.round(np.round(u * levels / shot.drive, 9)))
     return Hidden("grey_quantisation", {"levels": levels}, commands=curve)
 
 

@@ -10,7 +10,14 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
-from lcopa_bayes.effectsearch.noise import AxisNoise, Law, axis_noise, joint_noise, quiet_pieces
+from lcopa_bayes.effectsearch.noise import (
+    AxisNoise,
+    Law,
+    axis_noise,
+    joint_noise,
+    plausible,
+    quiet_pieces,
+)
 from lcopa_bayes.effectsearch.regression import Optimum, Regression
 from lcopa_bayes.effectsearch.whitening import Whitening, parts
 from lcopa_bayes.inference.defaultpriors import Scales
@@ -132,6 +139,17 @@ def renewed(model: ExtendedModel, optimum: Optimum, known: Whitening) -> Whiteni
         return known
     delay = model.dead_time(optimum.x)
     return whitening(model, measured(model.plant, optimum.residual, delay))
+
+
+def settled(model: ExtendedModel, optimum: Optimum, known: Whitening) -> tuple[Optimum, Whitening]:
+    """Optimum and noise where nothing stands out from the noise that was measured: then all of the residual
+    is noise, and knows it better than samples at rest do."""
+    posterior = model.plant
+    scales = Scales.of([one.record for one in posterior.samples])
+    pieces = (axis_pieces(posterior, optimum.residual, axis) for axis in range(len(known.noise)))
+    seen = tuple(plausible([one for one in own if one.values.size > 1], scales) for own in pieces)
+    white = replace(known, noise=tuple(map(Law.of, seen)), posterior=seen)
+    return Regression(model, white).descend(optimum.x), white
 
 
 def axis_pieces(posterior: Posterior, stacked: Vector, axis: int) -> list[Observed]:

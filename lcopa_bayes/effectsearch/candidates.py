@@ -32,6 +32,8 @@ _INSTANCES = 16
 """Instances descended from, those of largest evidence [-]."""
 _FORCED = 3
 """The same beside a force that is already there, and of linear dynamics [-]."""
+_OTHER = 0.9
+"""Cosine between signatures below which an instance of an effect is another [-]."""
 _STEPS = 12
 _SIZES = (1.0, -1.0)
 """Coefficients from which a single one is also started, with fitted and with integer orders [prior sd]."""
@@ -71,13 +73,29 @@ def refitted(state: State, seen: Trace) -> tuple[list[Refit], list[str]]:
             if (far or traced.card.dynamics) and movable(traced):
                 effect, reached_at = descended(state, seen, traced)
                 amplitude = reached_at[-amplitude.size :] / state.model.having(effect).scale
-            added = [(effect, amplitude)]
-            done.append(
-                refit(state.model, state.optimum, state.whitening, added, seen.scale.quiet, near=reached_at)
-            )
+            starts = [(effect, amplitude)]
+            settled = reached_at is not None or traced.card.dynamics or not seen.alarmed
+            other = None if settled else other_instance(seen, traced, least)
+            if other is not None:
+                starts.append((other.effect, other.amplitude(seen.residual, seen.scale)))
+            known = (state.model, state.optimum, state.whitening)
+            ends = [refit(*known, [start], seen.scale.quiet, near=reached_at) for start in starts]
+            done.append(min(ends, key=lambda end: end.optimum.cost))
         except ArithmeticError as error:
             failures.append(f"{name}: {error}")
     return under_one_noise(done), failures
+
+
+def other_instance(seen: Trace, traced: Traced, least: float) -> Signature | None:
+    """The best instance of an effect that is another than its best one, of an evidence of `least` or more;
+    None without any.
+
+    The plant bends towards what is missing: of two frames of a pulse that explain the rest alike the
+    better one beside that plant need not be the better one beside the plant as it is.
+    """
+    likely = [one for one in traced.signatures if seen.alone(one) > least]
+    apart = [one for one in likely if one.cosine(traced.signature) < _OTHER]
+    return max(apart, key=seen.alone, default=None)
 
 
 def _blind(seen: Trace) -> list[Traced]:

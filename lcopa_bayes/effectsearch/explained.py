@@ -16,7 +16,7 @@ from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.declared import coefficient_prior
 from lcopa_bayes.inference.noise import Noise
 from lcopa_bayes.model.effects.catalogue import catalogue
-from lcopa_bayes.model.effects.effect import Effect
+from lcopa_bayes.model.effects.effect import Effect, Ranges
 from lcopa_bayes.model.effects.records import Outliers
 from lcopa_bayes.results.discretisation import discretisation
 from lcopa_bayes.results.fit import plan_of, weighted_fit
@@ -27,8 +27,9 @@ def explained_study(study: Study, model: ExtendedModel, outliers: Outlying | Non
     """The study with the effects of a model declared, named as the study and ``-explained``.
 
     Scales and priors of the effects are stated as the loop used them; their internal constants, which it
-    chose from a list and moved, are held where they came to lie. With `outliers` the samples that were left
-    out return, and the noise is declared to hold them, unless the study states such noise already.
+    chose from a list and moved, are free about where they came to lie (`constant_about`). With `outliers`
+    the samples that were left out return, and the noise is declared to hold them, unless the study states
+    such noise already.
     """
     ranges, effects = model.effected.ranges, model.effects
     priors: dict[str, PriorSettings] = {}
@@ -39,7 +40,7 @@ def explained_study(study: Study, model: ExtendedModel, outliers: Outlying | Non
             priors[name] = PriorSettings(name, dist=prior.dist, parameters=prior.parameters)
         for key, value in effect.constants.items():
             name = f"{effect.name}.{key}"
-            priors[name] = PriorSettings(name, fixed=float(value))
+            priors[name] = constant_about(effect, key, float(value), ranges)
     names = tuple(effect.name for effect in effects)
     if outliers is not None:
         study = outliers.returned(study)
@@ -53,6 +54,23 @@ def explained_study(study: Study, model: ExtendedModel, outliers: Outlying | Non
     own = {name: prior for name, prior in study.priors.items() if "." not in name}
     name = study.name.removesuffix("-explained") + "-explained"
     return replace(study, name=name, effects=declared, priors=own | priors)
+
+
+def constant_about(effect: Effect, key: str, value: float, ranges: Ranges) -> PriorSettings:
+    """Prior of an internal constant of an effect that was found at `value`.
+
+    Flat over two of the values that the loop tries to either side: others are other effects. Held where
+    nothing but the noise depends on it, or where commands jump with it (`timed`), and without others to try.
+    """
+    name = f"{effect.name}.{key}"
+    listed = np.unique([float(getattr(one, key)) for one in effect.grid(ranges)])
+    first = int(np.searchsorted(listed, value)) - 2
+    last = int(np.searchsorted(listed, value, "right")) + 1
+    low, high = listed[max(first, 0)], listed[min(last, listed.size - 1)]
+    fixed = {one.name for one in effect.internal(ranges) if one.kind == "choice" or one.high <= one.low}
+    if effect.card.disturbance or effect.timed or key in fixed or not low <= value <= high or low == high:
+        return PriorSettings(name, fixed=value)
+    return PriorSettings(name, dist="uniform", parameters={"loc": float(low), "scale": float(high - low)})
 
 
 def declarable(study: Study, effects: Sequence[Effect]) -> bool:

@@ -14,12 +14,13 @@ from lcopa_bayes.core.estimate import Estimate
 from lcopa_bayes.data.agreement import Disagreement, disagreements
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.bandwidening import Widening
-from lcopa_bayes.effectsearch.basefit import BaseFit, too_smooth
+from lcopa_bayes.effectsearch.basefit import BaseFit, settled, too_smooth
 from lcopa_bayes.effectsearch.basemodel import fitted_base
 from lcopa_bayes.effectsearch.explained import coordinates_of, declarable, explained_draws, explained_study
 from lcopa_bayes.effectsearch.heldouteffects import missed, unseen_share
 from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
 from lcopa_bayes.effectsearch.outliers import Outlying, outlying, without_outliers
+from lcopa_bayes.effectsearch.refits import released
 from lcopa_bayes.effectsearch.rounds import CLEAR, SINGLE, Round, Search, search
 from lcopa_bayes.effectsearch.scores import (
     WIDTH,
@@ -200,6 +201,15 @@ def _looped(
     if not wrong or (base.smooth and wrong == base.failed):
         rng = np.random.default_rng([study.seed, 11])
         searched = search(start, kinds, rng, noise_samples=base.noise_samples, draws=draws, alone=alone)
+        if base.noise_known and not searched.rounds[-1].trace.alarmed:
+            searched = replace(searched, state=_settled(searched.state))
+            if not all(one.firm for one in base.noise) and not searched.state.model.effects:
+                # too few samples at rest leave noise plausible in which every effect drowns
+                unknown = (0,) * len(base.noise)
+                searched = search(searched.state, kinds, rng, noise_samples=unknown, draws=draws, alone=alone)
+                if not searched.rounds[-1].trace.alarmed:
+                    searched = replace(searched, state=_settled(searched.state))
+        searched = replace(searched, state=released(searched.state))
     # of a residual too smooth to be judged an effect is only named where it leaves noise
     if searched is None or (wrong and too_smooth(searched.state.optimum)):
         seen = missed(study, before.fit, before.unseen, start)
@@ -218,6 +228,8 @@ def _looped(
     if outliers is not None:
         verdict = beside(verdict, outliers.sentence)
     named = verdict.kind in ("explained", "partly explained", "disturbance")
+    if not searched.state.model.effects:
+        before = reached
     after = reached if named else before
     state, wider = after.state, after.state.model.wider
     if named:
@@ -254,6 +266,12 @@ def _looped(
         outliers,
         contrary,
     )
+
+
+def _settled(state: State) -> State:
+    """The same under the noise that its residual has."""
+    optimum, whitening = settled(state.model, state.optimum, state.whitening)
+    return replace(state, optimum=optimum, whitening=whitening)
 
 
 def _names(state: State) -> tuple[str, ...]:

@@ -144,11 +144,16 @@ class AxisNoise:
         return self.samples / float(np.median([one.correlated(self.samples) for one in drawn]))
 
     @property
+    def firm(self) -> bool:
+        """Whether so many independent samples know it apart from the fit that a verdict may be firm."""
+        return self.known and self.independent >= FEWEST
+
+    @property
     def caution(self) -> str:
         """Why no verdict is better than tentative beside this noise; empty when it is known well."""
         if not self.known:
             return self.sentence
-        if self.independent >= FEWEST:
+        if self.firm:
             return ""
         return (
             f"{self.sentence.rstrip('.')}; successive ones are so alike that they count as "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, final
@@ -16,7 +16,7 @@ from lcopa_bayes.effectsearch.basefit import renewed
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.noise import quiet_samples
 from lcopa_bayes.effectsearch.priorwidth import widened, with_room
-from lcopa_bayes.effectsearch.regression import Optimum, Regression
+from lcopa_bayes.effectsearch.regression import GAIN, Optimum, Regression
 from lcopa_bayes.effectsearch.scores import State, groups, log_scores
 from lcopa_bayes.effectsearch.signature import Scale
 from lcopa_bayes.effectsearch.trace import LEVEL
@@ -104,9 +104,7 @@ class Refit:
 
     def without(self, names: Sequence[str]) -> tuple[ExtendedModel, Vector]:
         """The model less these effects, and the coordinates that are left."""
-        gone = {k for name in names for k in self.places(name)}
-        kept = (e for e in self.model.effects if e.name not in names)
-        return self.model.having(*kept), np.delete(self.optimum.x, sorted(gone))
+        return without(self.model, self.optimum.x, names)
 
     @cached_property
     def resting(self) -> bool:
@@ -183,10 +181,7 @@ class Refit:
 
     def places(self, name: str) -> list[int]:
         """Coordinates of an effect's coefficients."""
-        first = self.model.plant_size
-        effects = self.model.effects
-        placed = self.model.effected.coefficients
-        return [first + k for k, one in enumerate(placed) if effects[one.effect].name == name]
+        return places(self.model, name)
 
     @property
     def new(self) -> tuple[Placed, ...]:
@@ -209,6 +204,19 @@ class Refit:
         if all(self.wald(name) < SIGNIFICANT for name in self.added):
             return True
         return len(self.added) == 1 and self.ratio(self.added[0]) < SIGNIFICANT
+
+
+def places(model: ExtendedModel, name: str) -> list[int]:
+    """Coordinates of the coefficients of an effect of a model."""
+    placed = enumerate(model.effected.coefficients)
+    return [model.plant_size + k for k, one in placed if model.effects[one.effect].name == name]
+
+
+def without(model: ExtendedModel, x: Vector, names: Sequence[str]) -> tuple[ExtendedModel, Vector]:
+    """A model less some effects, and the coordinates that are left."""
+    gone = [k for name in names for k in places(model, name)]
+    kept = (e for e in model.effects if e.name not in names)
+    return model.having(*kept), np.delete(x, gone)
 
 
 def refit(
@@ -257,14 +265,7 @@ def freed(
     They are parameters like any other of the descent, which uses the plant's own tangents; those that a fit
     holds by default stay.
     """
-    # a phase of commands moves them from sample to sample: no slope says where it should be
-    held = {effect.name for effect in model.effects if effect.card.place == "drive"}
-    loose = set()
-    for row in model.posterior.table.rows:
-        own = row.name.partition(".")[0]
-        if row.kind in CONSTANTS and own in names and not (row.kind == "fraction" and own in held):
-            loose.add(row.name)
-    wide = replace(model, exact=False, loose=frozenset(loose))
+    wide = replace(_loosened(model, names), exact=False)
     if len(wide.columns) == len(model.columns):
         return model, x
     best = Regression(replace(model, exact=False), whitening).cost(x)
@@ -278,6 +279,37 @@ def freed(
     if Regression(moved, whitening).cost(other) < best:
         model, x = replace(moved, exact=model.exact), other
     return _likely(model, x, whitening, names)
+
+
+def _loosened(model: ExtendedModel, names: Collection[str]) -> ExtendedModel:
+    """The model with the internal constants of some of its effects as coordinates."""
+    # a phase of commands moves them from sample to sample: no slope says where it should be
+    held = {effect.name for effect in model.effects if effect.card.place == "drive"}
+    loose = set()
+    for row in model.posterior.table.rows:
+        own = row.name.partition(".")[0]
+        if row.kind in CONSTANTS and own in names and not (row.kind == "fraction" and own in held):
+            loose.add(row.name)
+    return replace(model, loose=frozenset(loose))
+
+
+def released(state: State) -> State:
+    """The state at the likeliest internal constants of its effects, with what these leave open in the
+    covariance of all other coordinates; as it is where a descent does not find any as likely."""
+    model, whitening = state.model, state.whitening
+    wide = _loosened(model, [effect.name for effect in model.effects if not effect.timed])
+    if len(wide.columns) == len(model.columns):
+        return state
+    try:
+        best = Regression(wide, whitening).descend(wide.coordinates(model.values(state.optimum.x)))
+        moved, x = wide.held(best.x)
+        optimum = Regression(moved, whitening).at(x)
+    except ArithmeticError:
+        return state
+    if not optimum.cost <= state.optimum.cost + GAIN:
+        return state
+    own = np.isin(wide.names, moved.names)
+    return replace(state, model=moved, optimum=optimum, spread=best.covariance[np.ix_(own, own)])
 
 
 def _likely(

@@ -10,7 +10,14 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.effectsearch.candidates import refitted
-from lcopa_bayes.effectsearch.refits import SIGNIFICANT, Refit, log_bayes_factor, refit, under_one_noise
+from lcopa_bayes.effectsearch.refits import (
+    SIGNIFICANT,
+    Refit,
+    log_bayes_factor,
+    refit,
+    under_one_noise,
+    without,
+)
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.signature import (
@@ -63,12 +70,16 @@ class Search:
     share: float
     """Half the residual power that the effects took, over that and what the best class left would
     take [-]."""
+    brought: float
+    """Least log evidence that one of the effects brought, when it was added or beside the others [nat];
+    infinite without any."""
 
     @property
     def apart(self) -> bool:
-        """Whether every effect brought enough evidence for a firm name, and is confounded with no other."""
-        brought = (one.chosen.log_bayes_factor for one in self.rounds if one.chosen)
-        return all(worth >= FIRM for worth in brought) and all(len(each) == 1 for each in self.groups)
+        """Whether every effect brought enough evidence for a firm name and is confounded with no other, and
+        nothing that another name might explain too remains."""
+        alone = all(len(each) == 1 for each in self.groups)
+        return self.brought >= FIRM and alone and not self.rounds[-1].trace.alarmed
 
 
 def search(
@@ -116,7 +127,20 @@ def search(
     last = rounds[-1].trace
     left = last.scale.drop(last.largest) if last.alarmed else 0.0
     share = dropped / (dropped + left) if dropped > 0 else float(left <= 0)
-    return Search(tuple(rounds), state, confounded, gained, share)
+    worth = [one.chosen.log_bayes_factor for one in rounds if one.chosen]
+    worth += _beside_others(state, float(sum(noise_samples)))
+    return Search(tuple(rounds), state, confounded, gained, share, min(worth, default=np.inf))
+
+
+def _beside_others(state: State, quiet: float) -> list[float]:
+    """Log evidence that each of several effects brings beside the others [nat]: one of a pair may bring
+    all."""
+    worth = []
+    for effect in state.model.effects if len(state.model.effects) > 1 else ():
+        model, x = without(state.model, state.optimum.x, [effect.name])
+        fewer = Regression(model, state.whitening).descend(x, most=12, gain=0.02)
+        worth.append(log_bayes_factor(fewer, state.optimum, quiet))
+    return worth
 
 
 def _gained(start: State, state: State, quiet: float) -> tuple[float, float]:

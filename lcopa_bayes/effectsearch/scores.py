@@ -169,7 +169,8 @@ class State:
     sampled: tuple[Draws, Noise] | None = None
     """Draws of the explained study and its noise; None where only the optimum is known."""
     spread: Matrix | None = None
-    """Covariance of the coordinates in these draws, (k, k)."""
+    """Covariance of the coordinates in these draws, or with internal constants of effects free, (k, k); None
+    where that of the optimum is all."""
 
     @property
     def covariance(self) -> Matrix:
@@ -212,7 +213,7 @@ def left_out_scores(state: State) -> list[Score]:
 def _of_part(state: State, part: Part, draws: Matrix, own: bool, rng: np.random.Generator) -> Matrix:
     """Draws of a prediction, with `own` level about the level that would be taken from each."""
     if own:
-        noise = state.whitening.noise[part.axis]
+        noise = state.whitening.weighed[part.axis]
         known = [_level(part.samples, part.axis, draw, noise) for draw in draws]
         levels = np.array([level + np.sqrt(doubt) * rng.standard_normal() for level, doubt, _ in known])
         draws = draws - levels[:, None]
@@ -269,7 +270,7 @@ def _laplace(state: State, seed: int) -> tuple[Draws, Noise]:
     values = np.array([model.values(each) for each in x])[:, rows]
     noise = [
         Parameter(name, "", name, Place(axis, 0), None, float(value))
-        for axis, law in enumerate(state.whitening.noise)
+        for axis, law in enumerate(state.whitening.weighed)
         for name, value in zip(WhiteAR1.names, law.parameters, strict=True)
     ]
     held = replace(table, rows=(*(table.rows[k] for k in rows), *noise))
@@ -291,7 +292,7 @@ def _scores(
     for part in state.whitening.parts:
         centre, spread, source = mean[part.rows], variance[part.rows], level_from
         if own_levels:
-            misfit, noise = part.observed.values - centre, state.whitening.noise[part.axis]
+            misfit, noise = part.observed.values - centre, state.whitening.weighed[part.axis]
             level, doubt, source = _level(part.samples, part.axis, misfit, noise)
             # what the fit did not know about the level is known now
             centre, spread = centre + level, _without_level(spread, doubt)

@@ -123,7 +123,8 @@ class Findings:
     dynamics: bool = False
     """Whether linear dynamics without a name were added."""
     apart: bool = True
-    """Whether each effect brought 30 nat and is confounded with no other."""
+    """Whether each effect brought 30 nat, also beside the others, is confounded with no other, and nothing
+    significant remains."""
     reached: float = math.nan
     """Largest error of any axis on unseen records over the noise, with the effects [-]; NaN where these
     differ from record to record."""

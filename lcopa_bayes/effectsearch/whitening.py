@@ -97,18 +97,22 @@ class Whitening:
         return np.concatenate([one.values for record in self.samples for one in record.axes])
 
     @property
-    def held(self) -> tuple[Vector, ...]:
-        """Noise of each axis as it weights the samples: as `WhiteAR1` takes it, (3,), a sample that counts as
-        less than one the noisier."""
+    def weighed(self) -> tuple[Law, ...]:
+        """Noise of each axis as it weights the samples: one that counts as less than one is the noisier."""
         shares = self.dependence or (1.0,) * len(self.noise)
-        pairs = zip(self.noise, shares, strict=True)
-        return tuple(law.parameters * np.sqrt([share, share, 1.0]) for law, share in pairs)
+        pairs = zip(self.noise, np.sqrt(shares).tolist(), strict=True)
+        return tuple(Law(root * law.sigma, root * law.sigma_ar, law.rho) for law, root in pairs)
+
+    @property
+    def held(self) -> tuple[Vector, ...]:
+        """The same as `WhiteAR1` takes it, (3,) each."""
+        return tuple(law.parameters for law in self.weighed)
 
     def __call__(self, columns: Array) -> Array:
         """Whitened columns (..., n), same shape [-]."""
         out = np.empty_like(columns, dtype=float)
         for part in self.parts:
-            law = Law(*self.held[part.axis].tolist())
+            law = self.weighed[part.axis]
             out[..., part.rows] = law.whiten(columns[..., part.rows], part.observed.gaps)
         return out
 

@@ -23,8 +23,10 @@ _SAME_PHASE = 1e-7
 _ROUNDED = 1e-4
 """The same where there are too many phases: time stamps may have been rounded [blocks]."""
 _PHASES = 24
-"""Phases of a drive that are kept apart; more changes off the lattice than this are shared out between the
-two blocks around them, as block means of the drive would be."""
+"""Phases of a drive that are kept apart; further changes off the lattice are shared out between the two
+blocks around them, as block means of the drive would be."""
+_SHARED = 0.5
+"""Share of all changes of a drive beyond which none are kept apart [-]."""
 _PLACES = round(1.0 / _SAME_PHASE)
 _TOGETHER = 1 << 17
 """Numbers of a step response times phases that are read at once; more no longer fit the cache."""
@@ -46,39 +48,51 @@ class Phase:
 
 
 def phases(drive: AxisDrive, step: float) -> tuple[Phase, ...]:
-    """The changes of a drive by phase on blocks of width `step` [time unit]."""
+    """The changes of a drive by phase on blocks of width `step` [time unit].
+
+    Of more phases than are kept apart those of the largest changes are, and the rest are shared out: small
+    changes that an effect adds to the commands leave the response to these as it is, or its derivative would
+    be one of how they were read. Where most would be shared out all are, which is hardly less exact.
+    """
     jumps = drive.jumps
     place = (drive.times - drive.times[0]) / step
     for tolerance in (_SAME_PHASE, _ROUNDED):
-        groups = _alike(place, tolerance)
-        if groups is not None:
-            return tuple(
-                Phase(
-                    float(drive.times[members[0]]),
-                    np.round(place[members] - place[members[0]]).astype(int),
-                    jumps[members],
-                )
-                for members in groups
-            )
-    below = np.floor(place).astype(int)
-    share = place - below
-    at, where = np.unique(np.concatenate((below, below + 1)), return_inverse=True)
-    weights = np.concatenate(((1 - share) * jumps, share * jumps))
-    shared = np.asarray(np.bincount(where, weights=weights), dtype=float)
-    return (Phase(float(drive.times[0]), at, shared),)
+        groups, rest = _alike(place, np.argsort(-np.abs(jumps), kind="stable"), tolerance)
+        if not rest.size:
+            break
+    if np.abs(jumps[rest]).sum() > _SHARED * np.abs(jumps).sum():
+        groups, rest = [], np.arange(place.size)
+    out = [
+        Phase(
+            float(drive.times[members[0]]),
+            np.round(place[members] - place[members[0]]).astype(int),
+            jumps[members],
+        )
+        for members in sorted(map(np.sort, groups), key=lambda members: int(members[0]))
+    ]
+    if rest.size:
+        rest = np.sort(rest)
+        begin = place[rest[0]]
+        below = np.floor(place[rest] - begin).astype(int)
+        share = place[rest] - begin - below
+        at, where = np.unique(np.concatenate((below, below + 1)), return_inverse=True)
+        weights = np.concatenate(((1 - share) * jumps[rest], share * jumps[rest]))
+        shared = np.asarray(np.bincount(where, weights=weights), dtype=float)
+        out.append(Phase(float(drive.times[rest[0]]), at, shared))
+    return tuple(out)
 
 
-def _alike(place: Vector, tolerance: float) -> list[Index] | None:
-    """Positions by phase; None when there are more than _PHASES."""
+def _alike(place: Vector, sequence: Index, tolerance: float) -> tuple[list[Index], Index]:
+    """Positions by phase, at most _PHASES of them, phases in the order of `sequence`, and what is left."""
     beyond = place - np.round(place)
     groups: list[Index] = []
-    rest = np.arange(place.size)
+    rest = sequence
     while rest.size and len(groups) < _PHASES:
         apart = np.abs(beyond[rest] - beyond[rest[0]])
         same = np.minimum(apart, 1.0 - apart) < tolerance
         groups.append(rest[same])
         rest = rest[~same]
-    return None if rest.size else groups
+    return groups, rest
 
 
 def blocks_of(lattice: Lattice, begin: float) -> int:

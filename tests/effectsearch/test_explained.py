@@ -14,12 +14,12 @@ from lcopa_bayes.cli import main
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.data.studywriter import write_study
-from lcopa_bayes.effectsearch.explained import coordinates_of, explained_study
+from lcopa_bayes.effectsearch.explained import constant_about, coordinates_of, explained_study
 from lcopa_bayes.effectsearch.loop import Loop, loop
 from lcopa_bayes.identifiability.audit import audit
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.leastsquares import LeastSquares
-from lcopa_bayes.model.effects.commands import OverdrivePulse
+from lcopa_bayes.model.effects.commands import OverdrivePulse, RefreshHold
 from lcopa_bayes.model.effects.records import Vibration
 from lcopa_bayes.results.fit import Fit, fit
 
@@ -94,16 +94,22 @@ def test_an_audit_of_the_explained_study_is_of_the_same_effect(again: Fit):
     np.testing.assert_allclose(ends, (own.lower, own.upper), atol=0.5 * own.sd)  # type: ignore[arg-type]
 
 
-def test_constants_are_held_where_the_loop_left_them(bent: Loop):
-    """And coefficients of single records share a prior; an explained study is not explained twice."""
+def test_constants_are_free_about_where_the_loop_left_them(bent: Loop):
+    """But those of the noise and of clocks; coefficients of single records share a prior, and an explained
+    study is not explained twice."""
     state = bent.after.state
-    model = state.model.having(OverdrivePulse(1.25), Vibration(0.21))
+    listed = OverdrivePulse.grid(state.model.effected.ranges)
+    model = state.model.having(OverdrivePulse(listed[5].frame), Vibration(0.21), RefreshHold(1.0, 0.5))
     made = explained_study(bent.problem.study, model)
-    assert made.effects.use == ("overdrive_pulse", "vibration")
+    assert made.effects.use == ("overdrive_pulse", "vibration", "refresh_hold")
     table = problem_of(made).posterior.table
     rows = {row.name: row for row in table.rows}
-    assert rows["overdrive_pulse.frame"].value == 1.25
+    ends = rows["overdrive_pulse.frame"].prior.frozen.support()  # type: ignore[union-attr]
+    assert ends == pytest.approx((listed[3].frame, listed[7].frame))
     assert rows["vibration.frequency"].value == 0.21
+    assert rows["refresh_hold.refresh"].value == 1.0
+    past = constant_about(listed[0], "frame", listed[-1].frame + 1.0, model.effected.ranges)
+    assert past.fixed == listed[-1].frame + 1.0
     scale = 0.005 * model.effected.ranges.response[0]
     assert rows["vibration.a[r2]"].prior.parameters["scale"] == pytest.approx(scale)  # type: ignore[union-attr]
     assert explained_study(made, model).name == made.name == "small-explained"

@@ -37,7 +37,7 @@ LIBRARY = [catalogue()[name] for name in NAMES]
 AXIS = (Axis("x", "rad"),)
 
 
-def records(seed, curvature=0.0, quiet=8.0):
+def records(seed, curvature=0.0, quiet=8.0, noise=NOISE):
     rng = np.random.default_rng(seed)
     path = TransferPath(1.0, 1.0, (3.0,), (0.9,), 1.0)
     device = Device(((path,),), AXIS, AXIS, (0.0,))
@@ -52,7 +52,7 @@ def records(seed, curvature=0.0, quiet=8.0):
     for number, command in enumerate(commands):
         taken = simulate(device, Bench(camera=0.2), command, duration=36.0, name=f"r{number}", rng=rng)
         y = taken.response + curvature * taken.response**3
-        y = y + NOISE * rng.standard_normal(y.shape)
+        y = y + noise * rng.standard_normal(y.shape)
         out.append(Record(taken.name, taken.time, taken.drive, y, AXIS, AXIS, "ms"))
     return out
 

@@ -166,6 +166,15 @@ def test_grey_levels_are_those_of_one_driver():
         assert np.allclose(16 * drive.values, np.round(16 * drive.values), atol=1e-9)
 
 
+def test_half_way_between_grey_levels_rounding_errors_do_not_decide():
+    """4.5, 4.5 + 1e-15, 13.5 and 7.5 of 15 levels go to the even one."""
+    scene = BASE.simulator.scenes(BASE.plant(VALUES), np.zeros(0))[0]
+    drive = AxisDrive(np.arange(4.0), np.array([0.3, 0.1 + 0.2, 0.9, 0.5]))
+    grey, _ = ALL["grey_quantisation"](15.0).commands(drive, 0.0, 0, scene, np.ones(1))
+    assert grey.values[[0, -2, -1]] * 15 == pytest.approx([4.0, 14.0, 8.0])
+    assert grey.times.tolist() == [0.0, 2.0, 3.0]
+
+
 @pytest.mark.parametrize("name", sorted(set(NAMES) - {"outliers", "grey_quantisation", "unmodelled_smooth"}))
 def test_it_does_something(name: str):
     made = middle(name)

@@ -185,3 +185,13 @@ def test_phases_hold_every_change(rng):
         centre = np.diff(drive.values, prepend=0.0) @ drive.times
         assert jumps @ when == pytest.approx(centre, abs=1e-9)
         assert all((np.diff(part.blocks) > 0).all() for part in parts)
+
+
+def test_small_changes_added_to_a_drive_leave_the_rest_as_it_is(rng):
+    """20 changes and 20 of a millionth of their size are more than are kept apart; the response is linear."""
+    times, at = np.arange(0.0, 20.0, 0.1), np.cumsum(rng.uniform(0.3, 0.9, 20))
+    jumps, small = rng.choice([-1.0, 1.0], 20), 1e-6 * rng.normal(size=20)
+    late = at + 0.1234 + rng.uniform(0.0, 0.2, 20)
+    both = AxisDrive.of_jumps(np.concatenate((at, late)), np.concatenate((jumps, small)))
+    added = respond(both, times, 1.0) - respond(AxisDrive.of_jumps(at, jumps), times, 1.0)
+    assert added == pytest.approx(superposed(AxisDrive.of_jumps(late, small), times, 1.0), abs=2e-8)

@@ -99,6 +99,10 @@ def _levels(drive: AxisDrive, rest: float) -> Vector:
     return rest + np.concatenate(([0.0], drive.values))
 
 
+_HALVES = 9
+"""Digits of a command in grey levels [-]: half way between two, rounding errors do not decide."""
+
+
 @final
 @dataclass(frozen=True)
 class GreyQuantisation(DriveEffect):
@@ -132,7 +136,8 @@ class GreyQuantisation(DriveEffect):
     def commands(self, drive: AxisDrive, rest: float, axis: int, scene: Scene, psi: Vector) -> Acting:
         """Level by level."""
         step, levels = scene.ranges.drive[axis] / self.levels, _levels(drive, rest)
-        return _mapped(drive, levels + psi[0] * (step * np.round(levels / step) - levels))
+        grey = np.round(np.round(levels / step, _HALVES))
+        return _mapped(drive, levels + psi[0] * (step * grey - levels))
 
 
 @final

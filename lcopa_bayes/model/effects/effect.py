@@ -226,6 +226,11 @@ class Effect(ABC):
         """Internal constants by name."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
+    @property
+    def timed(self) -> bool:
+        """Whether commands jump with internal constants, those of a clock: no slope says where they are."""
+        return self.card.place == "drive" and bool(self.fractions)
+
 
 Acting: TypeAlias = tuple[AxisDrive, float]
 """Commands as they act, deviations from the resting drive, and that rest [drive unit]."""
