@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from math import sqrt
 from typing import final
 
@@ -216,29 +216,30 @@ def _resampled(
 ) -> Draws:
     """Draws at positions of weighted draws.
 
-    Effective sample sizes, modes and their shares are those of the weights, the sizes together with the
-    number of draws. Parts of the weighted draws take the place of the ensembles of a sampler in R-hat.
+    Effective sample sizes, modes and their shares are those of the weights and of resampling together. Parts
+    of the weighted draws take the place of the ensembles of a sampler in R-hat.
     """
     values = _completed(posterior, weighted.coordinates[chosen.ravel()], rng)
     values = values.reshape(*chosen.shape, -1)
     rows, multimodal = posterior.table.rows, []
 
-    def joined(worth: Vector) -> Vector:
-        return 1 / (1 / worth + 1 / chosen.size)
-
-    centre, tail = joined(weighted.centre_ess), joined(weighted.tail_ess)
+    added = partial(weighted.resampling_variance, count=chosen.shape[1])
+    centre = 1 / (1 / weighted.centre_ess + added(weighted.scores))
+    tail = 1 / (1 / weighted.tail_ess + added(weighted.below).max(axis=0))
     for at, k in enumerate(posterior.sampled):
         if edges := weighted.boundaries[at]:
             shares, worth = weighted.shares(at)
-            errors = np.sqrt(shares * (1 - shares) / joined(worth))
+            inside = np.searchsorted(edges, weighted.sampled[:, at])[:, None] == np.arange(len(shares))
+            errors = np.sqrt(shares * (1 - shares) * (1 / worth + added(inside.astype(float))))
             multimodal.append(Modes(rows[k].name, rows[k].unit, edges, shares[None], errors[None]))
     sizes = {k: (float(centre[at]), float(tail[at])) for at, k in enumerate(posterior.sampled)}
-    linear = (float(min(centre, default=weighted.ess)), float(min(tail, default=weighted.ess)))
+    # each draw has linear parameters of its own
+    bulk, ends = (1 / (1 / min(one, default=weighted.ess) + 1 / chosen.size) for one in (centre, tail))
     measured = tuple(
         with_shares(
             Quality(
                 row.name,
-                *(size := sizes.get(k, linear)),
+                *(size := sizes.get(k, (float(bulk), float(ends)))),
                 float(array_stats.rhat_nested(values[..., k], np.arange(len(chosen)))),  # type: ignore[no-untyped-call]
                 scatter=sqrt(len(chosen) / size[0]),
             ),

@@ -114,7 +114,7 @@ class _Point(NamedTuple):
     log_marginal: Vector
     """Log of prior times likelihood, the rest integrated out, estimated [nat]; -inf without a draw."""
     efficiency: Vector
-    """Effective share of the draws tried [-]."""
+    """Effective share of the draws tried [-]; NaN without any."""
 
 
 @final
@@ -367,13 +367,12 @@ class Search:
         return bool(mean > np.log(_HEAVIER / expected))
 
     def _evaluated(self, y: Matrix, values: Matrix, starts: Matrix | None) -> _Point:
-        """Optima and draws at points; the first of a search twice, the second time from their neighbours,
-        unless these are hopeless too."""
+        """Optima and draws at points; the first of a search twice, the second time from those with hope."""
         hoped = np.ones(len(y), dtype=bool)
         if starts is None:
-            known = np.concatenate([point.y for point in self._points])
-            optima = np.concatenate([point.values for point in self._points])
-            objective = np.concatenate([point.objective for point in self._points])
+            known, optima, objective = (
+                np.concatenate(part) for part in list(zip(*self._points, strict=True))[:3]
+            )
             begin = optima[best_near(y, known, objective)]
         else:
             begin = starts[nearest(y, self.outer.y(starts), 1)[:, 0]]
@@ -382,14 +381,12 @@ class Search:
             begin, hoped = begin[best], objective[best] > objective.max() - HOPELESS
         efficiency = [float(np.nanmedian(point.efficiency)) for point in self._points[-1:]]
         tries = int(np.clip(_EFFECTIVE_TRIES / max(*efficiency, 1e-3), *_TRIES)) if efficiency else _TRIES[0]
-        optimum, level = begin.copy(), np.full(len(y), -np.inf)
-        z, density, marginal = self.posterior.coordinates(begin), level.copy(), level.copy()
-        share = np.full(len(y), np.nan)
-        drawn = self._done(Draw(tries), values[hoped], begin[hoped])
-        for whole, part in zip((optimum, level, z, density, marginal, share), drawn, strict=True):
+        level, density, marginal, share = np.outer([-np.inf, -np.inf, -np.inf, np.nan], np.ones(len(y)))
+        point = _Point(y, begin, level, self.posterior.coordinates(begin), density, marginal, share)
+        for whole, part in zip(point[1:], self._done(Draw(tries), values[hoped], begin[hoped]), strict=True):
             whole[hoped] = part
         marginal += self.posterior.table.log_permutations
-        return _Point(y, optimum, level, z, density, marginal, share)
+        return point
 
     def _done(self, task: Optima | Draw, values: Matrix, starts: Matrix | None) -> list[Matrix]:
         """A task for all points, by the workers."""

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import logsumexp
 from scipy.stats import norm
 
-from lcopa_bayes.core.arrays import Index, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.importanceweights import effective, smoothed
 from lcopa_bayes.sampling.modes import boundaries
@@ -144,30 +144,39 @@ class Weighted:
         return effective(self.log_weights) if self.log_weights.size else 0.0
 
     @cached_property
+    def scores(self) -> Matrix:
+        """Normal scores of the sampled parameters, (draws, parameters) [-]."""
+        out = np.empty(self.sampled.shape)
+        for column, own in zip(self.sampled.T, out.T, strict=True):
+            rank = np.argsort(column, kind="stable")
+            own[rank] = np.cumsum(self._weights[rank]) - 0.5 * self._weights[rank]
+        return np.asarray(norm.ppf(np.clip(out, 1e-9, 1 - 1e-9)))
+
+    @cached_property
+    def below(self) -> Array:
+        """Whether the sampled parameters are at most their 5 and 95 % quantiles, (2, draws, parameters)."""
+        out = np.empty((len(_TAILS), *self.sampled.shape))
+        for column, own in zip(self.sampled.T, np.moveaxis(out, 2, 0), strict=True):
+            rank = np.argsort(column, kind="stable")
+            beyond = np.cumsum(self._weights[rank])
+            ends = column[rank][np.minimum(np.searchsorted(beyond, _TAILS), column.size - 1)]
+            own[:] = column <= ends[:, None]
+        return out
+
+    @cached_property
     def centre_ess(self) -> Vector:
         """Effective sample size for the mean of each sampled parameter's normal scores, (parameters,)."""
         if self.factors:
             return self._of_factors(lambda one: one.centre_ess)
-        weights, out = self._weights, []
-        for column in self.sampled.T:
-            rank = np.argsort(column, kind="stable")
-            below = np.empty(column.size)
-            below[rank] = np.cumsum(weights[rank]) - 0.5 * weights[rank]
-            out.append(_worth(norm.ppf(np.clip(below, 1e-9, 1 - 1e-9)), weights))
-        return np.array(out)
+        return np.array([_worth(own, self._weights) for own in self.scores.T])
 
     @cached_property
     def tail_ess(self) -> Vector:
         """The smaller effective sample size of the 5 and the 95 % quantile, (parameters,)."""
         if self.factors:
             return self._of_factors(lambda one: one.tail_ess)
-        weights, out = self._weights, []
-        for column in self.sampled.T:
-            rank = np.argsort(column, kind="stable")
-            beyond = np.cumsum(weights[rank])
-            ends = column[rank][np.minimum(np.searchsorted(beyond, _TAILS), column.size - 1)]
-            out.append(min(_worth((column <= end).astype(float), weights) for end in ends))
-        return np.array(out)
+        each = [[_worth(own, self._weights) for own in end.T] for end in self.below]
+        return np.asarray(np.min(each, axis=0))
 
     @cached_property
     def boundaries(self) -> tuple[tuple[float, ...], ...]:
@@ -217,6 +226,23 @@ class Weighted:
     def batches(self, count: int, rng: np.random.Generator) -> Index:
         """Positions of resampled draws, `count` of every part, (batches, count)."""
         return np.stack([part.start + resampled(self.log_weights[part], count, rng) for part in self.parts])
+
+    def resampling_variance(self, values: Array, count: int) -> Array:
+        """Variance that `batches` add to means of `values`, (..., draws, columns), over that of a draw, (...,
+        columns) [-].
+
+        A draw is taken as often as is expected of its weight, up to the next whole number: what is random is
+        the remainder f, with variance f (1 - f), in draws whose order is random. It is far less than that of
+        independent choices where most draws are taken.
+        """
+        parts = [self.log_weights[part] for part in self.parts]
+        remainder = np.concatenate([count * np.exp(part - logsumexp(part)) for part in parts]) % 1.0
+        chance = remainder * (1.0 - remainder)
+        share = chance / max(float(chance.sum()), 1e-300)
+        apart = values - (share @ values)[..., None, :]
+        spread = self._weights @ (values - (self._weights @ values)[..., None, :]) ** 2
+        added = (chance @ apart**2) / (BATCHES * count) ** 2
+        return np.asarray(np.divide(added, spread, out=np.zeros_like(added), where=spread > 0))
 
 
 def tail_smoothed(log_weights: Vector) -> tuple[Vector, float]:
