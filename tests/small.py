@@ -110,11 +110,11 @@ def row_values(table: ParameterTable, told: Mapping[str, float]) -> Vector:
 
 
 def draws_of(table: ParameterTable, values: Matrix) -> Draws:
-    """Draws that count as perfectly converged, in two ensembles."""
+    """Draws that count as perfectly converged, and as all wanted, in two ensembles."""
     half = values.shape[0] // 2
-    found = tuple(Quality(row.name, 1e4, 1e4, 1.0) for row in table.rows if row.free)
+    found = tuple(Quality(row.name, 1e6, 1e6, 1.0) for row in table.rows if row.free)
     stacked = values[: 2 * half].reshape(2, half, -1)
-    return Draws(table, stacked, np.zeros((2, half)), found, 400.0)
+    return Draws(table, stacked, np.zeros((2, half)), found, max(400.0, 2.0 * half))
 
 
 ON_OFF_TABLE = "Messung 3;;;\n\nZeit [min];Heater [%];T1 (°C);Notiz\n" + "".join(

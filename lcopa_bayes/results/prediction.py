@@ -24,8 +24,8 @@ from lcopa_bayes.sampling.draws import Draws
 
 _CELLS = 2_000_000
 """Draws times samples behind the bands of one axis of one record."""
-_FEWEST = 200
-"""Draws behind a band at least."""
+_FEWEST, _PER_WANTED = 200, 2.5
+"""Draws behind a band at least, and at most over the effective draws wanted [-]: more are worth no more."""
 _WITH_EFFECTS = 400
 """Draws behind a band at most where the plant has effects, which take a simulation each."""
 _MOVED = 1e-9
@@ -195,7 +195,7 @@ def plant_draws(draws: Draws, model: ForwardModel, seed: int) -> tuple[Matrix, A
     """Table values behind the bands of a model's one experiment, (draws, rows), and the plant's responses
     without offsets, (axes, draws, samples) [response unit]; with effects as `surfaced` gives them."""
     size = model.experiments[0].mesh.reading.samples
-    most = max(_FEWEST, _CELLS // size)
+    most = max(_FEWEST, min(_CELLS // size, int(_PER_WANTED * draws.target_ess)))
     values = draws.thinned(most if model.effects is None else min(most, _WITH_EFFECTS))
 
     def simulated(own: Matrix) -> Array:
