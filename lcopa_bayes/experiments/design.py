@@ -15,6 +15,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import Estimate, quantile
+from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.experiments.candidates import PLAIN, Candidate, Limits, bench_times, candidates, limits_of
 from lcopa_bayes.experiments.information import Bench
 from lcopa_bayes.identifiability.contraction import prior_draws, prior_spread
@@ -80,22 +81,39 @@ def ratios(over: Vector, under: Vector) -> Vector:
 
 
 def promises(
-    bench: Bench, drives: Sequence[Candidate], draws: Matrix, *, repeats: int = 1, prior: Vector | None = None
+    bench: Bench,
+    drives: Sequence[Candidate],
+    draws: Matrix,
+    *,
+    repeats: int = 1,
+    prior: Vector | None = None,
+    jobs: int = 1,
 ) -> list[Promise]:
-    """What each drive promises at draws (draws, rows) of table values.
+    """What each drive promises at draws (draws, rows) of table values, by `jobs` processes.
 
     `prior`, (parameters,): standard deviations that count as information beforehand, in the coordinates of
     `Bench.slopes`; None: the measurement alone.
     """
-    result: list[list[Matrix]] = [[] for _ in drives]
-    for values in draws:
-        known, sizes = StepResponses(), bench.sizes(values)
-        for place, drive in enumerate(drives):
-            gram = repeats * bench.gram(values, drive.command, known)
-            if prior is not None:
-                gram[np.diag_indices_from(gram)] += prior**-2.0
-            result[place].append(cramer_rao(gram * np.outer(sizes, sizes)))
-    return [Promise(drive, bench.time, np.array(each)) for drive, each in zip(drives, result, strict=True)]
+    with workers((bench, drives, repeats, prior), jobs=min(jobs, len(draws))) as crew:
+        result = list(crew.each(_covariances, list(draws)))
+    return [
+        Promise(drive, bench.time, np.array(each))
+        for drive, each in zip(drives, zip(*result, strict=True), strict=True)
+    ]
+
+
+def _covariances(
+    shared: tuple[Bench, Sequence[Candidate], int, Vector | None], values: Vector
+) -> list[Matrix]:
+    """Covariance that each drive promises at table values (rows,), (parameters, parameters)."""
+    (bench, drives, repeats, prior), result = shared, []
+    known, sizes = StepResponses(), bench.sizes(values)
+    for drive in drives:
+        gram = repeats * bench.gram(values, drive.command, known)
+        if prior is not None:
+            gram[np.diag_indices_from(gram)] += prior**-2.0
+        result.append(cramer_rao(gram * np.outer(sizes, sizes)))
+    return result
 
 
 def cramer_rao(gram: Matrix) -> Matrix:
@@ -310,13 +328,14 @@ def design(
     with_prior: bool = False,
     draws: int = DRAWS,
     ladder: bool = True,
+    jobs: int = 1,
 ) -> Design:
     """Compare candidate drives for a fitted study at many bench times.
 
     `time` [time unit of the study] is what the winner is chosen for, by default 40 spans of the records;
-    without `ladder` no other time is tried, nor with effects a longer one. The measurement counts alone
-    unless `with_prior`. InputError as `limits_of` and `bench_times`, for fewer than one repeat, and when no
-    plant parameter is free.
+    without `ladder` no other time is tried, nor with effects a longer one; `jobs`, processes to use. The
+    measurement counts alone unless `with_prior`. InputError as `limits_of` and `bench_times`, for fewer than
+    one repeat, and when no plant parameter is free.
     """
     problem, study = fit.problem.thrifty, fit.study
     limits, times, chosen = checked(problem, time=time, repeats=repeats, amplitude=amplitude, refresh=refresh)
@@ -335,7 +354,7 @@ def design(
         if not possible or possible[0].name != PLAIN:
             raise InputError(f"no candidate drive lies inside the amplitude limit at {each:g}")
         bench = Bench(problem, each, limits.period)
-        tried.append(tuple(promises(bench, possible, averaged, repeats=repeats, prior=known)))
+        tried.append(tuple(promises(bench, possible, averaged, repeats=repeats, prior=known, jobs=jobs)))
     points = averaged if problem.ranges is not None else np.concatenate([averaged, believed[:_PRIOR_POINTS]])
     result = _symmetries(first, limits, points)
     return Design(fit, limits, repeats, chosen, averaged, first.names, tuple(tried), result)

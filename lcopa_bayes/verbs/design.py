@@ -100,7 +100,7 @@ def design(
     checked(problem_of(with_least_terms(study_of(source))), **wanted)  # before a long fit
     fit = basis(source, jobs=jobs, folder=folder, resume=resume, quick=quick, quiet=quiet)
     draws = DRAWS // _QUICK if quick else DRAWS
-    planned = designed(fit, **wanted, with_prior=with_prior, draws=draws)
+    planned = designed(fit, **wanted, with_prior=with_prior, draws=draws, jobs=jobs)
     trials = confirmed(planned, jobs=jobs, replicas=REPLICAS // 2 if quick else REPLICAS)
     values, texts = as_json(planned) | trials | {"template": None}, {}
     if values["winner"] is not None:
