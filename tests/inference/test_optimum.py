@@ -9,6 +9,7 @@ from small import TRUTH, TWO, path, problem, record
 
 from lcopa_bayes.bench.command import prbs
 from lcopa_bayes.bench.device import Device
+from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.optimum import along_orders, find_optima
@@ -216,6 +217,15 @@ def test_noise_is_estimated_from_the_residual():
 def test_a_nearly_noise_free_record_keeps_its_small_noise():
     found = best(made(record(camera=0.05, noise_sd=1e-4), blocks=2000), starts=3)
     assert found["sigma"] < 3e-4
+
+
+def test_processes_that_descend_side_by_side_find_the_same_optima():
+    posterior = problem(record(1)).posterior
+    alone = find_optima(posterior, np.random.default_rng(3), starts=4)
+    with workers(posterior, jobs=2) as crew:
+        together = find_optima(posterior, np.random.default_rng(3), starts=4, crew=crew)
+    assert [one.log_density for one in together] == [one.log_density for one in alone]
+    assert_allclose([one.values for one in together], [one.values for one in alone], rtol=0)
 
 
 def test_along_an_order_everything_else_is_at_its_optimum():
