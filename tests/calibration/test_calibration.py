@@ -425,7 +425,7 @@ def test_default_priors_of_a_stated_truth_are_those_of_its_own_records():
 
 def test_what_the_width_of_the_blocks_does_is_counted(monkeypatch):
     """Wide blocks that may not be narrowed: the shift is measured, lowers the grade, and both are counted."""
-    monkeypatch.setattr("lcopa_bayes.results.discretisation._FINEST", 1)
+    monkeypatch.setattr("lcopa_bayes.results.discretisation.FINEST", 1)
     priors = PRIORS | {"order_1": ("uniform", {"loc": 0.2, "scale": 1.0})}
     clean = record(camera=0.6, noise_sd=1e-4)
     coarse = study(clean, noise="white", priors=priors | {"sigma": 1e-4}, blocks=4)

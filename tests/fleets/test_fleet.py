@@ -207,7 +207,7 @@ def test_what_is_no_fleet_is_refused_with_one_message(devices, tmp_path, capsys)
         (devices / "a", "is one study, not a fleet"),
     ):
         assert main(["fleet", str(folder), "--out", str(tmp_path / "out")]) == 2
-        (line,) = capsys.readouterr().err.splitlines()
+        (line,) = capsys.readouterr().err.removeprefix("fleet: loading\n").splitlines()
         assert words in line
         assert not (tmp_path / "out").exists()
     one = lb.load_study(devices / "a")
