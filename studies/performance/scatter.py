@@ -125,6 +125,27 @@ def drawn(results: Mapping[str, Any], path: Path) -> None:
     save(figure, path)
 
 
+def sentence(study: str, result: Mapping[str, Any]) -> str:
+    """A study's ratios in words."""
+    grades = ", ".join(f"{count} {grade}" for grade, count in result["grades"].items())
+    return (
+        f"{study}: {result['fits']} fits ({grades}). Of {len(result['rows'])} ratios the median is "
+        f"{result['median']:.2f} and the largest {result['largest']:.2f}; {result['too_small']} stated errors "
+        f"are too small by more than a factor {LIMIT:g}, {result['too_large']} too large."
+    )
+
+
+def report(results: Mapping[str, Any]) -> str:
+    """The page."""
+    said = "\n\n".join(sentence(study, result) for study, result in results.items())
+    return (
+        "# Stated Monte Carlo errors against the scatter over seeds\n\n"
+        "The root mean square of the deviations of a quantity over seeds, divided by its stated error: 1 where "
+        "stated errors are true, above 1 where they are too small. Made by "
+        f"`studies/performance/scatter.py`.\n\n{said}\n\n![Scatter over stated error](scatter.svg)\n"
+    )
+
+
 def measured(study: str, folder: Path, seeds: Sequence[int], crew: Workers[None]) -> dict[str, Any]:
     """Rows of a study, and what its fits say of themselves."""
     fits = []
@@ -139,7 +160,8 @@ def measured(study: str, folder: Path, seeds: Sequence[int], crew: Workers[None]
         "grades": {grade: grades.count(grade) for grade in dict.fromkeys(grades)},
         "median": float(np.median([row["ratio"] for row in rows])),
         "largest": max(row["ratio"] for row in rows),
-        "beyond": sum(not 1 / LIMIT <= row["ratio"] <= LIMIT for row in rows),
+        "too_small": sum(row["ratio"] > LIMIT for row in rows),
+        "too_large": sum(row["ratio"] < 1 / LIMIT for row in rows),
         "rows": rows,
     }
 
@@ -150,20 +172,17 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--kept", type=Path, default=Path("runs/scatter"), help="folder of the fits")
-    parser.add_argument("--out", type=Path, help="folder for scatter.svg and scatter.json")
+    parser.add_argument("--out", type=Path, help="folder for scatter.md, .svg and .json")
     options = parser.parse_args()
     options.kept.mkdir(parents=True, exist_ok=True)
     with workers(None, jobs=options.jobs) as crew:
         seeds = range(1, options.seeds + 1)
         results = {study: measured(study, options.kept, seeds, crew) for study in options.studies}
-    for study, result in results.items():
-        print(
-            f"{study}: {result['fits']} fits {result['grades']}; {len(result['rows'])} ratios, median "
-            f"{result['median']:.2f}, largest {result['largest']:.2f}, {result['beyond']} beyond {LIMIT:g}"
-        )
+    print(report(results))
     if options.out:
         options.out.mkdir(parents=True, exist_ok=True)
         (options.out / "scatter.json").write_text(json.dumps(results, indent=1, allow_nan=False) + "\n")
+        (options.out / "scatter.md").write_text(report(results), encoding="utf-8")
         drawn(results, options.out / "scatter.svg")
 
 
