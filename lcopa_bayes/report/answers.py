@@ -347,4 +347,4 @@ def _of(names: Sequence[str], rows: Sequence[Values], noun: str, most: int = 8) 
 
 def _stopped(clauses: Sequence[str]) -> str:
     """Clauses that may begin with names, as a sentence; empty without any."""
-    return f"{'; '.join(clauses)}." if clauses else ""
+    return f"{'; '.join(one.rstrip('.') for one in clauses)}." if clauses else ""

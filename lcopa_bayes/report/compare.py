@@ -26,8 +26,10 @@ def drawn(folder: Path, values: Mapping[str, Any]) -> Drawings:
 def _verdict(results: Mapping[str, Any]) -> Verdict:
     """Grade of the preferred candidate."""
     own = next((row for row in results["models"] if row["name"] == results["preferred"]), None)
-    grade, reason = (own["grade"], own["grade_reason"]) if own else ("unusable", results["why"])
-    return Verdict(str(grade), f"{results['why']} {results['fractional']['sentence']}", str(reason))
+    if own is None:
+        return Verdict("unusable", results["why"], "")
+    said = f"{results['why']} {results['fractional']['sentence']}"
+    return Verdict(str(own["grade"]), said, str(own["grade_reason"]))
 
 
 def _curves(folder: Path, results: Mapping[str, Any]) -> dict[str, pd.DataFrame]:

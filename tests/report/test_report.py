@@ -539,7 +539,7 @@ def test_the_most_prior_sensitive_parameters_are_shown_and_the_rest_counted(html
     ]
     assert rows[2][1:4] == ["–", "–", "not trusted"]  # noqa: RUF001
     assert "matters for 1 of 2 parameters: time_1" in shown
-    assert "Not trusted for 1 parameter(s), gain" in shown
+    assert "Not trusted for gain: " in shown
     moved_by = [moved(f"p{k}", 0.01, "-") for k in range(30)]
     many = section_of(page_with(tmp_path / "many", sensitivity=moved_by), "prior-sensitivity")
     assert len(rows_of(many)) == 1 + 20
