@@ -58,19 +58,7 @@ def pages_of(place: Path) -> dict[str, Path]:
     shutil.copy(REPORTS / "calibration" / "one-term" / "results.json", place / "calibrate")
     for verb in ("claims", "optics"):
         assert main([verb, "--out", str(place / verb), "--quiet"]) == 0
-    ran = (
-        "audit",
-        "predict",
-        "check",
-        "compare",
-        "loop",
-        "calibrate",
-        "claims",
-        "optics",
-        "design",
-        "identify",
-    )
-    return {verb: write_page_of(verb, place / verb) for verb in ran}
+    return {one.name: write_page_of(one.name, one) for one in sorted(place.iterdir()) if one.is_dir()}
 
 
 @pytest.fixture(scope="module")
@@ -118,6 +106,28 @@ def test_the_rules_see_a_fault(browser, tmp_path):
     )
     text = str(faults(browser, path, "light"))
     assert all(rule in text for rule in ("image-alt", "html-has-lang", "px wide", "missing is not defined"))
+
+
+def test_panels_side_by_side_stand_below_each_other_on_a_phone(browser, report):
+    page, errors = opened(browser, report, viewport=PHONE)
+    figure = page.locator("#frequency-response figure .wide")
+    lefts = (
+        "e => [...e.querySelectorAll(':scope > svg')].map(one => Math.round(one.getBoundingClientRect().x))"
+    )
+    assert figure.evaluate(lefts) == [figure.evaluate("e => Math.round(e.getBoundingClientRect().x)")] * 3
+    first, second, third = (one.bounding_box() for one in figure.locator(":scope > svg").all())
+    assert (
+        first["height"] < second["height"] == pytest.approx(third["height"], rel=0.2)
+    )  # a legend, two panels
+    assert second["y"] + second["height"] <= third["y"] + 1
+    figure.click()
+    assert len(figure.evaluate(lefts)) == 1
+    figure.click()
+    assert len(figure.evaluate(lefts)) == 3
+    page.set_viewport_size({"width": 1300, "height": 844})
+    page.wait_for_function("document.querySelectorAll('#frequency-response figure .wide > svg').length === 1")
+    assert errors == []
+    page.close()
 
 
 def test_sections_fold_and_open_where_a_link_leads(browser, report):
