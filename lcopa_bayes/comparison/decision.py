@@ -17,6 +17,7 @@ from lcopa_bayes.comparison.averaging import (
     simplest,
 )
 from lcopa_bayes.comparison.priorwidth import FACTORS
+from lcopa_bayes.results.summary import joined
 
 
 def fractional(usable: Sequence[Row]) -> dict[str, Any]:
@@ -151,8 +152,8 @@ def decided(rows: Sequence[Row]) -> dict[str, Any]:
         why = "fewer than two candidates have a usable posterior: nothing can be compared"
         return values | {
             "preferred": None,
-            "why": why,
-            "agreement": {"agree": None, "sentence": why},
+            "why": joined([why]),
+            "agreement": {"agree": None, "sentence": joined([why])},
             "fractional": undecided(why),
             "by_evidence": None,
             "by_prediction": None,
@@ -258,7 +259,7 @@ def flags(rows: Sequence[Row]) -> list[dict[str, str]]:
             )
         out.append({"model": row["name"], "kind": "imitation" if high else "residual", "sentence": said})
     ranked = [row for row in rows if row["usable"] and row["held_out"]]
-    for axis in dict.fromkeys(one["axis"] for row in ranked for one in row["fit_scores"]):
+    for axis, unit in {one["axis"]: one["unit"] for row in ranked for one in row["fit_scores"]}.items():
         fitted = min(ranked, key=lambda row: row["residual_rms"][axis])
         error = {row["name"]: row["held_out_rmse"].get(axis) for row in ranked}
         if None in error.values() or len(ranked) < 2:
@@ -270,8 +271,9 @@ def flags(rows: Sequence[Row]) -> list[dict[str, str]]:
                     "model": fitted["name"],
                     "kind": "overfit",
                     "sentence": (
-                        f"it fits axis {axis} best (RMSE {fitted['residual_rms'][axis]:.3g}) and predicts it "
-                        f"worst (RMSE {error[fitted['name']]:.3g}; {least}: {error[least]:.3g})"
+                        f"it fits axis {axis} best (RMSE {fitted['residual_rms'][axis]:.3g} {unit}) and "
+                        f"predicts it worst (RMSE {error[fitted['name']]:.3g} {unit}; {least}: "
+                        f"{error[least]:.3g} {unit})"
                     ),
                 }
             )

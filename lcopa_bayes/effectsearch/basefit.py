@@ -117,10 +117,10 @@ def measured(posterior: Posterior, residual: Vector, delay: float) -> tuple[Axis
     out = []
     scales = Scales.of([one.record for one in posterior.samples])
     for axis, response in enumerate(posterior.table.layout.responses):
-        noise = axis_noise(posterior.samples, axis, delay, response.name, scales)
+        noise = axis_noise(posterior.samples, axis, delay, response, scales)
         if noise is None:
             quiet = sum(p.values.size for p in quiet_pieces(posterior.samples, axis, delay))
-            noise = joint_noise(axis_pieces(posterior, residual, axis), response.name, quiet, scales)
+            noise = joint_noise(axis_pieces(posterior, residual, axis), response, quiet, scales)
         out.append(noise)
     return tuple(out)
 

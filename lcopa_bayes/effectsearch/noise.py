@@ -18,6 +18,7 @@ from scipy.special import logsumexp
 from scipy.stats import chi2
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.data.record import Axis
 from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.noise import WhiteAR1
 from lcopa_bayes.inference.observations import Observed, PlausibleNoise, Samples, mixed_shapes
@@ -216,7 +217,7 @@ def _repeats(one: Samples, other: Samples, axis: int) -> bool:
 
 
 def axis_noise(
-    samples: Sequence[Samples], axis: int, delay: float, name: str, scales: Scales
+    samples: Sequence[Samples], axis: int, delay: float, response: Axis, scales: Scales
 ) -> AxisNoise | None:
     """Noise of an axis from quiet samples, and from repeats where these agree; None when too few.
 
@@ -229,32 +230,33 @@ def axis_noise(
     usable = [piece for piece in quiet if np.ptp(piece.values) > 0]
     if count >= FEWEST and usable:
         alone = plausible(usable, scales)
-        said = f"{name}: {_named(alone)} from {count} quiet samples"
+        said = f"{response.name}: {_named(alone, response.unit)} from {count} quiet samples"
         if not again:
             return AxisNoise.of(alone, count, "quiet", f"{said}.")
         ratio, p = _repeated(alone, repeats)
         if p > _ALIKE:
             both = plausible([*usable, *repeats], scales)
-            said = f"{name}: {_named(both)} from {count} quiet samples and {again} differences of repeats"
+            measured = f"{count} quiet samples and {again} differences of repeats"
+            said = f"{response.name}: {_named(both, response.unit)} from {measured}"
             return AxisNoise.of(both, count + again, "quiet", f"{said}, which agree.")
         differ = f"repeats differ by {ratio:.2f} times the quiet noise (p = {p:.1g})"
         return AxisNoise.of(alone, count, "quiet", f"{said}; {differ}: something varies between records.")
     if again >= FEWEST:
         alone = plausible([piece for piece in repeats if np.ptp(piece.values) > 0], scales)
-        said = f"{name}: {_named(alone)} from {again} differences of repeats"
+        said = f"{response.name}: {_named(alone, response.unit)} from {again} differences of repeats"
         return AxisNoise.of(alone, again, "repeats", f"{said}; {count} quiet samples are too few.")
     return None
 
 
-def _named(posterior: PlausibleNoise) -> str:
+def _named(posterior: PlausibleNoise, unit: str) -> str:
     law = Law.of(posterior)
     if law.share * law.rho < _SEEN:
-        return f"white noise of sd {law.sd:.3g}"
+        return f"white noise of sd {law.sd:.3g} {unit}"
     part = "" if law.share > 1 - _SEEN else f" in {100 * law.share:.0f} % of its power"
-    return f"noise of sd {law.sd:.3g} and correlation {law.rho:.2f}{part}"
+    return f"noise of sd {law.sd:.3g} {unit} and correlation {law.rho:.2f}{part}"
 
 
-def joint_noise(residual: Sequence[Observed], name: str, quiet: int, scales: Scales) -> AxisNoise:
+def joint_noise(residual: Sequence[Observed], response: Axis, quiet: int, scales: Scales) -> AxisNoise:
     """Noise of an axis fitted together with the plant, from its residual on each record [response unit].
 
     Coloured noise as free as the residual would take every slow effect for noise, and a fit whitened by it
@@ -269,11 +271,10 @@ def joint_noise(residual: Sequence[Observed], name: str, quiet: int, scales: Sca
     coloured = plausible([piece for piece in residual if piece.values.size > 1], scales)
     dependence = _dependence(pieces, Law.of(coloured))
     sentence = (
-        f"{name}: {quiet} quiet samples and no repeats are too few to know the noise ({FEWEST} are needed), "
-        f"so noise of sd {law.sd:.3g} is fitted to the residual together with the plant, and {count} "
-        f"samples count as {count / dependence:.0f} independent ones: what it takes for noise may be an "
-        "effect, so no verdict is better than tentative. Record a stretch before the first command, or a "
-        "repeat."
+        f"{response.name}: {quiet} quiet samples and no repeats are too few to measure the noise ({FEWEST} "
+        f"are needed), so its sd of {law.sd:.3g} {response.unit} is that of the residual, where {count} "
+        f"samples count as {count / dependence:.0f} independent ones. An effect may pass for noise there, so "
+        "no verdict is better than tentative. Record a stretch before the first command, or a repeat."
     )
     return AxisNoise(law, coloured, count, "joint", sentence, dependence)
 

@@ -102,7 +102,9 @@ def _power(values: Vector) -> float:
 def _by_record(pooled: _Axis, white: list[Vector]) -> View:
     rms, names = np.array([_power(one) for one in white]), [part.samples.record.name for part in pooled.parts]
     worst = int(np.argmax(rms))
-    said = f"largest on {names[worst]}, {rms[worst]:.2f} times the noise, smallest {rms.min():.2f} times"
+    said = (
+        f"largest on record {names[worst]}, {rms[worst]:.2f} times the noise, smallest {rms.min():.2f} times"
+    )
     error = np.sqrt(0.5 / np.array([one.size for one in white]))
     across = "record: " + ", ".join(f"{k} {name}" for k, name in enumerate(names))
     x = np.arange(len(names), dtype=float)

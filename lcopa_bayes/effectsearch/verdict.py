@@ -158,7 +158,8 @@ def decide(given: Findings) -> Verdict:
         said += f", but not all that is, worth {given.gained:.0f} nat together."
         return Verdict("partly explained", "tentative", said + rest)
     if set(given.effects) <= set(given.disturbances):
-        said = f"{named} disturb(s) the records; the plant stays as it is, the noise model changes."
+        verb = "disturbs" if one else "disturb"
+        said = f"{named} {verb} the records; the plant stays as it is, the noise model changes."
         return Verdict("disturbance", confidence, said + rest)
     return Verdict("explained", confidence, f"{said}, worth {given.gained:.0f} nat." + rest)
 
@@ -221,8 +222,8 @@ def _quiet(given: Findings, confidence: Confidence) -> Verdict:
     elif given.reached > REACHED:
         confidence = "tentative"
         nothing += (
-            f" But on unseen records the error is {given.reached:.2f} times the noise, and chance cannot be "
-            "told from what is missing: their drive leaves the range of the fitted ones, or the noise is "
+            f" But on unseen records the error is {given.reached:.2f} times the noise, which may be chance "
+            "or something that is missing: their drive leaves the range of the fitted ones, or the noise is "
             "known from the same residual alone."
         )
     if given.scatter > given.threshold:

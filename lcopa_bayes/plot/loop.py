@@ -21,13 +21,20 @@ def _residual(axes: Axes, curve: Mapping[str, Any], when: str, colour: str, unit
     axes.set(title=plain(f"{curve['record']}, {curve['axis']}: {when}"), xlabel=label("time", unit))
 
 
+def _scaled(panels: Sequence[Axes], along: str) -> None:
+    """Both panels with their own scale, as a phone shows them one below the other."""
+    for panel in panels:
+        panel.set_ylabel(along)
+        panel.tick_params(labelleft=True)
+
+
 def before_after_figure(curve: Mapping[str, Any], time_unit: str) -> Figure:
     """A residual without and with the effects, each with its 90 % band."""
     figure = blank(1.9)
     panels = figure.subplots(1, 2, sharey=True)
     for panel, when in zip(panels, ("before", "after"), strict=True):
         _residual(panel, curve, when, HELD_OUT if curve["held_out"] else SEEN, time_unit)
-    panels[0].set_ylabel(label("residual", curve["unit"]))
+    _scaled(panels, label("residual", curve["unit"]))
     return figure
 
 
@@ -41,7 +48,8 @@ def effects_figure(classes: Sequence[Mapping[str, Any]], threshold: float) -> Fi
     panel.axvline(threshold, color=HELD_OUT, lw=1.0, ls="--")
     panel.set_yticks(places, [plain(one["name"]) for one in classes])
     panel.invert_yaxis()
-    panel.set_xscale("symlog", linthresh=10)
+    if max(map(abs, panel.get_xlim())) > 10:  # without a power of ten in view there are no round numbers
+        panel.set_xscale("symlog", linthresh=10)
     panel.set_xlabel("log Bayes factor against nothing missing [nat]")
     return figure
 
@@ -62,5 +70,5 @@ def view_figure(before: Mapping[str, Any], after: Mapping[str, Any]) -> Figure:
         panel.set_xlabel(plain(across))
         if names:  # of the places, each behind its number
             panel.set_xticks(x, [plain(name.split(" ", 1)[1]) for name in names.split(", ")], rotation=90)
-    panels[0].set_ylabel(plain(str(before["along"])))
+    _scaled(panels, plain(str(before["along"])))
     return figure

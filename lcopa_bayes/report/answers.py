@@ -185,14 +185,21 @@ def _predict(v: Values) -> _Answers:
     yield "What next?", said, "Fitted range"
 
 
+def scatter_at_rest(record: Values) -> list[tuple[float, str]]:
+    """Scatter at rest over the range of each response of a checked record [-], with its axis."""
+    return [
+        (one["scatter"] / (one["highest"] - one["lowest"]), one["axis"])
+        for one in record["responses"]
+        if one["samples"] and one["scatter"] is not None and one["highest"] > one["lowest"]
+    ]
+
+
 def _check(v: Values) -> _Answers:
     yield "What is the plant?", v["sentences"][0], "Plant"
     fitted = [row for row in v["records"] if not row["held_out"]]
     axes = [(one, row) for row in fitted for one in row["responses"] if one["samples"]]
     noisy = [
-        (one["scatter"] / (one["highest"] - one["lowest"]), f"{row['record']}/{one['axis']}", row)
-        for one, row in axes
-        if one["scatter"] is not None and one["highest"] > one["lowest"]
+        (share, f"{row['record']}/{axis}", row) for row in fitted for share, axis in scatter_at_rest(row)
     ]
     if noisy:
         share, name, row = max(noisy, key=lambda each: each[0])
@@ -210,9 +217,10 @@ def _check(v: Values) -> _Answers:
     said = f"{len(default)} of {len(v['parameters'])} priors come from the records by rule."
     yield "What is assumed?", said, "Priors"
     lacking = [one.rstrip(".") for one in (*v["problems"], *v["disagreements"])]
+    place = "Remarks" if lacking else "Plant"
     if len(fitted) == len(v["records"]):
         lacking.append("no record is held out to test the prediction")
-    yield "What is missing?", joined(lacking), "Plant"
+    yield "What is missing?", joined(lacking), place
     ready = f"`fit` samples the {len(v['parameters'])} parameters of {v['study']}."
     yield "What next?", "Mend what is missing, then check again." if v["problems"] else ready, ""
 
@@ -347,4 +355,4 @@ def _of(names: Sequence[str], rows: Sequence[Values], noun: str, most: int = 8) 
 
 def _stopped(clauses: Sequence[str]) -> str:
     """Clauses that may begin with names, as a sentence; empty without any."""
-    return f"{'; '.join(clauses)}." if clauses else ""
+    return f"{'; '.join(one.rstrip('.') for one in clauses)}." if clauses else ""

@@ -26,8 +26,10 @@ def drawn(folder: Path, values: Mapping[str, Any]) -> Drawings:
 def _verdict(results: Mapping[str, Any]) -> Verdict:
     """Grade of the preferred candidate."""
     own = next((row for row in results["models"] if row["name"] == results["preferred"]), None)
-    grade, reason = (own["grade"], own["grade_reason"]) if own else ("unusable", results["why"])
-    return Verdict(str(grade), f"{results['why']} {results['fractional']['sentence']}", str(reason))
+    if own is None:
+        return Verdict("unusable", results["why"], "")
+    said = f"{results['why']} {results['fractional']['sentence']}"
+    return Verdict(str(own["grade"]), said, str(own["grade_reason"]))
 
 
 def _curves(folder: Path, results: Mapping[str, Any]) -> dict[str, pd.DataFrame]:
@@ -51,14 +53,19 @@ def _evidence(results: Mapping[str, Any]) -> list[Drawing]:
 
 
 def _records(results: Mapping[str, Any], curves: Mapping[str, pd.DataFrame]) -> list[Drawing]:
-    """Every axis of every record with the medians of all models, their residuals, and held-out bands."""
+    """Every axis of every record with the medians of all models, their residuals, and held-out bands: first
+    where the bands of the preferred candidate, else of the first, hold the fewest samples."""
     rows = [row for row in results["models"] if row["name"] in curves]
     if not rows:
         return []
     first = curves[rows[0]["name"]]
-    series = first[["record", "axis", "held_out"]].drop_duplicates().sort_values("held_out", kind="stable")
+    shown = first[["record", "axis", "held_out"]].drop_duplicates().itertuples(index=False, name=None)
+    best = next((row for row in rows if row["name"] == results["preferred"]), rows[0])
+    scores = (*best["fit_scores"], *best["held_out"])
+    held_by = {(one["record"], one["axis"]): one["coverage_90"] for one in scores}
     drawings = []
-    for number, (record, axis, held) in enumerate(series.itertuples(index=False), start=1):
+    worst_first = sorted(shown, key=lambda one: held_by.get(one[:2], 1.0))
+    for number, (record, axis, held) in enumerate(worst_first, start=1):
         parts = {
             row["name"]: entry[(entry["record"] == record) & (entry["axis"] == axis)]
             for row in rows

@@ -45,10 +45,60 @@
     copy.className = "tool";
     table.parentElement.after(copy);
   }
+  // On a narrow screen panels side by side stand one below the other, and a legend by itself, as views of the
+  // one drawing: shrunk to the screen as a whole its text would be too small to read.
+  const narrow = matchMedia("screen and (max-width: 40rem)");
+  const around = (boxes) => {
+    const [x, y] = ["x", "y"].map((at) => Math.min(...boxes.map((box) => box[at])));
+    const width = Math.max(...boxes.map((box) => box.x + box.width)) - x;
+    return { x, y, width, height: Math.max(...boxes.map((box) => box.y + box.height)) - y };
+  };
+  const apart = (boxes, at, size) => {
+    const groups = [];
+    let end = -Infinity;
+    for (const box of [...boxes].sort((a, b) => a[at] - b[at])) {
+      if (box[at] > end) groups.push([]);
+      groups[groups.length - 1].push(box);
+      end = Math.max(end, box[at] + box[size]);
+    }
+    return groups;
+  };
+  const outline = (axes) => around([...axes.children].filter((part, k) => !k || /axis_|text_|legend_/.test(part.id))
+    .map((part) => part.getBBox()));
+  const labelled = (axes) => [...axes.querySelectorAll("g[id*='axis_']")].map((axis) => !!axis.querySelector("text"));
+  const views = (drawn, whole) => {
+    const boxes = [...drawn.children].slice(1).map((part) =>
+      /axes_/.test(part.id) ? { ...outline(part), panel: labelled(part) } : around([part.getBBox()]));
+    return apart(boxes, "y", "height").flatMap((row) => {
+      const columns = apart(row, "x", "width");
+      const panels = row.map((box) => box.panel || []);  // those that share labels with others stay beside them
+      const alone = panels.every(([across, up]) => across && up === panels[0][1]);
+      if (alone && columns.length > 1 && columns.length < 4) return columns.map(around);
+      const full = row.some((box) => box.panel) && { x: whole.x + 3, width: whole.width - 6 };
+      return [{ ...around(row), ...full }];
+    });
+  };
+  const stack = () => {
+    for (const svg of document.querySelectorAll("figure .wide > svg:first-child")) {
+      const drawn = svg.querySelector("g[id$='figure_1']"), place = svg.parentElement;
+      while (svg.nextElementSibling) svg.nextElementSibling.remove();
+      svg.setAttribute("viewBox", svg.dataset.whole = svg.dataset.whole || svg.getAttribute("viewBox"));
+      svg.removeAttribute("style");
+      if (!narrow.matches || place.classList.contains("large") || !svg.getClientRects().length) continue;
+      views(drawn, svg.viewBox.baseVal).forEach((box, k) => {
+        const part = k ? place.appendChild(svg.cloneNode()) : svg;
+        if (k) part.appendChild(document.createElementNS(svg.namespaceURI, "use")).setAttribute("href", `#${drawn.id}`);
+        const [width, height] = [box.width + 6, box.height + 6];
+        part.setAttribute("viewBox", `${box.x - 3} ${box.y - 3} ${width} ${height}`);
+        part.setAttribute("style", `aspect-ratio: ${width} / ${height}; max-width: ${1.4 * width}px`);
+      });
+    }
+  };
   for (const picture of document.querySelectorAll("figure .wide")) {
-    picture.addEventListener("click", () => picture.classList.toggle("large"));
+    picture.addEventListener("click", () => { picture.classList.toggle("large"); stack(); });
   }
   const hint = () => {
+    stack();
     for (const part of document.querySelectorAll(".wide")) {
       part.classList.toggle("scrolls", part.scrollWidth > part.clientWidth + 16);
     }

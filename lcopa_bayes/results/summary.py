@@ -134,7 +134,7 @@ def _missing(fit: Fit) -> str:
     reasons = [one.reason for one in fit.draws.limitations if one.level != "reliable"]
     if fit.draws.modes:
         names = listed([one.parameter for one in fit.draws.modes])
-        reasons.append(f"the records leave several modes, of {names}")
+        reasons.append(f"the posterior has several modes, which differ in {names}")
     if not reasons:
         return "Nothing that the checks of the model against its records could see."
     return joined(reasons)

@@ -46,13 +46,21 @@ def inventory(study: Study) -> dict[str, Any]:
     InputError where its settings do not fit its records.
     """
     problem, obstacles = problem_of(with_least_terms(study)), unmet(study)
-    disagree = [str(one) for one in disagreements((*study.fit, *study.held_out))]
+    contradicted = disagreements((*study.fit, *study.held_out))
+    disagree = [str(one) for one in contradicted]
     rows = problem.posterior.table.rows
     sentences = [*_of_plant(problem), *_of_model(problem)]
     if study.model.terms == "auto":
         sentences.append("A fit lets the records choose more terms, and what paths share.")
     verdict = f"To mend before a fit: {'; '.join(obstacles)}." if obstacles else "The records can be fitted."
     verdict = " ".join([verdict, *(f"Records disagree: {one}." for one in disagree)])
+
+    def remarked(record: Record) -> dict[str, Any]:
+        """What was read of a record, with the remarks that name it."""
+        own = [one for one in obstacles if one.startswith(f"record {record.name!r}:")]
+        own += [str(one) for one in contradicted if record.name in one.records]
+        return _record(record, problem, held_out=record in study.held_out) | {"remarks": own}
+
     return plain(
         {
             "study": study.name,
@@ -63,10 +71,7 @@ def inventory(study: Study) -> dict[str, Any]:
             "problems": obstacles,
             "disagreements": disagree,
             "sentences": sentences,
-            "records": [
-                *(_record(one, problem, held_out=False) for one in study.fit),
-                *(_record(one, problem, held_out=True) for one in study.held_out),
-            ],
+            "records": [remarked(one) for one in (*study.fit, *study.held_out)],
             "parameters": [_prior(row) for row in rows],
         }
     )

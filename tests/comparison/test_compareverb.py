@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from lcopa_bayes.data.record import save_record
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.paper.claims import judge
 from lcopa_bayes.paper.verdict import Evidence
+from lcopa_bayes.report.compare import drawn
 from lcopa_bayes.report.pages import write_page_of
 from lcopa_bayes.results.fit import plan_of
 
@@ -114,6 +116,17 @@ def test_the_page_shows_all_of_it_and_is_drawn_again_the_same(folder, told):
     assert page.count("<svg") == 3  # evidence, the fitted record, the held-out one
     for words in (*PICK, "Influence of the prior", "Is this order an integer?", "Warnings", "held out"):
         assert words in page
+    assert page.index('id="warnings"') < page.index('id="scores"')
+
+
+@pytest.mark.parametrize("worse", ["fit_scores", "held_out"])
+def test_the_record_whose_bands_hold_least_is_drawn_first(folder, told, tmp_path, worse):
+    shutil.copytree(folder / "run", tmp_path / "run")
+    for row in told["models"]:
+        for key in ("fit_scores", "held_out"):
+            row[key] = [one | {"coverage_90": 0.5 if key == worse else 0.9} for one in row[key]]
+    (first, other) = drawn(tmp_path / "run", told)["candidates"][1:]
+    assert [bool(one.mark) for one in (first, other)] == [worse == "held_out", worse != "held_out"]
 
 
 def test_claims_refuse_a_folder_without_a_comparison(tmp_path, capsys):

@@ -238,9 +238,10 @@ def test_repeats_measure_the_noise():
     ).posterior
     pieces = repeat_pieces(posterior.samples, 0)
     assert sum(piece.values.size for piece in pieces) == np.isfinite(made[0].response).sum()
-    noise = axis_noise(posterior.samples, 0, 0.0, "x", Scales.of(made))
+    noise = axis_noise(posterior.samples, 0, 0.0, Axis("x", "rad"), Scales.of(made))
     assert noise is not None
     assert noise.known
+    assert f"noise of sd {noise.law.sd:.3g} rad and" in noise.sentence
 
 
 def test_descent_reaches_the_least_squares_optimum():
@@ -335,7 +336,7 @@ def test_what_chance_may_explain_is_said_beside_clean():
     assert "probability 0.07" in less.sentence
     far = decide(replace(FOUND, alarmed=False, reached=8.1))
     assert (far.kind, far.confidence) == ("clean", "tentative")
-    assert "8.10 times the noise, and chance cannot be told" in far.sentence
+    assert "8.10 times the noise, which may be chance or something that is missing" in far.sentence
 
 
 def test_normal_errors_of_the_largest_size_are_held_as_often_as_bands_must_hold():

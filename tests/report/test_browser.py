@@ -16,6 +16,7 @@ from test_report import run_folder
 import lcopa_bayes as lb
 from lcopa_bayes.bench.command import on_off
 from lcopa_bayes.cli import main
+from lcopa_bayes.data.record import save_record
 from lcopa_bayes.report import write_report
 from lcopa_bayes.report.pages import write_page_of
 
@@ -28,6 +29,7 @@ TINY = {"ensembles": 2, "walkers": 16, "steps": 60, "thin": 1, "target_ess": 50}
 PHONE = {"width": 390, "height": 844}
 REPORTS = Path(__file__).parents[2] / "reports"
 CANDIDATES = ["fractional-1", "first-order"]
+SCAN = ("--alpha", "1.4", "1.8", "--beta", "0.5", "0.9", "--delay", "0.4", "1.0", "--rounds", "0")
 
 
 @pytest.fixture(scope="module")
@@ -48,12 +50,15 @@ def pages_of(place: Path) -> dict[str, Path]:
     lb.check(small, folder=place / "check")
     lb.compare(small, CANDIDATES, folder=place / "compare")
     lb.loop(small, folder=place / "loop")
+    lb.design(fit, quick=True, bench_time=24.0, folder=place / "design")
+    save_record(record(1), place / "step.csv")
+    (place / "study.toml").write_text('[records]\nfit = ["step.csv"]\n[model]\nterms = 2\n')
+    assert main(["identify", str(place), *SCAN, "--out", str(place / "identify"), "--quiet"]) == 0
     (place / "calibrate").mkdir()
     shutil.copy(REPORTS / "calibration" / "one-term" / "results.json", place / "calibrate")
     for verb in ("claims", "optics"):
         assert main([verb, "--out", str(place / verb), "--quiet"]) == 0
-    verbs = ("audit", "predict", "check", "compare", "loop", "calibrate", "claims", "optics")
-    return {verb: write_page_of(verb, place / verb) for verb in verbs}
+    return {one.name: write_page_of(one.name, one) for one in sorted(place.iterdir()) if one.is_dir()}
 
 
 @pytest.fixture(scope="module")
@@ -101,6 +106,28 @@ def test_the_rules_see_a_fault(browser, tmp_path):
     )
     text = str(faults(browser, path, "light"))
     assert all(rule in text for rule in ("image-alt", "html-has-lang", "px wide", "missing is not defined"))
+
+
+def test_panels_side_by_side_stand_below_each_other_on_a_phone(browser, report):
+    page, errors = opened(browser, report, viewport=PHONE)
+    figure = page.locator("#frequency-response figure .wide")
+    lefts = (
+        "e => [...e.querySelectorAll(':scope > svg')].map(one => Math.round(one.getBoundingClientRect().x))"
+    )
+    assert figure.evaluate(lefts) == [figure.evaluate("e => Math.round(e.getBoundingClientRect().x)")] * 3
+    first, second, third = (one.bounding_box() for one in figure.locator(":scope > svg").all())
+    assert (
+        first["height"] < second["height"] == pytest.approx(third["height"], rel=0.2)
+    )  # a legend, two panels
+    assert second["y"] + second["height"] <= third["y"] + 1
+    figure.click()
+    assert len(figure.evaluate(lefts)) == 1
+    figure.click()
+    assert len(figure.evaluate(lefts)) == 3
+    page.set_viewport_size({"width": 1300, "height": 844})
+    page.wait_for_function("document.querySelectorAll('#frequency-response figure .wide > svg').length === 1")
+    assert errors == []
+    page.close()
 
 
 def test_sections_fold_and_open_where_a_link_leads(browser, report):

@@ -3,6 +3,7 @@
 import inspect
 import json
 import re
+from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
@@ -15,7 +16,10 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from small import record, study
 
+import lcopa_bayes as lb
+from lcopa_bayes.bench.command import step
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.inference import defaultpriors
 from lcopa_bayes.plot.draws import ranked
@@ -23,6 +27,7 @@ from lcopa_bayes.plot.rundata import load_run
 from lcopa_bayes.plot.theme import extremes
 from lcopa_bayes.report import records, write_page, write_report
 from lcopa_bayes.report.formatting import NOT_REACHED, figures, interval, sentence, signed, stopped, to_spread
+from lcopa_bayes.report.pages import write_page_of
 from lcopa_bayes.report.svg import Drawing, inlined
 from lcopa_bayes.sampling.modes import Modes
 
@@ -539,7 +544,7 @@ def test_the_most_prior_sensitive_parameters_are_shown_and_the_rest_counted(html
     ]
     assert rows[2][1:4] == ["–", "–", "not trusted"]  # noqa: RUF001
     assert "matters for 1 of 2 parameters: time_1" in shown
-    assert "Not trusted for 1 parameter(s), gain" in shown
+    assert "Not trusted for gain: " in shown
     moved_by = [moved(f"p{k}", 0.01, "-") for k in range(30)]
     many = section_of(page_with(tmp_path / "many", sensitivity=moved_by), "prior-sensitivity")
     assert len(rows_of(many)) == 1 + 20
@@ -569,3 +574,21 @@ def test_a_fixed_parameter_is_not_called_sampled(tmp_path):
     (folder / "results.json").write_text(json.dumps(results), encoding="utf-8")
     shown = section_of(write_report(folder).read_text(encoding="utf-8"), "priors-and-posteriors")
     assert [cells[-1] for cells in rows_of(shown)] == ["treated", "fixed", "sampled"]
+
+
+def test_a_check_begins_with_its_remarks_and_the_record_that_they_name(tmp_path):
+    at, slow = {"command": step(1.0, at=5.0)}, {"camera": 0.3}
+    quiet, noisy = (
+        record(k, name=name, noise_sd=sd, **at, **slow) for k, name, sd in ((1, "a", 0.01), (2, "b", 0.1))
+    )
+    other = record(3, name="c", noise_sd=0.001, **at, **slow)
+    odd = replace(other, response=5.0 * other.response)
+    for these, expected in (((quiet, noisy), "ba"), ((quiet, noisy, odd), "acb")):  # a and c disagree
+        folder = tmp_path / expected
+        lb.check(study(*these), folder=folder)
+        titles = re.findall("<h2>(.*?)</h2>", write_page_of("check", folder).read_text("utf-8"))
+        assert [title.removeprefix("Record ") for title in titles if title.startswith("Record ")] == [
+            *expected
+        ]
+        assert ("Remarks" in titles) == (odd in these)
+        assert titles.index("Plant") == (2 if odd in these else 1)
