@@ -130,8 +130,8 @@ def sentence(study: str, result: Mapping[str, Any]) -> str:
     grades = ", ".join(f"{count} {grade}" for grade, count in result["grades"].items())
     return (
         f"{study}: {result['fits']} fits ({grades}). Of {len(result['rows'])} ratios the median is "
-        f"{result['median']:.2f} and the largest {result['largest']:.2f}; {result['too_small']} stated errors "
-        f"are too small by more than a factor {LIMIT:g}, {result['too_large']} too large."
+        f"{result['median']:.2f} and the largest {result['largest']:.2f}; {result['too_small']} stated "
+        f"errors are too small by more than a factor {LIMIT:g}, {result['too_large']} too large."
     )
 
 
@@ -140,8 +140,8 @@ def report(results: Mapping[str, Any]) -> str:
     said = "\n\n".join(sentence(study, result) for study, result in results.items())
     return (
         "# Stated Monte Carlo errors against the scatter over seeds\n\n"
-        "The root mean square of the deviations of a quantity over seeds, divided by its stated error: 1 where "
-        "stated errors are true, above 1 where they are too small. Made by "
+        "The root mean square of the deviations of a quantity over seeds, divided by its stated error: 1 "
+        "where stated errors are true, above 1 where they are too small. Made by "
         f"`studies/performance/scatter.py`.\n\n{said}\n\n![Scatter over stated error](scatter.svg)\n"
     )
 
