@@ -246,9 +246,9 @@ def counting(counted: Counted) -> Any:
     plain = {name: getattr(ForwardModel, name) for name in ("unit_responses", "unit_slopes")}
 
     def counter(method: Callable[..., Any]) -> Callable[..., Any]:
-        def call(model: ForwardModel, dynamics: Any, *more: Any) -> Any:
+        def call(model: ForwardModel, dynamics: Any, *more: Any, **named: Any) -> Any:
             counted.evaluations += dynamics.batch
-            return method(model, dynamics, *more)
+            return method(model, dynamics, *more, **named)
 
         return call
 

@@ -17,6 +17,7 @@ from small import record, study
 
 from lcopa_bayes.cli import VERBS
 from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.inference.conditional import Conditional
 from lcopa_bayes.sampling.unitcube import UnitCube
 
 FOLDER = Path(__file__).parents[2] / "studies" / "performance"
@@ -160,6 +161,9 @@ def test_what_a_sampler_asks_is_counted_and_its_time_ends():
     )
     counted.log_density(coordinates)
     assert counted.evaluations == 6
+    with samplers.counting(counted):  # whoever asks for responses or slopes of plants
+        Conditional(posterior, delays=True).expanded(posterior.values(coordinates))
+    assert counted.evaluations == 9
     counted.budget = -1.0
     with pytest.raises(samplers.OutOfTimeError):
         counted.log_likelihood(coordinates)
