@@ -107,8 +107,13 @@ class Loop:
 
     @property
     def grade(self) -> Grade:
-        """How far the numbers can be trusted; without draws they rest on a Laplace approximation."""
+        """How far the numbers can be trusted: as far as the verdict, and without draws no further than a
+        Laplace approximation."""
         if self.draws is not None:
+            if self.draws.grade.level == "reliable" and self.verdict.confidence == "tentative":
+                return Grade(
+                    "tentative", "the draws are reliable, but the verdict that they rest on is tentative"
+                )
             return self.draws.grade
         return Grade(
             "tentative", "intervals are those of a Laplace approximation at the mode; nothing was sampled"

@@ -29,6 +29,7 @@ from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.effect import UnstableError
 from lcopa_bayes.model.path import TransferPath
+from lcopa_bayes.sampling.convergence import Grade
 
 loops = sys.modules[loop.__module__]
 NOISE = 5e-3
@@ -138,6 +139,13 @@ def test_what_leaves_is_plain_json_with_grades(bent):
     assert {p["grade"] for p in told["parameters"]} <= {"reliable", "tentative", "unusable"}
     json.dumps(drawn(bent), allow_nan=False)
     assert any("odd_curvature" in line for line in words(told))
+
+
+@pytest.mark.parametrize(("confidence", "level"), [("firm", "reliable"), ("tentative", "tentative")])
+def test_a_loop_is_no_more_reliable_than_its_verdict(bent, confidence, level):
+    draws = SimpleNamespace(grade=Grade("reliable", "draws agree"))
+    one = replace(bent, verdict=replace(bent.verdict, confidence=confidence), draws=draws)
+    assert one.grade.level == level
 
 
 def test_parameters_without_draws_are_values_and_not_coordinates(clean):
