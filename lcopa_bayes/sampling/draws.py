@@ -233,8 +233,8 @@ def _resampled(
             errors = np.sqrt(shares * (1 - shares) * (1 / worth + added(inside.astype(float))))
             multimodal.append(Modes(rows[k].name, rows[k].unit, edges, shares[None], errors[None]))
     sizes = {k: (float(centre[at]), float(tail[at])) for at, k in enumerate(posterior.sampled)}
-    # each draw has linear parameters of its own
-    bulk, ends = (1 / (1 / min(one, default=weighted.ess) + 1 / chosen.size) for one in (centre, tail))
+    # of linear parameters, which each draw has of its own, a part varies as others do, the rest by itself
+    bulk, ends = (min(*one, weighted.ess, chosen.size) for one in (centre, tail))
     measured = tuple(
         with_shares(
             Quality(

@@ -22,7 +22,7 @@ Done = Callable[[Optima, Matrix, Matrix | None], list[Matrix]]
 
 _PILOT = 128
 """Points from the prior at which delays and noise are estimated."""
-_PICKED, HOPELESS = 16, 60.0
+_PICKED, _HOPELESS = 16, 60.0
 """Points of the pilot that the first proposal is placed at, and by how much less likely others are omitted
 [nat]."""
 _SPREAD = 2.0
@@ -100,7 +100,7 @@ def _rest(
     for _ in range(2):
         chosen, noise = _with_noise(outer, chosen)
         chosen, reached, natural = done(Optima(pilot=True), chosen, chosen)
-    good = reached > reached.max() - HOPELESS
+    good = reached > reached.max() - _HOPELESS
     chosen, noise, natural = chosen[good], noise[good], natural[good]
     own = ~outer.orders
     fitted = Conditional(posterior, delays=True).columns

@@ -32,7 +32,7 @@ from lcopa_bayes.core.parallel import Progress, Workers
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.aroundoptima import around_optima
-from lcopa_bayes.sampling.firstproposal import HOPELESS, NEIGHBOURS, best_near, first_proposal, nearest
+from lcopa_bayes.sampling.firstproposal import NEIGHBOURS, best_near, first_proposal, nearest
 from lcopa_bayes.sampling.importanceweights import effective, usable_k
 from lcopa_bayes.sampling.mixture import spread_evenly
 from lcopa_bayes.sampling.mixturemoves import learned
@@ -114,7 +114,7 @@ class _Point(NamedTuple):
     log_marginal: Vector
     """Log of prior times likelihood, the rest integrated out, estimated [nat]; -inf without a draw."""
     efficiency: Vector
-    """Effective share of the draws tried [-]; NaN without any."""
+    """Effective share of the draws tried [-]."""
 
 
 @final
@@ -367,8 +367,7 @@ class Search:
         return bool(mean > np.log(_HEAVIER / expected))
 
     def _evaluated(self, y: Matrix, values: Matrix, starts: Matrix | None) -> _Point:
-        """Optima and draws at points; the first of a search twice, the second time from those with hope."""
-        hoped = np.ones(len(y), dtype=bool)
+        """Optima and draws at points; the first of a search twice, the second time from their neighbours."""
         if starts is None:
             known, optima, objective = (
                 np.concatenate(part) for part in list(zip(*self._points, strict=True))[:3]
@@ -377,16 +376,12 @@ class Search:
         else:
             begin = starts[nearest(y, self.outer.y(starts), 1)[:, 0]]
             begin, objective, _ = self._done(Optima(), values, begin)
-            best = best_near(y, y, objective)
-            begin, hoped = begin[best], objective[best] > objective.max() - HOPELESS
-        efficiency = [float(np.nanmedian(point.efficiency)) for point in self._points[-1:]]
+            begin = begin[best_near(y, y, objective)]
+        efficiency = [float(np.median(point.efficiency)) for point in self._points[-1:]]
         tries = int(np.clip(_EFFECTIVE_TRIES / max(*efficiency, 1e-3), *_TRIES)) if efficiency else _TRIES[0]
-        level, density, marginal, share = np.outer([-np.inf, -np.inf, -np.inf, np.nan], np.ones(len(y)))
-        point = _Point(y, begin, level, self.posterior.coordinates(begin), density, marginal, share)
-        for whole, part in zip(point[1:], self._done(Draw(tries), values[hoped], begin[hoped]), strict=True):
-            whole[hoped] = part
+        optimum, level, z, density, marginal, share = self._done(Draw(tries), values, begin)
         marginal += self.posterior.table.log_permutations
-        return point
+        return _Point(y, optimum, level, z, density, marginal, share)
 
     def _done(self, task: Optima | Draw, values: Matrix, starts: Matrix | None) -> list[Matrix]:
         """A task for all points, by the workers."""

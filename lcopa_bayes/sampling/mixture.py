@@ -21,7 +21,7 @@ _FITTED = 6_000
 """Most points a mixture is fitted to."""
 FREEDOM = 5.0
 """Degrees of freedom of the components: tails heavy enough to cover what the fit does not include [-]."""
-_ROUNDS, _GAIN = 60, 1e-2
+_ROUNDS, _GAIN = 60, 1e-3
 """Most rounds of expectation maximisation, and gain per point below which they end [nat]: a good cover is
 wanted, not the maximum."""
 _RIDGE = 1e-6
@@ -41,8 +41,9 @@ class Mixture:
     """Lower Cholesky factors of the scale matrices, (components, dimension, dimension)."""
 
     @classmethod
-    def fitted(cls, points: Matrix, seed: int, components: int = _COMPONENTS) -> Mixture:
-        """Fit to points (n, dimension) by expectation maximisation of Gaussians, at most `components`.
+    def fitted(cls, points: Matrix, seed: int, components: int = _COMPONENTS, gain: float = _GAIN) -> Mixture:
+        """Fit to points (n, dimension) by expectation maximisation of Gaussians, at most `components`,
+        until a round gains less for each point [nat].
 
         Deterministic given `seed`. Fewer components are used when there are not ten points per
         dimension for each of them.
@@ -53,7 +54,7 @@ class Mixture:
         shift, spread = points.mean(axis=0), points.std(axis=0)
         spread = np.where(spread > 0, spread, 1.0)
         random = np.random.RandomState(np.random.MT19937(np.random.SeedSequence(seed)))
-        fit = GaussianMixture(components, tol=_GAIN, max_iter=_ROUNDS, reg_covar=_RIDGE, random_state=random)
+        fit = GaussianMixture(components, tol=gain, max_iter=_ROUNDS, reg_covar=_RIDGE, random_state=random)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ConvergenceWarning)
             fit.fit((points - shift) / spread)

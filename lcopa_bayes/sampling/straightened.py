@@ -27,6 +27,8 @@ _SMOOTH = 1e-6
 """Precision of a coefficient's prior, over that of the draws [-]."""
 _EFFECTIVE, _RESAMPLED = 40.0, 3_000
 """Effective draws for each dimension that a fit asks for, and draws of equal weight that it takes [-]."""
+_GAIN = 1e-2
+"""Gain per point that ends a fit [nat]: the next one follows at once."""
 _COMPONENTS, _PER_COMPONENT = 20, 12
 """Most components, and effective draws per dimension for each [-]."""
 _LEVELLED, _WIDER, _WIDE = 0.3, 1.7, 0.2
@@ -67,7 +69,7 @@ class Straightened:
         chosen = straight[rng.choice(len(y), _RESAMPLED, p=weights)]
         worth = effective(np.log(weights[own]))
         count = int(np.clip(worth / (_PER_COMPONENT * dimension), 1, _COMPONENTS))
-        core = Mixture.fitted(chosen, int(rng.integers(2**31)), count)
+        core = Mixture.fitted(chosen, int(rng.integers(2**31)), count, _GAIN)
         level = core.levelled()
         wide = replace(level, factors=_WIDER * level.factors)
         mixture = core.blended(level, _LEVELLED).blended(wide, _WIDE)

@@ -408,19 +408,6 @@ def test_a_proposal_is_learned_where_hardly_a_draw_has_any_weight(rng):
     assert best.min() > others.max()
 
 
-def test_points_that_are_not_drawn_at_have_no_weight():
-    """Draws at them by themselves lie 40 nat and more below the best."""
-    posterior = problem(record(camera=0.6), terms=1, priors={"sigma": 0.02}).posterior
-    with workers(posterior) as crew:
-        search = Search(posterior, 1, crew, Progress(quiet=True))
-        search.run(100.0)
-    point = search._points[0]
-    left_out = np.isneginf(point.objective)
-    assert 0.1 < left_out.mean() < 0.9
-    task = search.outer.values(point.y[left_out]), point.values[left_out], np.random.SeedSequence(2)
-    assert outer.Draw(64)(posterior, task)[4].max() < point.log_marginal.max() - 40.0
-
-
 def test_a_search_without_a_single_draw_gives_nothing(monkeypatch):
     def none(conditional, at, tries, rng):
         size, least = conditional.posterior.dimension, np.full(len(at.values), -np.inf)
