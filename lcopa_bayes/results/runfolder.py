@@ -103,8 +103,8 @@ def add_origin(folder: Path, verb: str, origin: Mapping[str, Any]) -> None:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """The lock of a folder, which ends with the process that holds it; what a killed one was about to write
-    is removed. InputError when another process holds it."""
+    """The lock of a folder, which ends with the process that holds it; what a killed one or its workers were
+    about to write is removed. InputError when another process holds it."""
     place = folder.resolve()
     if place in _held or fcntl is None:
         _held[place] = _held.get(place, 0) + 1
@@ -122,6 +122,9 @@ def locked(folder: Path) -> Iterator[None]:
         _held[place] = 1
         try:
             yield
+        except BaseException:
+            remove_unfinished(folder)  # a worker may have been killed
+            raise
         finally:
             del _held[place]
             path.unlink(missing_ok=True)

@@ -9,6 +9,7 @@ import os
 import random
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -70,6 +71,15 @@ def test_what_a_killed_process_was_writing_is_removed_and_nothing_else(tmp_path)
     with locked(tmp_path):
         left = sorted(str(one.relative_to(tmp_path)) for one in tmp_path.rglob("*"))
         assert left == [LOCK, ".own", "tables", "tables/b.csv"]
+
+
+def test_what_a_killed_worker_was_writing_is_removed(tmp_path):
+    for ending, left in ((InputError("a worker process ended"), False), (None, True)):
+        with suppress(InputError), locked(tmp_path):
+            (tmp_path / ".part-x.csv").write_text("half")
+            if ending is not None:
+                raise ending
+        assert (tmp_path / ".part-x.csv").exists() is left
 
 
 def test_pages_are_not_written_while_another_run_writes(tmp_path):
