@@ -369,10 +369,10 @@ class Search:
     def _evaluated(self, y: Matrix, values: Matrix, starts: Matrix | None) -> _Point:
         """Optima and draws at points; the first of a search twice, the second time from their neighbours."""
         if starts is None:
-            known, optima, objective = (
-                np.concatenate(part) for part in list(zip(*self._points, strict=True))[:3]
-            )
-            begin = optima[best_near(y, known, objective)]
+            known = np.concatenate([point.y for point in self._points])
+            objective = np.concatenate([point.objective for point in self._points])
+            begin = np.concatenate([point.values for point in self._points])
+            begin = begin[best_near(y, known, objective)]
         else:
             begin = starts[nearest(y, self.outer.y(starts), 1)[:, 0]]
             begin, objective, _ = self._done(Optima(), values, begin)

@@ -144,23 +144,28 @@ class Weighted:
         return effective(self.log_weights) if self.log_weights.size else 0.0
 
     @cached_property
+    def _cumulative(self) -> tuple[Index, Matrix]:
+        """Order of the draws by each sampled parameter, and the sum of weights up to each draw in that order,
+        both (draws, parameters)."""
+        rank = np.argsort(self.sampled, axis=0, kind="stable")
+        return rank, np.cumsum(self._weights[rank], axis=0)
+
+    @cached_property
     def scores(self) -> Matrix:
         """Normal scores of the sampled parameters, (draws, parameters) [-]."""
+        rank, beyond = self._cumulative
         out = np.empty(self.sampled.shape)
-        for column, own in zip(self.sampled.T, out.T, strict=True):
-            rank = np.argsort(column, kind="stable")
-            own[rank] = np.cumsum(self._weights[rank]) - 0.5 * self._weights[rank]
+        np.put_along_axis(out, rank, beyond - 0.5 * self._weights[rank], axis=0)
         return np.asarray(norm.ppf(np.clip(out, 1e-9, 1 - 1e-9)))
 
     @cached_property
     def below(self) -> Array:
         """Whether the sampled parameters are at most their 5 and 95 % quantiles, (2, draws, parameters)."""
+        rank, beyond = self._cumulative
         out = np.empty((len(_TAILS), *self.sampled.shape))
-        for column, own in zip(self.sampled.T, np.moveaxis(out, 2, 0), strict=True):
-            rank = np.argsort(column, kind="stable")
-            beyond = np.cumsum(self._weights[rank])
-            ends = column[rank][np.minimum(np.searchsorted(beyond, _TAILS), column.size - 1)]
-            own[:] = column <= ends[:, None]
+        for k, column in enumerate(self.sampled.T):
+            ends = np.minimum(np.searchsorted(beyond[:, k], _TAILS), column.size - 1)
+            out[:, :, k] = column <= column[rank[ends, k]][:, None]
         return out
 
     @cached_property
