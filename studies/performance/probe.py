@@ -37,8 +37,8 @@ LIKELIHOOD = {
 }
 """Methods whose time is that of the likelihood, by module."""
 PLANTS: dict[str, Callable[..., int]] = {
-    "ForwardModel.unit_responses": lambda model, dynamics, *more: dynamics.batch,
-    "ForwardModel.unit_slopes": lambda model, dynamics, **wanted: dynamics.batch,
+    "ForwardModel.unit_responses": lambda model, dynamics, *more, **wanted: dynamics.batch,
+    "ForwardModel.unit_slopes": lambda model, dynamics, *more, **wanted: dynamics.batch,
     "Simulation.__call__": lambda simulation, values: len(values),
     "ExtendedModel.predict": lambda model, x: 1,
     "ExtendedModel.tangents": lambda model, x: 1,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import json
 import os
 import subprocess
@@ -30,6 +32,7 @@ import plots  # noqa: E402
 import probe  # noqa: E402
 import samplers  # noqa: E402
 import scatter  # noqa: E402
+import targets  # noqa: E402
 import verbs  # noqa: E402
 from comparison import Estimate, Reference, Spread  # noqa: E402
 
@@ -407,3 +410,40 @@ def test_the_scatter_of_fits_shows_what_their_stated_errors_are_worth(overstated
     assert_allclose([row["ratio"] for row in rows], np.sqrt(overstated), rtol=4 / np.sqrt(2 * 200))
     scatter.drawn({"a": {"rows": rows, "fits": 200}}, tmp_path / "scatter.svg")
     assert "share" in (tmp_path / "scatter.svg").read_text()
+
+
+def test_jobs_are_counted_against_what_is_wanted():
+    """One within its limit, one beyond it, one that did not end, one in fits of its study."""
+    row = {"study": "s", "cpu": 1.0, "outcome": "done", "grade": None, "smallest_ess": None, "unit": ""}
+    rows = [
+        row | {"verb": "fit", "wanted": 5, "took": 4.0, "wall": 4.0, "grade": "reliable"},
+        row | {"verb": "design", "wanted": 5, "took": 6.0, "wall": 6.0},
+        row | {"verb": "audit", "wanted": 5, "took": 1.0, "wall": 1.0, "outcome": "stopped"},
+        row | {"verb": "compare", "wanted": 3, "took": 2.5, "wall": 10.0, "unit": "fits"},
+    ]
+    rows[0] |= {"smallest_ess": 412.4, "target_ess": 400.0}
+    text = targets.text_of(rows, "A machine.")
+    assert "| fit | s | 5 s | 4.0 | 4.0 | 1.0 | reliable | 412 of 400 |" in text
+    assert "| compare | s | 3 fits | 2.5 | 10.0 | 1.0 |  |  |" in text
+    assert "| audit | s | 5 s | 1.0 | 1.0 | 1.0 | stopped |  |" in text
+    assert text.endswith("\n2 of 4 within what is wanted.\n")
+
+
+def test_jobs_are_verbs_of_known_studies():
+    known = {one.name for one in verbs.SOURCES} | set(verbs.MEASURED)
+    assert all(verb in VERBS and study in known for verb, study, _, _ in targets.WANTED)
+
+
+def test_plants_are_counted_however_a_response_is_called():
+    """Every argument a response takes, by place or by name."""
+    for name, count in probe.PLANTS.items():
+        kind, method = name.split(".")
+        for module in probe.LIKELIHOOD:
+            own = getattr(importlib.import_module(module), kind, None)
+            if own is not None:
+                rest = list(inspect.signature(getattr(own, method)).parameters.values())[2:]
+                at = [None for one in rest if one.kind is not one.KEYWORD_ONLY]
+                by_name = {one.name: None for one in rest if one.kind is one.KEYWORD_ONLY}
+                assert (
+                    count(None, SimpleNamespace(batch=1) if "Forward" in kind else [0], *at, **by_name) == 1
+                )
