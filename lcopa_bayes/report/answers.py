@@ -115,7 +115,9 @@ def _loop(v: Values) -> _Answers:
     yield "What was wrong before?", said * bool(names), "Bias of the parameters without the effect"
     groups = [(one["name"], one["group"][1:]) for one in v["effects"] if one["group"][1:]]
     doubts = [f"{name} may as well be {listed(others)}" for name, others in groups]
-    yield "What stays uncertain?", _stopped([*doubts, *v["cautions"]]), "What was missing"
+    first = [one.partition(". ")[0] for one in v["cautions"][:1]]
+    more = [f"{len(v['cautions']) - 1} more below"] if len(v["cautions"]) > 1 else []
+    yield "What stays uncertain?", _stopped([*doubts, *first, *more]), "What was missing"
     done = "Fit explained.toml, the study with what was found." if names else "Nothing: the model suffices."
     yield "What next?", v["next_measurement"] or done, "What was missing"
 

@@ -173,6 +173,8 @@ SAID = [
     ("loop", (), None, "What was wrong", "Biased without it: gain by 15 sd."),
     ("loop", ("moved",), [], "What was wrong", "Without it no parameter was biased."),
     ("loop", ("effects", 0, "group"), ["creep", "drift"], "What stays uncertain?", "creep may as well be drift."),
+    ("loop", ("cautions",), ["x: few samples. Repeat.", "b.", "c"], "What stays uncertain?", "x: few samples; 2 more "
+     "below."),
     ("loop", ("next_measurement",), "Repeat.", "What next?", "Repeat."),
     ("design", (), None, "What to measure", "binary, 4 ms for 90 ms: low or high."),
     ("design", ("winner",), None, "What to measure", "No drive tried determines any parameter."),
