@@ -253,7 +253,17 @@ def _given(options: argparse.Namespace, *keys: str) -> dict[str, Any]:
 
 
 def _new(options: argparse.Namespace) -> Outcome:
-    keys = ("held_out", "time", "drives", "responses", "time_unit", "decimal", "time_format", "sheet")
+    keys = (
+        "held_out",
+        "time",
+        "drives",
+        "responses",
+        "time_unit",
+        "decimal",
+        "time_format",
+        "drive_until",
+        "sheet",
+    )
     result = lcopa_bayes.new(
         options.folder, options.files, overwrite=options.overwrite, **_given(options, *keys)
     )

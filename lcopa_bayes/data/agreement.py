@@ -20,6 +20,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.data.description import FOLLOWED, Described, LaggedSum
+from lcopa_bayes.data.drive import moved_with_drive
 from lcopa_bayes.data.record import Record
 
 _LAGS = 6
@@ -42,6 +43,7 @@ _EXCHANGED = 5.0
 are exchanged [-]."""
 _SURE = 5.0
 """Standard errors from zero from which a ratio has a sign and a size [-]."""
+_DISAGREE = "records disagree: "
 _UNIT = "one of them is in another unit than it states; correct the unit, or convert the values"
 _SIGN = "check the signs of drive and response in both"
 _PLANT = (
@@ -73,6 +75,11 @@ class Disagreement:
     def __str__(self) -> str:
         return f"{self.reason}: {self.remedy}"
 
+    @property
+    def sentence(self) -> str:
+        """Both, with a capital and a full stop."""
+        return f"{self.reason[0].upper()}{self.reason[1:]}: {self.remedy}."
+
 
 def disagreements(records: Sequence[Record]) -> tuple[Disagreement, ...]:
     """What the records, all of equal axes, contradict: each record by itself, then in pairs.
@@ -90,6 +97,8 @@ def disagreements(records: Sequence[Record]) -> tuple[Disagreement, ...]:
         max((-seen[0] for seen in one.best if _runs_ahead(*seen, period)), default=0.0) for one in described
     ]
     ahead = [_ahead(one.record, lead) for one, lead in zip(described, leads, strict=True) if lead > 0.0]
+    led = {one.records for one in ahead}
+    ahead += [_at_once(one) for one in records if (one.name,) not in led and any(_moves_at_once(one))]
     rest = [one for one, lead in zip(described, leads, strict=True) if lead <= 0.0]
     if len(rest) < 2:
         return tuple(ahead)
@@ -124,6 +133,22 @@ def _ahead(record: Record, lead: float) -> Disagreement:
         f"the response of record {record.name!r} runs about {lead:.3g} {record.time_unit} ahead of its drive",
         "no plant responds to a drive of later times; align the clocks of its drive and response columns",
         gross=True,
+    )
+
+
+def _moves_at_once(record: Record) -> list[float]:
+    return [moved_with_drive(record, axis) for axis in range(len(record.response_axes))]
+
+
+def _at_once(record: Record) -> Disagreement:
+    moved = _moves_at_once(record)
+    axis = record.response_axes[int(np.argmax(np.abs(moved)))]
+    return Disagreement(
+        (record.name,),
+        f"response {axis.name!r} of record {record.name!r} moves by {max(moved, key=abs):.3g} {axis.unit} in "
+        "the very row in which a drive first changes, while a drive holds from its row on",
+        "if the drive of a row acted until its response was read, convert the table with `new --drive-until`",
+        gross=False,
     )
 
 
@@ -261,7 +286,7 @@ class _Comparison:
             which, name = _exchanged(self.one.record, order), self.one.record.name
             seen = f"record {name!r} follows {self._them} with its {which} exchanged, not as it is"
             remedy = "exchange the columns, or their names, in one of the two"
-            return Disagreement(self.names, seen, remedy, gross=True, misfit=orders[order])
+            return Disagreement(self.names, f"{_DISAGREE}{seen}", remedy, gross=True, misfit=orders[order])
         return next((self._in_size(ratio) for ratio in self.ratios if ratio.remedy), None)
 
     def _in_size(self, ratio: _Ratio) -> Disagreement:
@@ -272,7 +297,7 @@ class _Comparison:
             f"{ratio.sd:.1g})"
         )
         gross = ratio.remedy in (_UNIT, _SIGN)
-        return Disagreement(self.names, seen, ratio.remedy, gross, ratio.value, ratio.misfit)
+        return Disagreement(self.names, f"{_DISAGREE}{seen}", ratio.remedy, gross, ratio.value, ratio.misfit)
 
 
 def _centred(columns: Matrix, response: Vector) -> tuple[Matrix, Vector]:

@@ -64,6 +64,8 @@ class Mapped:
     """Decimal sign, ``.`` or ``,``; empty: recognised from the numbers."""
     time_format: str = ""
     """Format of time stamps, as of `datetime.strptime`; empty: recognised from them."""
+    until: bool = False
+    """Whether the drive of a row is that which acted until it, and not that from it on."""
 
 
 @final
@@ -144,6 +146,8 @@ def convert(tables: Sequence[CellTable], mapped: Mapped) -> tuple[list[Record], 
             continue
         if any(np.isnan(columns[name].values[k]).any() for name in drives.values()):
             notes.append(f"{table.path.name}: an empty cell of a drive holds the value above it.")
+        if mapped.until:
+            held = [np.append(one[1:], one[-1]) for one in held]
         measured = np.column_stack([columns[name].values[k] for name in responses.values()])
         records.append(
             Record(
@@ -151,6 +155,8 @@ def convert(tables: Sequence[CellTable], mapped: Mapped) -> tuple[list[Record], 
             )
         )
     refuse_if(problems)
+    if mapped.until:
+        notes.append("A drive acts until its row: every value stands one row earlier in the records.")
     return records, notes
 
 

@@ -21,7 +21,7 @@ from lcopa_bayes.core.arrays import Matrix, Vector, frozen
 from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.core.rules import rebuilt
 from lcopa_bayes.core.units import TIME_UNITS, in_time_unit
-from lcopa_bayes.data.record import Axis, Columns, Driven
+from lcopa_bayes.data.record import Axis, Columns, Driven, Record
 
 
 @final
@@ -107,6 +107,34 @@ def first_change(driven: Driven) -> float:
     """Time of the first change of any drive axis; the first row's where none changes [time unit]."""
     starts = (float(one.times[0]) for one in axis_drives(driven) if one.moves)
     return min(starts, default=float(driven.time[0]))
+
+
+_RESTING, _CLEAR, _LARGE, _WHOLE = 8, 4.0, 0.05, 0.4
+"""Fewest samples before a change that show how a response scatters at rest [-], and what a sample has clearly
+moved by: over their largest deviation, over the range of the response, and over what the next sample has, of
+which a clock that errs by part of a row explains less [-]."""
+
+
+def moved_with_drive(record: Record, axis: int) -> float:
+    """How far a response has clearly moved in the very row in which a drive first changes; 0 where it has not
+    [response unit].
+
+    A drive holds from its row on, so that no plant has moved there yet: such a record has rows whose drive
+    acted before the response was read.
+    """
+    moved = np.flatnonzero((record.drive != record.drive[0]).any(axis=1))
+    seen = np.flatnonzero(np.isfinite(record.response[:, axis]))
+    if not moved.size or moved[0] not in seen:
+        return 0.0
+    count = int(np.searchsorted(seen, moved[0]))
+    if count < _RESTING or count + 1 == seen.size:
+        return 0.0
+    values = record.response[seen, axis]
+    level = values[:count].mean()
+    least = max(_CLEAR * float(np.abs(values[:count] - level).max()), _LARGE * float(np.ptp(values)))
+    first, second = values[count : count + 2] - level
+    clear = abs(first) > max(least, _WHOLE * abs(second)) and second * first > 0.0
+    return float(first) if clear else 0.0
 
 
 Units = str | Mapping[str, str] | None

@@ -200,9 +200,9 @@ def _looped(
         problem, base, start, enlarged = fitted_base(study, kinds, as_stated=as_stated, draws=draws)
     before = _side(problem, start)
     contrary = disagreements((*study.fit, *study.held_out))
-    cautions = (*(f"records disagree: {one}" for one in contrary), *base.caution, *_alone(study))
+    cautions = (*map(str, contrary), *base.caution, *_alone(study))
     alone = len(study.fit) == 1 and not study.held_out
-    searched, wrong = None, next((f"records disagree: {one}" for one in contrary if one.gross), base.failed)
+    searched, wrong = None, next((str(one) for one in contrary if one.gross), base.failed)
     if not wrong or (base.smooth and wrong == base.failed):
         rng = np.random.default_rng([study.seed, 11])
         searched = search(start, kinds, rng, noise_samples=base.noise_samples, draws=draws, alone=alone)

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.special import expit
 
 from lcopa_bayes.core.arrays import Flags, Index, Matrix, Vector
+from lcopa_bayes.data.drive import moved_with_drive
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.inference.noise import WhiteAR1
 
@@ -90,13 +91,18 @@ class Samples:
         return float(self.record.time[moved[0]]) if moved.size else np.inf
 
     def quiet(self, axis: int) -> Observed:
-        """Samples of an axis taken before any drive change can have acted, that at the change included."""
+        """Samples of an axis taken before any drive change can have acted, that at the change included unless
+        it has moved."""
+        return self.axes[axis].first(int(np.count_nonzero(self._at_rest(axis))))
+
+    def _at_rest(self, axis: int) -> Flags:
         times = self.times[self.axes[axis].index]
-        return self.axes[axis].first(int(np.searchsorted(times, self.first_change, side="right")))
+        moved = moved_with_drive(self.record, axis) != 0.0
+        return times < self.first_change if moved else times <= self.first_change
 
     def level_samples(self, axis: int) -> tuple[Flags, str]:
         """Samples of an axis that give the offset of a record that was not fitted, and what they are."""
-        quiet = self.times[self.axes[axis].index] <= self.first_change
+        quiet = self._at_rest(axis)
         if quiet.all():
             return (
                 quiet,

@@ -227,9 +227,7 @@ def limitations(
 def _disagreeing(study: Study) -> Iterator[Limitation]:
     """Records that one plant cannot follow."""
     for one in disagreements((*study.fit, *study.held_out)):
-        yield Limitation(
-            "unusable" if one.gross else "tentative", f"records disagree: {one.reason}", one.remedy
-        )
+        yield Limitation("unusable" if one.gross else "tentative", one.reason, one.remedy)
 
 
 @final

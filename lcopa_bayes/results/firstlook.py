@@ -94,7 +94,7 @@ class FirstLook:
     def verdict(self) -> str:
         """How well the best optimum follows the records, and what the numbers rest on."""
         study = self.problem.study
-        parts = [f"Records disagree: {one}." for one in disagreements((*study.fit, *study.held_out))]
+        parts = [one.sentence for one in disagreements((*study.fit, *study.held_out))]
         for held, name in ((False, "Fitted"), (True, "Held out")):
             shown = [band for band in self.bands if band.held_out == held]
             if shown:

@@ -53,7 +53,7 @@ def inventory(study: Study) -> dict[str, Any]:
     if study.model.terms == "auto":
         sentences.append("A fit lets the records choose more terms, and what paths share.")
     verdict = f"To mend before a fit: {'; '.join(obstacles)}." if obstacles else "The records can be fitted."
-    verdict = " ".join([verdict, *(f"Records disagree: {one}." for one in disagree)])
+    verdict = " ".join([verdict, *(one.sentence for one in contradicted)])
 
     def remarked(record: Record) -> dict[str, Any]:
         """What was read of a record, with the remarks that name it."""

@@ -171,6 +171,7 @@ USAGES: Mapping[str, Usage] = {
             _option("--time-unit", "unit of a numeric time column", default=""),
             _option("--decimal", "decimal sign, . or ,", default=""),
             _option("--time-format", "format of time stamps, as '%%d.%%m.%%Y %%H:%%M:%%S'", default=""),
+            _flag("--drive-until", "the drive of a row acted until it, not from it on"),
             _option("--sheet", "sheet of a workbook"),
             _OVERWRITE,
         ),

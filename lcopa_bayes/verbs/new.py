@@ -10,6 +10,7 @@ from typing import Any, final
 import pandas as pd
 
 from lcopa_bayes.core.errors import gathered, refuse_if
+from lcopa_bayes.data.agreement import disagreements
 from lcopa_bayes.data.cells import CellTable
 from lcopa_bayes.data.conversion import Mapped, convert
 from lcopa_bayes.data.requirements import unmet
@@ -87,6 +88,7 @@ def new(
     time_unit: str = "",
     decimal: str = "",
     time_format: str = "",
+    drive_until: bool = False,
     sheet: str | None = None,
     overwrite: bool = False,
 ) -> NewStudy:
@@ -97,7 +99,8 @@ def new(
     names the sheet; `overwrite`, replace files that are there. Tables share their headers. What is ambiguous
     in headers and data is stated: `time`, `drives` and `responses`, columns by header, by header without its
     unit or by number, each perhaps with a new name, as in "heater [%]=Column B"; `time_unit` of a numeric
-    time column, `decimal`, the decimal sign, and `time_format` of time stamps, as of `datetime.strptime`.
+    time column, `decimal`, the decimal sign, and `time_format` of time stamps, as of `datetime.strptime`;
+    `drive_until`, the drive of a row acted until its response was read, and does not hold from then on.
 
     InputError with everything that cannot be read or is ambiguous; then nothing is written.
     """
@@ -118,10 +121,10 @@ def new(
     if not paths:
         problems.append("no table: name one or more files")
     refuse_if(problems)
-    stated = Mapped(time, tuple(drives), tuple(responses), time_unit, decimal, time_format)
+    stated = Mapped(time, tuple(drives), tuple(responses), time_unit, decimal, time_format, drive_until)
     records, notes = convert(tables, stated)
     own, apart = records[: len(fitted)], records[len(fitted) :]
     study = Study(folder.resolve().name, fit=own, held_out=apart)
-    result = NewStudy(study, tuple(notes), tuple(unmet(study)))
+    result = NewStudy(study, tuple(notes), tuple(unmet(study) or map(str, disagreements((*own, *apart)))))
     result.save(folder, overwrite=overwrite)
     return result

@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
 from shapes import SHAPES
-from small import TWO, record, study
+from small import ONE, TWO, path, record, study
 
 from lcopa_bayes.bench.command import on_off, step
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.data.agreement import _SIGN, _Ratio, disagreements
+from lcopa_bayes.data.drive import moved_with_drive
 from lcopa_bayes.data.record import Record
+from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.results.firstlook import first_look
 from lcopa_bayes.verbs.check import check
 
@@ -130,6 +133,39 @@ def test_a_response_ahead_of_its_drive_is_recognised_with_its_lead(ahead: float,
     assert ahead - 1.2 < stated < ahead + 0.3  # the plant's delay of 0.73 hides a part, rows are 0.2 apart
 
 
+def led_by_a_row(seed: int, order: float, *, rows: int, noise_sd: float = 0.01) -> Record:
+    """A step whose rows state the drive that acted until them, where `rows` is 1; without a delay."""
+    device = replace(ONE, paths=((path(2.0, 0.0, (1.5,), (order,)),),))
+    one = record(seed, device=device, command=step(1.0, at=5.0), duration=20.0, noise_sd=noise_sd)
+    return replace(one, drive=np.concatenate([one.drive[:1]] * rows + [one.drive])[: len(one.drive)])
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 999), order=st.sampled_from([0.5, 0.8, 1.0]))
+def test_a_drive_that_acted_until_its_row_is_recognised(seed: int, order: float) -> None:
+    late, own = (led_by_a_row(seed, order, rows=rows) for rows in (1, 0))
+    (said,) = disagreements((late,))
+    assert "in the very row" in said.reason
+    assert not said.gross
+    assert disagreements((own,)) == ()
+    rest = Samples.of(own, 0.2).quiet(0).values
+    assert_array_equal(Samples.of(late, 0.2).quiet(0).values, rest)  # without the sample that has moved
+    assert moved_with_drive(late, 0) == late.response[late.drive[:, 0] != 0][0, 0] - rest.mean()
+
+
+def test_what_is_no_movement_with_the_drive() -> None:
+    late = led_by_a_row(1, 0.5, rows=1)
+    at = int(np.argmax(late.drive[:, 0] != 0))
+    other = late.response.copy()
+    for change in (
+        {"response": np.where(np.arange(len(other))[:, None] == at + 1, other[at - 1], other)},  # one outlier
+        {"response": np.where(np.arange(len(other))[:, None] == at, np.nan, other)},
+        {"response": np.where(np.arange(len(other))[:, None] < at - 7, np.nan, other)},  # too few at rest
+        {"drive": np.zeros_like(late.drive)},
+    ):
+        assert moved_with_drive(replace(late, **change), 0) == 0.0
+
+
 @settings(max_examples=15, deadline=None)
 @given(
     seed=st.integers(0, 9), clock=st.sampled_from([1e-9, 1.0, 1e6]), unit=st.sampled_from([1e-12, 1.0, 1e9])
@@ -152,3 +188,5 @@ def test_records_that_disagree_are_in_the_verdicts() -> None:
     assert "Records disagree" in seen.verdict
     assert "Records disagree" in first_look(campaign).verdict
     assert "Records disagree" not in check(study(on, half)).verdict
+    alone = check(study(led_by_a_row(1, 0.5, rows=1))).verdict
+    assert alone.startswith("The records can be fitted. Response 'y' of record ")

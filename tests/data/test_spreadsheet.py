@@ -184,6 +184,13 @@ def test_the_decimal_sign_is_recognised_or_asked_for(cells, sign, tmp_path):
     assert (known if not problems else "") == sign
 
 
+def test_a_drive_that_acted_until_its_row_stands_a_row_earlier(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("time_s,drive_u_V,response_y_V\n0,0,1\n1,2,3\n2,5,4\n3,5,4\n")
+    assert read(path).drive[:, 0].tolist() == [0, 2, 5, 5]
+    assert read(path, until=True).drive[:, 0].tolist() == [2, 5, 5, 5]
+
+
 def test_numbers_in_foreign_notation():
     assert_array_equal(
         numbers(["1.234,5", "\u22122", "3 000", "x", "", "5%"], ","), [1234.5, -2, 3000, np.nan, np.nan, 5]
