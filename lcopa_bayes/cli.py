@@ -259,9 +259,12 @@ def _given(options: argparse.Namespace, *keys: str) -> dict[str, Any]:
 
 
 def _new(options: argparse.Namespace) -> Outcome:
-    keys = ("held_out", "time", "drives", "responses", "time_unit", "decimal", "time_format", "sheet")
+    keys = ("held_out", "time", "drives", "responses", "time_unit", "decimal", "time_format")
     result = lcopa_bayes.new(
-        options.folder, options.files, overwrite=options.overwrite, **_given(options, *keys)
+        options.folder,
+        options.files,
+        overwrite=options.overwrite,
+        **_given(options, *keys, "sheet", "average"),
     )
     after = f"lcopa-bayes check {options.folder}"
     return result.to_json() | {"folder": str(options.folder)}, f"{result}\n\nnext: {after}"

@@ -172,6 +172,13 @@ USAGES: Mapping[str, Usage] = {
             _option("--decimal", "decimal sign, . or ,", default=""),
             _option("--time-format", "format of time stamps, as '%%d.%%m.%%Y %%H:%%M:%%S'", default=""),
             _option("--sheet", "sheet of a workbook"),
+            _option(
+                "--average",
+                "samples whose mean is written in their place (default: 1)",
+                type=_whole(1),
+                default=1,
+                metavar="N",
+            ),
             _OVERWRITE,
         ),
     ),
