@@ -42,6 +42,8 @@ BUNDLED = ("paper-step-x", "paper-step")
 """Studies of records like the paper's, whose run folders hold evidence on its claims."""
 
 
+_PAGE = "report.html"
+"""The page of a fit."""
 _MODULES = {"run": "fit", "identify": "papers"}
 """Modules of verbs that have another name."""
 
@@ -122,8 +124,7 @@ def _outcome(options: argparse.Namespace, command: Sequence[str]) -> Outcome:
         if not (options.quiet or options.json):
             print(f"{options.verb}: loading", file=sys.stderr, flush=True)
         if _jobs(options) > 1:
-            module = _MODULES.get(options.verb, options.verb)
-            imported_ahead(f"lcopa_bayes.verbs.{module}", "lcopa_bayes.report.pages")
+            imported_ahead(_module(options.verb), "lcopa_bayes.report.pages")
     from lcopa_bayes.core.files import trusting
     from lcopa_bayes.results.runfolder import commanded
 
@@ -161,6 +162,11 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
         for option, how in usage.options:
             own.add_argument(option, **how)
     return parser
+
+
+def _module(verb: str) -> str:
+    """Where the public function of a verb is."""
+    return f"lcopa_bayes.verbs.{_MODULES.get(verb, verb)}"
 
 
 def _reported(result: Result, folder: Path, jobs: int = 1, page: Path | None = None) -> Outcome:
@@ -211,12 +217,12 @@ def _jobs(options: argparse.Namespace) -> int:
 
 
 def _on_study(
-    verb: str, *keys: str, module: str = "", inside: str = "", anew: bool = False, **derived: Derived
+    verb: str, *keys: str, page: str = "", inside: str = "", anew: bool = False, **derived: Derived
 ) -> Callable[[argparse.Namespace], Outcome]:
     """What runs a public function of a study or a finished fit.
 
     `keys` are options that it takes by their names, `derived` gives others from the options and the source,
-    `module` is that of the function where it is not public; `anew` calls it with the study alone, and the run
+    `page` is the file of the page that it draws itself; `anew` calls it with the study alone, and the run
     folder is then one `inside` another by the name of the study.
     """
 
@@ -226,13 +232,13 @@ def _on_study(
         jobs = _jobs(options) if hasattr(options, "jobs") else 1
         source = _source(options)
         source = study_of(source) if anew else source
-        function = getattr(import_module(f"lcopa_bayes.verbs.{module}") if module else lcopa_bayes, verb)
+        function = getattr(import_module(_module(verb)), verb)
         given = _given(options, *keys) | {key: of(options, source) for key, of in derived.items()}
         given |= {"jobs": jobs} if hasattr(options, "jobs") else {}
-        given |= {"page": True} if verb == "fit" else {}
+        given |= {"page": True} if page else {}
         folder = _folder(options, source, *filter(None, [inside]))
         result = function(source, folder=folder, **given)
-        return _reported(result, folder, jobs, folder / "report.html" if verb == "fit" else None)
+        return _reported(result, folder, jobs, folder / page if page else None)
 
     return perform
 
@@ -253,19 +259,12 @@ def _given(options: argparse.Namespace, *keys: str) -> dict[str, Any]:
 
 
 def _new(options: argparse.Namespace) -> Outcome:
-    keys = (
-        "held_out",
-        "time",
-        "drives",
-        "responses",
-        "time_unit",
-        "decimal",
-        "time_format",
-        "drive_until",
-        "sheet",
-    )
+    keys = ("held_out", "time", "drives", "responses", "time_unit", "decimal", "time_format", "drive_until")
     result = lcopa_bayes.new(
-        options.folder, options.files, overwrite=options.overwrite, **_given(options, *keys)
+        options.folder,
+        options.files,
+        overwrite=options.overwrite,
+        **_given(options, *keys, "sheet", "average"),
     )
     after = f"lcopa-bayes check {options.folder}"
     return result.to_json() | {"folder": str(options.folder)}, f"{result}\n\nnext: {after}"
@@ -359,8 +358,8 @@ VERBS: Mapping[str, Callable[[argparse.Namespace], Outcome]] = {
     "new": _new,
     "check": _on_study("check", anew=True),
     "look": _on_study("look", anew=True),
-    "run": _on_study("fit", *_SAMPLING, "cross_check", anew=True, rival=_rival),
-    "fit": _on_study("fit", *_SAMPLING, "cross_check", anew=True),
+    "run": _on_study("fit", *_SAMPLING, "cross_check", page=_PAGE, anew=True, rival=_rival),
+    "fit": _on_study("fit", *_SAMPLING, "cross_check", page=_PAGE, anew=True),
     "audit": _on_study("audit", *_SAMPLING),
     "design": _on_study("design", *_SAMPLING, "bench_time", "repeats", "amplitude", "refresh", "with_prior"),
     "compare": _on_study("compare", *_SAMPLING, "candidates", "described"),
@@ -374,7 +373,7 @@ VERBS: Mapping[str, Callable[[argparse.Namespace], Outcome]] = {
     ),
     "fleet": _fleet,
     "predict": _predict,
-    "identify": _on_study("identify", "posterior", "quiet", module="papers", scan=_scan),
+    "identify": _on_study("identify", "posterior", "quiet", scan=_scan),
     "optics": _optics,
     "claims": _claims,
     "explain": _explain,

@@ -12,6 +12,8 @@ from lcopa_bayes.core.arrays import Array, Vector
 
 LEVEL = 0.9
 """Probability inside the intervals that are reported [-]."""
+HALF_WIDTH = 1.6448536269514722
+"""Half the width of such an interval of a normal distribution [sd]."""
 EQUAL_TAILED = "equal-tailed credible"
 """The kind of interval reported: as much probability below it as above."""
 

@@ -115,7 +115,7 @@ def _guessed(posterior: Posterior) -> tuple[Law, ...]:
 def measured(posterior: Posterior, residual: Vector, delay: float) -> tuple[AxisNoise, ...]:
     """Noise of every axis; from the stacked `residual` [response unit] where nothing else gives it."""
     out = []
-    scales = Scales.of([one.record for one in posterior.samples])
+    scales = fitted_scales(posterior)
     for axis, response in enumerate(posterior.table.layout.responses):
         noise = axis_noise(posterior.samples, axis, delay, response, scales)
         if noise is None:
@@ -145,11 +145,16 @@ def settled(model: ExtendedModel, optimum: Optimum, known: Whitening) -> tuple[O
     """Optimum and noise where nothing stands out from the noise that was measured: then all of the residual
     is noise, and knows it better than samples at rest do."""
     posterior = model.plant
-    scales = Scales.of([one.record for one in posterior.samples])
+    scales = fitted_scales(posterior)
     pieces = (axis_pieces(posterior, optimum.residual, axis) for axis in range(len(known.noise)))
-    seen = tuple(plausible([one for one in own if one.values.size > 1], scales) for own in pieces)
+    seen = tuple(plausible(own, scales) for own in pieces)
     white = replace(known, noise=tuple(map(Law.of, seen)), posterior=seen)
     return Regression(model, white).descend(optimum.x), white
+
+
+def fitted_scales(posterior: Posterior) -> Scales:
+    """Scales of the fit records."""
+    return Scales.of([one.record for one in posterior.samples])
 
 
 def axis_pieces(posterior: Posterior, stacked: Vector, axis: int) -> list[Observed]:

@@ -11,11 +11,10 @@ from scipy.stats import chi2, norm
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.effectsearch.basefit import axis_pieces
+from lcopa_bayes.effectsearch.basefit import axis_pieces, fitted_scales
 from lcopa_bayes.effectsearch.noise import Law, joint_noise, laws
 from lcopa_bayes.effectsearch.scores import Score, State, pooled_rmse
 from lcopa_bayes.effectsearch.verdict import Miss
-from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.recursions import correlated
 
 _ROOM = 0.05
@@ -123,7 +122,7 @@ class _Residual:
     def of(cls, state: State, axis: int) -> _Residual:
         """From the fitted records."""
         posterior = state.model.plant
-        scales = Scales.of([one.record for one in posterior.samples])
+        scales = fitted_scales(posterior)
         pieces = axis_pieces(posterior, state.optimum.residual, axis)
         known = joint_noise(pieces, posterior.table.layout.responses[axis], 0, scales)
         law = Law.of(known.posterior)

@@ -10,7 +10,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.core.estimate import Estimate
+from lcopa_bayes.core.estimate import HALF_WIDTH, Estimate
 from lcopa_bayes.data.agreement import Disagreement, disagreements
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.bandwidening import Widening
@@ -23,7 +23,6 @@ from lcopa_bayes.effectsearch.outliers import Outlying, outlying, without_outlie
 from lcopa_bayes.effectsearch.refits import released
 from lcopa_bayes.effectsearch.rounds import CLEAR, SINGLE, Round, Search, search
 from lcopa_bayes.effectsearch.scores import (
-    WIDTH,
     Score,
     State,
     fit_scores,
@@ -127,7 +126,7 @@ class Loop:
             return next(one for one in self.draws.estimates() if one.name == name).as_json()
         row = state.model.posterior.table.rows[state.model.columns[k]]
         x, sd = float(state.optimum.x[k]), float(np.sqrt(state.covariance[k, k]))
-        lower, middle, upper = row.value_at(x + sd * WIDTH * np.array([-1.0, 0.0, 1.0])).tolist()
+        lower, middle, upper = row.value_at(x + sd * HALF_WIDTH * np.array([-1.0, 0.0, 1.0])).tolist()
         return Estimate(
             name=row.name,
             value=middle,
@@ -207,13 +206,12 @@ def _looped(
         rng = np.random.default_rng([study.seed, 11])
         searched = search(start, kinds, rng, noise_samples=base.noise_samples, draws=draws, alone=alone)
         if base.noise_known and not searched.rounds[-1].trace.alarmed:
-            searched = replace(searched, state=_settled(searched.state))
+            searched = _settled(searched)
             if not all(one.firm for one in base.noise) and not searched.state.model.effects:
                 # too few samples at rest leave noise plausible in which every effect drowns
                 unknown = (0,) * len(base.noise)
                 searched = search(searched.state, kinds, rng, noise_samples=unknown, draws=draws, alone=alone)
-                if not searched.rounds[-1].trace.alarmed:
-                    searched = replace(searched, state=_settled(searched.state))
+                searched = _settled(searched)
         searched = replace(searched, state=released(searched.state))
     # of a residual too smooth to be judged an effect is only named where it leaves noise
     if searched is None or (wrong and too_smooth(searched.state.optimum)):
@@ -273,10 +271,13 @@ def _looped(
     )
 
 
-def _settled(state: State) -> State:
-    """The same under the noise that its residual has."""
+def _settled(searched: Search) -> Search:
+    """The same under the noise that its residual has, unless something stands out from the noise."""
+    if searched.rounds[-1].trace.alarmed:
+        return searched
+    state = searched.state
     optimum, whitening = settled(state.model, state.optimum, state.whitening)
-    return replace(state, optimum=optimum, whitening=whitening)
+    return replace(searched, state=replace(state, optimum=optimum, whitening=whitening))
 
 
 def _names(state: State) -> tuple[str, ...]:

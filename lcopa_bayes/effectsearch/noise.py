@@ -98,7 +98,7 @@ class Law:
 
 
 def plausible(pieces: Sequence[Observed], scales: Scales) -> PlausibleNoise:
-    """Posterior of the noise given pieces of it.
+    """Posterior of the noise given pieces of it; one of a single sample says nothing.
 
     To equal parts noise of a single correlation, under Jeffreys' prior ``1 / sqrt(1 - rho^2)`` (Berger and
     Yang 1994, Econometric Theory 10; under a flat one noise of correlation near 1 raises more alarms than
@@ -109,6 +109,7 @@ def plausible(pieces: Sequence[Observed], scales: Scales) -> PlausibleNoise:
     mixed, log_prior = mixed_shapes(scales.correlations)
     log_prior -= np.log(np.exp(log_prior).sum())
     even = np.full(_CORRELATIONS, -np.log(_CORRELATIONS))
+    pieces = [piece for piece in pieces if piece.values.size > 1]
     return PlausibleNoise.of(pieces, np.vstack([alone, mixed]), np.concatenate([even, log_prior]))
 
 
@@ -268,7 +269,7 @@ def joint_noise(residual: Sequence[Observed], response: Axis, quiet: int, scales
     count = sum(piece.size for piece in pieces)
     power = sum(float(((piece - piece.mean()) ** 2).sum()) for piece in pieces)
     law = Law(max(float(np.sqrt(power / count)), 1e-300))
-    coloured = plausible([piece for piece in residual if piece.values.size > 1], scales)
+    coloured = plausible(residual, scales)
     dependence = _dependence(pieces, Law.of(coloured))
     sentence = (
         f"{response.name}: {quiet} quiet samples and no repeats are too few to measure the noise ({FEWEST} "

@@ -13,11 +13,10 @@ from dataclasses import dataclass, replace
 from typing import Any, final
 
 import numpy as np
-from scipy.stats import norm
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of, root_of
-from lcopa_bayes.core.estimate import LEVEL, attributes
+from lcopa_bayes.core.estimate import HALF_WIDTH, attributes
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.noise import Law
@@ -92,8 +91,6 @@ _MOST = 400
 _SEED = 15
 _TRIES = 4
 """Draws for each of them within the support [-]."""
-WIDTH = float(norm.ppf(0.5 + LEVEL / 2))
-"""Half width of a central 90 % interval of a normal distribution [sd]."""
 
 
 @final
@@ -122,7 +119,7 @@ class Score:
     @property
     def half_width(self) -> Vector:
         """Half the width of the 90 % band with noise, (n,) [response unit]; NaN where no band is given."""
-        return np.asarray(WIDTH * np.sqrt(self.variance + self.noise_sd**2))
+        return np.asarray(HALF_WIDTH * np.sqrt(self.variance + self.noise_sd**2))
 
     @property
     def rmse(self) -> float:

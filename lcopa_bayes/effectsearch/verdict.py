@@ -9,7 +9,7 @@ from typing import Literal, final
 
 from scipy.stats import norm
 
-from lcopa_bayes.core.estimate import LEVEL
+from lcopa_bayes.core.estimate import HALF_WIDTH
 
 Kind = Literal["clean", "explained", "partly explained", "disturbance", "unexplained"]
 Confidence = Literal["firm", "tentative"]
@@ -29,7 +29,7 @@ FIRM = 30.0
 """Log evidence that every effect must have brought where names are firm [nat]."""
 REACHED = 1.1
 """Root mean square error over noise that a clean or explained axis has on unseen records at most [-]."""
-COVERED = float(2 * norm.cdf(norm.ppf(0.5 + LEVEL / 2) / REACHED) - 1)
+COVERED = float(2 * norm.cdf(HALF_WIDTH / REACHED) - 1)
 """Share of samples that 90 % bands hold of normal errors so large: bands that hold less do not cover [-]."""
 CHANCE = 0.02
 """Probability below which chance does not explain such errors or bands on unseen records [-]: with that of an

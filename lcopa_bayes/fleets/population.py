@@ -23,6 +23,7 @@ from scipy.special import logsumexp
 from scipy.stats import median_abs_deviation
 
 from lcopa_bayes.core.arrays import Array, Flags, Index, Matrix, Vector
+from lcopa_bayes.core.estimate import HALF_WIDTH
 from lcopa_bayes.sampling.importanceweights import LARGEST_K, effective, smoothed
 
 _NODES = 32
@@ -78,7 +79,7 @@ class Population:
         """Mean and standard deviation of the normal that has the median and 90 % interval of the next
         device."""
         low, _, middle, _, high = np.quantile(self.following, LEVELS)
-        return float(middle), float((high - low) / (2 * 1.6448536269514722))
+        return float(middle), float((high - low) / (2 * HALF_WIDTH))
 
 
 @final

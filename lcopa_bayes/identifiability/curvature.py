@@ -11,10 +11,9 @@ from itertools import combinations
 from typing import Any, final
 
 import numpy as np
-from scipy.stats import norm
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.core.estimate import LEVEL, plain
+from lcopa_bayes.core.estimate import HALF_WIDTH, LEVEL, plain
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.likelihood import Landscape
@@ -229,7 +228,6 @@ def delays(study: Study, table: ParameterTable, values: Vector) -> dict[str, Any
             at[k] = values[table.names.index(row.name)]
     curved = curvature(landscape, at, np.ones(at.size))
     where = [curved.names.index(f"delay_{path}") for path in paths]
-    wide = float(norm.ppf(0.5 + LEVEL / 2))
     separations = []
     for a, b in combinations(range(len(paths)), 2):
         p, q = where[a], where[b]
@@ -237,7 +235,7 @@ def delays(study: Study, table: ParameterTable, values: Vector) -> dict[str, Any
         mixed = 2 * curved.correlations[p, q] * curved.sd[p] * curved.sd[q] if both else 0.0
         spread = np.sqrt(max(curved.sd[p] ** 2 + curved.sd[q] ** 2 - mixed, 0.0)) if both else np.inf
         pair = (paths[a], paths[b])
-        separations.append({"pair": pair, "smallest_difference": float(wide * spread), "level": LEVEL})
+        separations.append({"pair": pair, "smallest_difference": float(HALF_WIDTH * spread), "level": LEVEL})
     rows = [
         {"path": path, "sd": float(curved.sd[p]), "unit": study.time_unit}
         for path, p in zip(paths, where, strict=True)

@@ -7,7 +7,7 @@ from typing import Any, Literal, final
 
 import numpy as np
 
-from lcopa_bayes.core.estimate import LEVEL, attributes, plain
+from lcopa_bayes.core.estimate import HALF_WIDTH, LEVEL, attributes, plain
 from lcopa_bayes.identifiability.contraction import Belief, Tolerance
 from lcopa_bayes.identifiability.curvature import Curvature
 from lcopa_bayes.identifiability.profile import Profile
@@ -141,7 +141,7 @@ def _against(verdict: Verdict, profile: Profile, belief: Belief, sd: float | Non
     out, (low, high) = [], profile.intervals[LEVEL]
     if low is not None and high is not None and sd is not None:
         ends = np.interp([low, high], profile.values, profile.coordinates)
-        half = float(ends[1] - ends[0]) / 2 / 1.645
+        half = float(ends[1] - ends[0]) / (2 * HALF_WIDTH)
         if not np.isfinite(sd):
             out.append("curvature: singular at the maximum, where the profile is bounded farther away")
         elif not 1 / _APART < sd / half < _APART:

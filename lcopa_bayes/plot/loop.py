@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from lcopa_bayes.core.estimate import HALF_WIDTH
 from lcopa_bayes.plot.theme import BAND, HELD_OUT, NOISE, SEEN, blank, label, plain
 
 
@@ -62,7 +63,7 @@ def view_figure(before: Mapping[str, Any], after: Mapping[str, Any]) -> Figure:
         x, y, error = (np.array(view[key], dtype=float) for key in ("x", "y", "error"))
         level = 0.0 if "mean" in view["along"] or "correlation" in view["along"] else 1.0
         panel.axhline(level, color=NOISE, lw=0.7)
-        panel.errorbar(x, y, yerr=1.645 * error, fmt=".-", ms=3, lw=0.8, elinewidth=0.6, color=BAND)
+        panel.errorbar(x, y, yerr=HALF_WIDTH * error, fmt=".-", ms=3, lw=0.8, elinewidth=0.6, color=BAND)
         if view["name"] == "spectrum" and x.size:
             panel.set(xscale="log", yscale="log")
         panel.set(title=plain(f"{view['axis']}, {view['name']}: {when}"))

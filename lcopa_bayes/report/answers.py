@@ -7,7 +7,16 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import log10
 from typing import Any, NamedTuple, TypeAlias, final
 
-from lcopa_bayes.report.formatting import ends, figures, percent, probability, stopped, to_spread, with_error
+from lcopa_bayes.report.formatting import (
+    ends,
+    figures,
+    percent,
+    probability,
+    spread,
+    stopped,
+    to_spread,
+    with_error,
+)
 from lcopa_bayes.results.summary import grouped, joined, listed
 
 Values: TypeAlias = Mapping[str, Any]
@@ -172,7 +181,7 @@ def _calibrate(v: Values) -> _Answers:
 
 def _predict(v: Values) -> _Answers:
     for row in v["axes"]:
-        value = to_spread(row["value_at_end"], (row["upper"] - row["lower"]) / 3.29)
+        value = to_spread(row["value_at_end"], spread(row))
         at = f"{row['end']:.4g} {v['time_unit']}"
         said = f"To {value} {row['unit']} at {at}, {ends(row)} with 90 % probability."
         yield f"Where does {row['axis']} go?", said, "Predicted response"

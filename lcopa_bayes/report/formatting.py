@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from math import floor, isfinite, log10
 from typing import Any
 
+from lcopa_bayes.core.estimate import HALF_WIDTH
+
 OPEN = "open"
 """An end of an interval that no draw bounds."""
 NOT_REACHED = "open (not reached within the record)"
@@ -54,8 +56,13 @@ def interval(lower: float | None, upper: float | None, spread: float | None, *, 
 
 def ends(row: Mapping[str, Any]) -> str:
     """The 90 % interval of an estimate, to the digits that its width allows."""
+    return interval(row["lower"], row["upper"], spread(row))
+
+
+def spread(row: Mapping[str, Any]) -> float | None:
+    """Standard deviation of the normal distribution that has this 90 % interval; None where it is open."""
     lower, upper = row["lower"], row["upper"]
-    return interval(lower, upper, None if lower is None or upper is None else abs(upper - lower) / 3.29)
+    return None if lower is None or upper is None else abs(upper - lower) / (2 * HALF_WIDTH)
 
 
 def percent(share: float | None, digits: int | None = None) -> str:

@@ -32,7 +32,7 @@ UNFOLDED = 4
 """Figures of a series that are shown at once."""
 _CODE = re.compile(r"`([^`\n]+)`")
 _POWER = re.compile(r"\^([-\u2212]?\d[\d.]*\d|[-\u2212]?\d)")
-_PRINTED = ("figures", "percent", "ends", "sentence", "stopped", "probability")
+_PRINTED = ("figures", "percent", "ends", "spread", "sentence", "stopped", "probability")
 """Functions of `formatting` that are filters; a template calls the others."""
 _CALLED = ("interval", "to_spread", "with_error", "NONE", "OPEN")
 _ADVICE = {

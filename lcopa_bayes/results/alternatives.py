@@ -19,7 +19,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Vector
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.core.estimate import LEVEL, Estimate, plain, quantile
+from lcopa_bayes.core.estimate import HALF_WIDTH, LEVEL, Estimate, plain, quantile
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.lagsum import lag_problem, thinned
 from lcopa_bayes.inference.noise import GaussianNoise
@@ -38,8 +38,6 @@ _MOVED = 0.5
 """Shift of a median over its standard deviation from which a number counts as moved [-] ..."""
 _WIDER = 1.5
 """... as from this width of its interval over that of the fitted plant [-]."""
-_NORMAL = 3.29
-"""Standard deviations that 90 % of a normal distribution take [-]."""
 _SHOWN = 4
 """Most numbers named in a sentence."""
 _STREAM = 17
@@ -113,7 +111,7 @@ class Averaged:
             return False
         if not np.isfinite([here.lower, here.value, here.upper]).all():
             return True
-        shifted = abs(here.value - middle) > _MOVED * (high - low) / _NORMAL
+        shifted = abs(here.value - middle) > _MOVED * (high - low) / (2 * HALF_WIDTH)
         return bool(shifted or here.upper - here.lower > _WIDER * (high - low))
 
     def as_json(self) -> dict[str, Any]:

@@ -173,6 +173,13 @@ USAGES: Mapping[str, Usage] = {
             _option("--time-format", "format of time stamps, as '%%d.%%m.%%Y %%H:%%M:%%S'", default=""),
             _flag("--drive-until", "the drive of a row acted until it, not from it on"),
             _option("--sheet", "sheet of a workbook"),
+            _option(
+                "--average",
+                "samples whose mean is written in their place (default: 1)",
+                type=_whole(1),
+                default=1,
+                metavar="N",
+            ),
             _OVERWRITE,
         ),
     ),

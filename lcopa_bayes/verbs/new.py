@@ -11,15 +11,17 @@ import pandas as pd
 
 from lcopa_bayes.core.errors import gathered, refuse_if
 from lcopa_bayes.data.agreement import disagreements
+from lcopa_bayes.data.averaging import averaged
 from lcopa_bayes.data.cells import CellTable
 from lcopa_bayes.data.conversion import Mapped, convert
 from lcopa_bayes.data.requirements import unmet
 from lcopa_bayes.data.spreadsheet import read_spreadsheet
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studywriter import write_folder
+from lcopa_bayes.identifiability.averagingloss import averaging_losses
 
 _SETTINGS = """\
-[model]
+[model]{means}
 # terms = 1  # viscous terms of every element; without it the records choose
 # share = "none"  # every path has an element of its own; "all": one for all
 # delay = "path"  # every path has a delay of its own; "shared": one for all
@@ -43,7 +45,7 @@ class NewStudy:
     """Records read from tables, and how these were read."""
 
     study: Study
-    """The study, with default settings."""
+    """The study, with default settings; of means of samples where these were asked for."""
     notes: tuple[str, ...]
     """What was taken for what, one sentence each."""
     warnings: tuple[str, ...]
@@ -74,7 +76,10 @@ class NewStudy:
         InputError when files of these names are there, unless `overwrite`, or one cannot be written.
         """
         notes = ["What was understood of the tables:", *(f"- {one}" for one in self.notes)]
-        return write_folder(Path(folder), self.study, notes=notes, settings=_SETTINGS, overwrite=overwrite)
+        exposure = self.study.model.exposure_ms
+        said = f"\nexposure_ms = {exposure!r}  # every sample is a mean" if exposure else ""
+        settings = _SETTINGS.format(means=said)
+        return write_folder(Path(folder), self.study, notes=notes, settings=settings, overwrite=overwrite)
 
 
 def new(
@@ -90,13 +95,16 @@ def new(
     time_format: str = "",
     drive_until: bool = False,
     sheet: str | None = None,
+    average: int = 1,
     overwrite: bool = False,
 ) -> NewStudy:
     """Make a study of tables as spreadsheets and loggers save them.
 
     Parameters: `folder`, where records and `study.toml` are written; `files` and `held_out`, tables to fit
     and to predict alone: text of any separator, encoding and decimal sign, or workbooks, of which `sheet`
-    names the sheet; `overwrite`, replace files that are there. Tables share their headers. What is ambiguous
+    names the sheet; `average`, samples in turn whose mean is written in their place, where records are too
+    long to be fitted whole: the notes state what that loses; `overwrite`, replace files that are there.
+    Tables share their headers. What is ambiguous
     in headers and data is stated: `time`, `drives` and `responses`, columns by header, by header without its
     unit or by number, each perhaps with a new name, as in "heater [%]=Column B"; `time_unit` of a numeric
     time column, `decimal`, the decimal sign, and `time_format` of time stamps, as of `datetime.strptime`;
@@ -125,6 +133,20 @@ def new(
     records, notes = convert(tables, stated)
     own, apart = records[: len(fitted)], records[len(fitted) :]
     study = Study(folder.resolve().name, fit=own, held_out=apart)
-    result = NewStudy(study, tuple(notes), tuple(unmet(study) or map(str, disagreements((*own, *apart)))))
+    if average != 1:
+        means = averaged(study, average)
+        study, notes = means, [*notes, *_losses(study, average)]
+    warnings = unmet(study) or map(str, disagreements((*study.fit, *study.held_out)))
+    result = NewStudy(study, tuple(notes), tuple(warnings))
     result.save(folder, overwrite=overwrite)
     return result
+
+
+def _losses(study: Study, count: int) -> list[str]:
+    """What means of `count` samples lose, and of twice as many where records hold two of these."""
+    said = [f"Every sample written is the mean of {count}."]
+    if unmet(study):  # nothing to fit yet
+        return said
+    fewest = min(record.sampled.size for record in (*study.fit, *study.held_out))
+    losses = averaging_losses(study, (count, 2 * count) if fewest >= 4 * count else (count,))
+    return [*said, *map(str, losses), "These losses are those of a plant of the fewest viscous terms."]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lcopa_bayes.core.estimate import EQUAL_TAILED, Estimate, plain
+from lcopa_bayes.core.estimate import EQUAL_TAILED, HALF_WIDTH, LEVEL, Estimate, plain
 
 
 def of(draws: np.ndarray) -> Estimate:
@@ -21,6 +21,9 @@ def test_quantiles_are_those_of_the_distribution():
     assert (told.lower, told.value, told.upper) == pytest.approx(stats.expon.ppf([0.05, 0.5, 0.95]), rel=1e-3)
     assert (told.mean, told.sd) == pytest.approx((1.0, 1.0), rel=1e-3)
     assert (told.level, told.interval) == (0.9, EQUAL_TAILED)
+    assert stats.norm.cdf([-HALF_WIDTH, HALF_WIDTH]) == pytest.approx(
+        [(1 - LEVEL) / 2, (1 + LEVEL) / 2], rel=1e-12
+    )
 
 
 def test_draws_that_never_reach_it_open_the_upper_side():

@@ -10,6 +10,7 @@ import pytest
 
 from lcopa_bayes.bench.command import on_off, staircase, step
 from lcopa_bayes.bench.device import Bench, Device, simulate
+from lcopa_bayes.core.estimate import HALF_WIDTH
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
@@ -20,7 +21,7 @@ from lcopa_bayes.effectsearch.heldouteffects import unseen_share
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.effectsearch.noise import axis_noise, repeat_pieces
 from lcopa_bayes.effectsearch.regression import Regression
-from lcopa_bayes.effectsearch.scores import WIDTH, log_scores, risen
+from lcopa_bayes.effectsearch.scores import log_scores, risen
 from lcopa_bayes.effectsearch.summary import drawn, results, words
 from lcopa_bayes.effectsearch.verdict import COVERED, Findings, Miss, decide
 from lcopa_bayes.effectsearch.whitening import Whitening
@@ -349,7 +350,7 @@ def test_what_chance_may_explain_is_said_beside_clean():
 
 def test_normal_errors_of_the_largest_size_are_held_as_often_as_bands_must_hold():
     errors = 1.1 * np.random.default_rng(2).normal(size=200_000)
-    assert np.mean(np.abs(errors) <= WIDTH) == pytest.approx(COVERED, abs=4 * np.sqrt(0.12 / 200_000))
+    assert np.mean(np.abs(errors) <= HALF_WIDTH) == pytest.approx(COVERED, abs=4 * np.sqrt(0.12 / 200_000))
 
 
 def test_the_error_that_has_risen_is_that_of_the_worst_axis(clean):

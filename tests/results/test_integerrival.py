@@ -1,6 +1,7 @@
 """The integer-order rival: which orders it holds, and that its scores are its own."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -48,7 +49,8 @@ def test_the_rival_predicts_the_same_records_and_is_told(fitted, rival, tmp_path
     assert rival.sentence in saved["verdict"]
     assert json.loads((tmp_path / "results.json").read_text())["rival"]["orders"] == dict(rival.orders)
     grade = rival.fit.draws.grade
-    assert f"{grade.level}: {grade.reason.partition(';')[0]}" in write_report(tmp_path).read_text()
+    reason = re.sub(r"`(.+?)`", r"<code>\1</code>", grade.reason)
+    assert f"{grade.level}: {reason}" in write_report(tmp_path).read_text()
 
 
 def test_no_rival_without_free_orders_or_held_out_records(fitted, rival):

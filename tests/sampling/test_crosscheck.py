@@ -234,7 +234,7 @@ def test_the_command_line_asks_for_it(monkeypatch, tmp_path):
         asked.append(options["cross_check"])
         raise InputError("asked")
 
-    monkeypatch.setattr("lcopa_bayes.fit", stop)
+    monkeypatch.setattr("lcopa_bayes.verbs.fit.fit", stop)
     save_record(record(camera=0.6), tmp_path / "one.csv")
     for words in (["fit"], ["fit", "--cross-check"], ["run", "--cross-check"]):
         assert main([*words, str(tmp_path / "one.csv")]) == 2

@@ -27,6 +27,7 @@ sys.path.insert(0, str(FOLDER))
 
 import comparison  # noqa: E402
 import forward  # noqa: E402
+import growth  # noqa: E402
 import page  # noqa: E402
 import plots  # noqa: E402
 import probe  # noqa: E402
@@ -447,3 +448,28 @@ def test_plants_are_counted_however_a_response_is_called():
                 assert (
                     count(None, SimpleNamespace(batch=1) if "Forward" in kind else [0], *at, **by_name) == 1
                 )
+
+
+def test_growth_is_measured_in_processes_of_their_own_and_drawn(tmp_path, capsys):
+    rows = growth.measured(["response", "csv", "quick fit"], [1000], 300.0)
+    late = growth.measured(["response"], [2000], 0.1)
+    assert [row["task"] for row in rows] == ["response", "csv", "quick fit"]
+    assert all(0.0 < row["memory_MB"] < 1000.0 for row in rows)
+    assert 0.0 < rows[0]["response_s"] < rows[0]["slopes_s"] < rows[2]["fit_s"]
+    assert late[0]["reason"] == "took more than 0.1 s"
+    assert rows[2]["least_ess"] > 100
+    said = growth.page([*rows, *late, rows[2] | {"losses": ["Means of 5 samples lose little."]}])
+    assert said.count("| quick fit | 1,000 |") == 2
+    assert "| response | 2,000 | took more than 0.1 s |" in said
+    assert "- 1,000 samples: Means of 5 samples lose little." in said
+    growth.drawn([*rows, *late], tmp_path / "growth.svg")
+    assert "peak memory" in (tmp_path / "growth.svg").read_text()
+
+
+def test_a_growth_record_of_means_states_its_loss(monkeypatch):
+    monkeypatch.setattr(growth, "WHOLE", 500)
+    row = growth.fitted(1000, quick=True)
+    assert row["count"] == 2
+    for one, count in zip(row["losses"], (2, 4), strict=True):
+        assert one.startswith(f"Means of {count} samples")
+    assert row["memory_MB"] >= row["loss_MB"] > 0

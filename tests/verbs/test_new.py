@@ -43,6 +43,23 @@ def test_a_spreadsheet_becomes_a_study_that_is_checked_and_looked_at(oven, tmp_p
     assert main(["look", str(folder), "--out", str(run)]) == 0
 
 
+def test_a_long_table_becomes_means_that_are_fitted_as_such(tmp_path, capsys):
+    long = tmp_path / "long.csv"
+    save_record(record(camera=0.01), long)
+    folder = tmp_path / "study"
+    assert main(["new", str(folder), str(long), "--average", "10"]) == 0
+    said = capsys.readouterr().out
+    assert "Every sample written is the mean of 10." in said
+    assert "Means of 10 samples make no standard deviation larger than 1." in said
+    assert "Means of 20 samples" in said
+    study, whole = lb.load_study(folder), lb.load_record(long)
+    assert study.exposure == pytest.approx(0.1)
+    assert study.fit[0].sampled.size == whole.sampled.size // 10
+    assert main(["new", str(tmp_path / "none"), str(long), "--average", "700"]) == 2
+    assert "are no two means of 700" in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
+
+
 def test_nothing_is_replaced_unless_allowed_and_nothing_written_of_what_is_refused(oven, tmp_path, capsys):
     folder = tmp_path / "study"
     lb.new(folder, oven)
