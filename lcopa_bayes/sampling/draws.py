@@ -183,8 +183,8 @@ def _near(run: Run, dimension: int) -> tuple[Limitation, ...]:
             f"no search met this posterior of {dimension} sampled parameters: ensembles began around its "
             f"least-squares optima and ended after {run.ensembles[0].steps} steps, and a mode elsewhere is "
             "missed",
-            'let [sampler] method = "ensembles" temper them from the prior, which takes hours, or fix '
-            "parameters that the record does not determine",
+            'allow more time ([sampler] seconds), let method = "ensembles" temper them from the prior, which '
+            "takes hours, or fix parameters that the record does not determine",
         ),
     )
 

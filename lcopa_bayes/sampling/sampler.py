@@ -55,8 +55,8 @@ _NEAR_WALKERS, _NEAR_PER_DIMENSION = 48, 2
 """Most walkers of an ensemble that begins around optima, or over two per sampled coordinate if these are
 more: they are tempered as one population, by ..."""
 _NEAR_SWEEPS, _NEAR_THIN, _NEAR_ROUNDS = 10, 2, 10
-"""... so many moves at each temperature, and take so many steps per kept draw and rounds at most: few walkers
-that go far, since those that remember their start say nothing."""
+"""... so many moves at each temperature, and take so many steps per kept draw and, without a budget of time,
+rounds at most: few walkers that go far, since those that remember their start say nothing."""
 _AXIS_STEPS = 1_500
 """Most steps of an ensemble of one axis of several: it begins at points of a search, or around optima."""
 _TRAIL = 1_500
@@ -271,7 +271,7 @@ def sample(
         near = ensembles[0].near
         thin = min(plan.thin, _NEAR_THIN) if near else plan.thin
         rounds = max(2, -(-plan.steps // (_ROUND * thin)))
-        rounds = min(rounds, _NEAR_ROUNDS) if near else rounds
+        rounds = min(rounds, _NEAR_ROUNDS) if near and plan.seconds is None else rounds
         done = ensembles[0].steps // (_ROUND * thin)
         if not done:
             _store(chain_file, Chain(ensembles), fingerprint)

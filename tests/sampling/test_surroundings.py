@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,10 +26,10 @@ def optima() -> tuple[Optimum, ...]:
     return find_optima(POSTERIOR, np.random.default_rng(1), starts=4)
 
 
-def run(monkeypatch: pytest.MonkeyPatch, target: float, seed: int = 3) -> Run:
+def run(monkeypatch: pytest.MonkeyPatch, target: float, seed: int = 3, **limits: Any) -> Run:
     """Of a posterior that is taken for one that no search can map."""
     monkeypatch.setattr(sampler, "_MAPPED", 0)
-    plan = SamplePlan.of(POSTERIOR.dimension, seed=seed, target_ess=target, method="auto")
+    plan = SamplePlan.of(POSTERIOR.dimension, seed=seed, target_ess=target, method="auto", **limits)
     return sample(POSTERIOR, plan, optima=optima())
 
 
@@ -60,6 +61,11 @@ def test_they_end_after_so_many_rounds_and_say_what_they_may_miss(monkeypatch):
     (limitation,) = draws.limitations
     assert "began around its least-squares optima" in limitation.reason
     assert 'method = "ensembles"' in limitation.remedy
+
+
+def test_a_budget_of_time_takes_the_place_of_the_most_rounds(monkeypatch):
+    monkeypatch.setattr(sampler, "_NEAR_ROUNDS", 2)
+    assert run(monkeypatch, 1e9, seconds=1e9, steps=200).ensembles[0].steps == 200
 
 
 def test_a_stored_run_remembers_that_it_began_there(monkeypatch, tmp_path):
