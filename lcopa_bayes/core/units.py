@@ -1,4 +1,4 @@
-"""Units of time, each a whole multiple of the one before."""
+"""Units of time, each a whole multiple of the one before, and units of ratios."""
 
 from __future__ import annotations
 
@@ -20,3 +20,15 @@ def in_time_unit(time: Array | float, given: str, wanted: str) -> Array:
     more, fewer = TIME_UNITS[given], TIME_UNITS[wanted]
     with np.errstate(over="ignore"):  # an infinite time is refused by `Record`
         return np.asarray(time * float(more // fewer) if more >= fewer else time / float(fewer // more))
+
+
+def per(unit: str, other: str) -> str:
+    """Unit of a ratio, ``-`` where it has none."""
+    if other == "-":
+        return unit
+    return f"1/{other}" if unit == "-" else f"{unit}/{other}"
+
+
+def measured(figure: str, unit: str) -> str:
+    """A figure with its unit, alone where it has none."""
+    return figure if unit == "-" else f"{figure} {unit}"

@@ -10,6 +10,7 @@ import pandas as pd
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.estimate import Estimate, attributes, plain
+from lcopa_bayes.core.units import per
 from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.likelihood import Landscape
 from lcopa_bayes.inference.parameter import Parameter
@@ -209,7 +210,7 @@ def _slopes(draws: Draws, curves: StepCurves, time_unit: str) -> list[Estimate]:
         curve = curves.normalised[curves.curve_of[i][j]]
         steepest = np.diff(curve, axis=1, prepend=0.0).max(axis=1) / step
         slope, name = curves.gains[:, i, j] * steepest, f"steepest_slope[{path}]"
-        out.append(Estimate.of(name, f"{unit}/{time_unit}", slope, ess=draws.ess, grade=draws.grade.level))
+        out.append(Estimate.of(name, per(unit, time_unit), slope, ess=draws.ess, grade=draws.grade.level))
     return out
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Flags, Index, Matrix, Vector
 from lcopa_bayes.core.errors import InputError, nearest, refuse_if
+from lcopa_bayes.core.units import per
 from lcopa_bayes.data.settings import ModelSettings, PriorSettings
 from lcopa_bayes.inference.defaultpriors import Scales
 from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS, KINDS
@@ -285,7 +286,7 @@ def parameter_table(
 
     for i, response in enumerate(layout.responses):
         for j, drive in enumerate(layout.drives):
-            unit = f"{response.unit}/{drive.unit}"
+            unit = per(response.unit, drive.unit)
             add("gain", (i, j), layout.path_name(i, j), unit, scales.gain(i, j))
     for e, slot in enumerate(layout.elements):
         for k in range(slot.terms):

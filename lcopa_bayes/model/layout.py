@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import NamedTuple, final
 
 from lcopa_bayes.core.errors import nearest, refuse_if
+from lcopa_bayes.core.units import per
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.data.settings import ModelSettings
 
@@ -102,7 +103,7 @@ class Layout:
     def paths(self) -> tuple[PathSlot, ...]:
         """All paths, by response and drive."""
         return tuple(
-            PathSlot(i, j, self.path_name(i, j) or response.name, f"{response.unit}/{drive.unit}")
+            PathSlot(i, j, self.path_name(i, j) or response.name, per(response.unit, drive.unit))
             for i, response in enumerate(self.responses)
             for j, drive in enumerate(self.drives)
         )

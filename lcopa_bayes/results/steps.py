@@ -11,6 +11,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.core.errors import InputError, nearest
 from lcopa_bayes.core.estimate import Estimate
+from lcopa_bayes.core.units import per
 from lcopa_bayes.data.drive import AxisDrive
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.simulation import Simulation
@@ -306,6 +307,6 @@ def _crosstalk(layout: Layout, curves: StepCurves) -> list[Metric]:
                 other = curves.gains[:, i, j]
                 ratio = np.where(direct != 0, other / np.where(direct != 0, direct, 1), np.inf)
                 name = f"crosstalk[{response.name}/{layout.responses[own].name} by {drive.name}]"
-                unit = f"{response.unit}/{layout.responses[own].unit}"
+                unit = per(response.unit, layout.responses[own].unit)
                 out.append(Metric(name, unit, ratio))
     return out

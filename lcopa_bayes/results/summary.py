@@ -12,6 +12,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.estimate import plain
+from lcopa_bayes.core.units import measured, per
 from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.results.residuals import WHITE_P
@@ -68,11 +69,9 @@ def plant(table: ParameterTable, values: Vector) -> list[str]:
             e = layout.element_of[i][j]
             gain = values[table.at("gain", i, j)]
             delay = values[table.at("delay", layout.delay_of[i][j])]
+            size = measured(f"{gain:.4g}", per(response.unit, drive.unit))
             below = f"({elements[e]})" if alone else layout.elements[e].name
-            lines.append(
-                f"{response.name} / {drive.name} = {gain:.4g} {response.unit}/{drive.unit} "
-                f"exp(-{delay:.4g} s) / {below}"
-            )
+            lines.append(f"{response.name} / {drive.name} = {size} exp(-{delay:.4g} s) / {below}")
     if not alone:
         lines += [f"{slot.name} = {elements[e]}" for e, slot in enumerate(layout.elements)]
     if table.effects is not None:
@@ -89,12 +88,14 @@ def _fitted(fit: Fit) -> str:
     for axis, response in enumerate(fit.draws.table.layout.responses):
         own = [band for band in fit.bands if band.axis == response.name and not band.held_out]
         residual = np.concatenate([band.observed - band.plant[2] for band in own])
-        said = f"The residual of {response.name} is {np.sqrt(np.mean(residual**2)):.3g} {response.unit} rms"
+        rms = measured(f"{np.sqrt(np.mean(residual**2)):.3g}", response.unit)
+        said = f"The residual of {response.name} is {rms} rms"
         still = [one.quiet(axis).values for one in fit.problem.posterior.samples]
         free = sum(max(0, values.size - 1) for values in still)
         if free >= _AT_REST:
             squares = sum(float(np.sum((values - values.mean()) ** 2)) for values in still if values.size)
-            said += f", where samples at rest scatter by {np.sqrt(squares / free):.3g} {response.unit}"
+            scatter = measured(f"{np.sqrt(squares / free):.3g}", response.unit)
+            said += f", where samples at rest scatter by {scatter}"
         parts.append(said)
     return ". ".join(parts) + "."
 
@@ -107,8 +108,8 @@ def _predicted(fit: Fit) -> str:
     several = "s" * (len(held) != 1)
     return (
         f"Of {len(held)} held-out response{several} the worst, {worst.record}/{worst.axis}, has "
-        f"{100 * worst.coverage(0.9):.0f} % of its samples in the 90 % band and an error of {worst.rmse:.3g} "
-        f"{worst.unit} rms."
+        f"{100 * worst.coverage(0.9):.0f} % of its samples in the 90 % band and an error of "
+        f"{measured(f'{worst.rmse:.3g}', worst.unit)} rms."
     )
 
 

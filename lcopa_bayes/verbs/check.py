@@ -16,6 +16,7 @@ import pandas as pd
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import csv_of
+from lcopa_bayes.core.units import measured
 from lcopa_bayes.data.agreement import disagreements
 from lcopa_bayes.data.drive import axis_drives, first_change
 from lcopa_bayes.data.record import Record
@@ -181,14 +182,15 @@ def _sentences(one: dict[str, Any], unit: str) -> list[str]:
     out = [f"{span}, {spaced if one['even'] else uneven}."]
     for drive in one["drives"]:
         if drive["first_change"] is None:
-            out.append(f"{drive['axis']} stays at {drive['rest']:.4g} {drive['unit']}.")
+            out.append(f"{drive['axis']} stays at {measured(format(drive['rest'], '.4g'), drive['unit'])}.")
         else:
             at = f"{drive['first_change']:.4g} {unit}"
+            highest = measured(f"{drive['highest']:.4g}", drive["unit"])
             many = drive["changes"] != 1
             often = f"{drive['changes']} times from {at} on" if many else f"once, at {at}"
             out.append(
                 f"{drive['axis']} changes {often}, between "
-                f"{drive['lowest']:.4g} and {drive['highest']:.4g} {drive['unit']}; longest hold "
+                f"{drive['lowest']:.4g} and {highest}; longest hold "
                 f"{drive['longest_hold']:.4g} {unit}."
             )
     for axis in one["responses"]:
@@ -196,12 +198,14 @@ def _sentences(one: dict[str, Any], unit: str) -> list[str]:
             out.append(f"{axis['axis']} was not sampled.")
             continue
         said = (
-            f"{axis['axis']} between {axis['lowest']:.4g} and {axis['highest']:.4g} {axis['unit']}, "
+            f"{axis['axis']} between {axis['lowest']:.4g} and "
+            f"{measured(format(axis['highest'], '.4g'), axis['unit'])}, "
             f"{axis['samples']} samples"
         )
         said += f", {axis['missing']} missing" if axis["missing"] else ""
         if axis["scatter"] is not None:
-            said += f"; {axis['at_rest']} at rest, which scatter by {axis['scatter']:.2g} {axis['unit']}"
+            scatter = measured(f"{axis['scatter']:.2g}", axis["unit"])
+            said += f"; {axis['at_rest']} at rest, which scatter by {scatter}"
         if axis["onset"] is not None:
             said += f"; it moves clearly {axis['onset']:.4g} {unit} after the first change of a drive"
         out.append(f"{said}.")

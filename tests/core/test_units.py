@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from lcopa_bayes.core.units import TIME_UNITS, in_time_unit
+from lcopa_bayes.core.units import TIME_UNITS, in_time_unit, per
 from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.inference.assembly import problem_of
 
@@ -47,3 +47,11 @@ def test_a_record_in_minutes_is_the_one_in_seconds(tmp_path):
         tables[unit] = {row.name: row for row in problem_of(study).posterior.table.rows}
     assert tables["min"]["delay"].unit == "min"
     assert 60 * tables["min"]["delay"].domain[1] == pytest.approx(tables["s"]["delay"].domain[1], rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("unit", "other", "ratio"),
+    [("rad", "V", "rad/V"), ("rad", "-", "rad"), ("-", "V", "1/V"), ("-", "-", "-")],
+)
+def test_the_unit_of_a_ratio(unit, other, ratio):
+    assert per(unit, other) == ratio
