@@ -26,6 +26,8 @@ _WALLS = 8
 """Descents between walls that move with the orders they separate, at most [-]."""
 _PUSHED = 0.3
 """Slope of the cost per standard deviation from which such a coordinate is held by its bound [nat]."""
+_HELD_BACK = 3.0
+"""Standard deviations by which it would go beyond it that are more than chance [-]."""
 
 
 @final
@@ -52,7 +54,8 @@ class Optimum:
     log_evidence: float
     """Laplace approximation of the log evidence; flat priors count by their width [nat]."""
     at_bound: tuple[str, ...]
-    """Names of the coordinates at an end of their support."""
+    """Names of the coordinates that an end of their support holds back by more than chance explains: a delay
+    of 0 is at one where there is none."""
     converged: bool
     effective: float
     """Independent samples [-]."""
@@ -155,6 +158,7 @@ class Regression:
         room = _AT_END * np.where(np.isfinite(high - low), high - low, spread)
         pushed = slope / np.sqrt(np.diag(information))
         stuck = ((x < ends[0] + room) & (pushed < -_PUSHED)) | ((x > ends[1] - room) & (pushed > _PUSHED))
+        beyond = np.abs(slope) * np.sqrt(np.diag(covariance_of(information))) > _HELD_BACK
         level = cost + 0.5 * white.size * _LOG_2PI + self.whitening.log_scale
         scaled = np.linalg.slogdet(information * np.outer(spread, spread))[1]
         return Optimum(
@@ -167,7 +171,7 @@ class Regression:
             information,
             cost,
             float(-level - 0.5 * scaled),
-            tuple(name for name, close in zip(self.model.names, near | stuck, strict=True) if close),
+            tuple(np.array(self.model.names)[(near | stuck) & beyond].tolist()),
             converged,
             self.whitening.effective,
             stuck,

@@ -262,6 +262,9 @@ def next_measurement(result: Loop) -> str:
             wanted = _wanted([cards[name] for name in group if name in cards])
             return f"To separate {', '.join(group)}, record {wanted}."
     if result.verdict.kind == "unexplained":
+        alone = [one.remedy for one in result.contrary if len(one.records) == 1]
+        if alone:
+            return f"{alone[0][0].upper()}{alone[0][1:]}."
         near = [one for one in trace.traced if one.card.place != "generic"][:2]
         return f"To find what is missing, record {_wanted([one.card for one in near])}." if near else ""
     hidden = [one for one in trace.traced if one.survival < SEEN and one.card.place != "generic"]
@@ -274,4 +277,5 @@ def next_measurement(result: Loop) -> str:
 def _wanted(cards: Sequence[Card]) -> str:
     """What reveals these effects, each excitation once."""
     excitations = (part.strip() for card in cards for part in card.reveals.split(";")[0].split(","))
-    return ", ".join(dict.fromkeys(excitations))
+    several = [one for one in dict.fromkeys(excitations) if one != "any record"]
+    return ", ".join(several) or "a further record"

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import small
+from small import ONE, path, record
 
 from lcopa_bayes.bench.command import step
 from lcopa_bayes.bench.device import Bench, Device, simulate
@@ -168,6 +170,20 @@ def test_a_delay_beyond_its_default_prior_gets_a_longer_one():
     assert "delay" in base.sentence
     assert delay == pytest.approx(23.8, abs=0.05)
     assert "delay" not in base.fit.optimum.at_bound
+
+
+@pytest.mark.parametrize(("rows", "held"), [(0, ()), (1, ("delay",))])
+def test_a_delay_is_held_back_where_the_response_leads_and_not_where_there_is_none(rows, held):
+    """Drives stated `rows` late; over ten seeds chance does not count as held back."""
+    device = replace(ONE, paths=((path(2.0, 0.0, (1.5,), (0.8,)),),))
+    for seed in range(10):
+        one = record(seed, device=device, command=step(1.0, at=5.0), duration=20.0, noise_sd=0.01)
+        late = replace(one, drive=np.concatenate([one.drive[:1]] * rows + [one.drive])[: len(one.drive)])
+        fit = base_fit(ExtendedModel(problem_of(small.study(late)).posterior), np.random.default_rng(0))
+        assert fit.optimum.at_bound == held
+        assert any("holds back" in one or "at the end of the prior" in one for one in fit.caution) == bool(
+            held
+        )
 
 
 def test_a_stated_prior_of_the_delay_is_kept():

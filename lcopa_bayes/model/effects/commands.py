@@ -226,7 +226,7 @@ class SampledDrive(DriveEffect):
         place="drive",
         formula="t -> t - w period / 2 for each change; w = 1 is a drive sampled at the middle of its holds",
         source="midpoint rule for a band-limited drive; Ljung 1999, System Identification, ch. 13",
-        reveals="a drive that changes with every sample, a delay near 0",
+        reveals="a drive that changes with every sample (with a delay near 0)",
         mistaken_for="a shorter delay, exactly so where the delay can shrink",
         linear=True,
     )
