@@ -94,7 +94,8 @@ def disagreements(records: Sequence[Record]) -> tuple[Disagreement, ...]:
     lags = np.geomspace(period, span, _LAGS)
     described = [one for one in (Described(record, lags) for record in records) if one.moving and one.best]
     leads = [
-        max((-seen[0] for seen in one.best if _runs_ahead(*seen, period)), default=0.0) for one in described
+        max((-seen[0] for seen in _judged(one) if _runs_ahead(*seen, period)), default=0.0)
+        for one in described
     ]
     ahead = [_ahead(one.record, lead) for one, lead in zip(described, leads, strict=True) if lead > 0.0]
     led = {one.records for one in ahead}
@@ -120,6 +121,12 @@ def disagreements(records: Sequence[Record]) -> tuple[Disagreement, ...]:
 def _severity(one: Disagreement) -> tuple[bool, bool, float]:
     """Sorts the gross ones first, those of all axes before those of one, then by what explains most."""
     return not one.gross, np.isfinite(one.ratio), one.misfit
+
+
+def _judged(one: Described) -> list[tuple[float, float, float]]:
+    """What is best of the axes that say when a record's clock ran: those that are followed closely, where
+    there are any; noise of long memory is ahead of anything on an axis that hardly moves."""
+    return [seen for seen in one.best if seen[1] <= 1 - _CLOSELY] or list(one.best)
 
 
 def _runs_ahead(delay: float, misfit: float, causal: float, period: float) -> bool:

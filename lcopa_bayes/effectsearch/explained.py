@@ -63,11 +63,13 @@ def constant_about(effect: Effect, key: str, value: float, ranges: Ranges) -> Pr
     nothing but the noise depends on it, or where commands jump with it (`timed`), and without others to try.
     """
     name = f"{effect.name}.{key}"
-    listed = np.unique([float(getattr(one, key)) for one in effect.grid(ranges)])
+    internal = {one.name: one for one in effect.internal(ranges)}
+    tried = [float(getattr(one, key)) for one in effect.grid(ranges)]
+    listed = np.unique([*tried, internal[key].low, internal[key].high])
     first = int(np.searchsorted(listed, value)) - 2
     last = int(np.searchsorted(listed, value, "right")) + 1
     low, high = listed[max(first, 0)], listed[min(last, listed.size - 1)]
-    fixed = {one.name for one in effect.internal(ranges) if one.kind == "choice" or one.high <= one.low}
+    fixed = {one.name for one in internal.values() if one.kind == "choice" or one.high <= one.low}
     if effect.card.disturbance or effect.timed or key in fixed or not low <= value <= high or low == high:
         return PriorSettings(name, fixed=value)
     return PriorSettings(name, dist="uniform", parameters={"loc": float(low), "scale": float(high - low)})

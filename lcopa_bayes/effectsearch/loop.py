@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, final
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.core.estimate import HALF_WIDTH, Estimate
+from lcopa_bayes.core.estimate import HALF_WIDTH, Estimate, plain
 from lcopa_bayes.data.agreement import Disagreement, disagreements
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.bandwidening import Widening
@@ -18,6 +20,7 @@ from lcopa_bayes.effectsearch.basefit import BaseFit, settled, too_smooth
 from lcopa_bayes.effectsearch.basemodel import fitted_base
 from lcopa_bayes.effectsearch.explained import coordinates_of, declarable, explained_draws, explained_study
 from lcopa_bayes.effectsearch.heldouteffects import missed, unseen_share
+from lcopa_bayes.effectsearch.openeffects import Alternative, alternatives, mixture, odds, pooled
 from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
 from lcopa_bayes.effectsearch.outliers import Outlying, outlying, without_outliers
 from lcopa_bayes.effectsearch.refits import released
@@ -45,6 +48,7 @@ from lcopa_bayes.effectsearch.verdict import (
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.effect import Effect
+from lcopa_bayes.results.alternatives import parts_of_sd
 from lcopa_bayes.sampling.convergence import Grade
 from lcopa_bayes.sampling.draws import Draws
 
@@ -97,6 +101,8 @@ class Loop:
     """Samples left out before anything was traced; None without any."""
     contrary: tuple[Disagreement, ...] = ()
     """Records that disagree."""
+    open: tuple[Alternative, ...] = ()
+    """Effects that the records leave open beside, or in place of, those of the final model."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -119,26 +125,43 @@ class Loop:
         )
 
     def estimate(self, k: int) -> dict[str, Any]:
-        """A coordinate of the final model with unit, 90 % interval and grade."""
+        """A coordinate of the final model over the effects that are open, with unit, 90 % interval and grade,
+        its standard deviations by noise and by structure, and lower end, median and upper end under the final
+        model `alone`."""
         state = self.after.state
-        if self.draws is not None:
-            name = state.model.names[k]
-            return next(one for one in self.draws.estimates() if one.name == name).as_json()
         row = state.model.posterior.table.rows[state.model.columns[k]]
-        x, sd = float(state.optimum.x[k]), float(np.sqrt(state.covariance[k, k]))
-        lower, middle, upper = row.value_at(x + sd * HALF_WIDTH * np.array([-1.0, 0.0, 1.0])).tolist()
-        return Estimate(
-            name=row.name,
-            value=middle,
-            unit=row.unit,
-            lower=lower,
-            upper=upper,
-            ess=np.nan,
-            grade="tentative",
-            mean=middle,
-            sd=sd * (middle if row.log_scale else 1.0),
-            interval="Laplace",
-        ).as_json()
+        parts, weights = self.values_of(k)
+        noise, structure = parts_of_sd(parts, weights)
+        if self.draws is not None:
+            own = next(one for one in self.draws.estimates() if one.name == row.name)
+            alone, ess, grade, interval = (own.lower, own.value, own.upper), own.ess, own.grade, own.interval
+        else:
+            sd, ess, grade, interval = np.sqrt(state.covariance[k, k]), np.nan, "tentative", "Laplace"
+            ends = row.value_at(state.optimum.x[k] + sd * HALF_WIDTH * np.array([-1.0, 0.0, 1.0]))
+            alone = tuple(ends.tolist())
+        made = Estimate.of(row.name, row.unit, pooled(parts, weights), ess=ess, grade=grade)
+        more = {"sd_noise": noise, "sd_structure": structure, "alone": alone}
+        return plain(replace(made, interval=interval).as_json() | more)
+
+    def values_of(self, k: int) -> tuple[list[Vector], Vector]:
+        """Equally probable values of a coordinate [`unit`] under the final model and each that is open to it
+        and has it, and the weights of these."""
+        state = self.after.state
+        row = state.model.posterior.table.rows[state.model.columns[k]]
+        parts, weights = self._mixture
+        own = [
+            (row.value_at(part[:, k]), weight)
+            for part, weight in zip(parts, weights, strict=True)
+            if k < part.shape[1]
+        ]
+        shares = np.array([weight for _, weight in own])
+        return [values for values, _ in own], shares / shares.sum()
+
+    @cached_property
+    def _mixture(self) -> tuple[list[Matrix], Vector]:
+        state = self.after.state
+        own = None if self.draws is None else coordinates_of(state.model, self.draws)
+        return mixture(state, own, self.open)
 
     @property
     def study(self) -> Study:
@@ -268,6 +291,7 @@ def _looped(
         sampled[0] if sampled is not None else None,
         outliers,
         contrary,
+        alternatives(searched.state, searched.rounds) if verdict.kind != "unexplained" else (),
     )
 
 
@@ -325,8 +349,9 @@ def _findings(
         scatter=first.scatter,
         missed=None if by_record else missed(study, after.fit, now, searched.state),
         unseen=unseen_share(study, was, now, searched.state) if study.held_out else np.nan,
-        risen=risen(was, now) if study.held_out else np.nan,
+        risen=risen(was, now) if study.held_out and not by_record else np.nan,
         reached=np.nan if by_record else over_noise(after.fit, now, clear=not last.alarmed),
+        nothing=1 / (1 + sum(odds(last, one.log_bayes_factor) for one in last.traced if not one.scatters)),
     )
 
 

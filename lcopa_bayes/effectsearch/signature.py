@@ -164,13 +164,17 @@ class Signature:
             return 0.0
         return float(min(np.linalg.svd(self.span.T @ other.span, compute_uv=False).max(), 1.0))
 
+    def width(self, residual: Vector, scale_of: Scale) -> float:
+        """Likeliest width of the prior, over the stated one [-]."""
+        inner = self.span.T @ residual
+        return float(self._factors[self._by_width(inner[:, None], scale_of)[:, 0].argmax()])
+
     def amplitude(self, residual: Vector, scale_of: Scale) -> Vector:
         """Posterior mean of the coefficients over their prior sd, under the likeliest width of the prior;
         the normal part of a one-signed one."""
-        inner = self.span.T @ residual
-        factor = self._factors[self._by_width(inner[:, None], scale_of)[:, 0].argmax()]
+        factor = self.width(residual, scale_of)
         scale = factor * self.scale
-        return np.asarray(factor * self.turned.T @ (scale / (1 + scale**2) * inner))
+        return np.asarray(factor * self.turned.T @ (scale / (1 + scale**2) * (self.span.T @ residual)))
 
 
 def signature_of(

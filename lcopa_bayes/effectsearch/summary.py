@@ -18,6 +18,8 @@ from lcopa_bayes.model.effects.effect import Card
 FAR = 2.0
 """Shifts beyond so many standard deviations are listed [-]."""
 
+SHOWN = 0.1
+"""Weight beside that of the final model from which an effect that is open is listed [-]."""
 _NEAREST = 4
 """Rivals that are listed for each named effect [-]."""
 
@@ -46,6 +48,7 @@ def results(result: Loop) -> dict[str, Any]:
             for axis, one in zip(result.problem.study.response_axes, result.base.noise, strict=True)
         ],
         "effects": _effects(result, chances),
+        "open": _open(result),
         "outliers": result.outliers
         and attributes(result.outliers, "count", "share", "width", "log_bayes_factor", "sentence"),
         "before": side(result.before, result),
@@ -122,6 +125,21 @@ def _effects(result: Loop, chances: dict[str, float]) -> list[dict[str, Any]]:
             }
         )
     return out
+
+
+def _open(result: Loop) -> list[dict[str, Any]]:
+    """Effects that are open, with the weight of all their instances beside 1 of the final model, by it."""
+    weights: dict[tuple[str, bool], float] = {}
+    for one in result.open:
+        key = one.name, one.instead
+        weights[key] = weights.get(key, 0.0) + one.weight
+    last = result.names[-1] if result.names else ""
+    return [
+        {"name": name, "instead": instead, "weight": weight}
+        | {"said": f"{name}{f' in place of {last}' if instead else ''} (weight {weight:.2f} beside 1)"}
+        for (name, instead), weight in sorted(weights.items(), key=lambda one: -one[1])
+        if weight > SHOWN
+    ]
 
 
 def _nearest(result: Loop, name: str) -> list[dict[str, Any]]:

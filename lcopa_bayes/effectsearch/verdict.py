@@ -119,7 +119,8 @@ class Findings:
     nothing: no such records, no such error, or effects that differ from record to record."""
     risen: float = math.nan
     """Largest error of any axis on held-out records with the effects over that without [-]; NaN without such
-    records."""
+    records, or with effects that differ from record to record: those of a held-out one are unknown, so that
+    either error is chance."""
     dynamics: bool = False
     """Whether linear dynamics without a name were added."""
     apart: bool = True
@@ -128,6 +129,8 @@ class Findings:
     reached: float = math.nan
     """Largest error of any axis on unseen records over the noise, with the effects [-]; NaN where these
     differ from record to record."""
+    nothing: float = 1.0
+    """Probability that nothing more is missing, by the last residual [-]."""
 
 
 def decide(given: Findings) -> Verdict:
@@ -209,6 +212,9 @@ def _quiet(given: Findings, confidence: Confidence) -> Verdict:
         "Nothing is missing that these records could show: the largest log Bayes factor of any effect is "
         f"{given.largest:.1f} nat, and chance alone reaches {given.threshold:.1f} once in a hundred times."
     )
+    if given.nothing < 0.5 and not given.scatter > given.threshold:
+        confidence = "tentative"
+        nothing += f" But that an effect is there is more probable than not ({_percent(1 - given.nothing)})."
     if given.missed is not None and given.missed.significant:
         return Verdict(
             "unexplained",

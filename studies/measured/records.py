@@ -1,11 +1,11 @@
-"""What `fit` and `loop` say of every measured record: one table.
+"""What `fit`, `loop` and `compare` say of every measured record: one table.
 
     python studies/measured/records.py [--records FOLDER] [--only NAME ...] [--jobs N] [--limit SECONDS]
         [--out FOLDER]
 
-Every folder of records is fitted and looped with the study file it comes with, the structure left to the
-records where that file does not state it. Finished rows are kept in the folder: a killed run goes on where it
-stopped, and a row that ended in an error, or not within the limit, says so.
+Every folder of records is fitted, looped and compared with the study file it comes with, the structure left
+to the records where that file does not state it. Finished rows are kept in the folder: a killed run goes on
+where it stopped, and a row that ended in an error, or not within the limit, says so.
 """
 
 import argparse
@@ -21,15 +21,17 @@ from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.files import writable_folder, write_text
 from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.results.fit import Fit
+from lcopa_bayes.verbs.compare import compare
 from lcopa_bayes.verbs.fit import fit
 from lcopa_bayes.verbs.loop import loop
 
 RECORDS = Path(os.environ.get("LCOPA_BAYES_DATA", "../shared")) / "records"
-VERBS = ("fit", "loop")
-HEADS = ("record", "structure", "grade", "sums of lags", "fit [CPU s]")
+VERBS = ("fit", "loop", "compare")
+HEADS: tuple[str, ...] = ("record", "structure", "grade", "sums of lags", "held out, RMSE", "fit [CPU s]")
 HEADS += ("loop", "names", "held out / noise", "loop [CPU s]")
+HEADS += ("preferred", "fractional orders", "compare [CPU s]")
 QUICK = ("silverbox", "cd_player_arm")
-"""Records of many samples, whose loop ends without draws."""
+"""Records of many samples, whose loop ends without draws and whose candidates take a quarter of the steps."""
 
 
 def fitted(folder: Path) -> dict[str, Any]:
@@ -65,7 +67,18 @@ def looped(folder: Path) -> dict[str, Any]:
     }
 
 
-ACTIONS: dict[str, Callable[[Path], dict[str, Any]]] = {"fit": fitted, "loop": looped}
+def compared(folder: Path) -> dict[str, Any]:
+    """What a comparison of the candidates of the study says."""
+    values = compare(folder, quick=folder.name in QUICK).values
+    return {
+        "preferred": values["preferred"],
+        "why": values["why"],
+        "fractional": values["fractional"],
+        "candidates": [row["name"] for row in values["models"]],
+    }
+
+
+ACTIONS: dict[str, Callable[[Path], dict[str, Any]]] = {"fit": fitted, "loop": looped, "compare": compared}
 
 
 def perform(folder: str, verb: str, limit: int) -> dict[str, Any]:
@@ -90,35 +103,51 @@ def page(rows: list[dict[str, Any]]) -> str:
     lines = [
         "# Measured records",
         "",
-        "Held-out errors are root mean squares over the noise of the fit, before and after the loop.",
+        "Held-out errors are root mean squares, of the fit in the unit of the record, of the loop over the",
+        "noise of the fit, before and after.",
         "",
         f"| {' | '.join(HEADS)} |",
         f"|{'---|' * len(HEADS)}",
     ]
     for name in dict.fromkeys(row["record"] for row in rows):
         own = {row["verb"]: row for row in rows if row["record"] == name}
-        lines.append(f"| {name} | {_fit_cells(own.get('fit'))} | {_loop_cells(own.get('loop'))} |")
+        cells = [_cells(own.get(verb), width, said) for verb, (width, said) in CELLS.items()]
+        lines.append(f"| {' | '.join([name, *cells])} |")
     return "\n".join([*lines, ""])
 
 
-def _fit_cells(row: dict[str, Any] | None) -> str:
+def _cells(row: dict[str, Any] | None, width: int, said: Callable[[dict[str, Any]], list[str]]) -> str:
+    """The cells of one verb, its seconds last; what it did not end in stands in the first."""
     if row is None or "refused" in row:
-        return f"{'not run' if row is None else row['refused']} | | | "
-    support = ", ".join(row["sums_of_lags"]) or "-"
-    return f"{row['structure']} | {row['grade']} | {support} | {row['cpu_seconds']:.0f}"
+        return " | ".join(["not run" if row is None else row["refused"], *[""] * width])
+    return " | ".join([*said(row), f"{row['cpu_seconds']:.0f}"])
 
 
-def _loop_cells(row: dict[str, Any] | None) -> str:
-    if row is None or "refused" in row:
-        return f"{'not run' if row is None else row['refused']} | | | "
+def _of_fit(row: dict[str, Any]) -> list[str]:
+    errors = [f"{one['axis']} {one['rmse']:.3g} {one['unit']}" for one in row["held_out"]]
+    lists = (row["sums_of_lags"], errors)
+    return [row["structure"], row["grade"], *(", ".join(one) or "-" for one in lists)]
+
+
+def _of_loop(row: dict[str, Any]) -> list[str]:
     pairs = [
         f"{name} {before:.2f} to {row['after']['held_out'][name]:.2f}"
         for name, before in row["before"]["held_out"].items()
     ]
-    return (
-        f"{row['verdict']} ({row['confidence']}) | {', '.join(row['effects']) or '-'} | "
-        f"{', '.join(pairs) or '-'} | {row['cpu_seconds']:.0f}"
-    )
+    said = f"{row['verdict']} ({row['confidence']})"
+    return [said, *(", ".join(one) or "-" for one in (row["effects"], pairs))]
+
+
+def _of_compare(row: dict[str, Any]) -> list[str]:
+    orders = row["fractional"]
+    if "integer" not in orders:
+        return [row["preferred"] or "none", orders["verdict"]]
+    against = f"{orders['log_bayes_factor']:+.1f} nat against {orders['integer']}"
+    return [row["preferred"] or "none", f"{orders['verdict']}, {against}"]
+
+
+CELLS = {"fit": (4, _of_fit), "loop": (3, _of_loop), "compare": (2, _of_compare)}
+"""Cells of a verb before its seconds: how many, and what they say."""
 
 
 def _too_long(*_: object) -> NoReturn:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import norm
 from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.bench.hiddeneffects import MarchError
@@ -15,6 +16,7 @@ from lcopa_bayes.core.files import write_text
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.loop import Loop, Side, loop
+from lcopa_bayes.effectsearch.openeffects import pooled
 from lcopa_bayes.effectsearch.scores import pooled_coverage
 
 _ATTEMPTS = 20
@@ -123,7 +125,8 @@ def judged(found: Loop, made: Campaign) -> dict[str, Any]:
         "before": errors(found.before, made),
         "after": errors(found.after, made),
         "plant_before": deviations(found.before, made),
-        "plant_after": deviations(found.after, made),
+        "plant_alone": deviations(found.after, made),
+        "plant_after": deviations(found.after, made, found),
         "coverage_before": pooled_coverage(found.before.unseen),
         "coverage_after": pooled_coverage(found.after.unseen),
         "share_with_band": float(np.mean([score.banded for score in found.after.unseen])),
@@ -149,8 +152,9 @@ def errors(side: Side, made: Campaign) -> dict[str, float]:
     }
 
 
-def deviations(side: Side, made: Campaign) -> dict[str, float]:
-    """Gains and delay less those of the device, on the scale they are sampled on, by name [posterior sd]."""
+def deviations(side: Side, made: Campaign, open_to: Loop | None = None) -> dict[str, float]:
+    """Gains and delay less those of the device, on the scale they are sampled on, by name [posterior sd];
+    of a loop over the effects that are open to it, where the true value lies among its values [normal sd]."""
     model, out = side.state.model, {}
     sd = np.sqrt(np.diag(side.state.covariance))
     for k in range(model.plant_size):
@@ -159,7 +163,11 @@ def deviations(side: Side, made: Campaign) -> dict[str, float]:
             continue
         path = made.device.paths[row.place.first][row.place.second] if row.kind == "gain" else None
         truth = path.steady if path is not None else made.device.paths[0][0].delay
-        out[row.name] = float((side.state.optimum.x[k] - row.coordinate(truth)) / sd[k])
+        if open_to is None:
+            out[row.name] = float((side.state.optimum.x[k] - row.coordinate(truth)) / sd[k])
+        else:
+            values = pooled(*open_to.values_of(k))
+            out[row.name] = -float(norm.ppf((np.sum(values < truth) + 0.5) / (values.size + 1)))
     return out
 
 

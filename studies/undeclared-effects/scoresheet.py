@@ -185,6 +185,7 @@ def sheet(rows: Sequence[Row], targets: Mapping[str, Any], seen: float) -> list[
         ),
         *intervals("clean", [r for r in usable if r["verdict"] == "clean"], "plant_after", targets),
         *intervals("corrected", plants, "plant_after", targets),
+        *intervals("corrected, final model alone", plants, "plant_alone", None),
         *intervals("before correction", plants, "plant_before", None),
         share("two effects, both found", by["pair"], _both, targets["two_effects"], "least"),
         share(

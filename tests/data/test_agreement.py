@@ -166,6 +166,22 @@ def test_what_is_no_movement_with_the_drive() -> None:
         assert moved_with_drive(replace(late, **change), 0) == 0.0
 
 
+def test_noise_of_long_memory_is_no_response_ahead_of_its_drive() -> None:
+    """An axis that hardly moves follows a later drive better by chance; the other says when the clock ran."""
+    rng = np.random.default_rng(34)
+    one = record(34, command=step(1.0, at=5.0), duration=40.0)
+    noise = rng.standard_normal(one.time.size)
+    for k in range(1, noise.size):
+        noise[k] = 0.95 * noise[k - 1] + np.sqrt(1 - 0.95**2) * noise[k]
+    strong = one.response[:, 0]
+    weak = 0.1 * strong + 0.03 * noise
+    axes = (*one.response_axes, replace(one.response_axes[0], name="weak"))
+    both = replace(one, response=np.column_stack([strong, weak]), response_axes=axes)
+    assert disagreements((both,)) == ()
+    alone = replace(both, response=weak[:, None], response_axes=axes[1:])
+    assert disagreements((alone,))  # nothing else says otherwise
+
+
 @settings(max_examples=15, deadline=None)
 @given(
     seed=st.integers(0, 9), clock=st.sampled_from([1e-9, 1.0, 1e6]), unit=st.sampled_from([1e-12, 1.0, 1e9])

@@ -42,8 +42,8 @@ def test_a_fit_of_the_explained_study_gives_the_numbers_of_the_loop(bent: Loop, 
     assert bent.names == ("odd_curvature",)
     for k in range(len(model.names)):
         own = bent.estimate(k)
-        assert own["value"] == pytest.approx(told[own["name"]].value, rel=1e-9), own["name"]
-        assert own["upper"] == pytest.approx(told[own["name"]].upper, rel=1e-9), own["name"]
+        there = told[own["name"]]
+        assert own["alone"] == pytest.approx([there.lower, there.value, there.upper], rel=1e-9), own["name"]
 
 
 def test_it_agrees_with_the_descent_of_the_loop(bent: Loop):

@@ -342,6 +342,9 @@ def test_what_chance_may_explain_is_said_beside_clean():
     less = decide(replace(FOUND, alarmed=False, missed=Miss("y", 1.2, 0.84, 0.07)))
     assert (sure.confidence, less.confidence) == ("firm", "tentative")
     assert "1.20 times the noise and 90 % bands hold 84 % of the samples" in less.sentence
+    doubted = decide(replace(FOUND, alarmed=False, nothing=0.4))
+    assert doubted.confidence == "tentative"
+    assert "more probable than not (60 %)" in doubted.sentence
     assert "probability 0.07" in less.sentence
     far = decide(replace(FOUND, alarmed=False, reached=8.1))
     assert (far.kind, far.confidence) == ("clean", "tentative")

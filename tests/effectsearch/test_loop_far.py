@@ -174,16 +174,14 @@ def test_a_delay_beyond_its_default_prior_gets_a_longer_one():
 
 @pytest.mark.parametrize(("rows", "held"), [(0, ()), (1, ("delay",))])
 def test_a_delay_is_held_back_where_the_response_leads_and_not_where_there_is_none(rows, held):
-    """Drives stated `rows` late; over ten seeds chance does not count as held back."""
+    """Drives stated `rows` late, the noise known from samples at rest."""
     device = replace(ONE, paths=((path(2.0, 0.0, (1.5,), (0.8,)),),))
-    for seed in range(10):
-        one = record(seed, device=device, command=step(1.0, at=5.0), duration=20.0, noise_sd=0.01)
+    for seed in range(5):
+        one = record(seed, device=device, command=step(1.0, at=15.0), duration=30.0, noise_sd=0.01)
         late = replace(one, drive=np.concatenate([one.drive[:1]] * rows + [one.drive])[: len(one.drive)])
         fit = base_fit(ExtendedModel(problem_of(small.study(late)).posterior), np.random.default_rng(0))
         assert fit.optimum.at_bound == held
-        assert any("holds back" in one or "at the end of the prior" in one for one in fit.caution) == bool(
-            held
-        )
+        assert any("at the end of the prior" in one for one in fit.caution) == bool(held)
 
 
 def test_a_stated_prior_of_the_delay_is_kept():

@@ -1,17 +1,23 @@
 """What a name is held to: constants that other records share, ripples that go on at rest, limits per axis."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from test_loop_unseen import fitted
 
 from lcopa_bayes.bench.undeclared import campaign, drawn
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
+from lcopa_bayes.effectsearch.explained import explained_study
 from lcopa_bayes.effectsearch.loop import loop
+from lcopa_bayes.effectsearch.refits import refit
 from lcopa_bayes.effectsearch.trace import SEEN
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.effects import effected
 from lcopa_bayes.model.effects.catalogue import catalogue
+from lcopa_bayes.model.effects.parallel import ExtraMode
 from lcopa_bayes.model.effects.response import Clipping
 
 AXIS = (Axis("x", "rad"),)
@@ -106,6 +112,47 @@ def test_a_limit_may_differ_from_axis_to_axis():
     offsets = made.plant(values).offsets[0]
     limits = np.array([0.5, 0.4]) * made.ranges.response
     np.testing.assert_allclose(clipped - offsets, np.clip(free - offsets, -limits, limits), atol=1e-12)
+
+
+def test_limits_that_differ_from_axis_to_axis_are_found():
+    """Both are parameters of the refit; of one axis there is nothing to compare."""
+    limits, axes = np.array([0.6, 0.54]), (Axis("x", "rad"), Axis("y", "rad"))
+
+    def record(name: str, seed: int, axis: int) -> Record:
+        clipped = commanded(name, seed, ripple=lambda t, y: np.clip(y, -limits[axis], limits[axis]))
+        still = NOISE * np.random.default_rng(seed + 99).standard_normal(clipped.response.shape)
+        still[np.isnan(clipped.response)] = np.nan
+        drives, read = [np.zeros_like(clipped.drive)] * 2, [still] * 2
+        drives[axis], read[axis] = clipped.drive, clipped.response
+        return Record(name, clipped.time, np.hstack(drives), np.hstack(read), axes, axes, "ms")
+
+    records = tuple(record(f"r{k}", k, k) for k in range(2))
+    study = Study("s", None, "ms", 1, records, (), ModelSettings(offset="shared"))
+    _, start = fitted(study)
+    model = start.model.at_scales(start.optimum.x, {"r0": 0.0, "r1": 0.0})
+    made = refit(model, start.optimum, start.whitening, [(Clipping(0.7), np.ones(1))], 500.0)
+    (found,), ranges = made.model.effects, made.model.effected.ranges
+    reached = found.constants["level"] * found.constants["skew"] ** np.arange(2) * ranges.response
+    np.testing.assert_allclose(reached, limits, rtol=5e-3)
+    assert explained_study(study, made.model).priors["clipping.skew"].fixed is None
+    single = replace(ranges, response=ranges.response[:1])
+    held = {one.name: one.low == one.high for one in Clipping.internal(single)}
+    assert held == {"level": False, "skew": True}
+
+
+def test_a_resonance_may_ring_longer_than_those_that_are_traced():
+    """A damping below the grid's is reached, and is open in the explained study."""
+    one, mode = commanded("r0", 0), ExtraMode(0.3, 0.012)
+    rows = np.flatnonzero(np.diff(one.drive[:, 0], prepend=0.0))
+    jumps = np.diff(one.drive[:, 0], prepend=0.0)[rows]
+    since = np.maximum(one.time[:, None] - one.time[rows] - DELAY, 0.0)
+    ringing = replace(one, response=one.response + 0.05 * (mode.step(since) @ jumps)[:, None])
+    study = Study("s", None, "ms", 1, (ringing,), (), ModelSettings(offset="shared"))
+    _, start = fitted(study)
+    model = start.model.at_scales(start.optimum.x, {"r0": 0.0})
+    made = refit(model, start.optimum, start.whitening, [(ExtraMode(0.29, 0.03), np.ones(1))], 500.0)
+    assert made.model.effects[0].constants == pytest.approx({"frequency": 0.3, "damping": 0.012}, rel=0.05)
+    assert explained_study(study, made.model).priors["extra_mode.damping"].fixed is None
 
 
 @pytest.mark.slow

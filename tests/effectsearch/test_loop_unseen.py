@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.stats import binom
-from test_loop_joint import walked
+from test_loop_joint import AXIS, walked
 
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.settings import ModelSettings
@@ -17,9 +17,10 @@ from lcopa_bayes.effectsearch.basefit import base_fit
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.heldouteffects import missed
 from lcopa_bayes.effectsearch.loop import Side, _side, loop
-from lcopa_bayes.effectsearch.scores import State
-from lcopa_bayes.effectsearch.verdict import CHANCE
+from lcopa_bayes.effectsearch.scores import State, risen
+from lcopa_bayes.effectsearch.verdict import CHANCE, RISEN
 from lcopa_bayes.inference.assembly import problem_of
+from lcopa_bayes.model.effects.records import TriggerJitter
 
 RECORDS = Path(os.environ.get("LCOPA_BAYES_DATA", Path(__file__).parents[2] / ".." / "shared")) / "records"
 SD = 0.02
@@ -124,6 +125,27 @@ def test_a_plant_that_differs_on_held_out_records_is_not_clean():
     assert found.verdict.kind == "unexplained"
     assert "on unseen records the error of x is" in found.verdict.sentence
     assert "no name is given" in found.verdict.sentence
+
+
+def late(name: str, by: float, steps: int, seed: int) -> Record:
+    """A first-order plant with a delay of 3 ms whose drive of so many steps came later than stated."""
+    rng = np.random.default_rng(seed)
+    time, at = np.arange(500) * 0.5, 20.0 + 200.0 / steps * np.arange(steps)
+    levels = np.cumsum(np.resize([1.0, -1.0], steps))
+    drive = np.concatenate([[0.0], levels])[np.searchsorted(at, time, side="right")]
+    since = np.maximum(time[:, None] - at - by - 3.0, 0.0)
+    response = 2.0 * (1 - np.exp(-since / 8.0)) @ np.resize([1.0, -1.0], steps)
+    response += SD * rng.standard_normal(time.size)
+    return Record(name, time, drive[:, None], response[:, None], AXIS, AXIS, "ms")
+
+
+def test_an_effect_of_single_records_is_named_though_unseen_records_have_others():
+    """The record of most changes, which sets the delay without the effect, is as late as the one held out."""
+    fit = (late("a", 0.5, 40, 1), *(late(f"b{k}", -0.5, 2, 2 + k) for k in range(5)))
+    study = Study("late", None, "ms", 3, fit, (late("c", 0.5, 40, 9),), ModelSettings(offset="shared"))
+    found = loop(study, library=[TriggerJitter], sample=False, quick=True, as_stated=True)
+    assert risen(found.before.unseen, found.after.unseen) > RISEN
+    assert (found.verdict.kind, found.names) == ("disturbance", ("trigger_jitter",))
 
 
 @pytest.mark.skipif(not RECORDS.is_dir(), reason="measured records are absent; set LCOPA_BAYES_DATA")

@@ -179,6 +179,9 @@ class Effect(ABC):
     """Units of the internal constants that have one."""
     fractions: ClassVar[frozenset[str]] = frozenset()
     """Internal constants that lie between 0 and 1."""
+    ratios: ClassVar[Mapping[str, tuple[float, float]]] = MappingProxyType({})
+    """Ends of internal constants that compare response axes; they have a default value, at which they stay
+    where there is one axis."""
 
     @classmethod
     def grid(cls, ranges: Ranges) -> tuple[Self, ...]:
@@ -187,15 +190,17 @@ class Effect(ABC):
 
     @classmethod
     def internal(cls, ranges: Ranges) -> tuple[Constant, ...]:
-        """Internal constants, in the order of the fields; they reach from end to end of `grid`, and what has
-        a default value is fixed there."""
+        """Internal constants, in the order of the fields; they reach from end to end of `grid` or of
+        `ratios`, and what else has a default value is fixed there."""
         listed, out = cls.grid(ranges), []
+        ratios = cls.ratios if ranges.axes > 1 else {}
         for field in fields(cls):
             values = [getattr(one, field.name) for one in listed]
             if isinstance(values[0], bool):
                 out.append(Constant(field.name, "-", 0.0, 0.0, "choice"))
                 continue
-            low, high = (min(values), max(values)) if field.default is MISSING else (field.default,) * 2
+            fixed = (min(values), max(values)) if field.default is MISSING else (field.default,) * 2
+            low, high = ratios.get(field.name, fixed)
             kind: Literal["constant", "fraction"] = "fraction" if field.name in cls.fractions else "constant"
             unit = cls.units.get(field.name, "-")
             out.append(Constant(field.name, unit, float(low), float(high), kind))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
 from types import MappingProxyType
 from typing import ClassVar, Self, final
@@ -13,7 +13,15 @@ from scipy.signal import fftconvolve
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.data.drive import AxisDrive
-from lcopa_bayes.model.effects.effect import Card, Coefficient, ParallelEffect, Ranges, Scene, single
+from lcopa_bayes.model.effects.effect import (
+    Card,
+    Coefficient,
+    Constant,
+    ParallelEffect,
+    Ranges,
+    Scene,
+    single,
+)
 from lcopa_bayes.model.layout import Layout
 
 _MANY = 64
@@ -219,6 +227,12 @@ class ExtraMode(ParallelEffect):
         return tuple(
             cls(float(f), damping) for damping in (0.03, 0.15) for f in np.geomspace(low, high, count)
         )
+
+    @classmethod
+    def internal(cls, ranges: Ranges) -> tuple[Constant, ...]:
+        """Any damping that leaves a resonance."""
+        frequency, damping = super().internal(ranges)
+        return frequency, replace(damping, low=0.003, high=0.5)
 
     def added(self, scene: Scene, psi: Vector) -> Matrix:
         """One damped oscillation per change."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import ClassVar, Self, final
 
 import numpy as np
@@ -12,6 +13,9 @@ from lcopa_bayes.model.effects.effect import Card, Ranges, ReadoutEffect, Scene,
 from lcopa_bayes.model.layout import Layout
 
 _STEERING = "diffraction angle against tilt, see lcopa_bayes.optics"
+RATIO = MappingProxyType({"skew": (0.8, 1.25)})
+"""A limit or a pixel of an axis over that of the one before, in deflections, which a plant without the effect
+gets wrong by a tenth [-]."""
 
 
 @final
@@ -119,6 +123,7 @@ class Clipping(ReadoutEffect):
     """The same of each next axis over that of the one before [-]: what clips also bends the deflections that
     the limit is measured in."""
 
+    ratios = RATIO
     linear = True
     estimated = single("c", 0.6, share=True)
     card: ClassVar[Card] = Card(
@@ -149,7 +154,10 @@ class CentroidLocking(ReadoutEffect):
 
     cycles: float
     """Pixels within the largest deflection [-]."""
+    skew: float = 1.0
+    """The same of each next axis over that of the one before [-]."""
 
+    ratios = RATIO
     linear = True
     estimated = single("a", 0.01)
     card: ClassVar[Card] = Card(
@@ -170,7 +178,8 @@ class CentroidLocking(ReadoutEffect):
     def seen(self, y: Matrix, scene: Scene, psi: Vector) -> Matrix:
         """Pointwise."""
         size = scene.ranges.response
-        return np.asarray(y + psi[0] * size * np.sin(2 * np.pi * self.cycles * y / size))
+        cycles = self.cycles * self.skew ** np.arange(scene.ranges.axes)
+        return np.asarray(y + psi[0] * size * np.sin(2 * np.pi * cycles * y / size))
 
 
 @final

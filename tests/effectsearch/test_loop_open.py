@@ -1,0 +1,100 @@
+"""What effects leave open of the numbers of a loop that the records neither show nor exclude."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_loop_joint import AXIS
+from test_loop_unseen import fitted
+
+from lcopa_bayes.data.record import Record
+from lcopa_bayes.data.settings import ModelSettings
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.effectsearch.loop import Loop, loop
+from lcopa_bayes.effectsearch.openeffects import Alternative, _step, mixture, pooled
+from lcopa_bayes.effectsearch.regression import Regression
+from lcopa_bayes.effectsearch.trace import trace
+from lcopa_bayes.model.effects.commands import OverdrivePulse
+from lcopa_bayes.model.effects.sensor import SensorLag
+from lcopa_bayes.results.alternatives import parts_of_sd
+
+DELAY, FRAME, SD = 3.0, 2.0, 0.02
+
+
+def pulsed(name: str, size: float, seed: int) -> Record:
+    """A first-order plant with a delay whose every step begins with a pulse of that size."""
+    rng = np.random.default_rng(seed)
+    time, at = np.arange(600) * 0.5, 20.0 + 30.0 * np.arange(9)
+    jumps = np.resize([1.0, -1.0, 0.5, -0.5], at.size)
+    drive = np.concatenate([[0.0], np.cumsum(jumps)])[np.searchsorted(at, time, side="right")]
+
+    def risen(late: float) -> np.ndarray:
+        return (1 - np.exp(-np.maximum(time[:, None] - at - DELAY - late, 0.0) / 8.0)) @ jumps
+
+    response = 2.0 * ((1 + size) * risen(0.0) - size * risen(FRAME)) + SD * rng.standard_normal(time.size)
+    return Record(name, time, drive[:, None], response[:, None], AXIS, AXIS, "ms")
+
+
+def study_of(size: float) -> Study:
+    records = tuple(pulsed(f"r{k}", size, 10 + k) for k in range(3))
+    return Study("pulsed", None, "ms", 3, records[:2], records[2:], ModelSettings(offset="shared"))
+
+
+@pytest.fixture(scope="module")
+def faint() -> Loop:
+    """A pulse that is too small to be seen, and large enough to move the delay."""
+    return loop(
+        study_of(0.075), library=[OverdrivePulse, SensorLag], sample=False, quick=True, as_stated=True
+    )
+
+
+def test_one_linear_step_is_the_optimum_with_the_effect():
+    """Second road: the model with the effect, descended to its optimum."""
+    _, state = fitted(study_of(0.075))
+    state = replace(state, model=state.model.at_scales(state.optimum.x, {f"r{k}": 0.0 for k in range(2)}))
+    seen = trace(state, [OverdrivePulse], np.random.default_rng(0), noise_samples=(500,), draws=400)
+    (pulse,) = seen.traced
+    shift, root = _step(state, pulse.signature, seen)
+    assert pulse.signature.width(seen.residual, seen.scale) == 1.0
+    model = state.model.having(pulse.signature.effect)
+    best = Regression(model, state.whitening).descend(np.append(state.optimum.x, 0.0))
+    sd = best.sd[:-1]
+    moved = (best.x[:-1] - state.optimum.x) / sd
+    assert np.abs(moved).max() > 1.0
+    np.testing.assert_allclose(shift / sd, moved, atol=0.15)
+    whole = np.sqrt(np.diag(state.optimum.covariance + root @ root.T))
+    np.testing.assert_allclose(whole, sd, rtol=0.1)
+
+
+def test_what_cannot_be_seen_is_in_the_interval(faint: Loop):
+    assert faint.verdict.kind == "clean"
+    (k,) = faint.after.state.model.delays
+    delay = faint.estimate(k)
+    low, _, high = delay["alone"]
+    assert not low < DELAY < high
+    assert delay["lower"] < DELAY < delay["upper"]
+    assert delay["sd_structure"] > 0.5 * delay["sd_noise"]
+
+
+def test_a_mixture_has_the_moments_of_its_parts():
+    rng = np.random.default_rng(1)
+    parts, weights = [rng.normal(0.0, 1.0, 20_000), rng.normal(3.0, 0.5, 20_000)], np.array([0.7, 0.3])
+    values = pooled(parts, weights)
+    noise, structure = parts_of_sd(parts, weights)
+    assert values.mean() == pytest.approx(0.9, abs=0.03)
+    assert noise == pytest.approx(np.sqrt(0.7 + 0.3 * 0.25), abs=0.02)
+    assert structure == pytest.approx(3 * np.sqrt(0.21), abs=0.02)
+    assert values.std() == pytest.approx(np.hypot(noise, structure), abs=0.02)
+
+
+def test_draws_outside_the_support_take_weight_away(faint: Loop):
+    state = faint.after.state
+    (k,) = state.model.delays
+    far = np.zeros(state.optimum.x.size)
+    far[k] = (
+        -state.optimum.x[k] if not state.model.posterior.table.rows[state.model.columns[k]].log_scale else 0
+    )
+    one = Alternative("a", 1.0, far, 1e-9 * np.eye(far.size), instead=False)
+    parts, weights = mixture(state, None, [one])
+    assert weights[1] == pytest.approx(1 / 3, abs=0.02)
+    assert (parts[1] >= state.model.bounds[0]).all()
