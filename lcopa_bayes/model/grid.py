@@ -214,7 +214,7 @@ def _weights(grid: Grid, times: Vector, exposure: float) -> csr_array:
     if exposure > 0.0:
         width = exposure / grid.step
         first, late = _through_integral(grid, at, derivative=False)
-        start, early = _through_integral(grid, at - width, derivative=False)
+        start, early = _through_integral(grid, np.maximum(at - width, 0.0), derivative=False)
         early[at < width] = 0.0  # at rest before the first block
         between = start[:, None] + np.arange(int((first - start).max()) + 1)
         whole = (between < first[:, None]).astype(float)

@@ -251,7 +251,7 @@ def _readings(response: StepResponse, origins: Matrix, lattice: Lattice, kind: K
         whole = np.floor(opened)
         early = response.on_lattice(opened - whole, before)
         # the shutter opens whole blocks before the block in which it closes
-        for k, blocks in np.ndenumerate(-whole.astype(int)):
+        for k, blocks in np.ndenumerate(np.minimum(-whole, early.shape[-1]).astype(int)):
             late[:, *k, blocks:] -= early[:, *k, : early.shape[-1] - blocks]
         readings = late / width
     return readings

@@ -39,6 +39,8 @@ _AWAY = 5.0
 _IN_TURN = 3
 """... in so many samples in turn."""
 _ENDS = (0.05, 0.95)
+_MANY = 50_000
+"""Samples of the fit records from which means of them are advised [-]: a fit then takes many minutes."""
 
 
 def inventory(study: Study) -> dict[str, Any]:
@@ -53,6 +55,11 @@ def inventory(study: Study) -> dict[str, Any]:
     sentences = [*_of_plant(problem), *_of_model(problem)]
     if study.model.terms == "auto":
         sentences.append("A fit lets the records choose more terms, and what paths share.")
+    if problem.posterior.size > _MANY:
+        sentences.append(
+            f"A fit takes time in proportion to the {problem.posterior.size} samples; `lcopa-bayes new "
+            "--average` puts means in their place and states what that loses."
+        )
     verdict = f"To mend before a fit: {'; '.join(obstacles)}." if obstacles else "The records can be fitted."
     verdict = " ".join([verdict, *(one.sentence for one in contradicted)])
 

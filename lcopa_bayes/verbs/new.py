@@ -131,6 +131,7 @@ def new(
     refuse_if(problems)
     stated = Mapped(time, tuple(drives), tuple(responses), time_unit, decimal, time_format, drive_until)
     records, notes = convert(tables, stated)
+    tables.clear()  # cells of 1e6 rows take 600 MB
     own, apart = records[: len(fitted)], records[len(fitted) :]
     study = Study(folder.resolve().name, fit=own, held_out=apart)
     if average != 1:

@@ -41,6 +41,7 @@ COMMANDS = {
     "run": ("run", "sampled", "--resume"),
     "audit": ("audit", "sampled", "--resume"),
     "compare": ("compare", "devices/a", "--quick", "--pick", "fractional-1", "first-order", "--resume"),
+    "design": ("design", "devices/a", "--quick", "--resume"),
     "loop": ("loop", "devices/a", "--quick"),
     "fleet": ("fleet", "devices", "--quick", "--resume"),
     "calibrate": ("calibrate", "devices/a", "--quick", "--replicas", "6", "--resume"),

@@ -159,6 +159,17 @@ def test_agrees_with_the_bench(element, delay, hold, start, rest, seed):
         assert np.abs(read - exact)[calm].max() < bound * scale
 
 
+@pytest.mark.parametrize("spacing", ["even", "uneven"])
+def test_an_exposure_of_any_length_is_read_without_overflow(spacing):
+    """Beyond the record a mean falls as its exposure grows, on a lattice and off it."""
+    times = 0.1 * np.arange(1.0, 81.0)
+    times = times if spacing == "even" else times**1.01
+    command = step(1.0, at=0.35)
+    longer, longest = (respond(KELVIN, 0.2, drive_of(command), times, exposure=one) for one in (1e3, 1e300))
+    assert 0.0 < longer[-1] < 0.02
+    assert_allclose(longest * 1e300, longer * 1e3, rtol=1e-6, atol=1e-9)
+
+
 @pytest.mark.parametrize("exposure", [0.001, 0.05, 0.1, 0.5, 3.0])
 def test_exposure_agrees_with_the_bench(exposure):
     command = staircase([0.7, -0.3, 0.4], hold=6.2345, start=0.0377)

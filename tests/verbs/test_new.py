@@ -43,7 +43,7 @@ def test_a_spreadsheet_becomes_a_study_that_is_checked_and_looked_at(oven, tmp_p
     assert main(["look", str(folder), "--out", str(run)]) == 0
 
 
-def test_a_long_table_becomes_means_that_are_fitted_as_such(tmp_path, capsys):
+def test_a_long_table_becomes_means_that_are_fitted_as_such(tmp_path, capsys, monkeypatch):
     long = tmp_path / "long.csv"
     save_record(record(camera=0.01), long)
     folder = tmp_path / "study"
@@ -55,6 +55,10 @@ def test_a_long_table_becomes_means_that_are_fitted_as_such(tmp_path, capsys):
     study, whole = lb.load_study(folder), lb.load_record(long)
     assert study.exposure == pytest.approx(0.1)
     assert study.fit[0].sampled.size == whole.sampled.size // 10
+    advised = "`lcopa-bayes new --average` puts means in their place"
+    assert advised not in str(lb.check(folder))
+    monkeypatch.setattr("lcopa_bayes.verbs.check._MANY", study.fit[0].sampled.size - 1)
+    assert advised in str(lb.check(folder))
     assert main(["new", str(tmp_path / "none"), str(long), "--average", "700"]) == 2
     assert "are no two means of 700" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
