@@ -31,6 +31,9 @@ _CLOSELY = 0.98
 """Share of a response's variance that is followed where a difference in size is judged [-]."""
 _AHEAD = 2.0
 """Residual variance with delays over that with advances from which a response runs ahead [-]."""
+_ROW = 1.5
+"""Lead of a response that moves in the row of its drive's first change up to which it leads by that row alone
+[sampling periods]."""
 _OTHER_UNIT = 30.0
 """Ratio of two records from which they are in different units [-]."""
 _REVERSED = 3.0
@@ -97,9 +100,14 @@ def disagreements(records: Sequence[Record]) -> tuple[Disagreement, ...]:
         max((-seen[0] for seen in _judged(one) if _runs_ahead(*seen, period)), default=0.0)
         for one in described
     ]
-    ahead = [_ahead(one.record, lead) for one, lead in zip(described, leads, strict=True) if lead > 0.0]
-    led = {one.records for one in ahead}
-    ahead += [_at_once(one) for one in records if (one.name,) not in led and any(_moves_at_once(one))]
+    at_once = {one.name for one in records if any(_moves_at_once(one))}
+    by_rows = [
+        _ahead(one.record, lead)
+        for one, lead in zip(described, leads, strict=True)
+        if lead > (_ROW * period if one.record.name in at_once else 0.0)
+    ]
+    at_once -= {one.records[0] for one in by_rows}
+    ahead = [*by_rows, *(_at_once(one) for one in records if one.name in at_once)]
     rest = [one for one, lead in zip(described, leads, strict=True) if lead <= 0.0]
     if len(rest) < 2:
         return tuple(ahead)

@@ -23,6 +23,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.data.drive import moved_with_drive
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.study import Study
 
@@ -65,7 +66,8 @@ def not_at_rest(fit: Sequence[Record], held_out: Sequence[Record] = ()) -> list[
             continue
         until = _still(record, reach)
         for axis, span in enumerate(spans):
-            seen = np.flatnonzero(np.isfinite(record.response[:until, axis]))
+            late = moved_with_drive(record, axis) != 0.0  # `agreement` says so
+            seen = np.flatnonzero(np.isfinite(record.response[: until - late, axis]))
             if seen.size < _FEWEST or not span > 0.0:
                 continue
             moved = unrest(record.time[seen], record.response[seen, axis], float(span))

@@ -82,6 +82,22 @@ def test_nothing_is_replaced_unless_allowed_and_nothing_written_of_what_is_refus
         lb.new(tmp_path / "other", [oven, oven])
 
 
+def test_a_logger_that_writes_drives_late_is_recognised_and_converted(tmp_path, capsys):
+    """The response of a tank at once, in the row in which the drive is written."""
+    table = tmp_path / "tank.csv"
+    rows = [f"{k},{2 * (k >= 20)},{3 + 0.7 * (k >= 20) + 0.001 * (-1) ** k}" for k in range(60)]
+    table.write_text("\n".join(["time_s,pump (V),level (cm)", *rows]))
+    assert main(["new", str(tmp_path / "late"), str(table)]) == 0
+    assert (
+        "warning: response 'level' of record 'tank' moves by 0.701 cm in the very row"
+        in capsys.readouterr().out
+    )
+    assert main(["new", str(tmp_path / "own"), str(table), "--drive-until"]) == 0
+    assert "warning" not in capsys.readouterr().out
+    drives = [lb.load_study(tmp_path / name).fit[0].drive[:, 0] for name in ("late", "own")]
+    assert (drives[1] == np.append(drives[0][1:], drives[0][-1])).all()
+
+
 def test_roles_may_be_stated_on_the_command_line(oven, tmp_path):
     given = ["--time", "Zeit", "--drive", "u [V]=Heater", "--response", "T1", "--held-out"]
     assert main(["new", str(tmp_path / "s"), str(oven), *given, str(_renamed(oven))]) == 0
