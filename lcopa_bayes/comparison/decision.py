@@ -197,8 +197,11 @@ def _agreement(evident: Row | None, predictive: Row | None, usable: Sequence[Row
         )
     last = min((row for row in usable if row["elpd"] is not None), key=lambda row: row["elpd"])
     worst = " and predicts worst of all" if last is evident else ""
+    rivals = [row for row in usable if row["log_evidence"] is not None]
+    highest = max(rivals, key=lambda row: row["log_evidence"]) is evident
+    stands = "has the highest evidence" if highest else "is the simplest that no evidence speaks against"
     return False, (
-        f"Fit and prediction disagree: {evident['name']} has the highest evidence{worst}, but {best['name']} "
+        f"Fit and prediction disagree: {evident['name']} {stands}{worst}, but {best['name']} "
         f"predicts what was left out better by {lost}. The models leave something out that both notice "
         "differently."
     )

@@ -323,7 +323,9 @@ def test_unseen_records_decide_where_fit_and_prediction_disagree():
     told = outcome(fits, predicts)
     assert told["preferred"] == "two"
     assert told["agreement"]["agree"] is False
-    assert "predicts worst of all" in told["why"]
+    assert "one has the highest evidence and predicts worst of all" in told["why"]
+    equal = outcome(fits, predicts | {"log_evidence": 30.3, "parameters": 7})
+    assert "one is the simplest that no evidence speaks against and predicts worst of all" in equal["why"]
     assert [flag["kind"] for flag in told["flags"]] == ["overfit"]
     same_record = outcome(card("one", 30.0, 5.0), card("two", 10.0, 15.0))
     assert same_record["preferred"] == "one"  # no unseen record: a warning alone
