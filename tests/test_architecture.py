@@ -168,3 +168,9 @@ def test_importing_has_no_side_effects():
         "sys.exit(bool({'matplotlib', 'corner', 'emcee', 'pandas'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
+
+
+def test_test_modules_have_names_of_their_own():
+    """They import each other's records by name, from whatever directory those are in."""
+    names = [path.name for path in Path(__file__).parent.rglob("*.py") if path.name != "__init__.py"]
+    assert not {name for name in names if names.count(name) > 1}

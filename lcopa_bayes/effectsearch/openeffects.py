@@ -87,9 +87,10 @@ def odds(seen: Trace, log_bayes_factor: float) -> float:
     """Of one more effect against none [-]: as probable beforehand as any other, and all together as none.
 
     Its evidence counts in what chance gives: where that is more than under noise that is known, by as much
-    less.
+    less. Infinite where a float does not hold it.
     """
-    return float(np.exp(log_bayes_factor * CHANCE / seen.threshold)) / len(seen.traced)
+    with np.errstate(over="ignore"):
+        return float(np.exp(log_bayes_factor * CHANCE / seen.threshold)) / len(seen.traced)
 
 
 def _beside(state: State, seen: Trace) -> list[Alternative]:

@@ -1,6 +1,8 @@
 """What effects leave open of the numbers of a loop that the records neither show nor exclude."""
 
 from dataclasses import replace
+from math import log
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.loop import Loop, loop
-from lcopa_bayes.effectsearch.openeffects import Alternative, _step, mixture, pooled
+from lcopa_bayes.effectsearch.openeffects import CHANCE, Alternative, _step, mixture, odds, pooled
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.trace import trace
 from lcopa_bayes.model.effects.commands import OverdrivePulse
@@ -98,3 +100,10 @@ def test_draws_outside_the_support_take_weight_away(faint: Loop):
     parts, weights = mixture(state, None, [one])
     assert weights[1] == pytest.approx(1 / 3, abs=0.02)
     assert (parts[1] >= state.model.bounds[0]).all()
+
+
+def test_odds_are_those_of_the_evidence_even_where_a_float_does_not_hold_them():
+    of_four = SimpleNamespace(threshold=CHANCE, traced=(None,) * 4)
+    assert odds(of_four, log(20.0)) == pytest.approx(5.0)
+    assert odds(SimpleNamespace(threshold=2 * CHANCE, traced=(None,)), 2 * log(20.0)) == pytest.approx(20.0)
+    assert odds(of_four, 1e4) == np.inf
