@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import logsumexp
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.comparison.averaging import averaged, stretches, total_sd
+from lcopa_bayes.comparison.averaging import Gain, averaged, by_prediction, stretches, total_sd
 from lcopa_bayes.comparison.candidatefit import REJECTED, Contender, contender
 from lcopa_bayes.comparison.candidates import Candidate
 from lcopa_bayes.comparison.containment import Check
@@ -95,14 +95,16 @@ def _predictions(rows: Sequence[dict[str, Any]]) -> None:
     where = stretches(ranked[0]["pointwise"])
     sums = np.array([columns[where == block].sum(axis=0) for block in np.unique(where)])
     totals = columns.sum(axis=0)
-    best = int(np.argmax(totals))
     weights = stacking_weights(columns)
     for k, row in enumerate(ranked):
         row["elpd"], row["elpd_sd"] = float(totals[k]), total_sd(sums[:, k])
-        row["elpd_difference"] = float(totals[k] - totals[best])
-        row["elpd_difference_sd"] = total_sd(sums[:, k] - sums[:, best])
         own = [one["monte_carlo_sd"] for one in row["predictions"]]
-        row["elpd_monte_carlo_sd"] = float(np.sqrt(np.sum(np.square(own))))
+        row["elpd_monte_carlo_sd"] = float(np.linalg.norm(own))
+    best = ranked[int(np.argmax(totals))]
+    for k, row in enumerate(ranked):
+        gain = Gain(0.0, 0.0) if row is best else by_prediction(row, best)
+        assert gain is not None
+        row["elpd_difference"], row["elpd_difference_sd"] = gain.nats, gain.sd
         row["stacking"] = float(weights[k])
 
 

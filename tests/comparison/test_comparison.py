@@ -419,3 +419,16 @@ def test_a_high_order_over_a_residual_that_is_not_white_is_flagged():
 def judged_rows(*cards: dict) -> list[dict]:
     totals = {"elpd": 0.0, "elpd_monte_carlo_sd": 0.0, "held_out_rmse": {}}
     return [one | totals for one in cards]
+
+
+def test_the_error_of_a_difference_holds_what_the_draws_add():
+    """Second road: the spread over the ten stretches of four samples, beside the Monte Carlo error of both."""
+    cards = [card("base", -100.0, -50.0), card("longer", -100.0, -40.0)]
+    behind, best = judged(cards, any_study())["models"]
+    gap = np.subtract(*(one["pointwise"]["log_density"] for one in cards))
+    where = stretches(cards[0]["pointwise"])
+    sums = np.bincount(where, gap)
+    expected = np.sqrt(sums.size * np.var(sums, ddof=1) + 2 * 0.01**2)
+    assert behind["elpd_difference"] == pytest.approx(-10.0)
+    assert behind["elpd_difference_sd"] == pytest.approx(expected)
+    assert best["elpd_difference_sd"] == 0.0
