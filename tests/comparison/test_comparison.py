@@ -422,7 +422,7 @@ def judged_rows(*cards: dict) -> list[dict]:
 
 
 def test_the_error_of_a_difference_holds_what_the_draws_add():
-    """Second road: the spread over the ten stretches of four samples, beside the Monte Carlo error of both."""
+    """Second road: the spread over ten stretches of four samples, and the Monte Carlo error of both."""
     cards = [card("base", -100.0, -50.0), card("longer", -100.0, -40.0)]
     behind, best = judged(cards, any_study())["models"]
     gap = np.subtract(*(one["pointwise"]["log_density"] for one in cards))
