@@ -47,7 +47,10 @@ def unseen_share(study: Study, before: Sequence[Score], after: Sequence[Score], 
 
 def missed(study: Study, fit: Sequence[Score], scores: Sequence[Score], state: State) -> Miss | None:
     """How far unseen records are missed, on the axis where chance reaches that least often; None without a
-    drawn prediction inside the drive range of the other records.
+    drawn prediction.
+
+    Inside the drive range of the other records; where no sample is inside, or chance explains the errors
+    there, beyond it, if chance does not explain those at twice their p-value.
 
     Chance is noise as the residual of the fit has it, which knows it as well as quiet samples where nothing
     is found in it, and what the fit leaves uncertain. Error and coverage have a p-value each by simulation;
@@ -56,13 +59,25 @@ def missed(study: Study, fit: Sequence[Score], scores: Sequence[Score], state: S
     """
     if not study.held_out and state.whitening.dependence:
         return None  # the residual was taken for noise, and errors of records left out are little else
-    rng = np.random.default_rng(_SEED)
     names = [axis.name for axis in study.response_axes]
     own = {axis: [one for one in scores if one.axis == axis and one.draws is not None] for axis in names}
-    seen = [_missed(study, fit, own[axis], state, k, rng) for k, axis in enumerate(names) if own[axis]]
-    judged = [one for one in seen if one is not None]
-    least = min(judged, key=lambda one: one.p, default=None)
-    return least and replace(least, p=min(1.0, least.p * len(judged)))
+
+    def least(*, beyond: bool) -> Miss | None:
+        rng = np.random.default_rng(_SEED)
+        each = [
+            _missed(study, fit, own[axis], state, k, rng, beyond=beyond)
+            for k, axis in enumerate(names)
+            if own[axis]
+        ]
+        judged = [one for one in each if one is not None]
+        chosen = min(judged, key=lambda one: one.p, default=None)
+        return chosen and replace(chosen, p=min(1.0, chosen.p * len(judged)))
+
+    inside, beyond = least(beyond=False), least(beyond=True)
+    if beyond is None or (inside is not None and inside.significant):
+        return inside
+    beyond = replace(beyond, p=min(1.0, 2 * beyond.p))
+    return beyond if beyond.significant else inside
 
 
 def _missed(
@@ -72,6 +87,8 @@ def _missed(
     state: State,
     axis: int,
     rng: np.random.Generator,
+    *,
+    beyond: bool,
 ) -> Miss | None:
     name = study.response_axes[axis].name
     sd, noise = max(pooled_rmse(fit, name), scores[0].noise_sd), _Residual.of(state, axis)
@@ -81,13 +98,13 @@ def _missed(
     full = float(np.hypot(sd, slow * np.sqrt(followed)))
     seen, chance, count = np.zeros(2), np.zeros((2, 1, 1)), 0
     for one in scores:
-        near = one.time < _left(study, one.record)
-        if not near.any():
+        counted = (one.time >= _left(study, one.record)) == beyond
+        if not counted.any():
             continue
         assert one.draws is not None
-        error, draws = (one.observed - one.predicted)[near], slow * one.draws[:, near]
-        drawn = np.stack([noise.draw(full, one.time[near], len(draws), rng) for _ in range(_REPEATS)])
-        half = one.half_width[near]
+        error, draws = (one.observed - one.predicted)[counted], slow * one.draws[:, counted]
+        drawn = np.stack([noise.draw(full, one.time[counted], len(draws), rng) for _ in range(_REPEATS)])
+        half = one.half_width[counted]
         seen, chance = seen + _error_and_misses(error, half), chance + _error_and_misses(drawn + draws, half)
         count += error.size
     if not count:
@@ -96,7 +113,7 @@ def _missed(
         (1 + np.count_nonzero(each >= one)) / (1 + each.size) for one, each in zip(seen, chance, strict=True)
     ]
     ratio, coverage = np.sqrt(seen[0] / count) / sd, 1 - seen[1] / count
-    return Miss(name, float(ratio), float(coverage), float(np.sqrt(np.prod(shares))))
+    return Miss(name, float(ratio), float(coverage), float(np.sqrt(np.prod(shares))), beyond)
 
 
 def _error_and_misses(errors: Array, half_width: Vector) -> Array:

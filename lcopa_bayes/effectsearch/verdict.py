@@ -33,7 +33,8 @@ COVERED = float(2 * norm.cdf(HALF_WIDTH / REACHED) - 1)
 """Share of samples that 90 % bands hold of normal errors so large: bands that hold less do not cover [-]."""
 CHANCE = 0.02
 """Probability below which chance does not explain such errors or bands on unseen records [-]: with that of an
-alarm, 1 %, three clean campaigns in a hundred are not called clean."""
+alarm, 1 %, three clean campaigns in a hundred are not called clean; four where a held-out drive leaves the
+range of the fitted ones, beyond which chance has half as much."""
 
 
 @final
@@ -58,6 +59,8 @@ class Miss:
     """Share of the samples inside 90 % bands [-]."""
     p: float
     """Probability of so large an error and so little coverage by chance [-]."""
+    beyond: bool = False
+    """Whether it is where their drive is beyond the range of the fitted records, else within it."""
 
     @property
     def far(self) -> bool:
@@ -72,9 +75,10 @@ class Miss:
     @property
     def said(self) -> str:
         """The errors, a clause without a full stop."""
+        where = ", after their drive leaves the range of the fitted ones," if self.beyond else ""
         return (
-            f"on unseen records the error of {self.axis} is {self.ratio:.2f} times the noise and 90 % bands "
-            f"hold {_percent(self.coverage)} of the samples (by chance with probability {self.p:.2g})"
+            f"on unseen records{where} the error of {self.axis} is {self.ratio:.2f} times the noise and 90 % "
+            f"bands hold {_percent(self.coverage)} of the samples (by chance with probability {self.p:.2g})"
         )
 
 

@@ -98,21 +98,39 @@ def test_errors_that_chance_does_not_reach_are_missed(kind, factor):
     assert away.significant
 
 
-def test_errors_beyond_the_fitted_drives_do_not_count():
-    study = campaign("white", 2)
+def test_errors_beyond_the_fitted_drives_count_by_themselves():
+    """Within the range they say as much as if nothing followed; beyond it, where chance does not."""
+    study = campaign("white", 5)
     side, start = fitted(study)
     (score,), (fit,) = side.unseen, study.fit
     held = replace(study.held_out[0], drive=fit.drive)
     study = replace(study, held_out=(held,))
     late = held.time > 100.0
     wild = replace(study, held_out=(replace(held, drive=np.where(late[:, None], 9.0, held.drive)),))
-    astray = replace(score, predicted=np.where(score.time > 100.0, 1e3, score.predicted))
     early = replace(score, **{name: getattr(score, name)[:200] for name in ("observed", "predicted")})
-    seen = missed(wild, side.fit, [astray], start).ratio
-    assert seen == pytest.approx(early.rmse / side.fit[0].rmse, rel=0.02)
-    assert missed(study, side.fit, [astray], start).ratio > 1e3
+    seen = missed(wild, side.fit, [score], start)
+    assert not seen.beyond
+    assert seen.ratio == pytest.approx(early.rmse / side.fit[0].rmse, rel=0.02)
+    off = replace(score, predicted=np.where(score.time > 100.0, 1e3, score.predicted))
+    seen = missed(wild, side.fit, [off], start)
+    assert seen.beyond
+    assert seen.significant
+    assert "after their drive leaves the range" in seen.said
+    assert not missed(study, side.fit, [off], start).beyond
     gone = replace(study, held_out=(replace(held, drive=np.full_like(held.drive, 9.0)),))
-    assert missed(gone, side.fit, [astray], start) is None
+    assert missed(gone, side.fit, [off], start).beyond
+    assert missed(gone, side.fit, [score], start) is None
+
+
+def test_a_record_beyond_the_fitted_drives_is_not_clean_where_the_model_fails_there():
+    """Twice the drive, with twice the response, and with a gain of 0.9 times."""
+    study = campaign("white", 3)
+    (other,), (score,) = study.held_out, fitted(study)[0].unseen
+    for factor, kind in ((2.0, "clean"), (1.8, "unexplained")):
+        response = other.response + (factor - 1) * score.predicted[:, None]
+        larger = replace(other, drive=2 * other.drive, response=response)
+        found = loop(replace(study, held_out=(larger,)), library=[], sample=False, quick=True, as_stated=True)
+        assert found.verdict.kind == kind
 
 
 def test_a_plant_that_differs_on_held_out_records_is_not_clean():

@@ -329,7 +329,7 @@ def test_a_fleet_by_loop_tells_its_effects(devices, tmp_path):
 def test_a_device_of_a_comparison_tells_what_it_prefers():
     values = lb.load_result(Path(__file__).parents[2] / "reports" / "paper-step", "compare").to_json()
     row = row_of("compare", values, None)
-    (preferred,) = (one for one in values["models"] if one["name"] == "fractional-2")
-    assert (row["preferred"], row["grade"]) == ("fractional-2", preferred["grade"])
+    (preferred,) = (one for one in values["models"] if one["name"] == values["preferred"])
+    assert (row["preferred"], row["grade"]) == (values["preferred"], preferred["grade"])
     assert row["probability"] == preferred["probability"]
     assert row_of("compare", values | {"preferred": None}, None)["grade"] == "unusable"
