@@ -50,7 +50,7 @@ def missed(study: Study, fit: Sequence[Score], scores: Sequence[Score], state: S
     drawn prediction.
 
     Inside the drive range of the other records; where no sample is inside, or chance explains the errors
-    there, beyond it, if chance does not explain those at twice their p-value.
+    there, beyond it, where errors have twice the p-value.
 
     Chance is noise as the residual of the fit has it, which knows it as well as quiet samples where nothing
     is found in it, and what the fit leaves uncertain. Error and coverage have a p-value each by simulation;
@@ -77,7 +77,8 @@ def missed(study: Study, fit: Sequence[Score], scores: Sequence[Score], state: S
     if beyond is None or (inside is not None and inside.significant):
         return inside
     beyond = replace(beyond, p=min(1.0, 2 * beyond.p))
-    return beyond if beyond.significant else inside
+    within = inside is None or not inside.far
+    return beyond if beyond.significant or (beyond.far and within) else inside
 
 
 def _missed(

@@ -90,7 +90,8 @@ def test_errors_that_chance_does_not_reach_are_missed(kind, factor):
     """The more independent the samples, the smaller they may be."""
     study = campaign(kind, 1)
     side, start = fitted(study)
-    (score,) = side.unseen
+    (score,), (fit,), (held,) = side.unseen, study.fit, study.held_out
+    study = replace(study, held_out=(replace(held, drive=fit.drive),))  # never beyond the fitted range
     far = replace(score, observed=score.predicted + factor * (score.observed - score.predicted))
     near, away = (missed(study, side.fit, [one], start) for one in (score, far))
     assert away.ratio == pytest.approx(factor * near.ratio)
