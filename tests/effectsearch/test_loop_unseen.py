@@ -88,7 +88,7 @@ def test_few_clean_campaigns_are_missed(kind):
 @pytest.mark.parametrize(("kind", "factor"), [("white", 1.25), ("coloured", 3.0), ("heavy", 1.5)])
 def test_errors_that_chance_does_not_reach_are_missed(kind, factor):
     """The more independent the samples, the smaller they may be."""
-    study = campaign(kind, 1)
+    study = campaign(kind, 3)
     side, start = fitted(study)
     (score,), (fit,), (held,) = side.unseen, study.fit, study.held_out
     study = replace(study, held_out=(replace(held, drive=fit.drive),))  # never beyond the fitted range
