@@ -85,6 +85,7 @@ def outlying(study: Study, fit: BaseFit) -> Outlying | None:
         own = parts(samples, axis)
         apart = [_apart(residual[part.rows]) for part in own]
         core = float(np.median(np.abs(np.concatenate(apart)))) / _NORMAL
+        core = max(core, _step([part.samples.record.response[:, axis] for part in own]) / np.sqrt(12))
         for part, distance in zip(own, apart, strict=True):
             flags = np.abs(distance) > _FAR * core
             rest = quiet_samples(part.samples, axis, delay)
@@ -131,6 +132,14 @@ def _apart(residual: Vector) -> Vector:
     padded = np.pad(residual, _BESIDE, mode="reflect" if residual.size > _BESIDE else "edge")
     around = sliding_window_view(padded, 2 * _BESIDE + 1)
     return np.asarray(residual - np.median(np.delete(around, _BESIDE, axis=1), axis=1))
+
+
+def _step(responses: Sequence[Vector]) -> float:
+    """Between the values of a sensor [response unit], whose rounding error has a standard deviation of a step
+    over the square root of 12; of one that does not round less than its noise, by the number of samples."""
+    values = np.concatenate(responses)
+    apart = np.diff(np.unique(values[np.isfinite(values)]))
+    return float(np.median(apart)) if apart.size else 0.0
 
 
 def _without(samples: Samples, number: int, far: Mapping[tuple[int, int], Flags]) -> Record:

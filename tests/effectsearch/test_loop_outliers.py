@@ -57,6 +57,15 @@ def test_outliers_are_found_where_they_are():
     assert found.log_bayes_factor > 50
 
 
+@pytest.mark.parametrize(("step", "above"), [(6.0, 0.3), (10.0, 0.4), (10.0, 0.45)])
+def test_a_coarse_sensor_has_no_outliers(step, above):
+    """Most of its samples are those beside them, from which the next value is one step of the sensor away."""
+    made, height = study(1), step * NOISE
+    coarse = [replace(r, response=height * np.round(r.response / height + above)) for r in made.fit]
+    made = replace(made, fit=tuple(coarse))
+    assert outlying(made, fitted(made)) is None
+
+
 @pytest.mark.parametrize("made", [study(1), study(2, 0.3)], ids=["clean", "bent"])
 def test_noise_and_effects_are_no_outliers(made):
     assert outlying(made, fitted(made)) is None
