@@ -169,8 +169,8 @@ def boundaries(
     scale = min(sd, float(three_quarters - quarter) / 1.34) or sd
     effective = float(np.clip(ess, *_SMOOTHED_AS)) if ess > 0 else _SMOOTHED_AS[0]
     width = _NARROW * 0.9 * scale * float(effective**-0.2)
-    if not (high > low and width > 0):
-        return ()
+    if not (high - low > _CELLS * np.spacing(max(abs(low), abs(high))) and width > 0):
+        return ()  # draws that rounding alone tells apart
     counts, edges = np.histogram(x, bins=_CELLS, range=(low, high), weights=weights[order])
     cell = (high - low) / _CELLS
     density = gaussian_filter1d(counts, width / cell, mode="reflect", truncate=5.0)

@@ -1,4 +1,4 @@
-"""Least squares: exact Jacobian, recovery of the bench's truth, the right hill among several."""
+"""Least squares: exact Jacobian, recovery of the bench's truth, the right mode among several."""
 
 from __future__ import annotations
 
@@ -128,17 +128,17 @@ def test_finds_the_delay_among_the_local_minima_of_a_random_binary_drive():
     command = prbs(-1.0, 1.0, hold=0.8, duration=30.0, rng=rng)
     fast = Device(((path(1.0, 2.37, (0.15,), (0.9,)),),), TWO.drive_axes[:1], TWO.response_axes[:1], (0.0,))
     posterior = made(record(device=fast, command=command, camera=0.1, duration=32.0, noise_sd=0.05))
-    (hill, *_) = find_optima(posterior, np.random.default_rng(2))
+    (mode, *_) = find_optima(posterior, np.random.default_rng(2))
     at = posterior.table.at("delay", 0)
-    assert hill.values[at] == pytest.approx(2.37, abs=0.02)
+    assert mode.values[at] == pytest.approx(2.37, abs=0.02)
     least, trapped = LeastSquares(posterior), []
     for delay in (0.5, 4.5, 6.5):
-        start = hill.values.copy()
+        start = mode.values.copy()
         start[at] = delay
         end, _ = least.solve(start)
         trapped.append(abs(end[at] - 2.37) > 0.5)
         high = posterior.log_density(posterior.coordinates(least.with_noise(end)[None]))[0]
-        assert high < hill.log_density - 50 or not trapped[-1]
+        assert high < mode.log_density - 50 or not trapped[-1]
     assert any(trapped)  # one start would not have been enough
 
 

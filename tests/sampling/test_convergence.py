@@ -1,4 +1,4 @@
-"""Grades: independent normal draws pass, hills that ensembles disagree about do not."""
+"""Grades: independent normal draws pass, modes that ensembles disagree about do not."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_independent_normal_draws_are_reliable():
     assert "independent sets of draws agree" in overall([quality], 400).reason
 
 
-def test_ensembles_on_different_hills_are_unusable_however_many_draws():
+def test_ensembles_on_different_modes_are_unusable_however_many_draws():
     apart = normal() + np.array([0.0, 0.0, 0.0, 6.0])[:, None, None]
     quality = one(apart)
     assert quality.rhat > 1.1
@@ -53,16 +53,16 @@ def test_ensembles_on_different_hills_are_unusable_however_many_draws():
     assert "several modes" in told.reason
 
 
-def test_hills_that_all_ensembles_weigh_differently_are_not_reliable():
+def test_modes_that_all_ensembles_weigh_differently_are_not_reliable():
     rng = np.random.default_rng(1)
     share = np.array([0.2, 0.4, 0.6, 0.8])
-    hill = rng.random(SHAPE[:2]) < share[:, None]  # a walker never changes its hill
-    assert one(normal() + 5.0 * hill[..., None]).grade(1).level != "reliable"
+    mode = rng.random(SHAPE[:2]) < share[:, None]  # a walker never changes its mode
+    assert one(normal() + 5.0 * mode[..., None]).grade(1).level != "reliable"
 
 
-def test_hills_that_every_walker_visits_are_fine():
-    hill = np.random.default_rng(2).random(SHAPE) < 0.5
-    assert one(normal() + 5.0 * hill).grade(400).level == "reliable"
+def test_modes_that_every_walker_visits_are_fine():
+    mode = np.random.default_rng(2).random(SHAPE) < 0.5
+    assert one(normal() + 5.0 * mode).grade(400).level == "reliable"
 
 
 def test_ensembles_of_different_width_are_seen():

@@ -27,30 +27,30 @@ def kolmogorov(draws: Vector, at: Vector, exact: Vector) -> float:
     return float(np.abs(share - exact).max())
 
 
-# -- several hills ---------------------------------------------------------------------------------
+# -- several modes ---------------------------------------------------------------------------------
 
-HILLS, SHARES, WIDTH = np.array([-6.0, 6.0]), np.array([0.3, 0.7]), 0.5
+MODES, SHARES, WIDTH = np.array([-6.0, 6.0]), np.array([0.3, 0.7]), 0.5
 
 
-def two_hills(z: Matrix) -> Vector:
-    """Log density of two normal hills, 24 standard deviations apart in both directions."""
+def two_modes(z: Matrix) -> Vector:
+    """Log density of two normal modes, 24 standard deviations apart in both directions."""
     parts = [
-        stats.norm(at, WIDTH).logpdf(z).sum(axis=1) + np.log(p) for at, p in zip(HILLS, SHARES, strict=True)
+        stats.norm(at, WIDTH).logpdf(z).sum(axis=1) + np.log(p) for at, p in zip(MODES, SHARES, strict=True)
     ]
     return np.asarray(np.logaddexp(*parts))
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 8))])
-def test_hills_that_no_step_joins_are_found_in_their_shares(seed):
-    toy = Toy(two_hills, {name: ("uniform", {"loc": -15.0, "scale": 30.0}) for name in "ab"})
+def test_modes_that_no_step_joins_are_found_in_their_shares(seed):
+    toy = Toy(two_modes, {name: ("uniform", {"loc": -15.0, "scale": 30.0}) for name in "ab"})
     run = sample(toy, SamplePlan(2, 48, 2000, 4, 400.0, seed))
     draws, (kept, _) = gather(toy, run), run.kept()
     assert draws.grade.level == "reliable", draws.grade.reason
     right = kept[..., 0] > 0
     assert_share(right, SHARES[1])
     for k in range(2):
-        assert ((kept[..., k] > 0) == right).all()  # the diagonal hills only
-        for at, there in ((HILLS[0], ~right), (HILLS[1], right)):
+        assert ((kept[..., k] > 0) == right).all()  # the diagonal modes only
+        for at, there in ((MODES[0], ~right), (MODES[1], right)):
             drawn = kept[..., k][there]
             assert abs(drawn.mean() - at) < 0.1 * WIDTH
             assert abs(drawn.std() / WIDTH - 1) < 0.1

@@ -1,4 +1,4 @@
-"""Hills of a marginal: planted ones are found with their shares, a single one is never split."""
+"""Modes of a marginal: planted ones are found with their shares, a single one is never split."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ GOOD = Quality("order_2", 900.0, 900.0, 1.0)
 
 
 def mixture(rng, shares, distance=6.0, shape=SHAPE, *, stay=False):
-    """Normal hills at 0 and `distance`, the upper one with `shares` per ensemble; walkers may never leave."""
+    """Normal modes at 0 and `distance`, the upper one with `shares` per ensemble; walkers may never leave."""
     upper = rng.random((*shape[:2], 1 if stay else shape[2])) < np.reshape(shares, (-1, 1, 1))
     return rng.normal(size=shape) + distance * upper
 
 
 @pytest.mark.parametrize("log_scale", [False, True])
 @pytest.mark.parametrize("stay", [False, True])
-def test_two_hills_are_found_with_their_shares(rng, log_scale, stay):
+def test_two_modes_are_found_with_their_shares(rng, log_scale, stay):
     x = mixture(rng, [0.7], shape=(4, 200, 10), stay=stay)
     found = modes_of("order_2", "-", np.exp(x) if log_scale else x, log_scale=log_scale)
     (boundary,) = np.log(found.boundaries) if log_scale else found.boundaries
@@ -38,7 +38,7 @@ def test_two_hills_are_found_with_their_shares(rng, log_scale, stay):
     assert found.shares.sum(axis=1) == pytest.approx(1.0)
 
 
-def test_three_hills_from_the_lowest_up(rng):
+def test_three_modes_from_the_lowest_up(rng):
     which = rng.choice(3, p=[0.2, 0.3, 0.5], size=(4, 50, 20))
     found = modes_of("time_1", "ms", rng.normal(size=which.shape) + 8 * which)
     assert [round(b / 4) for b in found.boundaries] == [1, 3]
@@ -59,27 +59,27 @@ SINGLE = {
 
 
 @pytest.mark.parametrize("name", SINGLE)
-def test_one_hill_stays_one(name):
+def test_one_mode_stays_one(name):
     split = [
         len(modes_of("x", "-", SINGLE[name](np.random.default_rng(seed))).boundaries) for seed in range(100)
     ]
     assert np.mean(np.array(split) > 0) <= 0.05
 
 
-def test_two_hills_are_found_in_nearly_every_sample():
+def test_two_modes_are_found_in_nearly_every_sample():
     found = [modes_of("x", "-", mixture(np.random.default_rng(seed), [0.7])) for seed in range(50)]
     assert np.mean([len(one.boundaries) == 1 for one in found]) >= 0.95
     assert np.mean([one.pooled[1] for one in found]) == pytest.approx(0.7, abs=4 * np.sqrt(0.21 / 50_000))
 
 
-@pytest.mark.parametrize(("distance", "hills"), [(3.0, 1), (5.0, 2)])
-def test_a_shallow_valley_does_not_part_hills(rng, distance, hills):
-    """Midway the density is 0.64 or 0.09 of that on either hill; the limit is a half."""
+@pytest.mark.parametrize(("distance", "modes"), [(3.0, 1), (5.0, 2)])
+def test_a_shallow_valley_does_not_part_modes(rng, distance, modes):
+    """Midway the density is 0.64 or 0.09 of that on either mode; the limit is a half."""
     found = modes_of("x", "-", mixture(rng, [0.5], distance, (4, 100, 100)))
-    assert len(found.boundaries) + 1 == hills
+    assert len(found.boundaries) + 1 == modes
 
 
-def test_sluggish_walkers_on_one_hill_do_not_make_two():
+def test_sluggish_walkers_on_one_mode_do_not_make_two():
     """An autoregression with an autocorrelation time of about 19: 20 000 draws are worth a thousand."""
     split = 0
     for seed in range(20):
@@ -101,7 +101,14 @@ def test_units_do_not_matter(scale, shift, seed):
     assert other.shares == pytest.approx(plain.shares, abs=0.01)
 
 
-def test_draws_that_do_not_vary_have_one_hill():
+@pytest.mark.parametrize("log_scale", [False, True])
+def test_draws_that_rounding_tells_apart_have_one_mode(rng, log_scale):
+    """As those of an ensemble that has not moved: fewer numbers lie between them than a histogram has cells."""
+    values = 3.7 + np.spacing(3.7) * rng.integers(0, 40, SHAPE)
+    assert modes_of("gain", "-", values, log_scale=log_scale).boundaries == ()
+
+
+def test_draws_that_do_not_vary_have_one_mode():
     assert modes_of("x", "-", np.ones(SHAPE)).boundaries == ()
     assert modes_of("x", "-", np.ones(SHAPE)).sentence() == "one mode of x"
 

@@ -325,18 +325,18 @@ def test_gathered_draws_are_those_kept_with_linear_parameters_added(uninterrupte
     assert draws.ess == min(quality.ess for quality in draws.qualities)
 
 
-def test_a_posterior_with_two_hills_no_walker_crosses_between_is_not_reliable():
-    """Each ensemble begins on one hill or the other; only comparing them shows it."""
+def test_a_posterior_with_two_modes_no_walker_crosses_between_is_not_reliable():
+    """Each ensemble begins on one mode or the other; only comparing them shows it."""
 
     def log_density(coordinates: np.ndarray) -> np.ndarray:
         near, far = ((coordinates - at) ** 2 for at in (0.0, 200.0))
         return np.logaddexp(-0.5 * near.sum(axis=1), -0.5 * far.sum(axis=1))
 
     wide = ("uniform", {"loc": -100.0, "scale": 400.0})
-    hills, chains = Toy(log_density, {"a": wide, "b": wide}), []
+    modes, chains = Toy(log_density, {"a": wide, "b": wide}), []
     for k, child in enumerate(np.random.SeedSequence(2).spawn(4)):
         start = 200.0 * (k % 2) + np.random.default_rng(k).normal(size=(12, 2))
-        chains.append(advance(hills, ensemble_at(hills, start, child), 200, 4).chain[50:].swapaxes(0, 1))
+        chains.append(advance(modes, ensemble_at(modes, start, child), 200, 4).chain[50:].swapaxes(0, 1))
     together = qualities("ab", np.array(chains))
     alone = qualities("ab", np.array([chains[0], chains[2]]))
     assert all(quality.grade(100).level == "unusable" for quality in together)
