@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.core.estimate import HALF_WIDTH, Estimate, plain
+from lcopa_bayes.core.estimate import HALF_WIDTH
 from lcopa_bayes.data.agreement import Disagreement, disagreements
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.bandwidening import Widening
@@ -20,7 +20,14 @@ from lcopa_bayes.effectsearch.basefit import BaseFit, settled, too_smooth
 from lcopa_bayes.effectsearch.basemodel import fitted_base
 from lcopa_bayes.effectsearch.explained import coordinates_of, declarable, explained_draws, explained_study
 from lcopa_bayes.effectsearch.heldouteffects import missed, unseen_share
-from lcopa_bayes.effectsearch.openeffects import Alternative, alternatives, mixture, odds, pooled
+from lcopa_bayes.effectsearch.openeffects import (
+    Alternative,
+    Weighed,
+    alternatives,
+    mixture,
+    odds,
+    step_figures,
+)
 from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
 from lcopa_bayes.effectsearch.outliers import Outlying, outlying, without_outliers
 from lcopa_bayes.effectsearch.refits import released
@@ -48,7 +55,6 @@ from lcopa_bayes.effectsearch.verdict import (
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.effect import Effect
-from lcopa_bayes.results.alternatives import parts_of_sd
 from lcopa_bayes.sampling.convergence import Grade
 from lcopa_bayes.sampling.draws import Draws
 
@@ -128,34 +134,34 @@ class Loop:
         """A coordinate of the final model over the effects that are open, with unit, 90 % interval and grade,
         its standard deviations by noise and by structure, and lower end, median and upper end under the final
         model `alone`."""
-        state = self.after.state
-        row = state.model.posterior.table.rows[state.model.columns[k]]
-        parts, weights = self.values_of(k)
-        noise, structure = parts_of_sd(parts, weights)
+        state, here = self.after.state, self.number(k)
         if self.draws is not None:
-            own = next(one for one in self.draws.estimates() if one.name == row.name)
-            alone, ess, grade, interval = (own.lower, own.value, own.upper), own.ess, own.grade, own.interval
-        else:
-            sd, ess, grade, interval = np.sqrt(state.covariance[k, k]), np.nan, "tentative", "Laplace"
-            ends = row.value_at(state.optimum.x[k] + sd * HALF_WIDTH * np.array([-1.0, 0.0, 1.0]))
-            alone = tuple(ends.tolist())
-        made = Estimate.of(row.name, row.unit, pooled(parts, weights), ess=ess, grade=grade)
-        more = {"sd_noise": noise, "sd_structure": structure, "alone": alone}
-        return plain(replace(made, interval=interval).as_json() | more)
+            own = next(one for one in self.draws.estimates() if one.name == here.name)
+            alone = own.lower, own.value, own.upper
+            return here.as_json(ess=own.ess, grade=own.grade, interval=own.interval) | {"alone": alone}
+        row, sd = state.model.posterior.table.rows[state.model.columns[k]], np.sqrt(state.covariance[k, k])
+        ends = row.value_at(state.optimum.x[k] + sd * HALF_WIDTH * np.array([-1.0, 0.0, 1.0]))
+        return here.as_json(ess=np.nan, grade="tentative", interval="Laplace") | {"alone": ends.tolist()}
 
-    def values_of(self, k: int) -> tuple[list[Vector], Vector]:
-        """Equally probable values of a coordinate [`unit`] under the final model and each that is open to it
-        and has it, and the weights of these."""
+    def number(self, k: int) -> Weighed:
+        """A coordinate [`unit`] over the final model and each that is open to it and has it."""
         state = self.after.state
         row = state.model.posterior.table.rows[state.model.columns[k]]
-        parts, weights = self._mixture
-        own = [
-            (row.value_at(part[:, k]), weight)
-            for part, weight in zip(parts, weights, strict=True)
-            if k < part.shape[1]
-        ]
+        pairs = zip(*self._mixture, strict=True)
+        own = [(row.value_at(part[:, k]), weight) for part, weight in pairs if k < part.shape[1]]
         shares = np.array([weight for _, weight in own])
-        return [values for values, _ in own], shares / shares.sum()
+        return Weighed(row.name, row.unit, [values for values, _ in own], shares / shares.sum())
+
+    @cached_property
+    def figures(self) -> tuple[Weighed, ...]:
+        """Figures of the plant's response to a unit step over the longest record, its effects aside, over the
+        same models."""
+        return self.figures_of(self.after.state, *self._mixture)
+
+    def figures_of(self, state: State, parts: Sequence[Matrix], weights: Vector) -> tuple[Weighed, ...]:
+        """The same of any `mixture`."""
+        span, unit = self.problem.scales.span, self.problem.study.time_unit
+        return step_figures(state, parts, weights, span=span, time_unit=unit)
 
     @cached_property
     def _mixture(self) -> tuple[list[Matrix], Vector]:

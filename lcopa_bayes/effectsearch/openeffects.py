@@ -11,22 +11,29 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of, root_of
+from lcopa_bayes.core.estimate import Estimate, plain, quantile
 from lcopa_bayes.effectsearch.rounds import Round
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.signature import Signature
 from lcopa_bayes.effectsearch.trace import LEAST as CHANCE
 from lcopa_bayes.effectsearch.trace import Trace
+from lcopa_bayes.results.alternatives import parts_of_sd
+from lcopa_bayes.results.steps import curves_of, metrics_of
 
 LEAST = 3e-3
 """Weight beside that of the final model below which an alternative is left out [-]."""
 _DRAWS = 4000
 """Draws of all models together [-]."""
+_RESPONSES = 400
+"""Step responses of all models together [-]."""
+_FEWEST = 10
+"""Step responses of one of them [-]."""
 _SEED = 23
 
 
@@ -77,10 +84,73 @@ def mixture(state: State, own: Matrix | None, found: Sequence[Alternative]) -> t
 
 
 def pooled(values: Sequence[Vector], weights: Vector) -> Vector:
-    """Equally probable values of a mixture whose parts are given by equally probable values."""
+    """Equally probable values of a mixture whose parts are given by equally probable values, perhaps
+    infinite."""
     counts = np.round(_DRAWS * weights).astype(int)
     pairs = zip(values, counts, strict=True)
-    return np.concatenate([np.quantile(one, (np.arange(n) + 0.5) / n) for one, n in pairs if n])
+    return np.concatenate([_spread(one, (np.arange(n) + 0.5) / n) for one, n in pairs if n])
+
+
+def _spread(values: Vector, places: Array) -> Vector:
+    method = "linear" if np.isfinite(values).all() else "higher"
+    return np.asarray(np.quantile(values, places, method=method))  # type: ignore[call-overload]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Weighed:
+    """One number over a final model and all that is open to it."""
+
+    name: str
+    unit: str
+    parts: Sequence[Vector]
+    """Equally probable values, those of the final model first [`unit`]."""
+    weights: Vector
+    """Of the parts; they add up to 1."""
+    note: str = ""
+
+    @property
+    def values(self) -> Vector:
+        """Equally probable values over all [`unit`]."""
+        return pooled(self.parts, self.weights)
+
+    def as_json(self, *, ess: float, grade: str, interval: str) -> dict[str, Any]:
+        """Median and 90 % interval, the standard deviations by noise and by structure, and lower end, median
+        and upper end under the final model `alone`."""
+        made = Estimate.of(self.name, self.unit, self.values, ess=ess, grade=grade, note=self.note)
+        noise, structure = parts_of_sd(self.parts, self.weights)
+        tail = (1 - made.level) / 2
+        alone = [float(quantile(self.parts[0], at)) for at in (tail, 0.5, 1 - tail)]
+        more = {"interval": interval, "sd_noise": noise, "sd_structure": structure, "alone": alone}
+        return plain(made.as_json() | more)
+
+
+def step_figures(
+    state: State, parts: Sequence[Matrix], weights: Vector, *, span: float, time_unit: str
+) -> tuple[Weighed, ...]:
+    """Figures of the plant's response to a unit step over `span` [time unit], its effects aside, over the
+    draws of a `mixture`; none where no draw of the final model is a plant."""
+    model = state.model
+    table, columns = model.plant.table, model.columns[: model.plant_size]
+    kept: list[Matrix] = []
+    shares: list[float] = []
+    for part, weight in zip(parts, weights, strict=True):
+        count = min(max(round(_RESPONSES * weight), _FEWEST), len(part))
+        drawn = part[np.linspace(0, len(part) - 1, count).astype(int)]
+        values = np.tile(model.template[: len(table.rows)], (count, 1))
+        for position, k in enumerate(columns):
+            values[:, k] = table.rows[k].value_at(drawn[:, position])
+        values = table.canonical(values)
+        values = values[table.supported(values)]
+        if not len(values) and not kept:
+            return ()
+        if len(values):
+            kept.append(values)
+            shares.append(weight)
+    every, ends = np.concatenate(kept), np.cumsum([len(one) for one in kept])[:-1]
+    found = metrics_of(table, curves_of(table, every, span), time_unit=time_unit)
+    share = np.array(shares) / sum(shares)
+    return tuple(Weighed(one.name, one.unit, np.split(one.values, ends), share, one.note) for one in found)
 
 
 def odds(seen: Trace, log_bayes_factor: float) -> float:

@@ -270,15 +270,23 @@ def freed(
         return model, x
     best = Regression(replace(model, exact=False), whitening).cost(x)
     try:
-        reached, _ = Regression(wide, whitening).reached(
-            wide.coordinates(model.values(x)), most=_EVALUATIONS, gain=_SLIGHT
-        )
+        start, fit = wide.coordinates(model.values(x)), Regression(wide, whitening)
+        starts = (start, *_whole(wide, start, names))
+        reached = min((fit.reached(one, most=_EVALUATIONS, gain=_SLIGHT)[0] for one in starts), key=fit.cost)
     except ArithmeticError:
         return model, x
     moved, other = wide.held(reached)
     if Regression(moved, whitening).cost(other) < best:
         model, x = replace(moved, exact=model.exact), other
     return _likely(model, x, whitening, names)
+
+
+def _whole(model: ExtendedModel, x: Vector, names: Collection[str]) -> tuple[Vector, ...]:
+    """Coordinates with all of each of these effects that comes in shares; none without any. A part of a limit
+    that is too low is likelier than its neighbours, and no descent leaves it."""
+    shares = {one.name for one in model.effected.coefficients if one.coefficient.share}
+    own = [name in shares and name.partition(".")[0] in names for name in model.names]
+    return (np.where(own, 1.0, x),) if any(own) else ()
 
 
 def _loosened(model: ExtendedModel, names: Collection[str]) -> ExtendedModel:

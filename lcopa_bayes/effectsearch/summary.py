@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lcopa_bayes.core.estimate import attributes, plain
+from lcopa_bayes.core.estimate import EQUAL_TAILED, attributes, plain
 from lcopa_bayes.effectsearch.loop import Loop, Side
 from lcopa_bayes.effectsearch.residuals import View, views
 from lcopa_bayes.effectsearch.rounds import Round
@@ -61,6 +61,7 @@ def results(result: Loop) -> dict[str, Any]:
         "moved": moved(result),
         "next_measurement": next_measurement(result),
         "parameters": [result.estimate(k) for k in range(result.after.state.model.plant_size)],
+        "figures": _figures(result),
         "residual": {
             when: [{"name": view.name, "axis": view.axis, "sentence": view.sentence} for view in shown]
             for when, shown in _views(result).items()
@@ -125,6 +126,15 @@ def _effects(result: Loop, chances: dict[str, float]) -> list[dict[str, Any]]:
             }
         )
     return out
+
+
+def _figures(result: Loop) -> list[dict[str, Any]]:
+    """Figures of the step responses; delays and steady values are among the parameters."""
+    draws = result.draws
+    ess, interval = (draws.ess, EQUAL_TAILED) if draws is not None else (np.nan, "Laplace")
+    grade = result.grade.level
+    kept = (one for one in result.figures if not one.name.startswith(("delay[", "steady_state[")))
+    return [one.as_json(ess=ess, grade=grade, interval=interval) for one in kept]
 
 
 def _open(result: Loop) -> list[dict[str, Any]]:

@@ -7,21 +7,32 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm
+from devicetruth import place, side_figures, size_deviations, step_deviations
 from threadpoolctl import threadpool_limits
 
-from lcopa_bayes.bench.hiddeneffects import MarchError
+from lcopa_bayes.bench.hiddeneffects import Hidden, MarchError
 from lcopa_bayes.bench.undeclared import NOISE, Campaign, campaign, drawn
+from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.core.files import write_text
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.loop import Loop, Side, loop
-from lcopa_bayes.effectsearch.openeffects import pooled
 from lcopa_bayes.effectsearch.scores import pooled_coverage
 
 _ATTEMPTS = 20
+FREEDOM = 4.0
+"""Degrees of freedom of the noise of a heavy-tailed control [-]."""
 TERMS = {"direct": 2, "cross": 1}
 """What the study of a campaign says of its model: the truth's, without any effect."""
+
+
+def _student(noise: Matrix, chance: np.random.Generator) -> Matrix:
+    """Normal noise made Student's t of the same standard deviation, with pi/4 of its correlations."""
+    return noise * np.sqrt((FREEDOM - 2) / chance.chisquare(FREEDOM, noise.shape))
+
+
+HEAVY = Hidden("outliers", {"inverse_nu": 1 / FREEDOM}, disturbance=True, noise=_student)
+"""What the noise of a heavy-tailed control has, under the name that the catalogue has for it."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +40,7 @@ class Task:
     """What one campaign hides."""
 
     kind: str
-    """clean, coloured, named, plain, outside, pair or control."""
+    """clean, coloured, heavy, named, plain, outside, pair or control."""
     effects: tuple[str, ...]
     drives: str
     correlation: float
@@ -73,7 +84,8 @@ def measured(task: Task) -> Campaign:
     for attempt in range(_ATTEMPTS):
         rng = np.random.default_rng([task.seed, 77, *([attempt] if attempt else [])])
         try:
-            made = campaign(drawn(task.effects, rng), rng, drives=task.drives, correlation=task.correlation)
+            hidden = [*drawn(task.effects, rng), *([HEAVY] if task.kind == "heavy" else [])]
+            made = campaign(hidden, rng, drives=task.drives, correlation=task.correlation)
         except MarchError:
             continue
         return shortened(made, task.quiet) if task.quiet else made
@@ -124,9 +136,12 @@ def judged(found: Loop, made: Campaign) -> dict[str, Any]:
         "base_failed": found.base.failed,
         "before": errors(found.before, made),
         "after": errors(found.after, made),
-        "plant_before": deviations(found.before, made),
-        "plant_alone": deviations(found.after, made),
-        "plant_after": deviations(found.after, made, found),
+        "plant_before": deviations(found.before, made)
+        | step_deviations(side_figures(found, found.before), found, made),
+        "plant_alone": deviations(found.after, made)
+        | step_deviations(found.figures, found, made, alone=True),
+        "plant_after": deviations(found.after, made, found) | step_deviations(found.figures, found, made),
+        "sizes_after": size_deviations(found, made),
         "coverage_before": pooled_coverage(found.before.unseen),
         "coverage_after": pooled_coverage(found.after.unseen),
         "share_with_band": float(np.mean([score.banded for score in found.after.unseen])),
@@ -166,8 +181,7 @@ def deviations(side: Side, made: Campaign, open_to: Loop | None = None) -> dict[
         if open_to is None:
             out[row.name] = float((side.state.optimum.x[k] - row.coordinate(truth)) / sd[k])
         else:
-            values = pooled(*open_to.values_of(k))
-            out[row.name] = -float(norm.ppf((np.sum(values < truth) + 0.5) / (values.size + 1)))
+            out[row.name] = place(open_to.number(k).values, truth)
     return out
 
 

@@ -42,6 +42,9 @@ def tasks(options: argparse.Namespace) -> list[Task]:
     made += [("named", (name,), "rich", 0.0) for name in NAMED for _ in range(options.each)]
     made += [("plain", (name,), "plain", 0.0) for name in NAMED for _ in range(max(1, options.each // 4))]
     made += [("outside", (name,), "rich", 0.0) for name in OUTSIDE for _ in range(options.outsiders)]
+    made += [
+        ("heavy", (), "rich", rho) for k in range(options.controls) for rho in (0.0, COLOURED)[k % 2 :][:1]
+    ]
     rng = np.random.default_rng([options.seed, 1])
     plant = sorted(NAMED)
     pairs = list(combinations(plant, 2))

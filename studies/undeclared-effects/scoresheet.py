@@ -14,6 +14,15 @@ EQUIVALENT = {"duffing_with_memory": {"cubic_stiffness"}, "fringing_gain": {"odd
 """Outsiders whose leading term the catalogue has: naming it, and nothing else, counts as right. A gain that
 changes with the deflection is an odd curvature of every axis while one axis moves."""
 
+FIGURES = {
+    "gain": "gains",
+    "delay": "delays",
+    "value_at_end": "values at record end",
+    "rise_10_90": "rise times",
+}
+"""Numbers of the device that are scored, by how their names begin."""
+SIZES = {"": "sizes and constants of effects"}
+
 
 def bounds(hits: int, trials: int, level: float = 0.95) -> tuple[float, float]:
     """Two-sided Clopper-Pearson interval of a share [-]."""
@@ -76,7 +85,10 @@ def number(
 def sheet(rows: Sequence[Row], targets: Mapping[str, Any], seen: float) -> list[dict[str, Any]]:
     """Every measure of "What to hold ourselves to"."""
     usable = [row for row in rows if not row["crashed"]]
-    by = {kind: [row for row in usable if row["kind"] == kind] for kind in ("clean", "coloured", "named")}
+    by = {
+        kind: [row for row in usable if row["kind"] == kind]
+        for kind in ("clean", "coloured", "heavy", "named")
+    }
     by |= {kind: [row for row in usable if row["kind"] == kind] for kind in ("plain", "outside", "pair")}
     controls = [row for row in usable if row["kind"] == "control"]
     cells = sorted({(row["correlation"], row["quiet"]) for row in controls})
@@ -135,6 +147,13 @@ def sheet(rows: Sequence[Row], targets: Mapping[str, Any], seen: float) -> list[
             targets["false_alarms"],
             "most",
         ),
+        share(
+            "false alarms, heavy-tailed noise",
+            by["heavy"],
+            alarming,
+            targets["false_alarms"],
+            "most",
+        ),
         share("noticed, where it survives", visible, lambda r: r["alarmed"], 0.0, "least"),
         share(
             "right effect first, where it survives",
@@ -184,9 +203,11 @@ def sheet(rows: Sequence[Row], targets: Mapping[str, Any], seen: float) -> list[
             "90 % bands before correction", [r["coverage_before"] for r in corrected], np.mean, 0.0, "least"
         ),
         *intervals("clean", [r for r in usable if r["verdict"] == "clean"], "plant_after", targets),
+        *intervals("heavy-tailed", by["heavy"], "plant_after", targets),
         *intervals("corrected", plants, "plant_after", targets),
         *intervals("corrected, final model alone", plants, "plant_alone", None),
         *intervals("before correction", plants, "plant_before", None),
+        *intervals("named effects", [r for r in usable if r["named"]], "sizes_after", targets, SIZES),
         share("two effects, both found", by["pair"], _both, targets["two_effects"], "least"),
         share(
             "the same where both survive",
@@ -200,18 +221,22 @@ def sheet(rows: Sequence[Row], targets: Mapping[str, Any], seen: float) -> list[
 
 
 def intervals(
-    name: str, rows: Sequence[Row], when: str, targets: Mapping[str, Any] | None
+    name: str,
+    rows: Sequence[Row],
+    when: str,
+    targets: Mapping[str, Any] | None,
+    kinds: Mapping[str, str] = FIGURES,
 ) -> list[dict[str, Any]]:
-    """Lines of the sheet: how often intervals of gains and of the delay hold those of the device; gains of
+    """Lines of the sheet: how often intervals of numbers of these kinds hold those of the device; numbers of
     one campaign count as independent. Without `targets` the shares are reported only."""
     out = []
     for level, key in ((0.5, "intervals_50"), (0.9, "intervals_90")):
         width = float(norm.ppf(0.5 + level / 2))
-        for kind in ("gain", "delay"):
+        for kind, plural in kinds.items():
             values = [z for row in rows for what, z in row[when].items() if what.startswith(kind)]
             out.append(
                 share(
-                    f"{100 * level:.0f} % intervals of the {kind}s, {name}",
+                    f"{100 * level:.0f} % intervals of the {plural}, {name}",
                     values,
                     lambda z, width=width: abs(z) <= width,
                     targets[key] if targets else 0.0,
@@ -241,6 +266,11 @@ def _survival(row: Row) -> float | None:
 def _told(row: Row) -> list[float | None]:
     """Survival of every hidden effect; None for one that changes only the noise."""
     return [one if one is None or one > 0 else 1e-9 for one in row["survival"].values()]
+
+
+def alarming(row: Row) -> bool:
+    """Whether something else is said than that the noise is what it is."""
+    return row["verdict"] not in ("clean", "disturbance") or not set(row["named"]) <= set(row["truth"])
 
 
 def _grouped(row: Row) -> bool:

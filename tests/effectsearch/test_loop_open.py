@@ -15,6 +15,7 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.loop import Loop, loop
 from lcopa_bayes.effectsearch.openeffects import CHANCE, Alternative, _step, mixture, odds, pooled
 from lcopa_bayes.effectsearch.regression import Regression
+from lcopa_bayes.effectsearch.summary import results
 from lcopa_bayes.effectsearch.trace import trace
 from lcopa_bayes.model.effects.commands import OverdrivePulse
 from lcopa_bayes.model.effects.sensor import SensorLag
@@ -76,6 +77,32 @@ def test_what_cannot_be_seen_is_in_the_interval(faint: Loop):
     assert not low < DELAY < high
     assert delay["lower"] < DELAY < delay["upper"]
     assert delay["sd_structure"] > 0.5 * delay["sd_noise"]
+
+
+def test_figures_of_the_step_response_are_over_what_is_open(faint: Loop):
+    """Second roads: the delay by the parameters, the rise of a lag in closed form, the static gain."""
+    told = {one.name: one for one in faint.figures}
+    (k,) = faint.after.state.model.delays
+    low, high = (np.quantile(told["delay[x]"].values, at) for at in (0.05, 0.95))
+    delay = faint.estimate(k)
+    assert [low, high] == pytest.approx([delay["lower"], delay["upper"]], abs=0.15 * delay["sd"])
+    assert told["delay[x]"].weights.size == len(told["delay[x]"].parts) > 1
+    rise, end = told["rise_10_90[x]"], told["value_at_end[x]"]
+    for one, truth in ((rise, 8 * np.log(9)), (end, 2.0)):
+        shown = one.as_json(ess=100.0, grade="reliable", interval="Laplace")
+        assert shown["lower"] < truth < shown["upper"]
+        assert np.hypot(shown["sd_noise"], shown["sd_structure"]) == pytest.approx(shown["sd"], rel=0.05)
+        assert shown["upper"] - shown["lower"] < 0.1 * truth
+    shown = results(faint)["figures"]
+    assert {one["name"] for one in shown} == set(told) - {"delay[x]", "steady_state[x]"}
+    assert all(one["interval"] == "Laplace" and one["grade"] == "tentative" for one in shown)
+
+
+def test_a_number_that_is_open_keeps_its_open_side():
+    values = [np.array([1.0, 2.0, 3.0, np.inf]), np.full(3, np.inf)]
+    both = pooled(values, np.array([0.5, 0.5]))
+    assert not np.isnan(both).any()
+    assert np.mean(np.isinf(both)) == pytest.approx(0.625, abs=0.13)
 
 
 def test_a_mixture_has_the_moments_of_its_parts():

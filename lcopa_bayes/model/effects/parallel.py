@@ -272,8 +272,10 @@ class MissingCrossPath(ParallelEffect):
 
     @classmethod
     def grid(cls, ranges: Ranges) -> tuple[Self, ...]:
-        """From a third of the response time to ten times it."""
-        return tuple(cls(float(time)) for time in np.geomspace(0.3 * ranges.speed, 10 * ranges.speed, 5))
+        """From a third of the response time to ten times it, or half of the longest record."""
+        low, high = 0.3 * ranges.speed, max(10 * ranges.speed, 0.5 * ranges.span)
+        count = 1 + max(4, ceil(np.log(high / low) / np.log(2.5)))
+        return tuple(cls(float(time)) for time in np.geomspace(low, high, count))
 
     def coefficients(self, ranges: Ranges) -> tuple[Coefficient, ...]:
         """k_ij [-] by response axis and drive."""

@@ -1,0 +1,123 @@
+"""The score sheet of the loop: its truths are those of the simulated device in the scales of the loop."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "studies" / "undeclared-effects"))
+
+import campaigns
+import devicetruth
+import scoresheet
+
+from lcopa_bayes.bench.hiddeneffects import Shot
+from lcopa_bayes.bench.undeclared import NAMED
+from lcopa_bayes.model.effects.catalogue import catalogue
+from lcopa_bayes.model.path import TransferPath
+
+SIZE = np.array([0.02, 0.03])
+RATIO = np.array([1.1, 1.1])
+RANGES = SimpleNamespace(response=RATIO * SIZE, column=(RATIO * SIZE)[:, None], axes=2)
+SCENE = SimpleNamespace(ranges=RANGES)
+LEVELS = np.random.default_rng(3).uniform(-1.2, 1.2, (2, 40)) * SIZE[:, None]
+
+
+def both(name: str) -> tuple:
+    """A hidden effect, the device that it is in, and the catalogue's at its sizes in the scales of a loop."""
+    hidden = NAMED[name](np.random.default_rng(5))
+    told = devicetruth.SIZES[name](hidden.numbers, RATIO)
+    kind = catalogue((), None)[name]
+    fields = kind.__dataclass_fields__ if hasattr(kind, "__dataclass_fields__") else {}
+    effect = kind(**{key: told[key] for key in fields if key in told})
+    psi = np.array([value for key, value in told.items() if key not in fields])
+    shot = Shot(0.0, np.ones(2), SIZE, 3.0, np.eye(2), np.random.default_rng(0))
+    return hidden, shot, effect, psi
+
+
+@pytest.mark.parametrize(
+    "name", ["odd_curvature", "even_curvature", "bilinear_crosstalk", "axis_rotation", "centroid_locking"]
+)
+def test_a_reading_is_the_same_at_the_size_in_the_scale_of_the_loop(name: str) -> None:
+    hidden, shot, effect, psi = both(name)
+    read = hidden.seen(LEVELS.T, None, None, shot)
+    np.testing.assert_allclose(effect.seen(LEVELS.T, SCENE, psi), read, rtol=1e-12)
+    assert np.abs(read - LEVELS.T).max() > 1e-3 * SIZE.min()
+
+
+def test_a_limit_is_the_same() -> None:
+    hidden, shot, effect, _ = both("clipping")
+    read = hidden.seen(LEVELS.T, None, None, shot)
+    np.testing.assert_allclose(effect.seen(LEVELS.T, SCENE, np.ones(1)), read, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["cubic_stiffness", "overflow"])
+def test_a_force_is_the_same(name: str) -> None:
+    hidden, shot, effect, psi = both(name)
+    acts = hidden.balance(shot, 0.1)
+    f = 0.5 * LEVELS[:, ::-1]
+    expected = np.stack([acts(f[:, k], LEVELS[:, k], 0 * f[:, k], k) for k in range(f.shape[1])], axis=1)
+    motion = SimpleNamespace(y=LEVELS)
+    np.testing.assert_allclose(effect.force(f, motion, SCENE, psi), expected, rtol=1e-9, atol=1e-15)
+
+
+def test_what_depends_on_the_level_is_as_much_viscosity_of_a_slower_plant() -> None:
+    e, share = 0.3, np.linspace(0.0, 1.0, 7)
+    told = devicetruth.SIZES["level_dependent_speed"]({"e": e}, RATIO)["e"]
+    made = SimpleNamespace(hidden=[SimpleNamespace(name="level_dependent_speed", numbers={"e": e})])
+    found = SimpleNamespace(names=("level_dependent_speed",))
+    path = TransferPath(1.0, 0.0, (1.0,), (1.0,), 1.0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(devicetruth, "ratios", lambda *_: RATIO)
+        factor = devicetruth.as_told(path, found, made).etas[0]
+    np.testing.assert_allclose(
+        factor * (1 + told * (1 - 2 * share / RATIO[0])), 1 + e * (1 - 2 * share), rtol=1e-12
+    )
+
+
+def test_every_named_effect_has_sizes_or_a_reason() -> None:
+    told = set(devicetruth.SIZES) | set(devicetruth.UNSCORED)
+    assert told == set(NAMED)
+    assert not set(devicetruth.SIZES) & set(devicetruth.UNSCORED)
+    for name, sizes in devicetruth.SIZES.items():
+        kind, numbers = catalogue((), None)[name], NAMED[name](np.random.default_rng(0)).numbers
+        fields = set(getattr(kind, "__dataclass_fields__", {}))
+        names = {one.name for one in getattr(kind, "estimated", ())} | {"k_x_2", "k_y_1", "Ts", "Te", "e"}
+        assert set(sizes(numbers, RATIO)) <= fields | names, name
+
+
+def test_the_figures_of_a_lag_are_those_of_the_closed_form() -> None:
+    path = TransferPath(0.6, 2.0, (4.0,), (1.0,), 2.0)  # time constant 2
+    told = devicetruth.step_truth(path, 12.0)
+    assert told["rise_10_90"] == pytest.approx(2.0 * np.log(9), rel=1e-6)
+    assert told["value_at_end"] == pytest.approx(0.3 * -np.expm1(-5.0), rel=1e-6)
+    assert devicetruth.step_truth(path, 6.0)["rise_10_90"] == np.inf
+
+
+def test_the_place_of_a_truth_is_positive_where_values_lie_above_it() -> None:
+    values = np.random.default_rng(0).normal(size=20_000)
+    assert devicetruth.place(values, -1.5) == pytest.approx(1.5, abs=0.05)
+    assert devicetruth.place(np.full(9, np.inf), np.inf) == pytest.approx(0.0)
+
+
+def test_heavy_tailed_noise_keeps_its_size_and_correlation() -> None:
+    rng = np.random.default_rng(2)
+    noise = rng.normal(size=(400_000, 1))
+    noise[1:] = 0.6 * noise[:-1] + 0.8 * noise[1:]
+    heavy = campaigns.HEAVY.noise(noise, rng)
+    assert heavy.std() == pytest.approx(noise.std(), rel=0.03)
+    share = float(np.mean(heavy[1:] * heavy[:-1]) / np.mean(noise[1:] * noise[:-1]))
+    assert share == pytest.approx(np.pi / 4, rel=0.05)  # twice the square of the mean of 1 / chi
+    assert np.mean(np.abs(heavy) > 5 * heavy.std()) > 100 * np.mean(np.abs(noise) > 5 * noise.std())
+
+
+def test_heavy_tails_by_their_name_are_no_alarm() -> None:
+    row = {"verdict": "disturbance", "named": ["outliers"], "truth": ["outliers"]}
+    assert not scoresheet.alarming(row)
+    assert not scoresheet.alarming(row | {"verdict": "clean", "named": []})
+    assert scoresheet.alarming(row | {"named": ["vibration"]})
+    assert scoresheet.alarming(row | {"verdict": "unexplained", "named": []})
