@@ -66,12 +66,14 @@ def alternatives(state: State, rounds: Sequence[Round]) -> tuple[Alternative, ..
 
 
 def mixture(state: State, own: Matrix | None, found: Sequence[Alternative]) -> tuple[list[Matrix], Vector]:
-    """Draws of the final model, from `own` where there are any, and of each alternative, inside the support
-    of the coordinates; and their weights, which add up to 1."""
+    """Draws of the final model, `own` or else normal ones about its optimum, and of each alternative, inside
+    the support of the coordinates; and their weights, which add up to 1."""
     rng = np.random.default_rng(_SEED)
     x, (low, high) = state.optimum.x, state.model.bounds
     if own is None:
-        own = x + rng.standard_normal((_DRAWS, x.size)) @ root_of(state.covariance).T
+        drawn = x + rng.standard_normal((_DRAWS, x.size)) @ root_of(state.covariance).T
+        inside = ((drawn >= low) & (drawn <= high)).all(axis=1)
+        own = drawn[inside] if inside.any() else x[None]
     parts, weights = [own], [1.0]
     for one in found:
         drawn = one.draws(own[rng.integers(len(own), size=_DRAWS)], x, rng)

@@ -103,7 +103,7 @@ def test_units_do_not_matter(scale, shift, seed):
 
 @pytest.mark.parametrize("log_scale", [False, True])
 def test_draws_that_rounding_tells_apart_have_one_mode(rng, log_scale):
-    """As those of an ensemble that has not moved: a histogram has more cells than numbers lie between them."""
+    """As of an ensemble that has not moved: a histogram has more cells than numbers lie between them."""
     values = 3.7 + np.spacing(3.7) * rng.integers(0, 40, SHAPE)
     assert modes_of("gain", "-", values, log_scale=log_scale).boundaries == ()
 
