@@ -148,9 +148,9 @@ class ForwardModel:
     def unit_responses(self, dynamics: Dynamics, known: StepResponses | None = None) -> list[Array]:
         """Deviation from rest per unit gain, for each experiment (units, batch, samples) [drive unit].
 
-        The response of axis i is ``offset_i + sum_j gain_ij (rest_j + unit_ij)``. Second order in the
-        block width; see `model.stepresponse`. `known` are step responses of these very dynamics, a
-        batch of one, under other commands; those that lack are added.
+        The response of axis i is ``offset_i + sum_j gain_ij (rest_j + unit_ij)``. Accuracy:
+        `model.stepresponse`. `known` are step responses of these very dynamics, a batch of one, under other
+        commands; those that lack are added.
         """
         shapes = [(len(self.layout.units), dynamics.batch, e.mesh.reading.samples) for e in self.experiments]
         out = [np.zeros(shape) for shape in shapes]

@@ -5,8 +5,7 @@
 One drive and one response of one viscous term, sampled at 10 kHz; the drive changes every 500 ms, so that 1e6
 samples are 100 s with 200 changes. Every measurement runs in a process of its own, on one thread, and its
 memory is the most that this process ever held. A fit takes all samples up to 20 000 of them, else means of
-so many that as many are left (`data.averaging`), on two blocks each; what these lose is measured against the
-likelihood of all.
+so many that as many are left (`data.averaging`); what these lose is measured against the likelihood of all.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -96,8 +94,6 @@ def fitted(samples: int, quick: bool) -> dict[str, Any]:
         out["losses"] = [str(one) for one in averaging_losses(whole, (count, 2 * count))]
         out["loss_s"], out["loss_MB"] = time.process_time() - begin, peak()
         whole = averaged(whole, count)
-        # a long record knows its plant so well that blocks of a mean each would move it
-        whole = replace(whole, model=replace(whole.model, blocks=2 * samples // count))
     begin = time.process_time()
     fit = lb.fit(whole, quick=quick)
     return out | {

@@ -90,14 +90,14 @@ def test_references_without_delay(etas, orders, exact):
     places = [t - 1 for t in exact]
     errors = [
         np.abs(respond(element, 0.0, UNIT_STEP, times, blocks=blocks)[places] - [*exact.values()]).max()
-        for blocks in (500, 1000, 2000, 4000)
+        for blocks in (250, 500, 1000)
     ]
-    assert errors[-1] < 1e-5
-    assert 1.9 < order_of(errors) < 2.1
+    assert errors[-1] < 2e-8
+    assert 3.4 < order_of(errors) < 4.3
 
 
 @pytest.mark.parametrize("element", [((2.0,), (1.0,)), KELVIN, ((2.0,), (0.5,))])
-def test_step_responses_are_second_order(element):
+def test_step_responses_are_third_to_fourth_order(element):
     times = np.arange(1.0, 26.0)
     if element[1] == (1.0,):
         exact = 1 - np.exp(-times / element[0][0])
@@ -105,24 +105,24 @@ def test_step_responses_are_second_order(element):
         exact = on_bench(element, 0.0, step(1.0), times)
     errors = [
         np.abs(respond(element, 0.0, UNIT_STEP, times, blocks=blocks) - exact).max()
-        for blocks in (250, 500, 1000, 2000)
+        for blocks in (250, 500, 1000)
     ]
-    assert errors[0] < 7e-5
-    assert 1.9 < order_of(errors) < 2.1
+    assert errors[0] < 7e-6
+    assert (2.2 if element[1] == (0.5,) else 3.6) < order_of(errors) < 4.2
 
 
-def test_a_delay_off_the_grid_is_second_order_too():
+def test_a_delay_off_the_grid_costs_no_accuracy():
     """Rounding it to blocks would leave first order."""
     times = 0.125 * np.arange(16, 200)  # well after the onset
     delays = np.random.default_rng(0).uniform(0, 1, 8)
     exact = np.array([on_bench(KELVIN, delay, step(1.0), times) for delay in delays])
     widths, errors = [], []
-    for blocks in (400, 800, 1600, 3200):
+    for blocks in (250, 500, 1000):
         widths.append(single(UNIT_STEP, times, 2, blocks=blocks).experiments[0].mesh.grid.step)
         read = [respond(KELVIN, delay, UNIT_STEP, times, blocks=blocks) for delay in delays]
         errors.append(float(np.sqrt(np.mean(np.square(read - exact)))))
     slope = np.polyfit(np.log(widths), np.log(errors), 1)[0]
-    assert 1.8 < slope < 2.2
+    assert 2.8 < slope < 4.2
 
 
 # Two roads: the bench inverts Laplace transforms and shares no code with the operational algebra
@@ -177,10 +177,10 @@ def test_exposure_agrees_with_the_bench(exposure):
     exact = on_bench(KELVIN, 2.2, command, times, exposure)
     errors = [
         np.abs(respond(KELVIN, 2.2, drive_of(command), times, blocks=blocks, exposure=exposure) - exact).max()
-        for blocks in (250, 500, 1000, 2000, 4000)
+        for blocks in (250, 500, 1000)
     ]
-    assert errors[0] < 5e-5
-    assert 1.6 < order_of(errors[2:]) < 2.4
+    assert errors[0] < 2e-5
+    assert errors[2] < max(errors[0] / 30, 2e-8)
 
 
 def test_irregular_samples_agree_with_the_bench(rng):
@@ -188,9 +188,9 @@ def test_irregular_samples_agree_with_the_bench(rng):
     exact = on_bench(KELVIN, 0.0, step(1.0), times)
     errors = [
         np.abs(respond(KELVIN, 0.0, UNIT_STEP, times, blocks=blocks) - exact).max()
-        for blocks in (200, 400, 800, 1600)
+        for blocks in (200, 400, 800)
     ]
-    assert 1.8 < order_of(errors) < 2.2
+    assert 3.0 < order_of(errors) < 4.5
 
 
 def test_a_single_sample_and_very_many_agree_with_the_bench():
