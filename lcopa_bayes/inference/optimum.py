@@ -45,6 +45,10 @@ _SHORTER, _LEAST_FIRST = 0.25, 0.1
 _SECTION, _WITHIN = (15, 1e-4), 10.0
 """Limits of a descent at a held order, as of `_DESCENT`, and log density below the best that ends them [nat].
 """
+_CONSTANT, _BARELY = 0.1, 0.02
+"""Order below which a term is nearly a constant, and that of one which is to become one [-]."""
+_BESIDE = (0.9, 0.3)
+"""Order and time of a constant that is to become a term, over those of the term before [-]."""
 _HARDLY = 1e-2
 """Size of a coefficient that cannot be negative where it should vanish [prior scale]."""
 
@@ -91,7 +95,9 @@ def find_optima(
     begun = _distinct(posterior, drawn[np.argsort(-likelihood[:own], kind="stable")], starts)
     if len(near):
         begun.append(drawn[own + int(likelihood[own:].argmax())])
-    return _kept(posterior, _descended(posterior, begun, crew=crew))
+    found = _kept(posterior, _descended(posterior, begun, crew=crew))
+    further = _with_spare_terms(posterior, found[0].values) if found else []
+    return _kept(posterior, [*found, *_descended(posterior, further, crew=crew)]) if further else found
 
 
 def again(
@@ -139,6 +145,37 @@ def _held_at(
     reached = held.solve(start, evaluations=_SECTION[0], enough=_SECTION[1])[0]
     there = posterior.table.canonical(problem.with_noise(reached)[None])[0]
     return _describe(posterior, problem, there, problem.residual(problem.coordinates(there), there)[1])
+
+
+def _with_spare_terms(posterior: Posterior, best: Vector) -> list[Vector]:
+    """Starts in the mode beside that of `best`, (rows,), which a term more than records need makes.
+
+    Of order 0 the last term of an element is a constant: it doubles the gains and stretches the times of the
+    terms before it. Where it is one already, it becomes a term beside the one before.
+    """
+    table, out = posterior.table, list[Vector]()
+    for times, orders in table.terms:
+        last = orders[-1]
+        low, high = table.rows[last].sampled_domain
+        if len(orders) < 2 or table.rows[last].prior is None or not low < _CONSTANT < high:
+            continue
+        if best[last] < _CONSTANT:
+            starts = [best.copy()]
+            starts[0][last] = _BESIDE[0] * best[orders[-2]]
+            starts[0][times[-1]] = _BESIDE[1] * best[times[-2]]
+        else:  # the last term, or the fastest, which slower ones outlive
+            starts = []
+            for omitted in {len(orders) - 1, int(np.argmin(best[times]))}:
+                kept = [k for k in range(len(orders)) if k != omitted]
+                values = best.copy()
+                values[orders[:-1]], values[times[:-1]] = best[orders][kept], best[times][kept]
+                values[last], values[times[-1]] = low + _BARELY, best[times[omitted]]
+                starts.append(values)
+        inside = [
+            np.isfinite(posterior.log_density(posterior.coordinates(one[None]))).all() for one in starts
+        ]
+        out += [one for one, possible in zip(starts, inside, strict=True) if possible]
+    return out
 
 
 def _near(posterior: Posterior, starts: Sequence[Vector]) -> list[Vector]:

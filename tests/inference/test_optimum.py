@@ -248,3 +248,17 @@ def test_along_an_order_everything_else_is_at_its_optimum():
             shifts = np.zeros((2, z.shape[1]))
             shifts[:, position] = size, -size
             assert posterior.log_density(z + shifts).max() < one.log_density + 0.2
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_term_that_is_a_constant_and_one_that_is_not_are_both_found_from_a_single_start(seed):
+    """Of a one-term plant two terms fit nearly as well in either mode, gains apart by a factor of about 2."""
+    posterior = made(record(noise_sd=0.01, camera=0.1), terms=2)
+    last, gain = posterior.table.at("order", 0, 1), posterior.table.at("gain", 0)
+    optima = find_optima(posterior, np.random.default_rng(seed), starts=1)
+    near = [one.values for one in optima if one.log_density > optima[0].log_density - 5.0]
+    constant = [values for values in near if values[last] < 0.1]
+    other = [values for values in near if values[last] > 0.3]
+    assert constant
+    assert other
+    assert constant[0][gain] > 1.5 * other[0][gain]
