@@ -35,7 +35,7 @@ _NOTHING = 0.02
 FACTORS = (2, 4)
 """How many times narrower the blocks are on which shifts are measured."""
 _REST = 16 / 15
-"""Shift to blocks without width over that to blocks four times narrower, at second order."""
+"""Shift to blocks without width over that to blocks four times narrower, at second order; less at higher."""
 FINEST = 16
 """Most by which blocks are narrowed [-]."""
 _MOST_CELLS = 1 << 15
