@@ -86,12 +86,14 @@ def test_a_search_keeps_a_damping_term_faster_than_the_samples_resolve():
 
 
 def test_a_cubic_spring_is_named_beside_a_drive_that_was_sampled():
-    """The delay cannot fall below 0: half a period less of it does not take the place of the drive's."""
+    """The delay cannot fall below 0: half a period less of it does not take the place of the drive's. What
+    remains is above the noise, so that not all may be explained."""
     names = ("sampled_drive", "cubic_stiffness", "unmodelled_linear")
     library = [catalogue()[name] for name in names]
     found = loop(study_of(1), library=library, sample=False, quick=True, as_stated=True)
     assert {effect.name for effect in found.effects} == {"sampled_drive", "cubic_stiffness"}
-    assert found.verdict.kind == "explained"
+    assert found.verdict.kind in ("explained", "partly explained")
+    assert found.after.fit[0].rmse > 1.5 * NOISE
     refit = found.rounds[0].chosen
     assert refit.added == ("sampled_drive",)
     assert refit.optimum.x[refit.model.names.index("delay")] < 0.01 * PERIOD
