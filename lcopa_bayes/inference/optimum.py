@@ -96,7 +96,7 @@ def find_optima(
     if len(near):
         begun.append(drawn[own + int(likelihood[own:].argmax())])
     found = _kept(posterior, _descended(posterior, begun, crew=crew))
-    further = _with_spare_terms(posterior, found[0].values) if found else []
+    further = _with_spare_terms(posterior, found) if found else []
     return _kept(posterior, [*found, *_descended(posterior, further, crew=crew)]) if further else found
 
 
@@ -147,15 +147,21 @@ def _held_at(
     return _describe(posterior, problem, there, problem.residual(problem.coordinates(there), there)[1])
 
 
-def _with_spare_terms(posterior: Posterior, best: Vector) -> list[Vector]:
-    """Starts in the mode beside that of `best`, (rows,), which a term more than records need makes.
+def _with_spare_terms(posterior: Posterior, found: Sequence[Optimum]) -> list[Vector]:
+    """Starts in the mode beside that of the best, which a term more than records need makes, unless one of
+    those `found` is in it.
 
     Of order 0 the last term of an element is a constant: it doubles the gains and stretches the times of the
     terms before it. Where it is one already, it becomes a term beside the one before.
     """
-    table, out = posterior.table, list[Vector]()
+    table, out, best = posterior.table, list[Vector](), found[0].values
+    level = found[0].log_density - _WEIGHTLESS
+    near = np.array([one.values for one in found if one.log_density > level])
     for times, orders in table.terms:
         last = orders[-1]
+        constant = near[:, last] < _CONSTANT
+        if constant.any() and not constant.all():
+            continue
         low, high = table.rows[last].sampled_domain
         if len(orders) < 2 or table.rows[last].prior is None or not low < _CONSTANT < high:
             continue
