@@ -73,8 +73,11 @@ def missed(study: Study, fit: Sequence[Score], scores: Sequence[Score], state: S
         chosen = min(judged, key=lambda one: one.p, default=None)
         return chosen and replace(chosen, p=min(1.0, chosen.p * len(judged)))
 
-    inside, beyond = least(beyond=False), least(beyond=True)
-    if beyond is None or (inside is not None and inside.significant):
+    inside = least(beyond=False)
+    if inside is not None and inside.significant:
+        return inside
+    beyond = least(beyond=True)
+    if beyond is None:
         return inside
     beyond = replace(beyond, p=min(1.0, 2 * beyond.p))
     within = inside is None or not inside.far
@@ -91,6 +94,9 @@ def _missed(
     *,
     beyond: bool,
 ) -> Miss | None:
+    masks = [(one.time >= _left(study, one.record)) == beyond for one in scores]
+    if not any(mask.any() for mask in masks):
+        return None
     name = study.response_axes[axis].name
     sd, noise = max(pooled_rmse(fit, name), scores[0].noise_sd), _Residual.of(state, axis)
     # samples that are weighted alike count by the power of their noise; means of it scatter more
@@ -98,8 +104,7 @@ def _missed(
     followed = np.concatenate([one.variance for one in fit if one.axis == name]).mean()  # noise, by the fit
     full = float(np.hypot(sd, slow * np.sqrt(followed)))
     seen, chance, count = np.zeros(2), np.zeros((2, 1, 1)), 0
-    for one in scores:
-        counted = (one.time >= _left(study, one.record)) == beyond
+    for one, counted in zip(scores, masks, strict=True):
         if not counted.any():
             continue
         assert one.draws is not None
@@ -108,8 +113,6 @@ def _missed(
         half = one.half_width[counted]
         seen, chance = seen + _error_and_misses(error, half), chance + _error_and_misses(drawn + draws, half)
         count += error.size
-    if not count:
-        return None
     shares = [
         (1 + np.count_nonzero(each >= one)) / (1 + each.size) for one, each in zip(seen, chance, strict=True)
     ]

@@ -15,7 +15,7 @@ from typing import Any, final
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of, root_of
 from lcopa_bayes.core.estimate import Estimate, plain, quantile
 from lcopa_bayes.effectsearch.rounds import Round
@@ -70,15 +70,19 @@ def mixture(state: State, own: Matrix | None, found: Sequence[Alternative]) -> t
     the support of the coordinates; and their weights, which add up to 1."""
     rng = np.random.default_rng(_SEED)
     x, (low, high) = state.optimum.x, state.model.bounds
+
+    def within(drawn: Matrix) -> Flags:
+        k = drawn.shape[1]  # an alternative in place of the last effect has fewer coordinates
+        return np.asarray(((drawn >= low[:k]) & (drawn <= high[:k])).all(axis=1))
+
     if own is None:
         drawn = x + rng.standard_normal((_DRAWS, x.size)) @ root_of(state.covariance).T
-        inside = ((drawn >= low) & (drawn <= high)).all(axis=1)
+        inside = within(drawn)
         own = drawn[inside] if inside.any() else x[None]
     parts, weights = [own], [1.0]
     for one in found:
         drawn = one.draws(own[rng.integers(len(own), size=_DRAWS)], x, rng)
-        k = one.shift.size
-        inside = ((drawn >= low[:k]) & (drawn <= high[:k])).all(axis=1)
+        inside = within(drawn)
         if inside.any():
             parts.append(drawn[inside])
             weights.append(one.weight * float(inside.mean()))

@@ -84,8 +84,7 @@ def outlying(study: Study, fit: BaseFit) -> Outlying | None:
     for axis in range(len(samples[0].axes)):
         own = parts(samples, axis)
         apart = [_apart(residual[part.rows]) for part in own]
-        core = float(np.median(np.abs(np.concatenate(apart)))) / _NORMAL
-        core = max(core, _step([part.samples.record.response[:, axis] for part in own]) / np.sqrt(12))
+        core = _core(apart, [part.samples.record.response[:, axis] for part in own])
         for part, distance in zip(own, apart, strict=True):
             flags = np.abs(distance) > _FAR * core
             rest = quiet_samples(part.samples, axis, delay)
@@ -118,8 +117,8 @@ def without_outliers(
 
 
 def _near(one: Score) -> Flags:
-    distance = np.abs(_apart(one.observed - one.predicted))
-    return np.asarray(distance <= _FAR * np.median(distance) / _NORMAL)
+    distance = _apart(one.observed - one.predicted)
+    return np.asarray(np.abs(distance) <= _FAR * _core([distance], [one.observed]))
 
 
 def _only(one: Score, near: Flags) -> Score:
@@ -132,6 +131,13 @@ def _apart(residual: Vector) -> Vector:
     padded = np.pad(residual, _BESIDE, mode="reflect" if residual.size > _BESIDE else "edge")
     around = sliding_window_view(padded, 2 * _BESIDE + 1)
     return np.asarray(residual - np.median(np.delete(around, _BESIDE, axis=1), axis=1))
+
+
+def _core(apart: Sequence[Vector], responses: Sequence[Vector]) -> float:
+    """Noise by the distances of samples from their neighbours, at least what the steps of the sensor leave
+    [response unit]."""
+    spread = float(np.median(np.abs(np.concatenate(apart)))) / _NORMAL
+    return max(spread, _step(responses) / float(np.sqrt(12)))
 
 
 def _step(responses: Sequence[Vector]) -> float:

@@ -120,3 +120,14 @@ def test_two_models_are_compared_on_the_same_samples():
     assert not {50.0, 120.0} & set(was.time)
     assert was.draws.shape == (3, was.time.size)
     assert was.time.size > 180
+
+
+def test_scores_of_a_coarse_sensor_keep_their_samples():
+    """Nine samples in ten repeat the one before; the tenth is a step of the sensor away."""
+    rng = np.random.default_rng(3)
+    observed = 0.3 * np.round(np.linspace(0.0, 6.0, 200) + (rng.random(200) < 0.1))
+    predicted = 0.3 * np.round(np.linspace(0.0, 6.0, 200))
+    t, nothing = np.arange(200.0), np.zeros(200)
+    score = Score("a", "y", "V", True, t, observed, predicted, nothing, 0.1, "the fit")
+    (was,), _ = without_outliers([score], [score])
+    assert was.time.size == 200
