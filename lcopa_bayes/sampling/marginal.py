@@ -76,9 +76,10 @@ _LEARNED = 0.15
 """Share of the last of these in proposals whose draws count: wider than they are [-]."""
 _LOST = 0.03
 """Effective draws per draw below which a few are of a region that proposals did not cover [-]."""
-_MOST, _MOST_DRAWN, _JUDGED = 4, 80.0, 10.0
+_MOST, _MOST_DRAWN, _JUDGED = 4, 80.0, 25.0
 """Most draws of a round over the least, of all that count over the effective draws wanted, and so many of
-these that they show whether the most would be enough [-]."""
+those since draws last counted anew that they show whether the most would be enough: with fewer, draws are
+often few of what a proposal has yet to learn [-]."""
 _VISITED = 6_000
 """Most points that a first proposal is learned from."""
 _WALKING, _BEGINNING, _TEACHING = 3, 200.0, 3_000
@@ -235,7 +236,7 @@ class Search:
         these are too many."""
         halves, since, worth, rate = [seen, seen], len(seen.counts), 0.0, expected
         self._bar.set_description("drawing from the posterior")
-        drawn = 0
+        drawn = begun = 0
         while drawn < _MOST_DRAWN * wanted:
             proposals: list[Proposal] = [
                 Blend(self._by_groups(other, first, settled=True), learned, _LEARNED)
@@ -252,10 +253,11 @@ class Search:
             if worth >= wanted and weighted.pareto_k <= usable_k(weighted.count):
                 if not self._misses(proposals[0], weighted, self._walked(), halves[0]):
                     return weighted
-                since, worth = len(halves[0].counts), 0.0
+                since, worth, begun = len(halves[0].counts), 0.0, drawn
             elif weighted.ess < _LOST * weighted.count:
-                since, worth = len(halves[0].counts), 0.0  # a region met for the first time is learned
-            if drawn > _JUDGED * wanted and worth * _MOST_DRAWN < drawn:
+                # a region met for the first time is learned
+                since, worth, begun = len(halves[0].counts), 0.0, drawn
+            elif drawn - begun > _JUDGED * wanted and worth * _MOST_DRAWN < drawn - begun:
                 break
             if self._late(_LEARNING):
                 self.unfinished = True

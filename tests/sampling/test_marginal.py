@@ -259,6 +259,19 @@ def test_a_search_gives_up_where_no_proposal_comes_near(monkeypatch):
     assert search_of(spikes, 1)._improved(first, np.empty((0, 2)), 500) is None
 
 
+def test_a_region_met_after_many_draws_is_learned():
+    """Draws that follow count anew, however many were drawn before."""
+    first = whole(Mixture(np.ones(1), np.array([[0.0, 1.0]]), 4.0 * np.eye(2)[None]))
+    search, answers = search_of(valley, 4), [True, False]
+    search._misses = lambda *_: answers.pop(0)
+    weighted = search._improved(first, np.empty((0, 2)), 25)
+    assert not answers
+    assert weighted is not None
+    drawn = sum(len(point.y) for point in search._points)
+    assert weighted.count <= drawn - 2 * marginal._LEARNING
+    assert abs(weighted.log_evidence) < 4 * weighted.log_evidence_sd
+
+
 def normal(mean: float, sd: float) -> Mixture:
     """One component of two dimensions."""
     return Mixture(np.ones(1), np.full((1, 2), mean), sd * np.eye(2)[None])
