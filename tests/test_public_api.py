@@ -316,8 +316,10 @@ def test_verbs_in_one_folder_keep_their_own_provenance(folder, tmp_path, capsys)
     lb.load_result(folder).save(run)
     draws = (run / "posterior.nc").read_bytes()
     assert main(["audit", str(run), "--quiet"]) == 0
+    drawn = (run / "report.html").stat().st_mtime_ns
     assert main(["loop", str(run), "--quick", "--as-stated", "--quiet"]) == 0
     assert (run / "posterior.nc").read_bytes() == draws  # not fitted again
+    assert (run / "report.html").stat().st_mtime_ns == drawn  # nor drawn again
     origins = json.loads((run / "provenance.json").read_text())
     assert list(origins) == ["fit", "audit", "loop"]
     assert origins["audit"]["command"] == ["lcopa-bayes", "audit", str(run), "--quiet"]
@@ -335,6 +337,7 @@ def test_verbs_in_one_folder_keep_their_own_provenance(folder, tmp_path, capsys)
     # of another fit than the one beside it
     other = lb.fit(small().with_seed(6))
     other.save(run)
+    assert not (run / "report.html").exists()
     with pytest.raises(lb.InputError, match="rests on another fit"):
         lb.load_result(run, "audit")
     # cut short, and published without its draws

@@ -264,34 +264,11 @@ class Landscape:
 
     def _noise(self, values: Vector, held: int | None) -> Vector:
         """The noise parameters that maximise the likelihood of the residual of `values`."""
-        posterior, table, out = self.posterior, self.posterior.table, values.copy()
-        canonical = table.canonical(values[None])
-        units = posterior.responses(canonical)
-        for axis in range(len(table.layout.responses)):
-            rows = [table.at(name, axis) for name in posterior.noise.names]
-            moving = [k for k in rows if table.rows[k].free and k != held]
-            if not moving:
-                continue
-            left = [
-                (
-                    posterior.residual(axis, r, samples.axes[axis], canonical, units[r]),
-                    samples.axes[axis].gaps,
-                )
-                for r, samples in enumerate(posterior.samples)
-            ]
-
-            def cost(x: Vector, rows: list[int] = rows, moving: list[int] = moving, left=left) -> float:  # type: ignore[no-untyped-def]
-                at = out.copy()
-                for k, coordinate in zip(moving, x, strict=True):
-                    at[k] = self.value(k, coordinate)
-                densities = [posterior.noise.pointwise(part, at[None, rows], gaps) for part, gaps in left]
-                return -float(sum(density.sum() for density in densities))
-
-            ends = [self.search(k) for k in moving]
-            start = [
-                float(np.clip(self.coordinate(k, out[k]), *e)) for k, e in zip(moving, ends, strict=True)
-            ]
-            optimum = minimize(cost, start, method="L-BFGS-B", bounds=ends, options={"ftol": 1e-12})
-            for k, coordinate in zip(moving, optimum.x, strict=True):
-                out[k] = self.value(k, float(coordinate))
+        table, out = self.posterior.table, values.copy()
+        for axis, fit in enumerate(self.least.noise_fits(table.canonical(values[None])[0])):
+            where = [table.at(name, axis) for name in self.posterior.noise.names]
+            moving = [k for k in fit.free if where[k] != held]
+            if moving:
+                low, high = np.array([self.search(where[k]) for k in moving]).T
+                out[where] = fit.likeliest(out[where], moving, (low, high))
         return out

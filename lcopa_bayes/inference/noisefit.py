@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import final
@@ -61,24 +61,30 @@ class NoiseFit:
             high.append(at[1] - edge)
         return np.array(low), np.array(high)
 
-    def values(self, x: Matrix, template: Vector) -> Matrix:
-        """Noise parameters at coordinates, (batch, names), fixed ones from `template`."""
+    def values(self, x: Matrix, template: Vector, moving: Sequence[int] | None = None) -> Matrix:
+        """Noise parameters at coordinates of those that move, by default all free ones, (batch, names); the
+        others from `template`."""
         out = np.tile(template, (len(x), 1))
-        for column, k in enumerate(self.free):
+        for column, k in enumerate(self.free if moving is None else moving):
             out[:, k] = self.rows[k].value_at(x[:, column])
         return out
 
-    def log_density(self, x: Matrix, template: Vector) -> Vector:
-        """Log density of the coordinates up to a constant, (batch,)."""
-        values = self.values(x, template)
-        total = np.zeros(len(x))
+    def log_likelihood(self, values: Matrix) -> Vector:
+        """Log likelihood of noise parameters (batch, names) up to a constant, (batch,)."""
+        total = np.zeros(len(values))
         for residual, gaps in zip(self.residuals, self.gaps, strict=True):
-            seen = np.broadcast_to(residual, (len(x), residual.size))
+            seen = np.broadcast_to(residual, (len(values), residual.size))
             if isinstance(self.noise, GaussianNoise):
                 squares, scales = self.noise.products(seen[:, None], values, gaps)
                 total -= 0.5 * squares[:, 0, 0] + scales
             else:
                 total += self.noise.pointwise(seen, values, gaps).sum(axis=1)
+        return total
+
+    def log_density(self, x: Matrix, template: Vector) -> Vector:
+        """Log density of the coordinates up to a constant, (batch,)."""
+        values = self.values(x, template)
+        total = self.log_likelihood(values)
         for column, k in enumerate(self.free):
             row, at = self.rows[k], x[:, column]
             total += row.log_prior(values[:, k])
@@ -95,18 +101,22 @@ class NoiseFit:
             return template
         sd = float(np.sqrt(power / sum(residual.size for residual in self.residuals)))
         optima = [
-            minimize(
-                self._cost,
-                self._start(estimates),
-                args=(template,),
-                jac=True,
-                method="L-BFGS-B",
-                bounds=list(zip(*self.ends, strict=True)),
-            )
+            _highest(lambda x: self.log_density(x, template), self._start(estimates), self.ends)
             for estimates in (self.noise.estimate(self.residuals), self.noise.nearly_white(sd))
         ]
-        x = min(optima, key=lambda one: float(one.fun)).x
+        x = max(optima, key=lambda one: one[1])[0]
         return np.asarray(self.values(x[None], template)[0])
+
+    def likeliest(self, template: Vector, moving: Sequence[int], ends: tuple[Vector, Vector]) -> Vector:
+        """Noise parameters at the maximum of the likelihood that `template` leads to, (names,).
+
+        Those that are `moving` change, between the `ends` of their coordinates (moving,).
+        """
+        start = np.array([self.rows[k].coordinate(template[k]) for k in moving])
+        x, _ = _highest(
+            lambda x: self.log_likelihood(self.values(x, template, moving)), np.clip(start, *ends), ends
+        )
+        return np.asarray(self.values(x[None], template, moving)[0])
 
     def covariance(self, values: Vector) -> Matrix:
         """Inverse curvature of the log density at values (names,) in the coordinates of the free parameters;
@@ -135,12 +145,20 @@ class NoiseFit:
             out.append(float(np.clip(at, *ends)))
         return np.array(out)
 
-    def _cost(self, x: Vector, template: Vector) -> tuple[float, Vector]:
-        """Negative log density and its gradient by central differences."""
-        shift = _SHIFT * np.eye(len(x))
-        low, high = self.ends
+
+def _highest(
+    density: Callable[[Matrix], Vector], start: Vector, ends: tuple[Vector, Vector]
+) -> tuple[Vector, float]:
+    """Where a log density of coordinates (batch, size) is highest between `ends`, and its value there."""
+    low, high = ends
+    shift = _SHIFT * np.eye(start.size)
+
+    def cost(x: Vector) -> tuple[float, Vector]:
         points = np.concatenate([x[None], np.minimum(x + shift, high), np.maximum(x - shift, low)])
-        at = self.log_density(points, template)
+        at = -density(points)
         plus, minus = np.split(points[1:], 2)
-        width = np.diagonal(plus - minus)
-        return -float(at[0]), -(at[1 : len(x) + 1] - at[len(x) + 1 :]) / width
+        return float(at[0]), (at[1 : x.size + 1] - at[x.size + 1 :]) / np.diagonal(plus - minus)
+
+    bounds = list(zip(low, high, strict=True))
+    optimum = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds)
+    return optimum.x, -float(optimum.fun)

@@ -16,6 +16,9 @@ from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.parallel import meanwhile
 from lcopa_bayes.results.runfolder import locked
 
+PAGE = "report.html"
+"""Page of a fit in its run folder."""
+
 
 class Result(ABC):
     """What a public function returns.

@@ -12,7 +12,7 @@ from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import read_json, save_json, writable_folder, write_text
 from lcopa_bayes.results.datatree import POSTERIOR
 from lcopa_bayes.results.predictive import Predictive
-from lcopa_bayes.results.result import Result
+from lcopa_bayes.results.result import PAGE, Result
 from lcopa_bayes.results.runfolder import add_origin, opened, origins, provenance
 from lcopa_bayes.results.savedfit import NAME, load_fit
 
@@ -71,10 +71,10 @@ class StoredResult(Result):
         return self
 
     def report(self, folder: Path | str, *, jobs: int = 1) -> Path:
-        """Write the page of the result, and that of the fit it rests on, into a run folder, saving both there
-        first where they are not there yet, figures in `jobs` processes; returns the path of the page.
-        InputError as `save`."""
-        if self.fit is not None:
+        """Write the page of the result into a run folder, and that of the fit it rests on where it is not
+        there yet, saving both there first where they are not, in a process of its own where `jobs` allows
+        one; returns the path of the page. InputError as `save`."""
+        if self.fit is not None and not ((Path(folder) / PAGE).is_file() and self.fit.is_in(Path(folder))):
             self.fit.report(folder, jobs=jobs)
         return super().report(folder, jobs=jobs)
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy import linalg, signal, stats
+from scipy.optimize import minimize
 from small import problem, record
 
 from lcopa_bayes.bench.command import step
@@ -204,6 +205,30 @@ def test_fixed_noise_stays_and_an_empty_residual_changes_nothing():
     assert best[1] == pytest.approx(0.4, rel=0.15)
     still = NoiseFit(fit.noise, fit.rows, [np.zeros(20)], [np.ones(20)])
     assert_allclose(still.best(np.array([0.3, 0.1, 0.9])), (0.3, 0.1, 0.9))
+
+
+@pytest.mark.parametrize("noise", ["ar1", "white+ar1"])
+def test_the_likeliest_noise_is_that_of_a_search_without_slopes(noise):
+    """The prior counts for nothing, and what is held stays."""
+    values = {"ar1": (0.5, 0.8), "white+ar1": (0.3, 0.4, 0.9)}[noise]
+    narrow = Prior("lognorm", {"s": 0.01, "scale": 2.0})
+    rows = dict.fromkeys(("sigma", "sigma_ar"), narrow) | {"rho": FLAT}
+    fit = fit_of(noise, *values, n=600, **rows)
+    moving, start = fit.free[1:], np.array(values)
+    ends = np.full(len(moving), -6.0), np.full(len(moving), 6.0)
+    best = fit.likeliest(start, moving, ends)
+    assert best[0] == values[0]
+
+    def cost(x):
+        at = fit.values(x[None], start, moving)
+        pairs = zip(fit.residuals, fit.gaps, strict=True)
+        return -sum(fit.noise.pointwise(part[None], at, gaps).sum() for part, gaps in pairs)
+
+    x = [fit.rows[k].coordinate(start[k]) for k in moving]
+    other = minimize(cost, x, method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-9}).x
+    assert_allclose([fit.rows[k].coordinate(best[k]) for k in moving], other, atol=2e-4)
+    still = fit.likeliest(start, moving, (np.array(x) - 0.01, np.array(x) + 0.01))
+    assert (np.abs([fit.rows[k].coordinate(still[k]) for k in moving] - np.array(x)) <= 0.01 + 1e-12).all()
 
 
 @pytest.mark.parametrize("noise", NOISES)
