@@ -31,7 +31,8 @@ _ROUNDS = 12
 _NUDGE, _LEVEL = 1e-4, 0.03
 """Step of a difference and slope at which a maximum is reached, per standard deviation [-], [nat]."""
 _GAINED = 1e-3
-"""Rounds between plant and noise end when the log likelihood gains less [nat]."""
+"""Rounds between plant and noise end when the noise, or a round, gains less: the plant that was fitted before
+fits it still [nat]."""
 
 
 @final
@@ -123,11 +124,11 @@ class Landscape:
         noise_moves = any(k not in self.least.columns and k != held for k in self.free)
         values, best = start, -np.inf
         for _ in range(_ROUNDS if noise_moves else 1):
-            values = self._plant(values, held, most)
+            both = [self._plant(values, held, most)]
             if noise_moves:
-                values = self._noise(values, held)
-            reached = float(self.log_likelihood(self.posterior.table.canonical(values[None]))[0])
-            gained, best = reached - best, max(best, reached)
+                both.append(self._noise(both[0], held))
+            values, levels = both[-1], self.log_likelihood(self.posterior.table.canonical(np.array(both)))
+            gained, best = min(levels[-1] - best, levels[-1] - levels[0]), max(best, float(levels[-1]))
             if gained < _GAINED:
                 break
         return Peak(values, best)
