@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Sequence
+from array import array
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
-from typing import NoReturn, final
+from typing import Any, NoReturn, TypeAlias, final
 
+import numpy as np
 import pandas as pd
 
 from lcopa_bayes.core.errors import InputError, nearest
@@ -19,6 +22,10 @@ TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc")
 """Suffixes of text files that are tables."""
 FORM = "time_<unit>, drive_<axis>_<unit> or response_<axis>_<unit>"
 """How columns are named."""
+Texts: TypeAlias = Sequence[str] | np.ndarray[Any, Any]
+"""Cells of a column, (n,), text where they are an array."""
+CHUNK = 10_000
+"""Rows held as lists of objects at a time: a cell takes 100 bytes there, and 16 in an array."""
 _MOST = 5
 """Problems named per column, so that one shifted column does not bury the others."""
 
@@ -30,8 +37,8 @@ class CellTable:
 
     path: Path
     names: list[str]
-    rows: list[int]
-    columns: list[Sequence[str]]
+    rows: Sequence[int]
+    columns: list[Texts]
     problems: list[str]
 
     def place(self, column: int, row: int | None = None) -> str:
@@ -52,19 +59,39 @@ def refuse(path: Path, why: str) -> NoReturn:
     raise InputError(f"{path}: {why}")
 
 
+def _array(cells: Sequence[str]) -> np.ndarray[Any, Any]:
+    """Cells in little memory; what UTF-8 cannot write becomes a question mark."""
+    try:
+        return np.array(cells, dtype=np.dtypes.StringDType())
+    except UnicodeEncodeError:
+        return _array([cell.encode(errors="replace").decode() for cell in cells])
+
+
+def packed(rows: Iterable[Sequence[str]], width: int) -> list[Texts]:
+    """Columns of rows of `width` cells each."""
+    rest, parts = iter(rows), [[_array([])] * width]
+    while chunk := list(islice(rest, CHUNK)):
+        parts.append([_array(cells) for cells in zip(*chunk, strict=True)])
+    return [np.concatenate(column) for column in zip(*parts, strict=True)]
+
+
 def _csv_cells(path: Path) -> CellTable:
-    rows, cells, ragged = [], [], []
+    lines, ragged = array("q"), list[str]()
+
+    def rectangular(names: Sequence[str]) -> Iterator[list[str]]:
+        for row in reader:
+            if len(row) == len(names):
+                lines.append(reader.line_num)
+                yield row
+            elif len(row) > 1 or "".join(row).strip():  # an empty line is no row
+                what = f"has {len(row)} cell(s) where the header has {len(names)}"
+                ragged.append(f"{path}, line {reader.line_num}: {what}; write every cell, even if empty")
+
     with path.open(encoding="utf-8-sig", newline="") as file:
         reader = csv.reader(file, skipinitialspace=True, strict=True)
         try:
             names = [name.strip() for name in next((row for row in reader if row), [])]
-            for row in reader:
-                if len(row) == len(names):
-                    rows.append(reader.line_num)
-                    cells.append(row)
-                elif len(row) > 1 or "".join(row).strip():  # an empty line is no row
-                    what = f"has {len(row)} cell(s) where the header has {len(names)}"
-                    ragged.append(f"{path}, line {reader.line_num}: {what}; write every cell, even if empty")
+            columns = packed(rectangular(names), len(names))
         except UnicodeDecodeError:
             refuse(
                 path,
@@ -78,7 +105,7 @@ def _csv_cells(path: Path) -> CellTable:
         raise InputError(
             f"{path}, line 1: the columns are not separated by commas; `lcopa-bayes new` reads such tables"
         )
-    table = CellTable(path, names, rows, [*zip(*cells, strict=True)] if cells else [()] * len(names), [])
+    table = CellTable(path, names, lines, columns, [])
     table.add(ragged, str(path))
     return table
 
@@ -90,10 +117,12 @@ def frame_cells(frame: pd.DataFrame, path: Path) -> CellTable:
         gone = value is None or value is pd.NA or (isinstance(value, float) and math.isnan(value))
         return "" if gone else str(value)  # str of a float is exact
 
-    columns: list[Sequence[str]] = [
-        [text(v) for v in frame.iloc[:, j].tolist()] for j in range(frame.shape[1])
-    ]
-    return CellTable(path, [str(c) for c in frame.columns], [*range(1, len(frame) + 1)], columns, [])
+    def column(values: pd.Series[Any]) -> Texts:
+        chunks = (values.iloc[first : first + CHUNK] for first in range(0, max(1, len(values)), CHUNK))
+        return np.concatenate([_array([text(v) for v in chunk.tolist()]) for chunk in chunks])
+
+    columns = [column(frame.iloc[:, j]) for j in range(frame.shape[1])]
+    return CellTable(path, [str(c) for c in frame.columns], range(1, len(frame) + 1), columns, [])
 
 
 def read_cells(path: Path) -> CellTable:

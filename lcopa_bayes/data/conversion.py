@@ -192,10 +192,6 @@ def _time(
 ) -> tuple[tuple[str, ...], list[Vector], str]:
     """Headers of the time, times of every table and their unit."""
     names = _time_columns(tables, columns, mapped)
-    joined = [
-        [" ".join(cells) for cells in zip(*(t.columns[t.names.index(name)] for name in names), strict=True)]
-        for t in tables
-    ]
     column = columns[names[0]]
     if len(names) == 1 and column.numeric:
         for table, values in zip(tables, column.values, strict=True):
@@ -212,10 +208,11 @@ def _time(
             )
         notes.append(f"{names[0]!r} is the time, in {unit}.")
         return names, list(column.values), unit
-    times = [
-        seconds(table, names[0], cells, mapped.time_format)
-        for table, cells in zip(tables, joined, strict=True)
-    ]
+    times = []
+    for table in tables:
+        cells, *more = (table.columns[table.names.index(name)] for name in names)
+        joined = [" ".join(both) for both in zip(cells, *more, strict=True)] if more else cells
+        times.append(seconds(table, names[0], joined, mapped.time_format))
     said = " and ".join(repr(name) for name in names)
     notes.append(f"The time is that of {said}, counted in s from the first row of each table.")
     return names, times, "s"
@@ -230,20 +227,22 @@ def _time_columns(
         if name is None:
             raise InputError(f"{where}: has no column {mapped.time!r}{nearest(mapped.time, columns)}")
         return (name,)
-    stamps = {
-        name: [cell for t in tables for cell in t.columns[t.names.index(name)] if cell]
-        for name, column in columns.items()
-        if not column.numeric
-    }
-    dates = [n for n, cells in stamps.items() if _all(r"\d+[./-]\d+[./-]\d+", cells)]
-    clocks = [n for n, cells in stamps.items() if _all(r"\d+:\d+(:\d+([.,]\d+)?)?(\s*[ap]m)?", cells)]
+    texts = [name for name, column in columns.items() if not column.numeric]
+
+    def stamped(name: str, pattern: str) -> bool:
+        cells = (cell for t in tables for cell in t.columns[t.names.index(name)] if cell)
+        matches = (bool(re.fullmatch(pattern, cell, re.IGNORECASE)) for cell in cells)
+        return next(matches, False) and all(matches)
+
+    dates = [name for name in texts if stamped(name, r"\d+[./-]\d+[./-]\d+")]
+    clocks = [name for name in texts if stamped(name, r"\d+:\d+(:\d+([.,]\d+)?)?(\s*[ap]m)?")]
     if len(dates) == len(clocks) == 1:
         return dates[0], clocks[0]
     rising = [
         name
         for name, column in columns.items()
         if (column.numeric and all((np.diff(one) > 0).all() for one in column.values))
-        or (name in stamps and _all(r"\d+[./:-]\d+.*", stamps[name]))
+        or (name in texts and stamped(name, r"\d+[./:-]\d+.*"))
     ]
     named = [name for name, column in columns.items() if _called_time(column.axis)]
     alone = named if len(named) == 1 else []
@@ -261,10 +260,6 @@ def _called_time(axis: Axis) -> bool:
     # T may be a temperature
     known = len(axis.name) > 1 or axis.unit == UNKNOWN or axis.unit.lower() in _UNIT_OF_TIME
     return known and bool(_TIME.search(axis.name.replace("_", " ").lower()))
-
-
-def _all(pattern: str, cells: Sequence[str]) -> bool:
-    return bool(cells) and all(re.fullmatch(pattern, cell, re.IGNORECASE) for cell in cells)
 
 
 def _roles(

@@ -23,7 +23,7 @@ from lcopa_bayes.core.errors import InputError, gathered, nearest, refuse_if
 from lcopa_bayes.core.files import write_whole
 from lcopa_bayes.core.rules import rebuilt
 from lcopa_bayes.core.units import TIME_UNITS, in_time_unit
-from lcopa_bayes.data.cells import FORM, SUFFIXES, CellTable, frame_cells, read_cells, refuse
+from lcopa_bayes.data.cells import CHUNK, FORM, SUFFIXES, CellTable, frame_cells, read_cells, refuse
 
 _ROLES = ("time", "drive", "response")
 
@@ -307,9 +307,10 @@ def save_record(record: Record, path: Path) -> None:
         if path.suffix.lower() != ".csv":
             return pd.DataFrame(columns).to_parquet(beside, index=False)
         with beside.open("w", encoding="utf-8", newline="") as file:
-            rows = zip(*(values.tolist() for values in columns.values()), strict=True)
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(columns)
-            writer.writerows(["" if math.isnan(v) else repr(v) for v in row] for row in rows)
+            for first in range(0, record.time.size, CHUNK):
+                rows = zip(*(v[first : first + CHUNK].tolist() for v in columns.values()), strict=True)
+                writer.writerows(["" if math.isnan(v) else repr(v) for v in row] for row in rows)
 
     write_whole(path, write)

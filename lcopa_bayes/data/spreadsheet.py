@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import csv
 import datetime
+import io
 import re
 import warnings
+from array import array
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from itertools import count, product, zip_longest
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain, count, islice, product, zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +24,7 @@ import pandas as pd
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError, nearest, refuse_if
-from lcopa_bayes.data.cells import TEXTS, CellTable, read_cells
+from lcopa_bayes.data.cells import TEXTS, CellTable, Texts, packed, read_cells
 
 WORKBOOKS = (".xlsx", ".xlsm")
 """Suffixes of spreadsheets; anything else is text."""
@@ -63,33 +65,39 @@ def _text(path: Path) -> CellTable:
     try:
         text = content.decode(encoding)
     except UnicodeDecodeError:
-        text = content.decode("cp1252", errors="replace")
+        encoding = "cp1252"
+        text = content.decode(encoding, errors="replace")
     if "\0" in text:
         raise InputError(f"{path}: is not a text file; save the table as CSV or xlsx")
-    best: tuple[int, int] = (0, 0)
-    rows: list[tuple[int, list[str]]] = []
-    for separator in _SEPARATORS:
-        split = _split(text, separator)
-        widths = Counter(len(cells) for _, cells in split if len(cells) > 1)
+    present = [separator for separator in _SEPARATORS if separator in text]
+    del text  # below, lines are decoded as they are read: all rows as objects take 300 bytes each
+    best, chosen = (0, 0), ""
+    for separator in present:
+        try:
+            widths = Counter(len(cells) for _, cells in _split(content, encoding, separator))
+        except csv.Error:
+            continue
+        widths.pop(1, None)
         width, lines = widths.most_common(1)[0] if widths else (0, 0)
         if (lines, width) > best:
-            best, rows = (lines, width), split
-    if not best[0]:
+            best, chosen = (lines, width), separator
+    if not chosen:
         raise InputError(
             f"{path}: holds no table; expected columns separated by comma, semicolon, tab or bar, below a "
             "header"
         )
-    return _tabled(path, rows, best[1])
+    return _tabled(path, _split(content, encoding, chosen))
 
 
-def _split(text: str, separator: str) -> list[tuple[int, list[str]]]:
-    """Line numbers and cells of the lines that are not empty."""
-    reader = csv.reader(text.splitlines(), delimiter=separator, skipinitialspace=True)
-    try:
-        lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
-    except csv.Error:
-        return []
-    return [(number, cells) for number, cells in lines if any(cells)]
+def _split(content: bytes, encoding: str, separator: str) -> Iterator[tuple[int, list[str]]]:
+    """Line numbers and cells of the lines that are not empty; csv.Error where they cannot be split."""
+    text = io.TextIOWrapper(io.BytesIO(content), encoding, errors="replace", newline="\n")
+    lines = (line for part in text for line in part.splitlines())  # all ends of lines there are
+    reader = csv.reader(lines, delimiter=separator, skipinitialspace=True)
+    for row in reader:
+        cells = [cell.strip() for cell in row]
+        if any(cells):
+            yield reader.line_num, cells
 
 
 def _workbook(path: Path, sheet: str | None) -> CellTable:
@@ -120,7 +128,7 @@ def _workbook(path: Path, sheet: str | None) -> CellTable:
         refuse_if(open_formulas[:5])
         widths = Counter(len([cell for cell in cells if cell]) for _, cells in rows)
         if rows and max(widths) > 1:
-            return _tabled(path, rows, max(len(cells) for _, cells in rows))
+            return _tabled(path, rows)
     where = f"{path}, sheet {sheet!r}" if sheet is not None else f"{path}"
     others = ", ".join(repr(name) for name in values.sheetnames if name != sheet)
     more = f"; the other sheets are {others}" if sheet is not None and others else ""
@@ -137,37 +145,42 @@ def _cell(value: object) -> str:
     return str(value).strip()
 
 
-def _tabled(path: Path, rows: Sequence[tuple[int, list[str]]], width: int) -> CellTable:
+def _tabled(path: Path, rows: Iterable[tuple[int, list[str]]]) -> CellTable:
     """Rows of cells below their header; what is wrong joins the problems of the table."""
-    first = next((k for k, (_, cells) in enumerate(rows) if len(cells) > 1 and _holds_data(cells)), None)
-    if first is None or first == 0 or first > _HEADED:
+    rest = iter(rows)
+    head = list(islice(rest, _HEADED + 1))
+    first = next((k for k, (_, cells) in enumerate(head) if len(cells) > 1 and _holds_data(cells)), None)
+    if not first:
         what = "has no header" if first == 0 else "has no rows of numbers"
         raise InputError(f"{path}: {what}; expected a line of column names above the rows of numbers")
-    above = [cells for _, cells in rows[:first] if any(cells)]
+    above = [cells for _, cells in head[:first]]
     units = _units(above[-1]) if len(above) > 1 and _filled(above[-2]) > 1 else None
     header = above[-2] if units else above[-1]
     if _filled(header) < 2:
-        raise InputError(f"{path}, line {rows[first][0]}: there is no line of column names above the numbers")
+        raise InputError(f"{path}, line {head[first][0]}: there is no line of column names above the numbers")
     names = [
         f"{name} [{unit}]" if units and unit else name
         for name, unit in zip_longest(header, (units or [])[: len(header)], fillvalue="")
     ]
-    used = [k for k, name in enumerate(names) if name or any(len(c) > k and c[k] for _, c in rows[first:])]
+    lines, ragged = array("q"), list[str]()
+
+    def fitting() -> Iterator[list[str]]:
+        for number, cells in chain(head[first:], rest):
+            if _filled(cells) > len(header):
+                ragged.append(
+                    f"{path}, line {number}: has {len(cells)} cells where the header has {len(header)}; if "
+                    "decimals are written with commas, save the table with semicolons between its columns"
+                )
+                continue
+            lines.append(number)
+            yield [*cells, *[""] * (len(header) - len(cells))][: len(header)]
+
+    columns = packed(fitting(), len(header))
+    used = [k for k, name in enumerate(names) if name or any(columns[k])]
     names = _distinct([names[k] or f"column {k + 1}" for k in used])
-    kept, lines, ragged = [], [], []
-    for number, cells in rows[first:]:
-        padded = [*cells, *[""] * (len(header) - len(cells))]
-        if len([cell for cell in padded if cell]) > len(header):
-            ragged.append(
-                f"{path}, line {number}: has {len(cells)} cells where the header has {len(header)}; if "
-                "decimals are written with commas, save the table with semicolons between its columns"
-            )
-            continue
-        kept.append([padded[k] for k in used])
-        lines.append(number)
-    if ragged and not kept:  # the same fault throughout
-        ragged = [f"{ragged[0].replace(f', line {rows[first][0]}', '')} (so in all {len(ragged)} rows)"]
-    table = CellTable(path, names, lines, list(zip(*kept, strict=True)) if kept else [()] * len(names), [])
+    if ragged and not lines:  # the same fault throughout
+        ragged = [f"{ragged[0].replace(f', line {head[first][0]}', '')} (so in all {len(ragged)} rows)"]
+    table = CellTable(path, names, lines, [columns[k] for k in used], [])
     table.add(ragged, str(path))
     refuse_if(table.problems)
     return table
@@ -228,25 +241,26 @@ def decimal_sign(table: CellTable, problems: list[str], stated: str = "") -> str
         problems += [] if stated in (".", ",") else [f"the decimal sign {stated!r} is not . or ,"]
         return stated
     cells = (_SPACES.sub("", cell) for column in table.columns for cell in column)
-    commas = [cell for cell in cells if "," in cell and _PLAIN.fullmatch(cell)]
-    for cell in commas:
+    first = ""
+    for cell in (cell for cell in cells if "," in cell and _PLAIN.fullmatch(cell)):
         if "." in cell:
             return max(",.", key=cell.rfind)
         if cell.count(",") > 1:
             return "."
         if not re.fullmatch(r"[+-]?[1-9]\d{0,2},\d{3}", cell):
             return ","
-    problems += [
-        f"{table.path}: {cell!r} may be a number of thousands or have a decimal comma; state the decimal "
-        "sign with --decimal"
-        for cell in commas[:1]
-    ]
+        first = first or cell
+    if first:
+        problems.append(
+            f"{table.path}: {first!r} may be a number of thousands or have a decimal comma; state the "
+            "decimal sign with --decimal"
+        )
     return "."
 
 
-def numbers(cells: Sequence[str], sign: str) -> Vector:
+def numbers(cells: Texts, sign: str) -> Vector:
     """Cells as numbers with a decimal `sign`, (n,); NaN for what is no number."""
-    return np.array([_number(cell, sign) for cell in cells])
+    return np.fromiter((_number(cell, sign) for cell in cells), dtype=float, count=len(cells))
 
 
 def _number(cell: str, sign: str) -> float:
@@ -261,19 +275,20 @@ def _number(cell: str, sign: str) -> float:
     return value if np.isfinite(value) else np.nan
 
 
-def seconds(table: CellTable, column: str, cells: Sequence[str], stated: str = "") -> Vector:
+def seconds(table: CellTable, column: str, cells: Texts, stated: str = "") -> Vector:
     """Time stamps as seconds since the first one, (n,).
 
     Times of day without a date go on over midnight. InputError where stamps have several formats, none that
     is known, or may have the month or the day first.
     """
     text = pd.Series([_stamp(cell) for cell in cells])
-    parsed = {form: _parsed(text, form) for form in ([stated] if stated else _FORMATS)}
-    share = {form: float(values.notna().mean()) for form, values in parsed.items()}
-    best = max(share, key=lambda form: share[form])
-    at = table.names.index(column)
-    if share[best] < 1.0:
-        bad = np.flatnonzero(parsed[best].isna())
+    forms = (stated,) if stated else _FORMATS
+    readable = [form for form in forms if _parsed(text[:1], form).notna().all()]
+    elapsed = [_elapsed(times, form) for form in readable if (times := _parsed(text, form)).notna().all()]
+    if not elapsed:
+        at, share = table.names.index(column), {form: _parsed(text, form).notna().mean() for form in forms}
+        best = max(share, key=share.__getitem__)
+        bad = np.flatnonzero(_parsed(text, best).isna())
         known = f"the format {best} of the others" if share[best] > 0 else "a known format"
         problems = [
             f"{table.place(at, int(row))}: {cells[row]!r} is not a time in {known}; write all times alike, "
@@ -281,7 +296,6 @@ def seconds(table: CellTable, column: str, cells: Sequence[str], stated: str = "
             for row in bad[:5]
         ]
         raise InputError(problems)
-    elapsed = [_elapsed(parsed[form], form) for form in parsed if share[form] == 1.0]
     rising = [one for one in elapsed if (np.diff(one) > 0).all()] or elapsed[:1]
     refuse_if(
         [

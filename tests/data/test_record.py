@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.data.record import Axis, Record, in_time_unit, load_record, save_record
+from lcopa_bayes.data.record import Axis, Record, in_time_unit, load_record, records_of, save_record
 
 HEADER = "time_ms,drive_x_rad,response_x_rad\n"
 GOOD = HEADER + "0,0,\n0.5,1,0.1\n1.5,1,0.2\n"
@@ -153,6 +153,12 @@ def test_all_problems_come_at_once_and_are_capped_per_column(tmp_path):
     ):
         assert sum(part in problem for problem in told) == 1
     assert len(told) == 9
+
+
+def test_a_cell_that_is_no_text_is_refused_with_its_row():
+    rows = {"time_ms": [0.0, 1.0], "drive_x_V": [0, 1], "response_x_rad": ["0.1", "\udc00"]}
+    with pytest.raises(InputError, match="row 2, column 'response_x_rad': '\\?' is not a finite number"):
+        records_of(pd.DataFrame(rows, dtype=object))
 
 
 def test_files_that_cannot_be_read(tmp_path):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 
 import numpy as np
+import pandas as pd
 import pytest
 from numpy.testing import assert_allclose
 from small import ON_OFF_TABLE as TABLE
@@ -62,6 +64,29 @@ def test_a_long_table_becomes_means_that_are_fitted_as_such(tmp_path, capsys, mo
     assert main(["new", str(tmp_path / "none"), str(long), "--average", "700"]) == 2
     assert "are no two means of 700" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize("stamped", [False, True])
+def test_a_long_table_takes_little_memory_per_row(tmp_path, stamped):
+    """A row of three numbers is 24 bytes; as objects of Python it took a thousand."""
+
+    def peak(rows):
+        at = 100 * np.arange(rows)
+        time = pd.to_datetime(at, unit="ms").strftime("%d.%m.%Y %H:%M:%S.%f") if stamped else at
+        rng = np.random.default_rng(1)
+        drive = np.repeat(rng.normal(size=rows // 500), 500).round(6)
+        table = tmp_path / f"{rows}.csv"
+        columns = {"Time" if stamped else "Time [ms]": time, "Heater [V]": drive, "T": rng.normal(size=rows)}
+        pd.DataFrame(columns).to_csv(table, sep=";", index=False)
+        tracemalloc.start()
+        try:
+            lb.new(tmp_path / f"study{rows}", table)
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    peak(2000)  # what is loaded once
+    assert (peak(25_000) - peak(12_500)) / 12_500 < 250
 
 
 def test_nothing_is_replaced_unless_allowed_and_nothing_written_of_what_is_refused(oven, tmp_path, capsys):
