@@ -16,7 +16,6 @@ from lcopa_bayes.effectsearch.noise import (
     axis_noise,
     joint_noise,
     plausible,
-    quiet_pieces,
 )
 from lcopa_bayes.effectsearch.regression import Optimum, Regression
 from lcopa_bayes.effectsearch.whitening import Whitening, parts
@@ -118,9 +117,8 @@ def measured(posterior: Posterior, residual: Vector, delay: float) -> tuple[Axis
     scales = fitted_scales(posterior)
     for axis, response in enumerate(posterior.table.layout.responses):
         noise = axis_noise(posterior.samples, axis, delay, response, scales)
-        if noise is None:
-            quiet = sum(p.values.size for p in quiet_pieces(posterior.samples, axis, delay))
-            noise = joint_noise(axis_pieces(posterior, residual, axis), response, quiet, scales)
+        if isinstance(noise, str):
+            noise = joint_noise(axis_pieces(posterior, residual, axis), response, noise, scales)
         out.append(noise)
     return tuple(out)
 

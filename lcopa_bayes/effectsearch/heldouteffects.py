@@ -145,7 +145,7 @@ class _Residual:
         posterior = state.model.plant
         scales = fitted_scales(posterior)
         pieces = axis_pieces(posterior, state.optimum.residual, axis)
-        known = joint_noise(pieces, posterior.table.layout.responses[axis], 0, scales)
+        known = joint_noise(pieces, posterior.table.layout.responses[axis], "", scales)
         law = Law.of(known.posterior)
         white = np.concatenate([law.whiten(piece.values, piece.gaps)[1:] for piece in pieces])
         rho = np.sqrt((known.dependence - 1) / (known.dependence + 1))

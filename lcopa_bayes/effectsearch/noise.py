@@ -219,8 +219,9 @@ def _repeats(one: Samples, other: Samples, axis: int) -> bool:
 
 def axis_noise(
     samples: Sequence[Samples], axis: int, delay: float, response: Axis, scales: Scales
-) -> AxisNoise | None:
-    """Noise of an axis from quiet samples, and from repeats where these agree; None when too few.
+) -> AxisNoise | str:
+    """Noise of an axis from quiet samples, and from repeats where these agree; else why these do not tell it,
+    and what to record.
 
     Repeats that differ by more than the quiet noise hold a disturbance from record to record (a trigger that
     jitters, a mount that shakes): then they are no measure of the noise, and the sentence says so.
@@ -242,11 +243,18 @@ def axis_noise(
             return AxisNoise.of(both, count + again, "quiet", f"{said}, which agree.")
         differ = f"repeats differ by {ratio:.2f} times the quiet noise (p = {p:.1g})"
         return AxisNoise.of(alone, count, "quiet", f"{said}; {differ}: something varies between records.")
-    if again >= FEWEST:
-        alone = plausible([piece for piece in repeats if np.ptp(piece.values) > 0], scales)
+    few = f"too few to measure the noise ({FEWEST} are needed)"
+    at_rest = few if count < FEWEST else "all alike, as the steps of the sensor hide the noise"
+    at_rest = f"{count} quiet samples are {at_rest}"
+    if again >= FEWEST and (differing := [piece for piece in repeats if np.ptp(piece.values) > 0]):
+        alone = plausible(differing, scales)
         said = f"{response.name}: {_named(alone, response.unit)} from {again} differences of repeats"
-        return AxisNoise.of(alone, again, "repeats", f"{said}; {count} quiet samples are too few.")
-    return None
+        return AxisNoise.of(alone, again, "repeats", f"{said}; {at_rest}.")
+    apart = f"{again} differences of repeats are {'too few' if again < FEWEST else 'all alike'}"
+    advice = (
+        "a stretch before the first command, or a repeat" if count < FEWEST else "repeats, or finer steps"
+    )
+    return f"{at_rest}, and {apart if again else 'nothing was repeated'}; record {advice}"
 
 
 def _named(posterior: PlausibleNoise, unit: str) -> str:
@@ -257,8 +265,9 @@ def _named(posterior: PlausibleNoise, unit: str) -> str:
     return f"noise of sd {law.sd:.3g} {unit} and correlation {law.rho:.2f}{part}"
 
 
-def joint_noise(residual: Sequence[Observed], response: Axis, quiet: int, scales: Scales) -> AxisNoise:
-    """Noise of an axis fitted together with the plant, from its residual on each record [response unit].
+def joint_noise(residual: Sequence[Observed], response: Axis, why: str, scales: Scales) -> AxisNoise:
+    """Noise of an axis fitted together with the plant, from its residual on each record [response unit];
+    `why`, what keeps it from being measured.
 
     Coloured noise as free as the residual would take every slow effect for noise, and a fit whitened by it
     predicts the next sample and not the response. So the fit weighs all samples alike, and what its residual
@@ -272,10 +281,9 @@ def joint_noise(residual: Sequence[Observed], response: Axis, quiet: int, scales
     coloured = plausible(residual, scales)
     dependence = _dependence(pieces, Law.of(coloured))
     sentence = (
-        f"{response.name}: {quiet} quiet samples and no repeats are too few to measure the noise ({FEWEST} "
-        f"are needed), so its sd of {law.sd:.3g} {response.unit} is that of the residual, where {count} "
-        f"samples count as {count / dependence:.0f} independent ones. An effect may pass for noise there, so "
-        "no verdict is better than tentative. Record a stretch before the first command, or a repeat."
+        f"{response.name}: {why}. Its sd of {law.sd:.3g} {response.unit} is that of the residual, where "
+        f"{count} samples count as {count / dependence:.0f} independent ones. An effect may pass for noise "
+        "there, so no verdict is better than tentative."
     )
     return AxisNoise(law, coloured, count, "joint", sentence, dependence)
 

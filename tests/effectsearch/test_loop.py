@@ -214,6 +214,26 @@ def test_a_single_record_without_quiet_samples_is_at_most_tentative():
     assert "quiet" in results(found)["next_measurement"] or "stretch" in results(found)["next_measurement"]
 
 
+def test_quiet_samples_within_one_step_of_the_sensor_are_said_to_be_alike():
+    one, other = (records(seed, quiet=12.0)[2] for seed in (4, 5))
+    steps = 20 * NOISE
+    coarse, repeat = (
+        replace(made, name=name, response=steps * np.round(made.response / steps))
+        for name, made in (("one", one), ("repeat", other))
+    )
+
+    def noise(*own):
+        posterior = problem_of(Study("coarse", None, "ms", 4, own)).posterior
+        return axis_noise(posterior.samples, 0, 0.0, Axis("x", "rad"), Scales.of(own))
+
+    said = noise(coarse)
+    assert "quiet samples are all alike" in said
+    assert "too few" not in said
+    assert "record repeats" in said
+    assert "differences of repeats are all alike" in noise(coarse, replace(coarse, name="copy"))
+    assert "differences of repeats; 118 quiet samples are all alike" in noise(coarse, repeat).sentence
+
+
 def test_no_effect_is_named_from_a_base_fit_that_failed():
     made = records(5)
     rng = np.random.default_rng(5)
@@ -248,7 +268,6 @@ def test_repeats_measure_the_noise():
     pieces = repeat_pieces(posterior.samples, 0)
     assert sum(piece.values.size for piece in pieces) == np.isfinite(made[0].response).sum()
     noise = axis_noise(posterior.samples, 0, 0.0, Axis("x", "rad"), Scales.of(made))
-    assert noise is not None
     assert noise.known
     assert f"noise of sd {noise.law.sd:.3g} rad and" in noise.sentence
 

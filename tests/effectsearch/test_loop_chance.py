@@ -234,7 +234,7 @@ def test_a_smooth_misfit_scatters_as_its_own_autocorrelations_say(width):
 
     (piece,), slow = drawn(1), np.cos(np.linspace(0, np.pi, n))
     single = samples_of([piece])
-    fitted = joint_noise([single[0].axes[0]], Axis("x", "rad"), 0, Scales.of([single[0].record]))
+    fitted = joint_noise([single[0].axes[0]], Axis("x", "rad"), "", Scales.of([single[0].record]))
 
     def scatter(dependence):
         """Variance of the product with a slow column that is stated, over that of many draws."""

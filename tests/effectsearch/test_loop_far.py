@@ -212,12 +212,12 @@ def test_a_dependent_residual_counts_as_fewer_samples():
     n, rng = 20_000, np.random.default_rng(3)
     ones, scales = np.ones(n), Scales.of(stepped(10.0).fit)
     drawn = WhiteAR1().draw(Law(0.0, 1.0, r).parameters[None], ones, rng)[0]
-    noise = joint_noise([Observed(np.arange(n), drawn, ones)], Axis("x", "rad"), 0, scales)
+    noise = joint_noise([Observed(np.arange(n), drawn, ones)], Axis("x", "rad"), "", scales)
     assert noise.law.share == 0
     assert f"sd of {noise.law.sd:.3g} rad" in noise.sentence
     assert noise.law.sd == pytest.approx(1.0, rel=0.05)
     assert noise.dependence == pytest.approx((1 + r**2) / (1 - r**2), rel=0.15)
-    white = joint_noise([Observed(np.arange(n), rng.standard_normal(n), ones)], Axis("x", "rad"), 0, scales)
+    white = joint_noise([Observed(np.arange(n), rng.standard_normal(n), ones)], Axis("x", "rad"), "", scales)
     assert white.dependence == pytest.approx(1.0, abs=0.1)
 
 
