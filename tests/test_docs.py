@@ -289,3 +289,13 @@ def test_every_public_name_is_on_its_page():
         r"^\.\. auto\w+:: lcopa_bayes\.(\w+)$", (ROOT / "docs" / "api.md").read_text("utf-8"), re.M
     )
     assert sorted(listed) == lcopa_bayes.__all__
+
+
+def test_reports_hold_no_path_of_a_machine_and_no_failure():
+    place = re.compile(r"(?<![\w.:/-])/(home|mnt|opt|private|root|tmp|usr|Users|var|work)/|\b[A-Z]:\\")
+    files = [one for one in (ROOT / "reports").rglob("*") if one.is_file()]
+    assert {".html", ".json", ".md", ".svg"} <= {one.suffix for one in files}
+    for file in files:
+        text = file.read_text(encoding="utf-8")
+        assert "unforeseen" not in text, file
+        assert not (at := place.search(text)), (file, text[at.start() : at.end() + 40])
