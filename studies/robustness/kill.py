@@ -1,24 +1,27 @@
 """Kill runs at random moments, resume them, and hold the results against runs that were let end.
 
-    python studies/robustness/kill.py [--kills N] [--verbs VERB ...] [--seed N] [--jobs N]
+    python studies/robustness/kill.py [--kills N] [--seconds S] [--verbs VERB ...] [--seed N] [--jobs N]
+        [--report FILE]
 
 Each verb is started on a small study, the process, one it started, or all of them are killed (SIGKILL), and
 the same command is given again, with --resume where the verb has it. After every kill nothing that was
 started may go on for longer than `LEAST`, the resumed run must end well, hold every number of the
 uninterrupted one, and leave no temporary file; a second run into the folder of one that is going on must be
-refused in one sentence. Exit code 1 when anything of this fails. Reads the process table of Linux.
+refused in one sentence. Exit code 1 when anything of this fails. Reads the process table of Linux. The
+committed summary is `reports/robustness/kills.md`.
 """
 
 import argparse
 import json
 import os
 import random
+import shlex
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +32,7 @@ import xarray
 
 from lcopa_bayes.bench.command import step
 from lcopa_bayes.bench.device import Bench, Device, simulate
+from lcopa_bayes.core.files import write_text
 from lcopa_bayes.data.record import Axis
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.studywriter import write_folder
@@ -55,6 +59,13 @@ MOST = 600.0
 _OF_THE_RUN = ("seconds", "command", "look")
 """Keys and columns that may differ: times, command lines, and the first look, which a resumed run leaves
 out."""
+_HEADING = """# Killed runs
+
+Each verb is started on a small study and killed (SIGKILL) at a random moment: the process, one that it
+started, or all of them. Then the same command is given again, with `--resume` where the verb has it. *Equal
+after*: that run ended well, every number it wrote is that of an uninterrupted run, nothing that the killed
+run started went on for longer than 5 s, and no temporary file was left. *Second run*: what a run into the
+folder of one that is going on was answered."""
 
 
 def write_studies(folder: Path, devices: str = "abc", samples: int = 60) -> None:
@@ -244,26 +255,55 @@ def attempt(
     return Kill(verb, target, moment, tuple(problems), ended)
 
 
+def summary(kills: Sequence[Kill], second: Mapping[str, list[str]], known: Mapping[str, float]) -> str:
+    """Table of what came of the kills, by verb, and every problem."""
+    rows = [
+        "| verb | takes [s] | killed (parent, child, both) | before half, after | equal after | orphans "
+        "| temporary files | second run |",
+        "|---|---:|---:|---:|---:|---:|---:|---|",
+    ]
+    for verb, seconds in known.items():
+        own = [one for one in kills if one.verb == verb and not one.ended]
+        struck = ", ".join(str(sum(one.target == target for one in own)) for target in TARGETS)
+        early = sum(2 * one.moment < seconds for one in own)
+        said = [problem for one in own for problem in one.problems]
+        counts = [sum(word in problem for problem in said) for word in ("orphans", "temporary files")]
+        equal = sum(not one.problems for one in own)
+        answer = "not as it should be" if second[verb] else "refused"
+        cells = [verb, f"{seconds:.1f}", f"{len(own)} ({struck})", f"{early}, {len(own) - early}", equal]
+        rows.append(f"| {' | '.join(map(str, [*cells, *counts, answer]))} |")
+    wrong = [f"- {one.verb}, {one.target} at {one.moment:.2f} s: {'; '.join(one.problems)}" for one in kills]
+    wrong = [line for line, one in zip(wrong, kills, strict=True) if one.problems]
+    wrong += [f"- {verb}, second run: {'; '.join(said)}" for verb, said in second.items() if said]
+    late = sum(one.ended for one in kills)
+    rows += ["", f"{late} more runs had ended before their kill, and were given again all the same."]
+    return "\n".join([*rows, *(["", *wrong] if wrong else [])])
+
+
 def main() -> int:
     """Kill as often as the command line asks for; the exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--kills", type=int, default=50, help="of each verb")
+    parser.add_argument("--seconds", type=float, default=np.inf, help="begin no further round after these")
     parser.add_argument("--verbs", nargs="+", choices=COMMANDS, default=list(COMMANDS))
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--report", type=Path, help="file of the summary")
     given = parser.parse_args()
-    pick, kills, wrong = random.Random(given.seed), [], 0
+    began, pick, kills = time.monotonic(), random.Random(given.seed), list[Kill]()
     with tempfile.TemporaryDirectory() as place:
         studies = Path(place) / "studies"
         write_studies(studies)
         known = {verb: reference(verb, studies, Path(place) / verb, jobs=given.jobs) for verb in given.verbs}
+        second = {}
         for verb in given.verbs:
-            problems = refused(verb, studies, Path(place) / f"{verb}-second", jobs=given.jobs)
-            wrong += bool(problems)
-            print(f"{verb}: a second run is {'; '.join(problems) or 'refused'}", flush=True)
+            second[verb] = refused(verb, studies, Path(place) / f"{verb}-second", jobs=given.jobs)
+            print(f"{verb}: a second run is {'; '.join(second[verb]) or 'refused'}", flush=True)
         for number in range(given.kills):
+            if time.monotonic() - began > given.seconds:
+                break
             for verb in given.verbs:
                 wanted, seconds = known[verb]
                 out, target = Path(place) / f"{verb}-{number}", pick.choice(TARGETS)
@@ -273,12 +313,14 @@ def main() -> int:
                     known[verb] = wanted, one.moment
                 said = "; ".join(one.problems) or ("ended before" if one.ended else "equal")
                 print(f"{verb}, {target} at {one.moment:.2f} s of {seconds:.2f} s: {said}", flush=True)
-    for verb in given.verbs:
-        own = [one for one in kills if one.verb == verb and not one.ended]
-        good = sum(not one.problems for one in own)
-        orphaned = sum("orphans" in problem for one in own for problem in one.problems)
-        print(f"{verb}: {len(own)} killed, {good} equal after, {orphaned} with orphans")
-    return int(wrong > 0 or any(one.problems for one in kills))
+    table = summary(kills, second, {verb: seconds for verb, (_, seconds) in known.items()})
+    print(table)
+    if given.report:
+        command = shlex.join(["python", "studies/robustness/kill.py", *sys.argv[1:]])
+        took = f"`{command}` took {(time.monotonic() - began) / 60:.0f} minutes"
+        said = f"{_HEADING}\n\n{took}, of runs of {given.jobs} processes."
+        write_text(given.report, f"{said}\n\n{table}\n")
+    return int(any(second.values()) or any(one.problems for one in kills))
 
 
 if __name__ == "__main__":

@@ -3,7 +3,8 @@
 Files of `corpus`, and tables, workbooks and run folders made here, are cut, spliced and encoded anew.
 No other exception and no warning may come of it, and no input may take longer than `MOST`. The environment
 variable LCOPA_BAYES_FUZZ is the number of inputs in all, such as 1000000; above the default they are new
-ones in every run.
+ones in every run. LCOPA_BAYES_FUZZ_SUMMARY is a file for what came of them, as `studies/robustness/fuzz.py`
+reports it.
 """
 
 from __future__ import annotations
@@ -12,9 +13,12 @@ import io
 import json
 import os
 import re
+import resource
 import shutil
 import signal
+import time
 import warnings
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -45,6 +49,8 @@ DEFAULT = 20_000
 INPUTS = int(os.environ.get("LCOPA_BAYES_FUZZ", DEFAULT))
 MOST = 5.0
 """Longest time that one input may take [s]."""
+SEEN: dict[str, dict[str, float]] = defaultdict(lambda: {"inputs": 0, "refused": 0, "longest": 0.0})
+"""Inputs, those refused in words, and the longest time of one [s], by test."""
 TEXTS = tuple(path.read_bytes() for path in sorted(CORPUS.glob("*.[ct]sv")))
 STUDIES = tuple(path.read_bytes() for path in sorted(CORPUS.glob("*.toml")))
 CAMPAIGN = (Path(__file__).parents[2] / "studies" / "paper-step" / "campaign.toml").read_bytes()
@@ -215,15 +221,20 @@ def refusing() -> Iterator[None]:
     """Within it a file may be refused in words, at once; a warning is an error."""
     signal.signal(signal.SIGALRM, overdue)
     signal.setitimer(signal.ITIMER_REAL, MOST)
+    seen = SEEN[os.environ["PYTEST_CURRENT_TEST"].rpartition("::")[2].split()[0]]
+    began = time.perf_counter()
+    seen["inputs"] += 1
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             yield
     except InputError as refused:
+        seen["refused"] += 1
         if not all(problem.strip() for problem in refused.problems or [""]):
             raise AssertionError("refused without a word") from refused
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
+        seen["longest"] = max(seen["longest"], time.perf_counter() - began)
 
 
 @pytest.fixture(scope="module")
@@ -233,9 +244,12 @@ def place(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module", autouse=True)
 def _alarm() -> Iterator[None]:
-    before = signal.getsignal(signal.SIGALRM)
+    before, memory = signal.getsignal(signal.SIGALRM), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     yield
     signal.signal(signal.SIGALRM, before)
+    if file := os.environ.get("LCOPA_BAYES_FUZZ_SUMMARY"):
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        Path(file).write_text(json.dumps({"tests": SEEN, "memory_kB": [memory, peak]}))
 
 
 def same(a: Record, b: Record) -> bool:
