@@ -46,7 +46,8 @@
     table.parentElement.after(copy);
   }
   // On a narrow screen panels side by side stand one below the other, and a legend by itself, as views of the
-  // one drawing: shrunk to the screen as a whole its text would be too small to read.
+  // one drawing, and a wide panel is squeezed but for its text and markers: shrunk to the screen as a whole its
+  // text would be too small to read.
   const narrow = matchMedia("screen and (max-width: 40rem)");
   const around = (boxes) => {
     const [x, y] = ["x", "y"].map((at) => Math.min(...boxes.map((box) => box[at])));
@@ -66,26 +67,69 @@
   const outline = (axes) => around([...axes.children].filter((part, k) => !k || /axis_|text_|legend_/.test(part.id))
     .map((part) => part.getBBox()));
   const labelled = (axes) => [...axes.querySelectorAll("g[id*='axis_']")].map((axis) => !!axis.querySelector("text"));
-  const views = (drawn, whole) => {
-    const boxes = [...drawn.children].slice(1).map((part) =>
-      /axes_/.test(part.id) ? { ...outline(part), panel: labelled(part) } : around([part.getBBox()]));
+  const moved = new Map(); // and how it stood before
+  const move = (part, how, hidden) => {
+    moved.set(part, part.getAttribute("transform"));
+    part.setAttribute("transform", `${how} ${part.getAttribute("transform") || ""}`);
+    if (hidden) part.setAttribute("visibility", "hidden");
+  };
+  const squeeze = (axes, view, most) => {
+    const panel = axes.firstElementChild.getBBox(), end = panel.x + panel.width;
+    const k = 1 - (view.width - most) / panel.width;
+    let taken = -Infinity; // by labels of ticks, which keep apart
+    for (const part of axes.querySelectorAll("use, g[id*='text_'], g[id*='legend_']")) {
+      const box = part.getBBox(), right = box.x + box.width, middle = box.x + box.width / 2, mark = part.matches("use");
+      if (part.parentElement.closest("g[id*='legend_']") || (mark && box.width > 12)) continue; // an area
+      const at = mark ? middle : box.x < panel.x + 2 ? panel.x : right > end - 2 ? end : middle;
+      const free = (k - 1) * Math.max(0, Math.min(at, end) - panel.x);
+      const by = mark ? free : Math.max(view.x - box.x, Math.min(free, view.x + most - right));
+      const label = !mark && part.closest("g[id*='xtick_']"), hidden = label && box.x + by < taken + 3;
+      if (label && !hidden) taken = right + by;
+      move(part, `translate(${panel.x + (by - panel.x) / k}) scale(${1 / k} 1)`, hidden);
+    }
+    move(axes, `translate(${panel.x * (1 - k)}) scale(${k} 1)`);
+  };
+  const lines = (legend, most) => {
+    const out = [];
+    let entry = [];
+    for (const part of legend.children) {
+      entry.push(part.getBBox());
+      if (!/text_/.test(part.id)) continue;
+      const longer = around([...out.slice(-1), ...entry]);
+      out.splice(longer.width > most ? out.length : -1, 1, longer.width > most ? around(entry) : longer);
+      entry = [];
+    }
+    return out;
+  };
+  const views = (drawn, whole, most) => {
+    const boxes = [...drawn.children].slice(1).map((part) => /axes_/.test(part.id)
+      ? { ...outline(part), panel: labelled(part), part } : { ...around([part.getBBox()]), part });
     return apart(boxes, "y", "height").flatMap((row) => {
+      if (row.length === 1 && /legend_/.test(row[0].part.id)) return lines(row[0].part, most);
       const columns = apart(row, "x", "width");
       const panels = row.map((box) => box.panel || []);  // those that share labels with others stay beside them
       const alone = panels.every(([across, up]) => across && up === panels[0][1]);
       if (alone && columns.length > 1 && columns.length < 4) return columns.map(around);
       const full = row.some((box) => box.panel) && { x: whole.x + 3, width: whole.width - 6 };
-      return [{ ...around(row), ...full }];
+      const [one, ...more] = row.filter((box) => box.panel);
+      return [{ ...around(row), ...full, axes: full.width > most && !more.length && one.part }];
     });
   };
   const stack = () => {
+    for (const [part, transform] of moved) {
+      if (transform === null) part.removeAttribute("transform"); else part.setAttribute("transform", transform);
+      part.removeAttribute("visibility");
+    }
+    moved.clear();
     for (const svg of document.querySelectorAll("figure .wide > svg:first-child")) {
       const drawn = svg.querySelector("g[id$='figure_1']"), place = svg.parentElement;
       while (svg.nextElementSibling) svg.nextElementSibling.remove();
       svg.setAttribute("viewBox", svg.dataset.whole = svg.dataset.whole || svg.getAttribute("viewBox"));
       svg.removeAttribute("style");
       if (!narrow.matches || place.classList.contains("large") || !svg.getClientRects().length) continue;
-      views(drawn, svg.viewBox.baseVal).forEach((box, k) => {
+      const most = place.clientWidth / 1.2; // so that letters of 7.5 points have 9 pixels
+      views(drawn, svg.viewBox.baseVal, most).forEach((box, k) => {
+        if (box.axes) squeeze(box.axes, box, most), box.width = most;
         const part = k ? place.appendChild(svg.cloneNode()) : svg;
         if (k) part.appendChild(document.createElementNS(svg.namespaceURI, "use")).setAttribute("href", `#${drawn.id}`);
         const [width, height] = [box.width + 6, box.height + 6];

@@ -114,18 +114,54 @@ def test_panels_side_by_side_stand_below_each_other_on_a_phone(browser, report):
     lefts = (
         "e => [...e.querySelectorAll(':scope > svg')].map(one => Math.round(one.getBoundingClientRect().x))"
     )
-    assert figure.evaluate(lefts) == [figure.evaluate("e => Math.round(e.getBoundingClientRect().x)")] * 3
-    first, second, third = (one.bounding_box() for one in figure.locator(":scope > svg").all())
+    assert figure.evaluate(lefts) == [figure.evaluate("e => Math.round(e.getBoundingClientRect().x)")] * 4
+    first, _, second, third = (one.bounding_box() for one in figure.locator(":scope > svg").all())
     assert (
         first["height"] < second["height"] == pytest.approx(third["height"], rel=0.2)
-    )  # a legend, two panels
+    )  # a legend in two lines, two panels
     assert second["y"] + second["height"] <= third["y"] + 1
     figure.click()
     assert len(figure.evaluate(lefts)) == 1
     figure.click()
-    assert len(figure.evaluate(lefts)) == 3
+    assert len(figure.evaluate(lefts)) == 4
     page.set_viewport_size({"width": 1300, "height": 844})
     page.wait_for_function("document.querySelectorAll('#frequency-response figure .wide > svg').length === 1")
+    assert errors == []
+    page.close()
+
+
+SQUEEZED = """e => {
+    const drawn = e.querySelector("g[id$='figure_1']"), root = drawn.getScreenCTM().inverse();
+    const all = (what) => [...drawn.querySelectorAll(what)].filter(one => !one.closest("[visibility]"));
+    const place = (one) => root.multiply(one.getScreenCTM());
+    const sizes = ({ a, b, c, d }) => [Math.hypot(a, b), Math.hypot(c, d)];
+    const middle = (one) => { const box = one.getBoundingClientRect(); return box.x + box.width / 2; };
+    const words = all("g[id*='xtick_'] text"), labels = words.map(one => one.getBoundingClientRect());
+    const marks = words.map(one => one.closest("g[id*='xtick_']").querySelector("use"));
+    return {
+        views: [...e.children].map(one => one.viewBox.baseVal.width),
+        letters: all("g[id*='axes_'] text").map(place).flatMap(sizes),
+        panels: [...drawn.querySelectorAll(":scope > g[id*='axes_']")].map(one => place(one).a),
+        off: words.map((one, k) => Math.abs(middle(one) - middle(marks[k]))),
+        gaps: labels.slice(1).map((one, k) => one.left - labels[k].right),
+    };
+}"""
+
+
+def test_a_wide_panel_is_squeezed_on_a_phone_but_not_its_letters(browser, report):
+    page, errors = opened(browser, report, viewport=PHONE)
+    figure = page.locator("#data-and-bands figure .wide").first
+    narrow = figure.evaluate(SQUEEZED)
+    assert max(narrow["views"]) < 300  # letters of 7.5 units have more than 8 pixels
+    assert narrow["letters"] == pytest.approx([1.0] * len(narrow["letters"]), abs=1e-3)
+    assert all(share < 0.6 for share in narrow["panels"])
+    assert max(narrow["off"]) < 1.0  # labels stay below their ticks
+    assert min(gap for gap in narrow["gaps"] if gap > -100) > 0  # below -100: the next panel begins
+    figure.click()
+    wide = figure.evaluate(SQUEEZED)
+    assert len(wide["views"]) == 1
+    assert wide["panels"] == pytest.approx([1.0] * len(wide["panels"]))
+    assert len(wide["off"]) >= len(narrow["off"])
     assert errors == []
     page.close()
 
