@@ -125,6 +125,13 @@ def frame_cells(frame: pd.DataFrame, path: Path) -> CellTable:
     return CellTable(path, [str(c) for c in frame.columns], range(1, len(frame) + 1), columns, [])
 
 
+def _frame(path: Path) -> pd.DataFrame:
+    try:
+        return pd.read_parquet(path)
+    except (LookupError, TypeError, AttributeError) as error:  # of damaged notes beside the columns
+        refuse(path, f"is not sound Parquet ({type(error).__name__}: {error}); write it anew")
+
+
 def read_cells(path: Path) -> CellTable:
     """The file as text; InputError when there is none or it cannot be read."""
     try:
@@ -136,7 +143,7 @@ def read_cells(path: Path) -> CellTable:
             refuse(
                 path, f"is not a record; expected a file ending in {ends}; `lcopa-bayes new` converts others"
             )
-        return _csv_cells(path) if path.suffix.lower() == ".csv" else frame_cells(pd.read_parquet(path), path)
+        return _csv_cells(path) if path.suffix.lower() == ".csv" else frame_cells(_frame(path), path)
     except InputError:
         raise
     except (OSError, ValueError, NotImplementedError) as error:

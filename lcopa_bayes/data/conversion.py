@@ -39,6 +39,8 @@ _UNIT_OF_TIME: Mapping[str, str] = {
     **dict.fromkeys(("mins", "minute", "minutes", "minuten"), "min"),
     **dict.fromkeys(("hr", "hrs", "hour", "hours", "std", "stunden"), "h"),
 }
+_LONGEST = 100
+"""Characters of a header in which a unit is looked for."""
 _HELD = 0.1
 """Share of rows at which a piecewise constant column changes, at most [-]."""
 _LEVELS = 5
@@ -166,7 +168,7 @@ def axis_of(header: str) -> Axis:
         r"^(?P<name>.*?)\s*(?:\[(?P<a>[^\]]*)\]|\((?P<b>[^)]*)\)|\s+in\s+(?P<c>\S+)|\s*/\s*(?P<d>\S+)"
         r"|\s+(?P<e>%|°\s?\w+))$"
     )
-    match = re.match(pattern, header.strip())
+    match = re.match(pattern, header.strip()[:_LONGEST])
     name, unit = header, ""
     if match and match["name"].strip():
         name, unit = match["name"], next((text for text in match.groups()[1:] if text), "")

@@ -34,6 +34,8 @@ _NUMBER = re.compile(r"[+-]?(\d[\d\s\u00a0\u202f.,']*|[.,]\d+)(e[+-]?\d+)?", re.
 """A number in any notation."""
 _STAMP = re.compile(r"[\d./: T+-]*\d[:./-]\d[\d./: TZ+-]*([ap]m)?(\d*[.,]\d+)?", re.IGNORECASE)
 """Something like a date or a time of day."""
+_LONGEST = 100
+"""Characters of the longest number, time or column name: the time of a search may grow with their square."""
 _SHORT = 4
 """Longest unit without brackets."""
 _HEADED = 40
@@ -155,11 +157,11 @@ def _tabled(path: Path, rows: Iterable[tuple[int, list[str]]]) -> CellTable:
         raise InputError(f"{path}: {what}; expected a line of column names above the rows of numbers")
     above = [cells for _, cells in head[:first]]
     units = _units(above[-1]) if len(above) > 1 and _filled(above[-2]) > 1 else None
-    header = above[-2] if units else above[-1]
+    header = [name[:_LONGEST] for name in (above[-2] if units else above[-1])]
     if _filled(header) < 2:
         raise InputError(f"{path}, line {head[first][0]}: there is no line of column names above the numbers")
     names = [
-        f"{name} [{unit}]" if units and unit else name
+        f"{name} [{unit[:_LONGEST]}]" if units and unit else name
         for name, unit in zip_longest(header, (units or [])[: len(header)], fillvalue="")
     ]
     lines, ragged = array("q"), list[str]()
@@ -189,7 +191,8 @@ def _tabled(path: Path, rows: Iterable[tuple[int, list[str]]]) -> CellTable:
 def _holds_data(cells: Iterable[str]) -> bool:
     """Whether at least half of the filled cells are numbers or times."""
     filled = [cell for cell in cells if cell]
-    data = [cell for cell in filled if _NUMBER.fullmatch(cell) or _STAMP.fullmatch(cell)]
+    short = (cell for cell in filled if len(cell) <= _LONGEST)
+    data = [cell for cell in short if _NUMBER.fullmatch(cell) or _STAMP.fullmatch(cell)]
     return bool(data) and 2 * len(data) >= len(filled)
 
 
@@ -242,7 +245,7 @@ def decimal_sign(table: CellTable, problems: list[str], stated: str = "") -> str
         return stated
     cells = (_SPACES.sub("", cell) for column in table.columns for cell in column)
     first = ""
-    for cell in (cell for cell in cells if "," in cell and _PLAIN.fullmatch(cell)):
+    for cell in (cell for cell in cells if "," in cell and len(cell) <= _LONGEST and _PLAIN.fullmatch(cell)):
         if "." in cell:
             return max(",.", key=cell.rfind)
         if cell.count(",") > 1:
@@ -265,7 +268,7 @@ def numbers(cells: Texts, sign: str) -> Vector:
 
 def _number(cell: str, sign: str) -> float:
     text = _SPACES.sub("", cell).replace("\u2212", "-").removesuffix("%")
-    if not (_PLAIN.fullmatch(text) and _WRITTEN[sign].fullmatch(text)):
+    if len(text) > _LONGEST or not (_PLAIN.fullmatch(text) and _WRITTEN[sign].fullmatch(text)):
         return np.nan
     text = text.replace(".", "").replace(",", ".") if sign == "," else text.replace(",", "")
     try:

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -159,6 +161,14 @@ def test_a_cell_that_is_no_text_is_refused_with_its_row():
     rows = {"time_ms": [0.0, 1.0], "drive_x_V": [0, 1], "response_x_rad": ["0.1", "\udc00"]}
     with pytest.raises(InputError, match="row 2, column 'response_x_rad': '\\?' is not a finite number"):
         records_of(pd.DataFrame(rows, dtype=object))
+
+
+@pytest.mark.parametrize("notes", [b"{}", b'{"columns": [{}], "index_columns": []}', b"[]"])
+def test_damaged_notes_of_pandas_are_refused_in_words(tmp_path, notes):
+    table = pa.table({"time_ms": [0.0, 1.0], "drive_x_V": [0.0, 1.0], "response_x_rad": [0.0, 1.0]})
+    pq.write_table(table.replace_schema_metadata({b"pandas": notes}), tmp_path / "a.parquet")
+    with pytest.raises(InputError, match="is not sound Parquet"):
+        load_record(tmp_path / "a.parquet")
 
 
 def test_files_that_cannot_be_read(tmp_path):

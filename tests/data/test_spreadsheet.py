@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import datetime
 import io
+import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -344,3 +345,16 @@ def test_any_table_is_read_or_refused_in_words(header, rows, separator, content,
         path.write_bytes(content)
     with suppress(InputError):
         assert read(path).time.size >= 2
+
+
+@pytest.mark.parametrize(
+    "long", ["1.1." * 12_500 + "x", "1" * 50_000, "1:1 " * 12_500, " ".join("a" * 25_000)]
+)
+def test_cells_of_any_length_are_read_at_once(tmp_path, long):
+    """Patterns whose time grows with the square of a cell took minutes over these."""
+    path = tmp_path / "a.csv"
+    path.write_text(f"Time [s];u ({long};y\n" + "".join(f"{k};{k % 2};{long}\n" for k in range(20)))
+    began = time.process_time()
+    with pytest.raises(InputError):
+        convert([read_spreadsheet(path)], Mapped(drives=("2",), responses=("y",)))
+    assert time.process_time() - began < 2.0
