@@ -104,9 +104,9 @@ def problem(*fit: Record, **options: object) -> Problem:
     return problem_of(study(*(fit or (record(),)), **options))
 
 
-def row_values(table: ParameterTable, told: Mapping[str, float]) -> Vector:
+def row_values(table: ParameterTable, reported: Mapping[str, float]) -> Vector:
     """Values in table order; an unnamed parameter is an error."""
-    return np.array([told[name] for name in table.names])
+    return np.array([reported[name] for name in table.names])
 
 
 def draws_of(table: ParameterTable, values: Matrix) -> Draws:

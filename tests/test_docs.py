@@ -101,11 +101,11 @@ def test_every_table_of_a_study_file_is_documented(tmp_path):
 
 @pytest.mark.parametrize("name", TABLES)
 def test_documented_defaults_are_those_of_the_code(name):
-    told = study_tables()[name]
+    reported = study_tables()[name]
     for key, default in ((one.name, one.default) for one in dataclasses.fields(TABLES[name])):
         if default is dataclasses.MISSING or default is None:
             continue
-        cell = told[key][0]
+        cell = reported[key][0]
         assert re.search(rf"(^|\W){re.escape(as_written(default))}(\W|$)", cell), f"{name}.{key}: {cell}"
 
 
@@ -119,12 +119,12 @@ def as_written(default: object) -> str:
 
 
 def test_documented_sizes_of_a_run_are_those_that_are_planned():
-    told = study_tables()["sampler"]
+    reported = study_tables()["sampler"]
     least, one_more = SamplePlan.of(0, seed=0), SamplePlan.of(1, seed=0)
     many = SamplePlan.of(100, seed=0), SamplePlan.of(101, seed=0)
-    assert numbers(told["steps"][0]) == [least.steps, one_more.steps - least.steps]
-    assert numbers(told["thin"][0]) == [least.thin]
-    assert numbers(told["walkers"][0]) == [least.walkers, many[1].walkers - many[0].walkers]
+    assert numbers(reported["steps"][0]) == [least.steps, one_more.steps - least.steps]
+    assert numbers(reported["thin"][0]) == [least.thin]
+    assert numbers(reported["walkers"][0]) == [least.walkers, many[1].walkers - many[0].walkers]
 
 
 def numbers(text: str) -> list[float]:
@@ -132,13 +132,13 @@ def numbers(text: str) -> list[float]:
 
 
 def test_priors_are_documented_for_every_kind_of_parameter():
-    told = rows(sections(ROOT / "docs" / "study.md")["`[priors]`"], "parameter")
-    assert set(told) == set(KINDS) - {*COEFFICIENTS, *CONSTANTS}
-    for name in told:
+    reported = rows(sections(ROOT / "docs" / "study.md")["`[priors]`"], "parameter")
+    assert set(reported) == set(KINDS) - {*COEFFICIENTS, *CONSTANTS}
+    for name in reported:
         kind = KINDS[name]
         ends = [end for end in (kind.low, kind.high) if abs(end) < float("inf")]
-        assert numbers(told[name][0]) == ends, name
-        assert ("or more" in told[name][0]) == (kind.zero and len(ends) == 1), name
+        assert numbers(reported[name][0]) == ends, name
+        assert ("or more" in reported[name][0]) == (kind.zero and len(ends) == 1), name
 
 
 def test_documented_limits_of_grades_are_those_of_the_code():
@@ -161,13 +161,13 @@ def test_documented_limits_of_grades_are_those_of_the_code():
     assert f"{discretisation.UNUSABLE:g} sd" in warnings["blocks too wide"][0]
     assert numbers(warnings["resonance faster than the samples"][0]) == [100 * adequacy.RESONANCE_SHARE]
     assert adequacy.DISTURBANCE_SHARE == 0.5
-    told = numbers(sections(ROOT / "docs" / "statistics.md")["Evidence"])
-    assert {evidence._RELIABLE, evidence._TENTATIVE} <= set(told)
+    reported = numbers(sections(ROOT / "docs" / "statistics.md")["Evidence"])
+    assert {evidence._RELIABLE, evidence._TENTATIVE} <= set(reported)
 
 
 def test_documented_verdicts_of_an_audit_are_those_it_may_give():
-    told = rows(sections(ROOT / "docs" / "questions.md")["audit"], "verdict")
-    assert set(told) == set(audit.Verdict.__args__)
+    reported = rows(sections(ROOT / "docs" / "questions.md")["audit"], "verdict")
+    assert set(reported) == set(audit.Verdict.__args__)
 
 
 def test_candidates_and_variants_are_documented():
@@ -181,12 +181,12 @@ def test_candidates_and_variants_are_documented():
 
 def test_every_effect_is_documented_by_its_formula():
     text = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
-    told: dict[str, list[str]] = {}
+    reported: dict[str, list[str]] = {}
     for part in text.split("\n## "):
-        told |= rows(part, "effect")
+        reported |= rows(part, "effect")
     cards = {name: kind.card for name, kind in bundled().items()}
-    assert set(told) == set(cards)
-    for name, (formula, shared) in told.items():
+    assert set(reported) == set(cards)
+    for name, (formula, shared) in reported.items():
         assert formula == "`" + cards[name].formula.replace("|", "\\|") + "`"
         assert (shared == "per record") == cards[name].per_record
 
@@ -195,8 +195,8 @@ def test_readme_lists_the_verbs_of_the_command_line(capsys):
     with pytest.raises(SystemExit):
         main(["--help"])
     known = set(re.findall(r"^    (\w+)(?:  |$)", capsys.readouterr().out, flags=re.MULTILINE))
-    told = rows(sections(ROOT / "README.md")["Commands"], "verb")
-    named = {name for cell in told for name in re.findall(r"\w+", cell)}
+    reported = rows(sections(ROOT / "README.md")["Commands"], "verb")
+    named = {name for cell in reported for name in re.findall(r"\w+", cell)}
     assert named == known
     assert len(known) > 10
 

@@ -126,7 +126,7 @@ def test_times_of_files_are_converted_to_one_unit_and_those_of_records_refused(t
         lb.Study(fit=ON, time_unit="s")
 
 
-def test_all_that_is_wrong_with_a_study_is_told_at_once(tmp_path):
+def test_all_that_is_wrong_with_a_study_is_reported_at_once(tmp_path):
     with pytest.raises(lb.InputError) as refused:
         lb.Study(
             fit=[ON, tmp_path / "nowhere.csv"],
@@ -507,11 +507,11 @@ def test_every_public_name_has_a_docstring_that_says_what_it_takes_gives_and_ref
                 if len(inspect.getdoc(each) or "") < 15
             ]
             if dataclasses.is_dataclass(one):
-                told = field_words(one)
+                reported = field_words(one)
                 lacking += [
                     f"{name}.{each.name}: no docstring"
                     for each in dataclasses.fields(one)
-                    if each.name not in told
+                    if each.name not in reported
                 ]
     assert lacking == []
 

@@ -357,8 +357,8 @@ def test_the_device_does_not_know_the_future_nor_the_clock(command, shift):
     whole = device.response(command, SAMPLES)
     now = 6.0
     past = command.times <= now - XX.delay
-    told = device.response(Command(command.times[past], command.values[past], command.rest), SAMPLES)
-    assert_allclose(whole[now >= SAMPLES], told[now >= SAMPLES], atol=1e-12)
+    reported = device.response(Command(command.times[past], command.values[past], command.rest), SAMPLES)
+    assert_allclose(whole[now >= SAMPLES], reported[now >= SAMPLES], atol=1e-12)
     later = Command(command.times + shift, command.values, command.rest)
     assert_allclose(device.response(later, SAMPLES + shift), whole, atol=1e-8)
 

@@ -1,4 +1,4 @@
-"""Every effect that library and bench both have, simulated by both: two roads to one response."""
+"""Every effect that library and bench both have, simulated by both: two methods to one response."""
 
 from __future__ import annotations
 
@@ -99,15 +99,17 @@ SHARED = sorted(set(NAMED) & set(bundled()) - NO_MEAN - {"pointing_drift"})
 
 
 def gap(name: str, seed: int, wrong: float = 1.0) -> tuple[float, float]:
-    """Largest difference of the two roads, and size of the effect [noise sd]."""
+    """Largest difference of the two methods, and size of the effect [noise sd]."""
     made, values, _ = base()
     numbers, exact = from_bench(name, seed)
     constants, psi = declared(name, numbers)
     with_effect = made.with_effects([bundled()[name](**constants)])
-    told = with_effect.responses(values, wrong * psi)
+    reported = with_effect.responses(values, wrong * psi)
     plain = made.responses(values, made.vanishing)
     linear = [DEVICE.response(c, t) for c, t in zip(base()[2], made.simulator.times, strict=True)]
-    own = [b - a for a, b in zip(plain, told, strict=True)]  # free of the grid's error of the linear plant
+    own = [
+        b - a for a, b in zip(plain, reported, strict=True)
+    ]  # free of the grid's error of the linear plant
     other = [b - a for a, b in zip(linear, exact, strict=True)]
     difference = max(np.abs(a - b).max() for a, b in zip(own, other, strict=True))
     return difference / NOISE, max(np.abs(b).max() for b in other) / NOISE

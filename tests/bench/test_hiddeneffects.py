@@ -43,8 +43,8 @@ def test_march_without_a_change_is_the_step_response():
     element = TransferPath(1.0, 0.0, (1.5, 0.8), (1.7, 0.6), 1.0)
     edges = 0.05 * np.arange(401)
     force = step_means(edges, np.array([0.0]), np.array([2.0]))[None]
-    told = marched((element,), force, lambda f, y, rate, k: f, np.zeros(1), 0.05)
-    assert_allclose(told[0], 2.0 * unit_step(element, edges[1:]), atol=1e-10)
+    reported = marched((element,), force, lambda f, y, rate, k: f, np.zeros(1), 0.05)
+    assert_allclose(reported[0], 2.0 * unit_step(element, edges[1:]), atol=1e-10)
 
 
 @pytest.mark.parametrize("orders", [(1.0,), (2.0, 1.0)])
@@ -59,14 +59,14 @@ def test_march_of_a_cubic_force_is_second_order(orders):
     exact = solve_ivp(law, (0, 6), [0.0] * len(orders), t_eval=[6.0], rtol=1e-11, atol=1e-12).y[0, -1]
     errors = []
     for n in (60, 120, 240):
-        told = marched(
+        reported = marched(
             (TransferPath(1.0, 0.0, etas, orders, 1.0),),
             np.ones((1, n)),
             lambda f, y, rate, k: f - 2.0 * y**3,
             np.zeros(1),
             6 / n,
         )
-        errors.append(abs(told[0, -1] - exact))
+        errors.append(abs(reported[0, -1] - exact))
     slope = np.log2(errors[0] / errors[1]), np.log2(errors[1] / errors[2])
     assert all(1.7 < one < 2.4 for one in slope)
 
@@ -101,21 +101,21 @@ def test_command_survives_its_parts():
 @pytest.mark.parametrize("schedules", [rich_schedules, plain_schedules])
 @pytest.mark.parametrize("seed", range(5))
 def test_schedules(schedules, seed):
-    told = schedules(np.random.default_rng(seed))
-    assert len(told) == 11
-    assert sum(one.held_out for one in told) == 3
-    for one in told:
+    reported = schedules(np.random.default_rng(seed))
+    assert len(reported) == 11
+    assert sum(one.held_out for one in reported) == 3
+    for one in reported:
         assert 30 <= one.duration <= 100
         assert one.command.times[0] >= 3.0
         assert np.abs(one.command.values).max() <= LARGEST + 1e-12
-    late = np.concatenate([one.command.times for one in told])
+    late = np.concatenate([one.command.times for one in reported])
     assert np.std(late % 1.0) > 0.2  # commands at any time, not on the refresh grid
     if schedules is plain_schedules:
-        assert all(one.command.times.size == 1 for one in told)
+        assert all(one.command.times.size == 1 for one in reported)
     else:
-        assert all(one.command.times[0] >= 6.0 for one in told)
-        assert_array_equal(told[0].command.values, told[10].command.values)  # the repeat
-        assert min(one.command.values.min() for one in told) < 0
+        assert all(one.command.times[0] >= 6.0 for one in reported)
+        assert_array_equal(reported[0].command.values, reported[10].command.values)  # the repeat
+        assert min(one.command.values.min() for one in reported) < 0
 
 
 def test_control_is_the_device_with_noise():
@@ -169,7 +169,7 @@ def test_sizes_are_drawn():
     assert max(np.abs(sizes)) <= 0.04
 
 
-def test_unknown_effect_is_told():
+def test_unknown_effect_is_reported():
     with pytest.raises(InputError, match="did you mean 'backflow'"):
         drawn(["backflaw"], np.random.default_rng(0))
 

@@ -101,15 +101,15 @@ def test_calibrate_with_an_effect_goes_to_its_end(tmp_path: Path, capsys: pytest
     out = tmp_path / "run"
     words = ["calibrate", str(tmp_path / "in"), "--replicas", "1", "--jobs", "1", "--quick", "--json"]
     assert main([*words, "--out", str(out)]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["replicas"] == 1
-    assert told["failures"] == []
-    assert told["engine"]["importance"] == 1
-    assert told["grades"]["unusable"] == 0
-    ranked = {one["parameter"] for one in told["ranks"]}
+    reported = json.loads(capsys.readouterr().out)
+    assert reported["replicas"] == 1
+    assert reported["failures"] == []
+    assert reported["engine"]["importance"] == 1
+    assert reported["grades"]["unusable"] == 0
+    ranked = {one["parameter"] for one in reported["ranks"]}
     assert {"gain", "cubic_stiffness.c", "log_likelihood"} <= ranked
-    assert told["model_gap"]["largest"] < 1.0
+    assert reported["model_gap"]["largest"] < 1.0
     assert "cubic_stiffness.c" in (out / "report.html").read_text()
     assert main([*words, "--out", str(out), "--resume"]) == 0
     again = json.loads(capsys.readouterr().out)
-    assert again["coverage"] == told["coverage"]
+    assert again["coverage"] == reported["coverage"]

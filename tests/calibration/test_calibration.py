@@ -233,25 +233,27 @@ def test_the_truth_on_the_bench_is_the_bundled_device():
 
 
 def test_two_axes_rests_exposure_and_missing_cells_are_kept():
-    told = record(device=TWO, noise_sd=0.0)
-    holes = np.array(told.response)
+    reported = record(device=TWO, noise_sd=0.0)
+    holes = np.array(reported.response)
     holes[3:9, 0] = np.nan
     holes[20, :] = np.nan
-    holed = Record("holed", told.time, told.drive, holes, told.drive_axes, told.response_axes, "ms")
-    made = problem(told, holed, noise="ar1", terms={"direct": 2, "cross": 1}, exposure_ms=0.1)
+    holed = Record(
+        "holed", reported.time, reported.drive, holes, reported.drive_axes, reported.response_axes, "ms"
+    )
+    made = problem(reported, holed, noise="ar1", terms={"direct": 2, "cross": 1}, exposure_ms=0.1)
     table = made.posterior.table
     truth = table.draw(1, np.random.default_rng(4))[0]
     exact = exact_responses(made, truth)
     device = device_of(table, truth, 1, time_unit="ms")
     command = on_off((1.0, 0.6), hold=5.0, at=0.35, rest=(0.0, 0.2))
-    assert_array_equal(command_of(told).times, command.times)
-    assert_array_equal(command_of(told).values, command.values)
+    assert_array_equal(command_of(reported).times, command.times)
+    assert_array_equal(command_of(reported).values, command.values)
     times = made.posterior.samples[1].times
     assert_allclose(exact[1], device.response(command, times, exposure=0.1), rtol=1e-12)
     assert exact[0].std() > 0
     rng, seen = np.random.default_rng(1), made.posterior.samples
     again = [measured(made, truth, one, clean, rng) for one, clean in zip(seen, exact, strict=True)]
-    for old, new in zip((told, holed), again, strict=True):
+    for old, new in zip((reported, holed), again, strict=True):
         assert_array_equal(np.isnan(old.response), np.isnan(new.response))
         assert_array_equal(old.drive, new.drive)
         assert_array_equal(old.time, new.time)
@@ -326,7 +328,7 @@ def test_step_responses_are_looked_at_after_every_delay():
     assert (np.diff(made.step_times) > 0).all()
 
 
-def test_a_replica_that_fails_is_told(monkeypatch, alone):
+def test_a_replica_that_fails_is_reported(monkeypatch, alone):
     real = Replication.__call__
 
     def poor(self, number):
@@ -340,12 +342,14 @@ def test_a_replica_that_fails_is_told(monkeypatch, alone):
     assert made.failures == (Failure(1, seed, "ArithmeticError: two contours differ"),)
     assert [o.replica for o in made.outcomes] == [0, 2]
     assert made.outcomes[0].ranks == alone.outcomes[0].ranks
-    told = results(made)
-    assert told["replicas"] == 2
-    assert told["asked"] == 3
-    assert told["grades"]["failed"] == 1
-    assert told["failures"] == [{"replica": 1, "seed": seed, "error": "ArithmeticError: two contours differ"}]
-    assert f"number 1 (seed {seed}): ArithmeticError: two contours differ" in told["verdict"]
+    reported = results(made)
+    assert reported["replicas"] == 2
+    assert reported["asked"] == 3
+    assert reported["grades"]["failed"] == 1
+    assert reported["failures"] == [
+        {"replica": 1, "seed": seed, "error": "ArithmeticError: two contours differ"}
+    ]
+    assert f"number 1 (seed {seed}): ArithmeticError: two contours differ" in reported["verdict"]
 
     def dead(self, number):
         raise ArithmeticError("nothing works")
@@ -359,10 +363,10 @@ def test_a_replica_that_fails_is_told(monkeypatch, alone):
 
 
 def test_both_engines_give_a_replica_the_same_posterior():
-    told = study(record(camera=0.6), noise="white", sampler={"ensembles": 2, "walkers": 32})
+    reported = study(record(camera=0.6), noise="white", sampler={"ensembles": 2, "walkers": 32})
     found = {}
     for engine in ENGINES:
-        made = replace(replication(told), engine=engine)
+        made = replace(replication(reported), engine=engine)
         seed = made.seed_of(0)
         truth = made.truths.draw(np.random.default_rng(1))
         truth[made.problem.posterior.table.of_kind("sigma")] = 0.02
@@ -404,17 +408,17 @@ def test_a_stated_truth_is_the_same_in_every_replica():
     for outcome in made.outcomes:
         assert {name: outcome.truths[names.index(name)] for name in STATED} == STATED
     assert len({outcome.ranks for outcome in made.outcomes}) == 3  # the noise differs
-    told = results(made)
-    assert told["truths"] == {"from": "stated", "folder": None, "grade": None, "stated": STATED}
-    assert "The truth was stated" in told["verdict"]
-    assert "Ranks are" not in told["verdict"]
-    json.dumps(told, allow_nan=False)
+    reported = results(made)
+    assert reported["truths"] == {"from": "stated", "folder": None, "grade": None, "stated": STATED}
+    assert "The truth was stated" in reported["verdict"]
+    assert "Ranks are" not in reported["verdict"]
+    json.dumps(reported, allow_nan=False)
 
 
 def test_default_priors_of_a_stated_truth_are_those_of_its_own_records():
     """As a fit derives them; where truths are drawn from the prior, the prior stays."""
-    told = study(record(camera=0.6), noise="white")
-    made = replication(told)
+    reported = study(record(camera=0.6), noise="white")
+    made = replication(reported)
     records = (record(7, camera=0.6, noise_sd=0.2),)
     assert made._measured_again(records).posterior.table is made.problem.posterior.table
     stated = replace(made, truths=truths_stated(TRUTH, made.problem.posterior.table))
@@ -432,12 +436,12 @@ def test_what_the_width_of_the_blocks_does_is_counted(monkeypatch):
     truth = {name: TRUTH[name] for name in ("gain", "time_1", "order_1", "offset")}
     made = calibrate(coarse, replicas=1, truth=truth)
     (outcome,) = made.outcomes
-    told = results(made)
+    reported = results(made)
     assert outcome.shift > 0.2
     assert not outcome.resolved
     assert outcome.grade != "reliable"
-    assert told["discretisation"]["negligible"] == 0
-    assert told["discretisation"]["largest"] == outcome.shift
+    assert reported["discretisation"]["negligible"] == 0
+    assert reported["discretisation"]["largest"] == outcome.shift
 
 
 @pytest.mark.parametrize("delay", [1.0, 1.07])
@@ -626,10 +630,10 @@ def test_truths_around_a_posterior_are_its_draws(fitted):
     assert (np.abs(drawn - truth).max(axis=1) == 0).any()
     assert truth[table.at("delay", 0)] == TRUTH["delay"]
     made = calibrate(STUDY, replicas=1, around=fitted)
-    told = results(made)
+    reported = results(made)
     source = {"from": "posterior", "folder": str(fitted), "grade": truths.grade, "stated": None}
-    assert told["truths"] == source
-    assert "inferred under the prior of the study" in told["verdict"]
+    assert reported["truths"] == source
+    assert "inferred under the prior of the study" in reported["verdict"]
     assert made.replication.truths.digest
 
 
@@ -684,33 +688,33 @@ def gathered(
 
 
 def test_an_exact_procedure_is_said_to_cover(rng):
-    told = results(gathered(rng, replication(), 200, reliable=0.95))
-    assert told["replicas"] == told["asked"] == 200
-    assert told["grade"] == "reliable"
-    assert told["grades"] == {"reliable": 190, "tentative": 10, "unusable": 0, "failed": 0}
-    assert told["reliable"]["replicas"] == 190
-    assert len(told["not_reliable"]) == 10
-    assert told["p_value"] > 0.05
-    rows = told["coverage"]
+    reported = results(gathered(rng, replication(), 200, reliable=0.95))
+    assert reported["replicas"] == reported["asked"] == 200
+    assert reported["grade"] == "reliable"
+    assert reported["grades"] == {"reliable": 190, "tentative": 10, "unusable": 0, "failed": 0}
+    assert reported["reliable"]["replicas"] == 190
+    assert len(reported["not_reliable"]) == 10
+    assert reported["p_value"] > 0.05
+    rows = reported["coverage"]
     assert [(row["parameter"], row["level"]) for row in rows[:2]] == [("gain", 0.5), ("gain", 0.9)]
     assert len(rows) == 2 * (4 + 4)
     assert all(row["lower"] <= row["level"] <= row["upper"] and row["within"] for row in rows)
-    assert all(sum(row["counts"]) == 200 and len(row["counts"]) == RANKED + 1 for row in told["ranks"])
-    assert "within its Monte Carlo band" in told["verdict"]
-    assert "every one of 4 parameters" in told["verdict"]
-    assert "Ranks are uniform" in told["verdict"]
-    assert "outside" not in told["verdict"]
+    assert all(sum(row["counts"]) == 200 and len(row["counts"]) == RANKED + 1 for row in reported["ranks"])
+    assert "within its Monte Carlo band" in reported["verdict"]
+    assert "every one of 4 parameters" in reported["verdict"]
+    assert "Ranks are uniform" in reported["verdict"]
+    assert "outside" not in reported["verdict"]
 
 
 def test_intervals_that_are_too_narrow_are_named(rng):
-    told = results(gathered(rng, replication(), 200, narrow="time_1"))
-    assert told["p_value"] < 1e-3
-    bad = [row["parameter"] for row in told["coverage"] if not row["within"]]
+    reported = results(gathered(rng, replication(), 200, narrow="time_1"))
+    assert reported["p_value"] < 1e-3
+    bad = [row["parameter"] for row in reported["coverage"] if not row["within"]]
     assert set(bad) == {"time_1"}
-    assert "outside its Monte Carlo band" in told["verdict"]
-    assert "time_1 at 90 %" in told["verdict"]
-    assert "Ranks are not uniform" in told["verdict"]
-    assert "gain" not in told["verdict"]
+    assert "outside its Monte Carlo band" in reported["verdict"]
+    assert "time_1 at 90 %" in reported["verdict"]
+    assert "Ranks are not uniform" in reported["verdict"]
+    assert "gain" not in reported["verdict"]
 
 
 def test_few_or_unreliable_replicas_are_graded_so(rng):
@@ -718,11 +722,11 @@ def test_few_or_unreliable_replicas_are_graded_so(rng):
     assert results(gathered(rng, made, 20))["grade"] == "tentative"
     assert results(gathered(rng, made, 60, reliable=0.8))["grade"] == "tentative"
     assert results(gathered(rng, made, 60, reliable=0.3))["grade"] == "unusable"
-    told = results(calibrate(STUDY, replicas=3, engine="sampling"))
-    assert told["grade"] == "unusable"
-    assert told["reliable"] is None
-    assert told["replicas"] == 3
-    json.dumps(told, allow_nan=False)
+    reported = results(calibrate(STUDY, replicas=3, engine="sampling"))
+    assert reported["grade"] == "unusable"
+    assert reported["reliable"] is None
+    assert reported["replicas"] == 3
+    json.dumps(reported, allow_nan=False)
 
 
 # -- the study of the default settings -------------------------------------------------------------
@@ -734,9 +738,9 @@ def test_the_study_of_the_defaults_counts_and_resumes(defaults, tmp_path, capsys
     assert defaults.main([*words, "1"]) == 0
     first = json.loads((tmp_path / "out" / "results.json").read_text())
     assert defaults.main([*words, "2"]) == 0
-    told = json.loads((tmp_path / "out" / "results.json").read_text())
-    assert (first["replicas"], told["replicas"]) == (1, 2)
-    (cell,) = told["cells"]
+    reported = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert (first["replicas"], reported["replicas"]) == (1, 2)
+    (cell,) = reported["cells"]
     assert cell["cell"] == "white_0.5pc_order0.9_delay1"
     assert all(
         first["cells"][0]["hits"][name]["0.9"] <= hits["0.9"] <= 2 for name, hits in cell["hits"].items()
@@ -775,13 +779,13 @@ def counted(defaults: ModuleType, rng, *, narrow: str = "") -> dict:
 
 def test_a_small_bias_in_every_cell_shows_when_cells_are_pooled(defaults, rng):
     """Six points of coverage, too few for one cell of 200 replicas."""
-    told = counted(defaults, rng)
-    assert all(row["within"] for row in told["coverage"] + told["pooled"])
-    told = counted(defaults, rng, narrow="delay")
-    outside = {row["parameter"] for row in told["pooled"] if not row["within"]}
+    reported = counted(defaults, rng)
+    assert all(row["within"] for row in reported["coverage"] + reported["pooled"])
+    reported = counted(defaults, rng, narrow="delay")
+    outside = {row["parameter"] for row in reported["pooled"] if not row["within"]}
     assert outside == {"delay"}
-    assert "outside: " in told["verdict"][3]
-    assert "delay at 90%" in told["verdict"][3]
+    assert "outside: " in reported["verdict"][3]
+    assert "delay at 90%" in reported["verdict"][3]
 
 
 @pytest.mark.slow
@@ -790,8 +794,8 @@ def test_default_settings_cover_at_a_stated_truth(defaults, delay):
     """On wide blocks read through a parabola 90 % intervals covered 0.3 to 0.7 (100 replicas)."""
     cell = defaults.Cell(0.002, delay, (3.4,), (0.9,), "white")
     made = calibrate(cell.study(2), replicas=60, truth=cell.truth, jobs=2)
-    told = results(made)
-    assert all(row["within"] for row in told["coverage"] if row["kind"] == "parameter")
+    reported = results(made)
+    assert all(row["within"] for row in reported["coverage"] if row["kind"] == "parameter")
 
 
 # -- the command line ------------------------------------------------------------------------------
@@ -826,11 +830,11 @@ def test_calibrate_writes_its_folder_and_prints_json(written, tmp_path, capsys, 
     out = tmp_path / "run"
     words = ("calibrate", written, "--replicas", 2, "--jobs", 1, "--out", out)
     code, printed, _ = run(capsys, *words, "--json")
-    told = json.loads(printed)
+    reported = json.loads(printed)
     assert code == 0
-    assert told["replicas"] == 2
-    assert told["coverage"][0].keys() >= {"parameter", "level", "observed", "lower", "upper"}
-    assert 0 < told["p_value"] <= 1
+    assert reported["replicas"] == 2
+    assert reported["coverage"][0].keys() >= {"parameter", "level", "observed", "lower", "upper"}
+    assert 0 < reported["p_value"] <= 1
     assert {path.name for path in out.iterdir()} == {
         *("results.json", "report.html", "provenance.json", "figures", "tables", "replicas")
     }
@@ -856,9 +860,9 @@ def test_a_killed_calibration_resumes_to_the_same_result(written, tmp_path):
     killed.wait()
     assert 1 <= len(list((cut / "replicas").glob("0*.json"))) < 3, "the run ended before it could be killed"
     assert main([*words, str(cut), "--resume"]) == 0
-    told = [json.loads((folder / "results.json").read_text()) for folder in (whole, cut)]
-    assert told[0].pop("seconds").keys() == told[1].pop("seconds").keys()
-    assert told[0] == told[1]
+    reported = [json.loads((folder / "results.json").read_text()) for folder in (whole, cut)]
+    assert reported[0].pop("seconds").keys() == reported[1].pop("seconds").keys()
+    assert reported[0] == reported[1]
 
 
 @pytest.mark.parametrize(
@@ -880,14 +884,14 @@ def test_a_killed_calibration_resumes_to_the_same_result(written, tmp_path):
         (("--dask", "not an address"), "no Dask scheduler answers there"),
     ],
 )
-def test_bad_input_is_told_and_nothing_is_written(written, tmp_path, capsys, monkeypatch, words, said):
+def test_bad_input_is_reported_and_nothing_is_written(written, tmp_path, capsys, monkeypatch, words, said):
     monkeypatch.setattr("lcopa_bayes.core.parallel.CONNECT", 0.5)
     out = tmp_path / "run"
-    code, printed, told = run(capsys, "calibrate", written, *words, "--out", out, "--quiet")
+    code, printed, reported = run(capsys, "calibrate", written, *words, "--out", out, "--quiet")
     assert code == 2
     assert printed == ""
-    assert said in told
-    assert told.startswith("error: ")
+    assert said in reported
+    assert reported.startswith("error: ")
     assert not out.exists()
 
 

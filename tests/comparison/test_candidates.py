@@ -61,7 +61,7 @@ def test_a_prior_on_an_order_does_not_free_an_integer():
     assert problem_of(made("fractional-1", own).study).posterior.table.rows[2].prior.support == (0.2, 1.2)
 
 
-def test_priors_of_parameters_that_are_gone_are_left_out_and_told():
+def test_priors_of_parameters_that_are_gone_are_left_out_and_reported():
     own = study(record(), terms=2, priors={"time_2": 3.0, "delay": 0.5})
     one = made("fractional-1", own)
     assert set(one.study.priors) == {"delay"}
@@ -132,7 +132,7 @@ def test_a_file_adds_and_picks(tmp_path):
         ("not toml", "is not valid TOML"),
     ],
 )
-def test_what_is_wrong_in_a_file_is_told(tmp_path, text, said):
+def test_what_is_wrong_in_a_file_is_reported(tmp_path, text, said):
     path = tmp_path / "more.toml"
     path.write_text(text)
     with pytest.raises(InputError) as refused:

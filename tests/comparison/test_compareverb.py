@@ -43,30 +43,30 @@ def folder(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def told(folder) -> dict:
+def reported(folder) -> dict:
     out = folder / "run"
     assert main(["compare", str(folder), "--pick", *PICK, "--out", str(out), "--jobs", "1", "--quiet"]) == 0
     return json.loads((out / "compare.json").read_text())
 
 
-def test_the_generating_model_is_preferred_and_the_reason_told(told):
-    assert told["preferred"] == "fractional-1"
-    assert told["fractional"]["verdict"] == "not shown"  # 40 samples do not tell it from two lags
-    assert "sums of 2 lags for y" in told["fractional"]["sentence"]
-    assert told["fractional"]["log_bayes_factor"] > 10
-    assert told["agreement"]["agree"]
-    first, whole = told["models"]
+def test_the_generating_model_is_preferred_and_the_reason_reported(reported):
+    assert reported["preferred"] == "fractional-1"
+    assert reported["fractional"]["verdict"] == "not shown"  # 40 samples do not tell it from two lags
+    assert "sums of 2 lags for y" in reported["fractional"]["sentence"]
+    assert reported["fractional"]["log_bayes_factor"] > 10
+    assert reported["agreement"]["agree"]
+    first, whole = reported["models"]
     assert first["log_evidence"] - whole["log_evidence"] > 10
     assert first["probability"] > 0.99
     assert first["held_out_rmse"]["y"] < whole["held_out_rmse"]["y"]
     assert first["elpd_difference"] == 0
     assert first["aic"] < whole["aic"]
-    (order,) = told["order_is_integer"]
+    (order,) = reported["order_is_integer"]
     assert (order["model"], order["parameter"], order["answer"]) == (PICK[0], "order_1", "not an integer")
 
 
-def test_every_score_has_its_error_and_grade(told):
-    for row in told["models"]:
+def test_every_score_has_its_error_and_grade(reported):
+    for row in reported["models"]:
         assert {"log_evidence_sd", "elpd_sd", "probability_sd", "grade", "log_evidence_grade"} <= set(row)
         assert [one["factor"] for one in row["prior_widths"]] == [0.5, 2.0]
         for one in row["prior_widths"]:
@@ -81,24 +81,24 @@ def test_every_score_has_its_error_and_grade(told):
             assert one["monte_carlo_sd"] >= 0
 
 
-def test_flat_directions_shift_the_evidence_by_the_log_of_the_width(told):
+def test_flat_directions_shift_the_evidence_by_the_log_of_the_width(reported):
     """Gain, time and delay well inside priors twice as wide: the density falls to half for each."""
-    row = told["models"][0]
+    row = reported["models"][0]
     wide = row["prior_widths"][1]
     assert wide["log_evidence"] - row["log_evidence"] == pytest.approx(-3 * np.log(2), abs=0.25)
 
 
-def test_a_finished_comparison_is_not_fitted_again(folder, told, capsys):
+def test_a_finished_comparison_is_not_fitted_again(folder, reported, capsys):
     cards = {path: path.stat().st_mtime_ns for path in (folder / "run").rglob("candidate.json")}
     options = ["--out", str(folder / "run"), "--jobs", "1", "--resume", "--json", "--quiet"]
     assert main(["compare", str(folder), "--pick", *PICK, *options]) == 0
     again = json.loads(capsys.readouterr().out)
-    assert again["models"] == told["models"]
+    assert again["models"] == reported["models"]
     assert len(cards) == 2
     assert all(path.stat().st_mtime_ns == when for path, when in cards.items())
 
 
-def test_a_damaged_card_is_refused_not_used(folder, told, tmp_path):
+def test_a_damaged_card_is_refused_not_used(folder, reported, tmp_path):
     place = tmp_path / "candidates" / "fractional-1"
     place.mkdir(parents=True)
     (place / "candidate.json").write_text("{")
@@ -106,7 +106,7 @@ def test_a_damaged_card_is_refused_not_used(folder, told, tmp_path):
         compare(candidates_of(study(record()), pick=PICK), folder=tmp_path, resume=True)
 
 
-def test_the_page_shows_all_of_it_and_is_drawn_again_the_same(folder, told):
+def test_the_page_shows_all_of_it_and_is_drawn_again_the_same(folder, reported):
     path = folder / "run" / "compare.html"
     page = path.read_text()
     path.unlink()
@@ -120,12 +120,12 @@ def test_the_page_shows_all_of_it_and_is_drawn_again_the_same(folder, told):
 
 
 @pytest.mark.parametrize("worse", ["fit_scores", "held_out"])
-def test_the_record_whose_bands_hold_least_is_drawn_first(folder, told, tmp_path, worse):
+def test_the_record_whose_bands_hold_least_is_drawn_first(folder, reported, tmp_path, worse):
     shutil.copytree(folder / "run", tmp_path / "run")
-    for row in told["models"]:
+    for row in reported["models"]:
         for key in ("fit_scores", "held_out"):
             row[key] = [one | {"coverage_90": 0.5 if key == worse else 0.9} for one in row[key]]
-    (first, other) = drawn(tmp_path / "run", told)["candidates"][1:]
+    (first, other) = drawn(tmp_path / "run", reported)["candidates"][1:]
     assert [bool(one.mark) for one in (first, other)] == [worse == "held_out", worse != "held_out"]
 
 
@@ -157,12 +157,17 @@ def compared(*, verdict: str = "warranted", answer: str = "not an integer", orde
         models[name] = models[name] | values
     row = {"model": "three", "parameter": "order_1", "grade": "reliable", "answer": answer}
     row["estimate"] = {"lower": order - 0.05, "upper": order + 0.05, "level": 0.9}
-    told = {"study": "s", "models": list(models.values()), "order_is_integer": [row], "preferred": "three"}
-    return told | {"fractional": {"verdict": verdict, "sentence": "Said."}}
+    reported = {
+        "study": "s",
+        "models": list(models.values()),
+        "order_is_integer": [row],
+        "preferred": "three",
+    }
+    return reported | {"fractional": {"verdict": verdict, "sentence": "Said."}}
 
 
-def verdict_of(claim: str, told: dict) -> str:
-    judged = judge(Evidence(compare=told))
+def verdict_of(claim: str, reported: dict) -> str:
+    judged = judge(Evidence(compare=reported))
     return judged[claim].kind.value
 
 
@@ -185,8 +190,8 @@ def test_m2_reads_the_distance_of_the_steady_states():
     from lcopa_bayes.model.literature import PAPER
     from lcopa_bayes.paper.comparisonclaims import same_steady_state
 
-    def kind(told: dict) -> str:
-        return same_steady_state(PAPER, told).kind.value
+    def kind(reported: dict) -> str:
+        return same_steady_state(PAPER, reported).kind.value
 
     apart = {"whole": {"step_metrics": model("", 0, 0, 0.0185)["step_metrics"]}}
     assert kind(compared()) == "supported"
@@ -210,8 +215,10 @@ def test_m4_tells_what_prediction_gains_with_its_error():
     assert "by +10.00 ± 4.00 nats" in how
 
 
-def test_a_comparison_of_an_earlier_version_is_refused_by_the_page(folder, told, tmp_path):
-    old = told | {"models": [{k: v for k, v in row.items() if k != "containment"} for row in told["models"]]}
+def test_a_comparison_of_an_earlier_version_is_refused_by_the_page(folder, reported, tmp_path):
+    old = reported | {
+        "models": [{k: v for k, v in row.items() if k != "containment"} for row in reported["models"]]
+    }
     (tmp_path / "compare.json").write_text(json.dumps(old))
     with pytest.raises(InputError, match="run `compare` again"):
         write_page_of("compare", tmp_path)
@@ -237,9 +244,9 @@ def test_one_fractional_term_beats_second_order_on_the_heating_system(tmp_path):
     out = tmp_path / "heat"
     words = ["--pick", "fractional-1", "second-order", "--quick", "--quiet", "--out", str(out)]
     assert main(["compare", str(RECORDS / "heating_system"), *words]) == 0
-    told = json.loads((out / "compare.json").read_text())
-    free, whole = (one["held_out_rmse"]["plate"] for one in told["models"])
+    reported = json.loads((out / "compare.json").read_text())
+    free, whole = (one["held_out_rmse"]["plate"] for one in reported["models"])
     assert free < 5.0 < whole
-    assert told["fractional"]["log_bayes_factor"] > 20
-    assert told["fractional"]["verdict"] == "not warranted"  # three lags do better than either
-    assert "Beside fractional-1, sums of 3 lags for plate" in told["fractional"]["sentence"]
+    assert reported["fractional"]["log_bayes_factor"] > 20
+    assert reported["fractional"]["verdict"] == "not warranted"  # three lags do better than either
+    assert "Beside fractional-1, sums of 3 lags for plate" in reported["fractional"]["sentence"]

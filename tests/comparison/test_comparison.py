@@ -172,20 +172,20 @@ def test_of_one_record_the_future_is_predicted_stretch_by_stretch():
 
 
 def test_the_error_of_a_total_knows_that_neighbours_err_together():
-    totals, told = [], []
+    totals, reported = [], []
     pointwise = {"part": ["a"] * 400, "axis": ["y"] * 400}
     where = stretches(pointwise)
     for seed in range(200):
         rng = np.random.default_rng(seed)
         noise = np.convolve(rng.normal(size=409), np.ones(10) / 10, mode="valid")
         totals.append(noise.sum())
-        told.append(total_sd(np.array([noise[where == block].sum() for block in np.unique(where)])))
-    assert 0.75 < np.mean(told) / np.std(totals) < 1.15
+        reported.append(total_sd(np.array([noise[where == block].sum() for block in np.unique(where)])))
+    assert 0.75 < np.mean(reported) / np.std(totals) < 1.15
     naive = 20 * np.std(noise)
     assert naive < 0.5 * np.std(totals)
 
 
-# -- carried draws ---------------------------------------------------------------------------------
+# -- reweighted draws ---------------------------------------------------------------------------------
 
 
 def gauss(data: np.ndarray) -> Toy:
@@ -195,7 +195,7 @@ def gauss(data: np.ndarray) -> Toy:
     return Toy(log_likelihood, {"a": ("norm", {"loc": 0.0, "scale": 2.0}), "b": ("norm", {"scale": 2.0})})
 
 
-def test_draws_carried_to_fewer_data_are_those_of_the_smaller_posterior(rng, monkeypatch):
+def test_draws_reweighted_to_fewer_data_are_those_of_the_smaller_posterior(rng, monkeypatch):
     data = np.concatenate([rng.normal(1.0, 0.5, 3), rng.normal(-1.5, 0.5, 12)])
     source, target = gauss(data), gauss(data[:3])
 
@@ -229,7 +229,7 @@ def test_draws_carried_to_fewer_data_are_those_of_the_smaller_posterior(rng, mon
 
 
 @pytest.mark.parametrize(
-    ("kind", "dist", "told", "half", "twice"),
+    ("kind", "dist", "reported", "half", "twice"),
     [
         ("gain", "norm", {"loc": 1.0, "scale": 2.0}, (1.0, 1.0), (1.0, 4.0)),
         ("delay", "uniform", {"loc": 0.0, "scale": 4.0}, (0.0, 2.0), (0.0, 8.0)),
@@ -237,8 +237,8 @@ def test_draws_carried_to_fewer_data_are_those_of_the_smaller_posterior(rng, mon
         ("time", "loguniform", {"a": 0.01, "b": 100.0}, (0.1, 10.0), (0.01, 1e6)),
     ],
 )
-def test_priors_half_and_twice_as_wide(kind, dist, told, half, twice):
-    row = Parameter(kind, "-", kind, Place(0, 0), Prior(dist, told))
+def test_priors_half_and_twice_as_wide(kind, dist, reported, half, twice):
+    row = Parameter(kind, "-", kind, Place(0, 0), Prior(dist, reported))
     for factor, wanted in ((0.5, half), (2.0, twice)):
         made = _scaled(row, factor).prior.parameters
         assert tuple(made.values()) == pytest.approx(wanted)
@@ -246,8 +246,8 @@ def test_priors_half_and_twice_as_wide(kind, dist, told, half, twice):
 
 def test_orders_and_noise_keep_their_priors():
     for kind, dist in (("order", "uniform"), ("sigma", "loguniform"), ("offset", "norm")):
-        told = {"a": 0.1, "b": 1.0} if dist == "loguniform" else {"loc": 0.0, "scale": 1.0}
-        row = Parameter(kind, "-", kind, Place(0, 0), Prior(dist, told))
+        reported = {"a": 0.1, "b": 1.0} if dist == "loguniform" else {"loc": 0.0, "scale": 1.0}
+        row = Parameter(kind, "-", kind, Place(0, 0), Prior(dist, reported))
         assert _scaled(row, 2.0) is row
 
 
@@ -262,7 +262,7 @@ def prior_widths(half: float | None, twice: float | None) -> list[dict]:
     ]
 
 
-def card(name: str, evidence: float | None, lpd: float, **told: object) -> dict:
+def card(name: str, evidence: float | None, lpd: float, **reported: object) -> dict:
     """A card whose 40 predicted samples share `lpd` evenly, with a small fixed wobble."""
     wobble = 0.01 * np.sin(np.arange(40.0) * (1 + len(name)))
     scores = [{"record": "a", "axis": "y", "unit": "rad", "rmse": 1.0, "samples": 40}]
@@ -295,7 +295,7 @@ def card(name: str, evidence: float | None, lpd: float, **told: object) -> dict:
         "sums_of_lags": [],
         "containment": {"contains": [], "sampled_again": False, "met": True},
     }
-    return base | told
+    return base | reported
 
 
 @cache
@@ -307,11 +307,11 @@ def outcome(*cards: dict) -> dict:
     return judged(cards, any_study())
 
 
-def test_the_simpler_of_equals_suffices_and_the_gain_is_told():
-    told = outcome(card("two", 10.0, 5.0), card("three", 10.3, 5.0, parameters=7))
-    assert told["preferred"] == "two"
-    assert "three, with more parameters, gains +0.3 ± 0.1 nats" in told["why"]
-    assert told["agreement"]["agree"]
+def test_the_simpler_of_equals_suffices_and_the_gain_is_reported():
+    reported = outcome(card("two", 10.0, 5.0), card("three", 10.3, 5.0, parameters=7))
+    assert reported["preferred"] == "two"
+    assert "three, with more parameters, gains +0.3 ± 0.1 nats" in reported["why"]
+    assert reported["agreement"]["agree"]
     richer = outcome(card("two", 10.0, 5.0), card("three", 14.0, 5.0, parameters=7))
     assert richer["preferred"] == "three"
 
@@ -320,42 +320,44 @@ def test_unseen_records_decide_where_fit_and_prediction_disagree():
     held = [{"record": "b", "axis": "y", "unit": "rad", "rmse": 2.0, "samples": 40}]
     fits = card("one", 30.0, 5.0, held_out=held, residual_rms={"y": 0.5})
     predicts = card("two", 10.0, 15.0, held_out=[held[0] | {"rmse": 1.0}])
-    told = outcome(fits, predicts)
-    assert told["preferred"] == "two"
-    assert told["agreement"]["agree"] is False
-    assert "one has the highest evidence and predicts worst of all" in told["why"]
+    reported = outcome(fits, predicts)
+    assert reported["preferred"] == "two"
+    assert reported["agreement"]["agree"] is False
+    assert "one has the highest evidence and predicts worst of all" in reported["why"]
     equal = outcome(fits, predicts | {"log_evidence": 30.3, "parameters": 7})
     assert "one is the simplest that no evidence speaks against and predicts worst of all" in equal["why"]
-    assert [flag["kind"] for flag in told["flags"]] == ["overfit"]
+    assert [flag["kind"] for flag in reported["flags"]] == ["overfit"]
     same_record = outcome(card("one", 30.0, 5.0), card("two", 10.0, 15.0))
     assert same_record["preferred"] == "one"  # no unseen record: a warning alone
     assert "warning" in same_record["why"]
 
 
 def test_an_unusable_candidate_is_ranked_nowhere():
-    told = outcome(
+    reported = outcome(
         card("one", 10.0, 5.0),
         card("two", 9.0, 5.0),
         card("bad", 90.0, 50.0, usable=False, grade_reason="its draws do not vary"),
     )
-    row = next(model for model in told["models"] if model["name"] == "bad")
-    assert told["preferred"] == "one"
+    row = next(model for model in reported["models"] if model["name"] == "bad")
+    assert reported["preferred"] == "one"
     assert row["probability"] is row["stacking"] is row["elpd"] is None
-    assert "its draws do not vary" in told["unranked"][0]["reason"]
+    assert "its draws do not vary" in reported["unranked"][0]["reason"]
 
 
 def test_without_evidence_prediction_stands_alone():
-    told = outcome(card("one", None, 5.0, evidence_undefined="improper prior of gain"), card("two", 9.0, 5.0))
-    assert told["evidence_undefined"][0]["name"] == "one"
-    assert told["models"][0]["elpd"] is not None
-    assert told["models"][0]["probability"] is None
+    reported = outcome(
+        card("one", None, 5.0, evidence_undefined="improper prior of gain"), card("two", 9.0, 5.0)
+    )
+    assert reported["evidence_undefined"][0]["name"] == "one"
+    assert reported["models"][0]["elpd"] is not None
+    assert reported["models"][0]["probability"] is None
     neither = outcome(card("one", None, 5.0), card("two", None, 9.0))
     assert neither["preferred"] == "two"
 
 
-def fractional(gain: float, predicted: float, **told: object) -> str:
-    free = card("free", gain, predicted, parameters=6, **told)
-    return str(outcome(free, card("first-order", 0.0, 0.0, **told))["fractional"]["verdict"])
+def fractional(gain: float, predicted: float, **reported: object) -> str:
+    free = card("free", gain, predicted, parameters=6, **reported)
+    return str(outcome(free, card("first-order", 0.0, 0.0, **reported))["fractional"]["verdict"])
 
 
 def test_a_fractional_win_needs_evidence_and_prediction():
@@ -389,7 +391,7 @@ def test_a_win_that_hangs_on_the_prior_is_not_claimed():
 
 
 @pytest.mark.parametrize(("half", "twice", "said"), [(None, 20.0, "0.5"), (20.0, None, "2")])
-def test_a_width_that_could_not_be_computed_is_told_and_no_win_claimed(half, twice, said):
+def test_a_width_that_could_not_be_computed_is_reported_and_no_win_claimed(half, twice, said):
     """Such a width is no width at which the win holds."""
     whole = card("first-order", 0.0, 0.0)
     known = outcome(card("free", 20.0, 10.0, parameters=6, prior_widths=prior_widths(20.0, 19.0)), whole)
@@ -422,7 +424,7 @@ def judged_rows(*cards: dict) -> list[dict]:
 
 
 def test_the_error_of_a_difference_holds_what_the_draws_add():
-    """Second road: the spread over ten stretches of four samples, and the Monte Carlo error of both."""
+    """Second method: the spread over ten stretches of four samples, and the Monte Carlo error of both."""
     cards = [card("base", -100.0, -50.0), card("longer", -100.0, -40.0)]
     behind, best = judged(cards, any_study())["models"]
     gap = np.subtract(*(one["pointwise"]["log_density"] for one in cards))

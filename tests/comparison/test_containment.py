@@ -96,8 +96,8 @@ def test_a_term_of_hardly_any_order_is_not_split_into_parts_that_vanish():
 )
 def test_a_noise_that_can_become_another_is_close_to_it(noise, small, loss):
     source, target = (single("fractional-1", noise=kind) for kind in (small, noise))
-    told = TRUE | ({"rho": 0.4} if small == "ar1" else {})
-    values = row_values(source.table, told)[None]
+    reported = TRUE | ({"rho": 0.4} if small == "ar1" else {})
+    values = row_values(source.table, reported)[None]
     found = lifted(values, source, target, np.random.default_rng(3))
     assert abs(full(target, found)[0] - full(source, values)[0]) < loss
     assert lifted(found, target, source, np.random.default_rng(3)) is None
@@ -199,9 +199,9 @@ def test_a_richer_model_starts_from_the_optimum_of_what_it_contains(monkeypatch,
         card("fractional-2", own.values, own.log_likelihood if trapped else peak.log_likelihood, 8),
         ((one, card("fractional-1", top.values, top.log_likelihood, 6)),),
     )
-    told = check()
-    assert told["containment"]["sampled_again"] is again
-    assert [row["missed"] for row in told["containment"]["contains"]] == [again]
+    reported = check()
+    assert reported["containment"]["sampled_again"] is again
+    assert [row["missed"] for row in reported["containment"]["contains"]] == [again]
     assert bool(seen) is again
     if again:
         assert own.log_likelihood < top.log_likelihood - 20
@@ -211,8 +211,8 @@ def test_a_richer_model_starts_from_the_optimum_of_what_it_contains(monkeypatch,
         left = check()
         assert (left["usable"], left["grade"], left["containment"]["met"]) == (False, "unusable", False)
         assert left["grade_reason"] == "needle"
-    resumed = replace(check, card=dict(check.card) | {"containment": told["containment"]})
-    assert resumed()["containment"] == told["containment"]  # what was checked is not checked again
+    resumed = replace(check, card=dict(check.card) | {"containment": reported["containment"]})
+    assert resumed()["containment"] == reported["containment"]  # what was checked is not checked again
 
 
 @pytest.fixture(scope="module")
@@ -237,8 +237,8 @@ def misled():
 def test_a_missed_mode_is_found_and_the_richer_model_sampled_again(misled, monkeypatch):
     two, astray = misled
     monkeypatch.setattr(candidatefit, "fit", astray)
-    told = compare(two, quick=True)
-    one, richer = told["models"]
+    reported = compare(two, quick=True)
+    one, richer = reported["models"]
     held = richer["containment"]
     (checked,) = held["contains"]
     assert checked["missed"]
@@ -249,7 +249,7 @@ def test_a_missed_mode_is_found_and_the_richer_model_sampled_again(misled, monke
     assert richer["max_log_likelihood"] >= one["max_log_likelihood"] - 0.5
     delay = next(row for row in richer["estimates"] if row["name"] == "delay")
     assert delay["value"] == pytest.approx(2.37, abs=0.1)
-    (flag,) = [flag for flag in told["flags"] if flag["kind"] == "missed mode"]
+    (flag,) = [flag for flag in reported["flags"] if flag["kind"] == "missed mode"]
     assert flag["model"] == "fractional-2"
     assert "fractional-1, which it contains" in flag["sentence"]
     assert not one["containment"]["contains"]
@@ -259,11 +259,11 @@ def test_a_missed_mode_is_found_and_the_richer_model_sampled_again(misled, monke
 def test_a_model_that_does_not_meet_the_mode_is_ranked_nowhere(misled, monkeypatch):
     two, astray = misled
     monkeypatch.setattr(candidatefit, "fit", lambda one, *, starts=None, **options: astray(one, **options))
-    told = compare(two, quick=True)
-    row = told["models"][1]
+    reported = compare(two, quick=True)
+    row = reported["models"][1]
     assert not row["containment"]["met"]
     assert row["grade"] == "unusable"
     assert "stays below" in row["grade_reason"]
     assert row["probability"] is row["elpd"] is None
-    assert "fractional-2" in [one["name"] for one in told["unranked"]]
-    assert "fractional-2 is not ranked" in told["why"] or len(told["unranked"]) == 2
+    assert "fractional-2" in [one["name"] for one in reported["unranked"]]
+    assert "fractional-2 is not ranked" in reported["why"] or len(reported["unranked"]) == 2

@@ -46,8 +46,10 @@ def answers(orders, sd: float, rng) -> list[tuple[str, float]]:
     for order in orders:
         seen = rng.normal(order, sd)
         draws = rng.normal(seen, sd, 2_000)
-        told = savage_dickey(draws, prior, Estimate.of("order_1", "-", draws, ess=2_000, grade="reliable"))
-        out.append((told.answer, float(norm.logpdf(1.0, seen, sd)) - log(0.5)))
+        reported = savage_dickey(
+            draws, prior, Estimate.of("order_1", "-", draws, ess=2_000, grade="reliable")
+        )
+        out.append((reported.answer, float(norm.logpdf(1.0, seen, sd)) - log(0.5)))
     return out
 
 
@@ -83,11 +85,15 @@ def forecasts(rng, *, rho: float = 0.9, samples: int = 200) -> tuple[Gain, float
     noise = AR1().draw(np.array([[1.0, rho]]), np.ones(samples), rng)
     rows = []
     for correlation in (rho, 0.0):
-        told = log_densities(AR1(), noise, np.array([[1.0, correlation]]), np.ones(samples), np.zeros(1), 1)[
-            0
-        ]
-        pointwise = {"part": ["a"] * told.size, "axis": ["y"] * told.size, "log_density": told.tolist()}
-        rows.append({"elpd": float(told.sum()), "elpd_monte_carlo_sd": 0.0, "pointwise": pointwise})
+        reported = log_densities(
+            AR1(), noise, np.array([[1.0, correlation]]), np.ones(samples), np.zeros(1), 1
+        )[0]
+        pointwise = {
+            "part": ["a"] * reported.size,
+            "axis": ["y"] * reported.size,
+            "log_density": reported.tolist(),
+        }
+        rows.append({"elpd": float(reported.sum()), "elpd_monte_carlo_sd": 0.0, "pointwise": pointwise})
     gain = by_prediction(*rows)
     assert gain is not None
     return gain, -0.5 * (samples - 1) * log(1 - rho**2)
@@ -146,12 +152,12 @@ def verdict(order: float, sd: float, rng) -> str:
     spread = np.hypot(sd, known)
     lpd = norm.logpdf(unseen, mean, spread), norm.logpdf(unseen, 1.0, sd)
     rows = []
-    for name, value, told, count in (
+    for name, value, reported, count in (
         ("free", evidence[0], lpd[0], 6),
         ("first-order", evidence[1], lpd[1], 5),
     ):
         row = card(name, float(value), 0.0, parameters=count)
-        row["pointwise"] |= {"log_density": told.tolist()}
+        row["pointwise"] |= {"log_density": reported.tolist()}
         rows.append(row | {"prior_widths": prior_widths(float(value), float(value))})
     return str(outcome(*rows)["fractional"]["verdict"])
 
@@ -191,8 +197,8 @@ def test_compared_records_of_known_order(order, most, least):
             record(100 + 2 * seed + k, device=device, camera=0.4, name=name) for k, name in enumerate("ab")
         ]
         one = study(*pair, noise="white", priors=priors, sampler=sampler, seed=seed)
-        told = compare(candidates_of(one, (), ["fractional-1", "first-order"]))
-        found.append(told["fractional"])
+        reported = compare(candidates_of(one, (), ["fractional-1", "first-order"]))
+        found.append(reported["fractional"])
     beaten = sum(one["least_over_priors"] > STRONG for one in found)
     assert least <= beaten <= most, found
     verdicts = [one["verdict"] for one in found]

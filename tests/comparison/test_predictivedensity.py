@@ -49,7 +49,7 @@ def test_sequential_densities_are_factors_of_the_joint_normal(rng, rho, known, o
     sigma, at = 0.7, np.cumsum(GAPS)
     covariance = sigma**2 * rho ** np.abs(at[:, None] - at)
     residual = rng.multivariate_normal(np.zeros(at.size), covariance) + 0.4
-    told = log_densities(
+    reported = log_densities(
         AR1(), residual[None], np.array([[sigma, rho]]), GAPS, None if own_level else np.array([0.4]), known
     )[0]
     wide = covariance + (1e5 if own_level else 0.0)
@@ -59,8 +59,8 @@ def test_sequential_densities_are_factors_of_the_joint_normal(rng, rho, known, o
         return float(multivariate_normal.logpdf(centred[:n], cov=wide[:n, :n]))
 
     exact = [joint(n + 1) - joint(n) for n in range(known, at.size)]
-    assert_allclose(told, exact, atol=1e-3 if own_level else 1e-9)
-    assert told.sum() == pytest.approx(joint(at.size) - joint(known), abs=2e-3)
+    assert_allclose(reported, exact, atol=1e-3 if own_level else 1e-9)
+    assert reported.sum() == pytest.approx(joint(at.size) - joint(known), abs=2e-3)
 
 
 def test_white_noise_is_that_of_no_memory(rng):
@@ -78,16 +78,16 @@ def test_a_level_under_student_noise_is_integrated(rng, nu, shift):
     residual = 3.0 + 0.5 * rng.standard_t(3.0, size=(2, 12))
     residual[:, 5:] += shift
     parameters = np.tile([0.5, nu], (2, 1))
-    told = log_densities(Student(), residual, parameters, np.ones(12), None, 4)
+    reported = log_densities(Student(), residual, parameters, np.ones(12), None, 4)
     grid = np.linspace(-400.0, 400.0, 400_001)
-    for row, values in zip(told, residual, strict=True):
+    for row, values in zip(reported, residual, strict=True):
         copies = np.tile([0.5, nu], (grid.size, 1))
         each = Student().pointwise(values[None] - grid[:, None], copies, np.ones(12))
         joint = logsumexp(np.cumsum(each, axis=1), axis=0)
         assert_allclose(row, np.diff(joint)[3:], atol=0.02)
     if nu > 100:
         gauss = log_densities(White(), residual, parameters[:, :1], np.ones(12), None, 4)
-        assert_allclose(told, gauss, atol=0.02)
+        assert_allclose(reported, gauss, atol=0.02)
 
 
 def test_a_level_of_its_own_needs_a_known_sample():
@@ -123,11 +123,11 @@ def test_gains_and_levels_are_integrated_out_of_a_sequence(rng, noise, offset):
     values[:, posterior.table.of_kind("sigma")] = 0.02
     for part in parts_of(posterior, []):
         target, own = without(posterior, part), posterior.samples[part.record]
-        told = linear_densities(target, part, own, _model(posterior, part), values, [3])[0]
+        reported = linear_densities(target, part, own, _model(posterior, part), values, [3])[0]
         for upto in (4, own.times.size):
             whole = first_known(posterior, part, upto).log_likelihood(values)
             known = first_known(posterior, part, 3).log_likelihood(values)
-            assert_allclose(told[:, : upto - 3].sum(axis=1), whole - known, rtol=1e-7, atol=1e-6)
+            assert_allclose(reported[:, : upto - 3].sum(axis=1), whole - known, rtol=1e-7, atol=1e-6)
 
 
 def test_a_held_out_record_is_predicted_as_one_that_is_left_out(rng):
@@ -144,8 +144,8 @@ def test_a_held_out_record_is_predicted_as_one_that_is_left_out(rng):
     table = replace(alone.posterior.table, rows=tuple(names[row.name] for row in alone.posterior.table.rows))
     same = replace(alone.posterior, table=table)
     fewer = np.delete(values, both.posterior.table.names.index("offset_b"), axis=1)
-    told = linear_densities(same, held, samples, _model(known, part), fewer, [3])[0]
-    assert_allclose(told, own, rtol=1e-6)
+    reported = linear_densities(same, held, samples, _model(known, part), fewer, [3])[0]
+    assert_allclose(reported, own, rtol=1e-6)
 
 
 # -- signs of weights ------------------------------------------------------------------------------
@@ -267,11 +267,11 @@ FEW = {"ensembles": 2, "walkers": 16, "steps": 400, "thin": 2, "target_ess": 100
 
 def test_candidates_that_share_levels_differently_are_compared():
     """Scores have one length whatever a candidate takes its level from; each says from where."""
-    told_priors = FIXED | GAIN
+    reported_priors = FIXED | GAIN
     pieces = [CandidateSettings(kind, offset=kind) for kind in ("record", "shared", "none")]
-    source = study(*two(), held_out=[record(3, name="c", camera=0.75)], priors=told_priors, sampler=FEW)
-    told = compare(candidates_of(source, pieces, ["record", "shared", "none"]))
-    rows = {row["name"]: row for row in told["models"]}
+    source = study(*two(), held_out=[record(3, name="c", camera=0.75)], priors=reported_priors, sampler=FEW)
+    reported = compare(candidates_of(source, pieces, ["record", "shared", "none"]))
+    rows = {row["name"]: row for row in reported["models"]}
     counts = {name: [one["samples"] for one in row["predictions"]] for name, row in rows.items()}
     assert counts["record"] == counts["shared"] == counts["none"]
     levels = {name: row["predictions"][0]["level_from"] for name, row in rows.items()}
@@ -309,6 +309,6 @@ def test_two_short_records_left_out_in_turn_are_those_of_separate_fits():
 def test_a_known_normal_level_is_scored_by_its_prediction():
     """One known sample of white noise: the next is normal with variance 2 sigma^2, and so on."""
     residual = np.array([[0.3, -0.2, 0.5]])
-    told = log_densities(White(), residual, np.array([[0.4]]), np.ones(3), None, 1)[0]
+    reported = log_densities(White(), residual, np.array([[0.4]]), np.ones(3), None, 1)[0]
     wanted = [norm.logpdf(-0.2, 0.3, 0.4 * np.sqrt(2)), norm.logpdf(0.5, 0.05, 0.4 * np.sqrt(1.5))]
-    assert_allclose(told, wanted, rtol=1e-12)
+    assert_allclose(reported, wanted, rtol=1e-12)

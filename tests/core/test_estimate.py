@@ -17,23 +17,25 @@ def of(draws: np.ndarray) -> Estimate:
 
 def test_quantiles_are_those_of_the_distribution():
     draws = stats.expon.ppf((np.arange(20_000) + 0.5) / 20_000)
-    told = of(draws)
-    assert (told.lower, told.value, told.upper) == pytest.approx(stats.expon.ppf([0.05, 0.5, 0.95]), rel=1e-3)
-    assert (told.mean, told.sd) == pytest.approx((1.0, 1.0), rel=1e-3)
-    assert (told.level, told.interval) == (0.9, EQUAL_TAILED)
+    reported = of(draws)
+    assert (reported.lower, reported.value, reported.upper) == pytest.approx(
+        stats.expon.ppf([0.05, 0.5, 0.95]), rel=1e-3
+    )
+    assert (reported.mean, reported.sd) == pytest.approx((1.0, 1.0), rel=1e-3)
+    assert (reported.level, reported.interval) == (0.9, EQUAL_TAILED)
     assert stats.norm.cdf([-HALF_WIDTH, HALF_WIDTH]) == pytest.approx(
         [(1 - LEVEL) / 2, (1 + LEVEL) / 2], rel=1e-12
     )
 
 
 def test_draws_that_never_reach_it_open_the_upper_side():
-    told = of(np.r_[np.linspace(1, 2, 90), np.full(10, np.inf)])
-    assert told.upper == np.inf
-    assert 1 < told.value < 2
-    assert np.isnan([told.mean, told.sd]).all()
-    out = told.as_json()
+    reported = of(np.r_[np.linspace(1, 2, 90), np.full(10, np.inf)])
+    assert reported.upper == np.inf
+    assert 1 < reported.value < 2
+    assert np.isnan([reported.mean, reported.sd]).all()
+    out = reported.as_json()
     assert (out["upper"], out["mean"], out["sd"]) == (None, None, None)
-    assert out["lower"] == told.lower
+    assert out["lower"] == reported.lower
     few = of(np.r_[np.linspace(1, 2, 97), np.full(3, np.inf)])
     assert 1 < few.upper <= 2
     most = of(np.r_[np.linspace(1, 2, 10), np.full(90, np.inf)])
@@ -74,12 +76,12 @@ def test_plain_makes_strict_json():
         "scalar array": np.array(4.0),
         1: [{"deep": np.float32(0.5)}],
     }
-    told = plain(nested)
-    assert told == {
+    reported = plain(nested)
+    assert reported == {
         "array": [[1.0, None], [None, -2.5]],
         "numbers": [None, 3, True, 2, True, None, "text"],
         "scalar array": 4.0,
         "1": [{"deep": 0.5}],
     }
-    assert type(told["numbers"][2]) is bool
-    assert json.loads(json.dumps(told, allow_nan=False)) == told
+    assert type(reported["numbers"][2]) is bool
+    assert json.loads(json.dumps(reported, allow_nan=False)) == reported

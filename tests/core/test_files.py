@@ -1,4 +1,4 @@
-"""Files appear whole or not at all, and a folder that cannot be written to is told at once."""
+"""Files appear whole or not at all, and a folder that cannot be written to is reported at once."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_a_folder_is_made_with_its_parents_and_left_empty(tmp_path):
     assert os.listdir(folder) == []
 
 
-def test_a_file_in_the_way_is_told(tmp_path):
+def test_a_file_in_the_way_is_reported(tmp_path):
     (tmp_path / "a").write_text("")
     for folder in (tmp_path / "a", tmp_path / "a" / "b"):
         with pytest.raises(InputError, match="output folder cannot be written to") as caught:
@@ -70,7 +70,7 @@ def test_a_file_in_the_way_is_told(tmp_path):
         assert "--out" in caught.value.problems[0]
 
 
-def test_a_folder_without_permission_is_told(tmp_path, monkeypatch):
+def test_a_folder_without_permission_is_reported(tmp_path, monkeypatch):
     def refuse(*_, **__):
         raise PermissionError(13, "Permission denied")
 
@@ -95,7 +95,7 @@ def test_a_folder_without_permission_is_told(tmp_path, monkeypatch):
     ],
 )
 @pytest.mark.parametrize("place", ["mkstemp", "write", "fsync", "replace"])
-def test_what_the_system_refuses_is_told_with_file_reason_and_remedy(
+def test_what_the_system_refuses_is_reported_with_file_reason_and_remedy(
     tmp_path, monkeypatch, failure, reason, remedy, place
 ):
     path = tmp_path / "a.h5"
@@ -116,6 +116,6 @@ def test_what_the_system_refuses_is_told_with_file_reason_and_remedy(
     assert (path.read_text(), os.listdir(tmp_path)) == ("old", ["a.h5"])
 
 
-def test_a_folder_that_is_gone_is_told(tmp_path):
+def test_a_folder_that_is_gone_is_reported(tmp_path):
     with pytest.raises(InputError, match="No such file or directory"):
         write_text(tmp_path / "gone" / "a.txt", "new")

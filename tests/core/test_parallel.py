@@ -53,7 +53,7 @@ def test_tasks_are_done_in_order_on_one_thread_each(jobs, monkeypatch):
     assert sorted(any_order) == sorted(made)
 
 
-def test_a_lost_worker_is_told_and_an_error_is_raised():
+def test_a_lost_worker_is_reported_and_an_error_is_raised():
     with pytest.raises(InputError, match="a worker process ended"), workers(0, jobs=2) as crew:
         list(crew.each(lost, range(3)))
     for jobs in (1, 2):
@@ -62,7 +62,7 @@ def test_a_lost_worker_is_told_and_an_error_is_raised():
 
 
 @pytest.mark.parametrize("error", [EOFError("unexpected EOF"), ConnectionRefusedError(111, "refused")])
-def test_workers_that_cannot_be_started_are_told(monkeypatch, error):
+def test_workers_that_cannot_be_started_are_reported(monkeypatch, error):
     """The process they are forked from was killed just then."""
 
     def refuse(self):

@@ -82,30 +82,32 @@ def test_the_loss_is_the_distance_of_two_optima(seed):
     """Each found by a search of its own, the gain and the offset integrated out there."""
     seen = record(seed, camera=0.005, duration=12.0, noise_sd=0.01)
     whole = Study(fit=seen, noise={"kind": "white"}, terms=1)
-    (told,) = averaging_losses(whole, (20,))
+    (reported,) = averaging_losses(whole, (20,))
     problems = [problem_of(study).refined(factor) for study, factor in ((whole, 1), (averaged(whole, 20), 4))]
     alone, means = (optima_of(problem)[0] for problem in problems)
     posterior = problems[0].posterior
     at = [posterior.coordinates(one.values[None])[0] for one in (alone, means)]
     for column, k in enumerate(posterior.sampled):
         name = posterior.table.names[k]
-        if name in told.names:
+        if name in reported.names:
             sd, wider = (np.sqrt(one.covariance[column, column]) for one in (alone, means))
-            place = told.names.index(name)
-            assert wider / sd == pytest.approx(told.widening[place], rel=0.03), name
-            assert (at[1] - at[0])[column] / sd == pytest.approx(told.shift[place], abs=0.1), name
-    assert np.abs(told.shift).max() > 0.3
+            place = reported.names.index(name)
+            assert wider / sd == pytest.approx(reported.widening[place], rel=0.03), name
+            assert (at[1] - at[0])[column] / sd == pytest.approx(reported.shift[place], abs=0.1), name
+    assert np.abs(reported.shift).max() > 0.3
 
 
 def test_the_loss_is_that_of_the_posterior_of_all_samples():
     whole = Study(fit=record(camera=0.01, duration=12.0, noise_sd=0.03), noise={"kind": "white"}, terms=1)
-    told = {one.count: one for one in averaging_losses(whole, (50, 25))}
+    reported = {one.count: one for one in averaging_losses(whole, (50, 25))}
     both = [lb.fit(study, quick=True) for study in (whole, averaged(whole, 25))]
-    for name, widening, shift in zip(told[25].names, told[25].widening, told[25].shift, strict=True):
+    for name, widening, shift in zip(
+        reported[25].names, reported[25].widening, reported[25].shift, strict=True
+    ):
         draws = [fit.draws.column(name) for fit in both]
         sampled, means = map(np.log, draws) if name.startswith("time") else draws
         assert means.std() / sampled.std() == pytest.approx(widening, rel=0.13), name  # 4 Monte Carlo errors
         assert (means.mean() - sampled.mean()) / sampled.std() == pytest.approx(shift, abs=0.3), name
-    assert told[25].widening.max() > 1.2
-    assert told[50].widening.max() > 1.1 * told[25].widening.max()
-    assert "Means of 25 samples make no standard deviation larger than 1." in str(told[25])
+    assert reported[25].widening.max() > 1.2
+    assert reported[50].widening.max() > 1.1 * reported[25].widening.max()
+    assert "Means of 25 samples make no standard deviation larger than 1." in str(reported[25])

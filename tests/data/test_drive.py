@@ -189,7 +189,7 @@ def test_axes_and_units_of_another_plant_are_refused_together():
     assert len(raised.value.problems) == 3
 
 
-def test_a_bad_file_is_told_with_its_place(tmp_path):
+def test_a_bad_file_is_reported_with_its_place(tmp_path):
     path = tmp_path / "plan.csv"
     path.write_text("time_ms,drive_x_rad\n0,0\n2,1\n1,high\n")
     with pytest.raises(InputError) as raised:

@@ -120,9 +120,9 @@ def test_a_bad_cell_is_named_by_line_and_column(tmp_path, line, column, rows, wo
 )
 def test_a_bad_header_is_named_by_column(tmp_path, header, words):
     row = ",0" * header.count(",")
-    told = "\n".join(problems_of(written(tmp_path, f"{header}\n0{row}\n1{row}\n")))
+    reported = "\n".join(problems_of(written(tmp_path, f"{header}\n0{row}\n1{row}\n")))
     for part in words:
-        assert part in told
+        assert part in reported
 
 
 @pytest.mark.parametrize(
@@ -145,16 +145,16 @@ def test_a_bad_table_is_one_problem(tmp_path, text, words):
 
 def test_all_problems_come_at_once_and_are_capped_per_column(tmp_path):
     rows = "".join(f"{k},bad,0\n" for k in range(9)) + "8,1,inf\n9,1\n"
-    told = problems_of(written(tmp_path, HEADER + rows))
-    assert sum("'bad'" in problem for problem in told) == 5
+    reported = problems_of(written(tmp_path, HEADER + rows))
+    assert sum("'bad'" in problem for problem in reported) == 5
     for part in (
         "and 4 more",
         "line 11, column 'response_x_rad'",
         "line 11, column 'time_ms'",
         "line 12: has 2",
     ):
-        assert sum(part in problem for problem in told) == 1
-    assert len(told) == 9
+        assert sum(part in problem for problem in reported) == 1
+    assert len(reported) == 9
 
 
 def test_a_cell_that_is_no_text_is_refused_with_its_row():
@@ -195,11 +195,11 @@ def test_parquet_problems_name_the_row(tmp_path):
     path = tmp_path / "a.parquet"
     columns = {"time_ms": [0, 1, 1], "drive_x_rad": [0.0, np.nan, 1.0], "response_x_rad": ["0", None, "high"]}
     pd.DataFrame(columns).to_parquet(path)
-    told = problems_of(path)
-    assert len(told) == 3
-    assert any("row 2, column 'drive_x_rad': the cell is empty" in problem for problem in told)
-    assert any("row 3, column 'response_x_rad': 'high'" in problem for problem in told)
-    assert any("row 3, column 'time_ms': 1.0 does not come after" in problem for problem in told)
+    reported = problems_of(path)
+    assert len(reported) == 3
+    assert any("row 2, column 'drive_x_rad': the cell is empty" in problem for problem in reported)
+    assert any("row 3, column 'response_x_rad': 'high'" in problem for problem in reported)
+    assert any("row 3, column 'time_ms': 1.0 does not come after" in problem for problem in reported)
 
 
 @pytest.mark.parametrize(

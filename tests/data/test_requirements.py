@@ -76,9 +76,9 @@ def test_the_command_line_tells_the_exposure_in_the_unit_of_the_records(tmp_path
     save_record(replace(PLAIN, time_unit="s"), tmp_path / "step.csv")
     (tmp_path / "study.toml").write_text("[model]\nexposure_ms = 300\n", encoding="utf-8")
     code = main(["fit", str(tmp_path), "--out", str(tmp_path / "run"), "--quick", "--quiet"])
-    printed, told = capfd.readouterr()
+    printed, reported = capfd.readouterr()
     assert (code, printed) == (2, "")
-    assert told.startswith(
+    assert reported.startswith(
         "error: record 'step': the exposure of 0.3 s is longer than the 0.2 s from one sample"
     )
     assert not (tmp_path / "run").exists()
@@ -119,7 +119,7 @@ def test_unusual_records_give_the_truth_of_the_bench(name):
     assert unmet(made) == []
     posterior = resolved(problem_of(made)).posterior
     best = find_optima(posterior, np.random.default_rng(0), starts=6)[0]
-    told = dict(zip(posterior.table.names, best.values, strict=True))
+    reported = dict(zip(posterior.table.names, best.values, strict=True))
     spread = dict(
         zip(
             [posterior.table.names[k] for k in posterior.sampled],
@@ -129,4 +129,4 @@ def test_unusual_records_give_the_truth_of_the_bench(name):
     )
     for key in ("time_1", "order_1", "delay"):
         size = truth[key] if key == "time_1" else 1.0  # sampled by its logarithm
-        assert abs(told[key] - truth[key]) < 4.5 * spread[key] * size, (key, told[key], spread[key])
+        assert abs(reported[key] - truth[key]) < 4.5 * spread[key] * size, (key, reported[key], spread[key])

@@ -121,10 +121,10 @@ def test_fit_and_loop_refuse_in_words_and_write_nothing(tmp_path, capfd):
     for verb in ("fit", "audit", "loop"):
         out = tmp_path / verb
         code = main([verb, str(tmp_path / "step.csv"), "--out", str(out), "--quick", "--quiet"])
-        printed, told = capfd.readouterr()
+        printed, reported = capfd.readouterr()
         assert (code, printed) == (2, "")
-        assert told.startswith("error: record 'step': response 'y' moves by ")
-        assert "add a row before the first (time " in told
+        assert reported.startswith("error: record 'step': response 'y' moves by ")
+        assert "add a row before the first (time " in reported
         assert not list(out.glob("*"))
 
 

@@ -1,4 +1,4 @@
-"""The door for studies: defaults, what is refused and in which words, and that all is told at once."""
+"""The door for studies: defaults, what is refused and in which words, and that all is reported at once."""
 
 import hashlib
 import os
@@ -275,7 +275,7 @@ def test_problems_of_the_study_file_and_all_records_come_together(tmp_path):
     text = '[study]\nseed = "x"\n[model]\ntermz = 3\n[priors]\ngain = {dist = "nrm"}\n'
     text += '[records]\nfit = ["a.csv", "b.csv"]\nheld_out = ["c.csv", "d.csv"]\n'
     bad = HEADER + "0,0,0\n1,one,0\n"
-    told = problems_of(folder_of(tmp_path, text, a=bad, b=STEP, c=bad, e=STEP))
+    reported = problems_of(folder_of(tmp_path, text, a=bad, b=STEP, c=bad, e=STEP))
     for part in (
         "`seed`",
         "'termz'",
@@ -284,8 +284,8 @@ def test_problems_of_the_study_file_and_all_records_come_together(tmp_path):
         "c.csv, line 3",
         "d.csv: no such",
     ):
-        assert sum(part in problem for problem in told) == 1
-    assert len(told) == 6
+        assert sum(part in problem for problem in reported) == 1
+    assert len(reported) == 6
 
 
 def test_columns_take_the_order_of_the_first_record(tmp_path):
@@ -307,8 +307,8 @@ def test_columns_take_the_order_of_the_first_record(tmp_path):
 )
 def test_another_axis_is_named_with_its_record(tmp_path, held_out, words):
     text = '[records]\nfit = ["a.csv"]\nheld_out = ["later.csv"]'
-    told = problems_of(folder_of(tmp_path, text, a=PAIR, later=held_out))
-    assert any(all(part in p for part in ("record 'later'", "record 'a'", *words)) for p in told)
+    reported = problems_of(folder_of(tmp_path, text, a=PAIR, later=held_out))
+    assert any(all(part in p for part in ("record 'later'", "record 'a'", *words)) for p in reported)
 
 
 @pytest.mark.parametrize("rows", ["0,1,0\n1,1,0\n2,1,0\n", "0,1,0\n1,1,0\n2,2,0\n", "0,1,0\n1,2,\n"])
@@ -320,15 +320,15 @@ def test_a_drive_that_never_acts_teaches_nothing(tmp_path, rows):
 
 
 def test_records_that_were_not_read_are_not_judged(tmp_path):
-    told = problems_of(folder_of(tmp_path, "", a=QUIET, b=HEADER + "0,0,0\n1,one,0\n"))
-    assert len(told) == 1
-    assert "b.csv, line 3" in told[0]
+    reported = problems_of(folder_of(tmp_path, "", a=QUIET, b=HEADER + "0,0,0\n1,one,0\n"))
+    assert len(reported) == 1
+    assert "b.csv, line 3" in reported[0]
 
 
-def test_axes_and_constant_drive_are_told_together(tmp_path):
-    told = problems_of(folder_of(tmp_path, "", a=QUIET, b=QUIET.replace("drive_x", "drive_y")))
-    assert len(told) == 3
-    assert "the drive is constant" in told[-1]
+def test_axes_and_constant_drive_are_reported_together(tmp_path):
+    reported = problems_of(folder_of(tmp_path, "", a=QUIET, b=QUIET.replace("drive_x", "drive_y")))
+    assert len(reported) == 3
+    assert "the drive is constant" in reported[-1]
 
 
 def test_a_response_axis_without_samples_is_refused(tmp_path):

@@ -37,12 +37,12 @@ def again(bent: Loop, tmp_path_factory: pytest.TempPathFactory) -> Fit:
 
 
 def test_a_fit_of_the_explained_study_gives_the_numbers_of_the_loop(bent: Loop, again: Fit):
-    told = {one.name: one for one in again.draws.estimates()}
+    reported = {one.name: one for one in again.draws.estimates()}
     model = bent.after.state.model
     assert bent.names == ("odd_curvature",)
     for k in range(len(model.names)):
         own = bent.estimate(k)
-        there = told[own["name"]]
+        there = reported[own["name"]]
         assert own["alone"] == pytest.approx([there.lower, there.value, there.upper], rel=1e-9), own["name"]
 
 
@@ -59,7 +59,7 @@ def test_it_agrees_with_the_descent_of_the_loop(bent: Loop):
 
 
 def test_what_the_loop_descends_is_the_posterior_of_the_explained_study(bent: Loop):
-    """Two roads to the residual at one place: effects put beside a plant, or declared in a study."""
+    """Two methods to the residual at one place: effects put beside a plant, or declared in a study."""
     state, made = bent.after.state, problem_of(bent.study).posterior
     assert bent.problem.refinement == 1
     values = dict(zip(state.model.posterior.table.names, state.model.values(state.optimum.x), strict=True))
@@ -133,7 +133,7 @@ def test_the_command_writes_it(tmp_path: Path):
     write_study(replace(source, name="made"), tmp_path / "in" / "study.toml")
     arguments = ["loop", str(tmp_path / "in"), "--out", str(tmp_path / "run"), "--quick", "--jobs", "1"]
     assert main([*arguments, "--quiet", "--as-stated"]) == 0
-    told = json.loads((tmp_path / "run" / "loop.json").read_text())
+    reported = json.loads((tmp_path / "run" / "loop.json").read_text())
     made = load_study(tmp_path / "run" / "explained.toml")
-    assert list(made.effects.use) == [one["name"] for one in told["effects"]]
+    assert list(made.effects.use) == [one["name"] for one in reported["effects"]]
     assert len(made.held_out) == 1

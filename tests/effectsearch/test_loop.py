@@ -91,13 +91,13 @@ def test_the_noise_is_measured_before_the_drive_moves(clean):
 def test_intervals_of_the_optimum_are_in_the_units_of_the_parameters(clean):
     """A time constant of 3^(1 / 0.9) ms, found by its logarithm."""
     model = clean.after.state.model
-    told = {one["name"]: one for one in (clean.estimate(k) for k in range(len(model.names)))}
+    reported = {one["name"]: one for one in (clean.estimate(k) for k in range(len(model.names)))}
     for name, truth in (("gain", 1.0), ("time_1", 3.0 ** (1 / 0.9)), ("order_1", 0.9), ("delay", 1.0)):
-        one = told[name]
+        one = reported[name]
         assert one["lower"] < one["value"] < one["upper"]
         assert abs(one["value"] - truth) < 4 * one["sd"]
         assert one["upper"] - one["lower"] == pytest.approx(2 * 1.645 * one["sd"], rel=0.02)
-    assert told["time_1"]["unit"] == "ms"
+    assert reported["time_1"]["unit"] == "ms"
 
 
 def test_the_hidden_effect_is_named_and_its_size_recovered(bent):
@@ -110,12 +110,12 @@ def test_the_hidden_effect_is_named_and_its_size_recovered(bent):
 
 
 def test_errors_fall_to_the_noise_floor(bent):
-    told = results(bent)
-    before, after = (told[side]["held_out_rmse_over_noise"]["x"] for side in ("before", "after"))
+    reported = results(bent)
+    before, after = (reported[side]["held_out_rmse_over_noise"]["x"] for side in ("before", "after"))
     assert after < before
     assert after < 1.15
-    assert 0.8 < told["after"]["held_out_coverage_90"] < 0.97
-    assert told["after"]["held_out_level_from"] == [
+    assert 0.8 < reported["after"]["held_out_coverage_90"] < 0.97
+    assert reported["after"]["held_out_level_from"] == [
         "shared with the fit records"
     ]  # one offset for all records
 
@@ -134,12 +134,12 @@ def test_held_out_bands_by_draws_are_those_of_the_linearised_model(clean):
 
 
 def test_what_leaves_is_plain_json_with_grades(bent):
-    told = results(bent)
-    text = json.dumps(told, allow_nan=False)
+    reported = results(bent)
+    text = json.dumps(reported, allow_nan=False)
     assert '"explained"' in text
-    assert {p["grade"] for p in told["parameters"]} <= {"reliable", "tentative", "unusable"}
+    assert {p["grade"] for p in reported["parameters"]} <= {"reliable", "tentative", "unusable"}
     json.dumps(drawn(bent), allow_nan=False)
-    assert any("odd_curvature" in line for line in words(told))
+    assert any("odd_curvature" in line for line in words(reported))
 
 
 @pytest.mark.parametrize(("confidence", "level"), [("firm", "reliable"), ("tentative", "tentative")])
@@ -180,7 +180,7 @@ def test_tangents_are_the_derivative_of_the_prediction(bent):
 
 
 def test_left_out_scores_are_the_conditional_density_of_the_linear_model():
-    """Two roads: one Gauss-Newton step, or the conditional of one normal density."""
+    """Two methods: one Gauss-Newton step, or the conditional of one normal density."""
     rng = np.random.default_rng(8)
     tangents, prior, data = rng.normal(size=(12, 3)), np.diag([0.5, 2.0, 1.0]), rng.normal(size=12)
     whole = np.eye(12) + tangents @ prior @ tangents.T
@@ -199,9 +199,9 @@ def test_left_out_scores_are_the_conditional_density_of_the_linear_model():
 
 def test_without_held_out_records_each_is_left_out_in_turn():
     found = loop(study(3, held_out=0), library=LIBRARY[:1], sample=False, quick=True, as_stated=True)
-    told = results(found)
+    reported = results(found)
     assert found.left_out
-    assert told["unseen_by"] == "leaving records out in turn"
+    assert reported["unseen_by"] == "leaving records out in turn"
     assert len(found.before.unseen) == len(found.study.fit)
 
 
@@ -246,7 +246,7 @@ def test_no_effect_is_named_from_a_base_fit_that_failed():
     json.dumps(results(found), allow_nan=False)
 
 
-def test_an_effect_that_cannot_be_simulated_is_told_not_raised(clean):
+def test_an_effect_that_cannot_be_simulated_is_reported_not_raised(clean):
     class Broken(LIBRARY[0]):  # type: ignore[misc,valid-type]
         def seen(self, y, scene, psi):
             raise UnstableError(("odd_curvature",), "r0", "it runs away")

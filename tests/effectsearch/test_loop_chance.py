@@ -1,4 +1,4 @@
-"""What chance gives the loop: noise known from samples of it, and decisions that err as seldom as told."""
+"""What chance gives the loop: noise known from samples of it, and decisions that err as seldom as stated."""
 
 from dataclasses import replace
 from functools import partial
@@ -143,7 +143,7 @@ def test_covariance_under_plausible_noise_is_that_of_its_draws():
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.9, 0.98])
-def test_errors_of_correlated_noise_are_missed_as_seldom_as_told(rho):
+def test_errors_of_correlated_noise_are_missed_as_seldom_as_reported(rho):
     """Of independent ones so many squares would lie beyond 5 standard deviations as good as never."""
     law = first_order(rho) if rho else Law(1.0)
     drawn, count = noise_of(law, 4000, 600, np.random.default_rng(5)), 600.0
@@ -156,12 +156,12 @@ def test_errors_of_correlated_noise_are_missed_as_seldom_as_told(rho):
             ]
         )
 
-    told = p_values([[law]])
+    reported = p_values([[law]])
     for level in (0.05, 0.005):
-        beyond = np.count_nonzero(told < level)
+        beyond = np.count_nonzero(reported < level)
         assert binom.sf(beyond - 1, 4000, 1.3 * level) > 1e-3  # a chi-squared of the right variance is near
         assert binom.cdf(beyond, 4000, level / 2) > 1e-3
-    assert not (told < norm.sf(5.0)).any()
+    assert not (reported < norm.sf(5.0)).any()
     alone = p_values([[Law(1.0)]])
     assert (np.mean(alone < norm.sf(5.0)) > 0.01) == (rho > 0)
 

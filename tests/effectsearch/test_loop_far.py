@@ -234,8 +234,8 @@ def test_an_overflow_does_not_harden():
     overflow = catalogue()["overflow"](0.8)
     study = stepped(10.0)
     base = fitted_base(study, [], as_stated=True, draws=40)
-    told = overflow.coefficients(base.start.model.effected.ranges)
-    assert all(one.one_signed for one in told)
+    reported = overflow.coefficients(base.start.model.effected.ranges)
+    assert all(one.one_signed for one in reported)
 
 
 def test_a_response_that_never_moves_is_refused_in_words():

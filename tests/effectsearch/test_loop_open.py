@@ -52,7 +52,7 @@ def faint() -> Loop:
 
 
 def test_one_linear_step_is_the_optimum_with_the_effect():
-    """Second road: the model with the effect, descended to its optimum."""
+    """Second method: the model with the effect, descended to its optimum."""
     _, state = fitted(study_of(0.075))
     state = replace(state, model=state.model.at_scales(state.optimum.x, {f"r{k}": 0.0 for k in range(2)}))
     seen = trace(state, [OverdrivePulse], np.random.default_rng(0), noise_samples=(500,), draws=400)
@@ -80,21 +80,21 @@ def test_what_cannot_be_seen_is_in_the_interval(faint: Loop):
 
 
 def test_figures_of_the_step_response_are_over_what_is_open(faint: Loop):
-    """Second roads: the delay by the parameters, the rise of a lag in closed form, the static gain."""
-    told = {one.name: one for one in faint.figures}
+    """Second methods: the delay by the parameters, the rise of a lag in closed form, the static gain."""
+    reported = {one.name: one for one in faint.figures}
     (k,) = faint.after.state.model.delays
-    low, high = (np.quantile(told["delay[x]"].values, at) for at in (0.05, 0.95))
+    low, high = (np.quantile(reported["delay[x]"].values, at) for at in (0.05, 0.95))
     delay = faint.estimate(k)
     assert [low, high] == pytest.approx([delay["lower"], delay["upper"]], abs=0.15 * delay["sd"])
-    assert told["delay[x]"].weights.size == len(told["delay[x]"].parts) > 1
-    rise, end = told["rise_10_90[x]"], told["value_at_end[x]"]
+    assert reported["delay[x]"].weights.size == len(reported["delay[x]"].parts) > 1
+    rise, end = reported["rise_10_90[x]"], reported["value_at_end[x]"]
     for one, truth in ((rise, 8 * np.log(9)), (end, 2.0)):
         shown = one.as_json(ess=100.0, grade="reliable", interval="Laplace")
         assert shown["lower"] < truth < shown["upper"]
         assert np.hypot(shown["sd_noise"], shown["sd_structure"]) == pytest.approx(shown["sd"], rel=0.05)
         assert shown["upper"] - shown["lower"] < 0.1 * truth
     shown = results(faint)["figures"]
-    assert {one["name"] for one in shown} == set(told) - {"delay[x]", "steady_state[x]"}
+    assert {one["name"] for one in shown} == set(reported) - {"delay[x]", "steady_state[x]"}
     assert all(one["interval"] == "Laplace" and one["grade"] == "tentative" for one in shown)
 
 

@@ -80,9 +80,9 @@ def test_an_effect_is_found_beside_outliers():
     made, _ = struck(study(2, 0.06), 7)
     found = loop(made, library=[*LIBRARY, catalogue()["outliers"]], sample=False, quick=True, as_stated=True)
     assert found.names == ("odd_curvature", "outliers")
-    told = results(found)
-    assert told["outliers"]["count"] > 0
-    assert "outliers" in told["sentence"]
+    reported = results(found)
+    assert reported["outliers"]["count"] > 0
+    assert "outliers" in reported["sentence"]
     assert found.study.effects.use == ("odd_curvature", "outliers")
     for record, given in zip(found.study.fit, made.fit, strict=True):
         np.testing.assert_array_equal(record.response, given.response)

@@ -180,7 +180,7 @@ def test_the_explained_study_has_the_wider_prior():
 
 
 def test_the_evidence_of_a_wider_prior_is_that_of_the_integral():
-    """Two roads: Laplace evidence of the refit, or the integral over the coefficient of optima beside it."""
+    """Two methods: Laplace evidence of the refit, or the integral over the coefficient of optima there."""
     found = looped(2)
     state, start = found.after.state, found.before.state
     effect = state.model.effects[0]

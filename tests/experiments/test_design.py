@@ -155,7 +155,7 @@ def test_bench_times_are_spans_and_hold_the_one_asked_for(one):
 
 
 def test_information_is_that_of_the_likelihood(one):
-    """Two roads: slopes of the design, and those that whiten a simulated record of the same drive."""
+    """Two methods: slopes of the design, and those that whiten a simulated record of the same drive."""
     values = row_values(one.posterior.table, TRUTH)
     bench = Bench(one, 24.0, 0.2)
     drive = candidates(limits_of(one), 24.0, np.random.default_rng(2), unit="ms")[-1].command
@@ -251,12 +251,12 @@ def test_the_winner_beats_the_step_as_promised_in_simulation(one):
         share = freedom * (side.spread / side.expected) ** 2
         assert (share > 0.3).all()
         assert (share < 30.0).all()
-    told = confirmed(made, replicas=4)["confirmed"]
-    assert json.dumps(told, allow_nan=False)
-    begun = {"Confirmed" if one["confirmed"] else "Not confirmed" for one in told["trials"]}
-    said = [one["sentence"] for one in told["trials"]]
+    reported = confirmed(made, replicas=4)["confirmed"]
+    assert json.dumps(reported, allow_nan=False)
+    begun = {"Confirmed" if one["confirmed"] else "Not confirmed" for one in reported["trials"]}
+    said = [one["sentence"] for one in reported["trials"]]
     assert all(one.startswith(tuple(begun)) and one.endswith(".") for one in said)
-    assert told["sentence"] == " ".join(said)
+    assert reported["sentence"] == " ".join(said)
 
 
 def test_a_sum_is_recognised_at_draws_of_the_prior_under_drives_that_change_often():
@@ -279,12 +279,12 @@ def test_what_only_acts_as_a_sum_gets_words_and_no_number():
     table = made.posterior.table
     rows = {name: rows[name] for name in table.names}
     found = as_json(design(fitted(made, rows=rows), time=50.0, draws=4))
-    told = {row["name"]: row for row in found["parameters"]}
+    reported = {row["name"]: row for row in found["parameters"]}
     for name in ("time_1", "time_2"):
-        assert "structurally unidentifiable" in told[name]["reason"]
-        assert told[name]["relative_sd"] is None
-        assert told[name]["time_words"] == "not by any drive tried"
-    assert told["gain"]["relative_sd"]["value"] > 0
+        assert "structurally unidentifiable" in reported[name]["reason"]
+        assert reported[name]["relative_sd"] is None
+        assert reported[name]["time_words"] == "not by any drive tried"
+    assert reported["gain"]["relative_sd"]["value"] > 0
     assert json.dumps(found, allow_nan=False)
 
 
@@ -301,12 +301,12 @@ def test_an_idle_path_is_seen_by_the_drive_that_moves_it():
     assert np.isfinite(found.winner.expected[at])
 
 
-def test_an_audit_is_told_what_to_measure_for_what_it_left_open(one):
+def test_an_audit_says_what_to_measure_for_what_it_left_open(one):
     rows = [{"name": name, "verdict": "one-sided"} for name in ("time_1", "sigma")]
-    told = next_measurement(fitted(one), [*rows, {"name": "gain", "verdict": "identified"}])
-    assert [row["name"] for row in told["parameters"]] == ["time_1", "sigma"]
-    assert told["parameters"][0]["expected_relative_sd"]["value"] > 0
-    assert told["parameters"][1]["drive"] is None
+    reported = next_measurement(fitted(one), [*rows, {"name": "gain", "verdict": "identified"}])
+    assert [row["name"] for row in reported["parameters"]] == ["time_1", "sigma"]
+    assert reported["parameters"][0]["expected_relative_sd"]["value"] > 0
+    assert reported["parameters"][1]["drive"] is None
     assert next_measurement(fitted(one), [{"name": "gain", "verdict": "identified"}]) is None
 
 
@@ -335,17 +335,17 @@ def test_a_filled_template_is_a_record(one, tmp_path):
 def test_a_plan_is_numbers_a_page_and_a_drive(one, tmp_path):
     made = design_next(fitted(one), quick=True, bench_time=60.0)
     made.report(tmp_path)
-    told = json.loads((tmp_path / "design.json").read_text())
-    assert told == made.to_json()
-    assert told["verdict"] in str(made)
-    assert list(made.summary()["parameter"]) == [row["name"] for row in told["parameters"]]
+    reported = json.loads((tmp_path / "design.json").read_text())
+    assert reported == made.to_json()
+    assert reported["verdict"] in str(made)
+    assert list(made.summary()["parameter"]) == [row["name"] for row in reported["parameters"]]
     assert made.drive is not None
-    assert_array_equal(made.drive.values[:, 0], load_template(tmp_path / told["template"])[:, 1])
-    assert_array_equal(made.drive.time, load_template(tmp_path / told["template"])[:, 0])
-    assert told["factor_over_step"]["value"] > 1
-    assert told["confirmed"]["trials"]
-    assert load_template(tmp_path / told["template"]).shape[0] == 301  # 60 at 0.2, and one before
-    assert told["winner"]["drive"] in check_page(tmp_path / "design.html")
+    assert_array_equal(made.drive.values[:, 0], load_template(tmp_path / reported["template"])[:, 1])
+    assert_array_equal(made.drive.time, load_template(tmp_path / reported["template"])[:, 0])
+    assert reported["factor_over_step"]["value"] > 1
+    assert reported["confirmed"]["trials"]
+    assert load_template(tmp_path / reported["template"]).shape[0] == 301  # 60 at 0.2, and one before
+    assert reported["winner"]["drive"] in check_page(tmp_path / "design.html")
 
 
 def load_template(path) -> np.ndarray:
@@ -380,7 +380,7 @@ def test_the_verb_refuses_before_it_fits(study, capsys):
 def test_the_verb_from_records_to_drive(study, capsys):
     words = ["design", study, "--quick", "--jobs", 1, "--time", 120, "--json", "--out", study / "run"]
     assert main([str(word) for word in words]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told.pop("report") == str(study / "run" / "design.html")
-    assert told == json.loads((study / "run" / "design.json").read_text())
-    assert (study / "run" / told["template"]).exists()
+    reported = json.loads(capsys.readouterr().out)
+    assert reported.pop("report") == str(study / "run" / "design.html")
+    assert reported == json.loads((study / "run" / "design.json").read_text())
+    assert (study / "run" / reported["template"]).exists()

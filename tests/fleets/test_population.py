@@ -135,7 +135,7 @@ def test_the_prior_that_draws_were_made_under_is_divided_out():
     assert abs(np.mean(kept.mean) - np.mean(wanted.mean)) > sd
 
 
-def test_weights_that_fail_are_told_and_a_normal_likelihood_stands_for_the_draws():
+def test_weights_that_fail_are_reported_and_a_normal_likelihood_stands_for_the_draws():
     """A precise population in the tail of one device's draws."""
     rng = np.random.default_rng(9)
     draws = [rng.normal(rng.normal(0.0, 0.02), 0.02, 1000) for _ in range(20)]

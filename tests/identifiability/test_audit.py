@@ -70,7 +70,7 @@ T = np.linspace(0.1, 3.0, 40)
 
 
 @pytest.mark.parametrize(
-    ("formula", "rank", "told"),
+    ("formula", "rank", "reported"),
     [
         (lambda a, b: a * np.exp(-b * T), 2, []),
         (lambda a, b, c: a * b / c * np.exp(-T) + c * 0, 1, ["only the product a b c^-1 acts"]),
@@ -88,11 +88,11 @@ T = np.linspace(0.1, 3.0, 40)
         ),
     ],
 )
-def test_symmetries_are_found_and_named(formula, rank, told):
+def test_symmetries_are_found_and_named(formula, rank, reported):
     found = toy(formula)
     assert found.rank == rank
     assert found.certain
-    assert [one.sentence for one in found.symmetries] == told
+    assert [one.sentence for one in found.symmetries] == reported
 
 
 def test_the_normalised_path_has_no_symmetry_and_the_printed_one_has_six():
@@ -115,13 +115,13 @@ def test_slopes_of_the_printed_form_are_those_of_finite_differences():
     form = printed_form(gain, times, orders, delay, np.random.default_rng(4))
 
     def normalised(values: Vector) -> Vector:
-        told = dict(zip(form.names, values, strict=True))
-        k = sum(told[f"k{i}"] for i in range(1, 5))
+        reported = dict(zip(form.names, values, strict=True))
+        k = sum(reported[f"k{i}"] for i in range(1, 5))
         lever = gain * form.values[-4:].sum() / (form.values[0] * form.values[1] / form.values[2])
-        etas = np.array([told["eta1"], told["eta2"]])
-        powers = np.array([told["order_1"], told["order_2"]])
-        b = lever * told["j"] * told["q"] / told["x"]
-        return np.array([b / k, *(np.log(etas / k) / powers), *powers, told["delay"]])
+        etas = np.array([reported["eta1"], reported["eta2"]])
+        powers = np.array([reported["order_1"], reported["order_2"]])
+        b = lever * reported["j"] * reported["q"] / reported["x"]
+        return np.array([b / k, *(np.log(etas / k) / powers), *powers, reported["delay"]])
 
     assert_allclose(normalised(form.values), [gain, *np.log(times), *orders, delay], rtol=1e-12)
     h, columns = 1e-5, []
@@ -163,8 +163,8 @@ def test_fisher_information_is_the_curvature_of_the_expected_log_likelihood(nois
     """Data equal to the model: there the Hessian of the log likelihood is minus the information."""
     posterior = problem(SHORT, noise=noise, priors={"gain": FLAT_GAIN}).posterior
     landscape, rows = Landscape(posterior), posterior.table.rows
-    told = TRUTH | {"rho": 0.6}
-    values = np.array([told[row.name] for row in rows])
+    reported = TRUTH | {"rho": 0.6}
+    values = np.array([reported[row.name] for row in rows])
     found = curvature(landscape, values, np.ones(values.size))
     columns = landscape.least.columns
     left = landscape.least.residual(landscape.least.coordinates(values), values)[0][: posterior.size]

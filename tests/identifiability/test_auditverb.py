@@ -55,8 +55,8 @@ def run(study) -> Path:
 
 
 def test_audit_tells_what_other_tools_rely_on(run):
-    told = json.loads((run / "audit.json").read_text())
-    rows = {row["name"]: row for row in told["parameters"]}
+    reported = json.loads((run / "audit.json").read_text())
+    rows = {row["name"]: row for row in reported["parameters"]}
     assert set(rows) == {"gain", "time_1", "time_2", "delay", "offset", "sigma"}
     for row in rows.values():
         assert row["verdict"] in VERDICTS
@@ -67,14 +67,14 @@ def test_audit_tells_what_other_tools_rely_on(run):
     assert merged == ["structurally unidentifiable"] * 2  # the search sees that only T1^0.8 + T2^0.8 acts
     assert rows["time_1"]["partners"][0] == "time_2"
     assert [rows[name]["verdict"] for name in ("gain", "delay", "sigma")] == ["identified"] * 3
-    assert told["verdict"].startswith("Given this model, ")
-    assert told["limitations"] == json.loads((run / "results.json").read_text())["limitations"]
-    assert told["spectrum"][-1]["prior_knows_more"]
-    advised = {row["name"]: row for row in told["next_measurement"]["parameters"]}
+    assert reported["verdict"].startswith("Given this model, ")
+    assert reported["limitations"] == json.loads((run / "results.json").read_text())["limitations"]
+    assert reported["spectrum"][-1]["prior_knows_more"]
+    advised = {row["name"]: row for row in reported["next_measurement"]["parameters"]}
     assert set(advised) == {name for name, row in rows.items() if row["verdict"] != "identified"}
     assert advised["time_1"]["drive"] is None  # no drive separates what only acts as a sum
     assert "structurally unidentifiable" in advised["time_1"]["reason"]
-    assert {row["name"] for row in told["functions"]} >= {"steady_state[y]", "rise_10_90[y]"}
+    assert {row["name"] for row in reported["functions"]} >= {"steady_state[y]", "rise_10_90[y]"}
 
 
 def test_the_page_stands_alone_and_shows_every_verdict(run):
@@ -110,7 +110,7 @@ def test_claims_refuse_a_folder_without_an_audit(tmp_path, capsys):
     assert "audit.json" in capsys.readouterr().err
 
 
-def told(**changes: object) -> dict:
+def reported(**changes: object) -> dict:
     """An audit in which every claim holds."""
     row = {
         "name": "order_1",
@@ -136,14 +136,16 @@ def told(**changes: object) -> dict:
     return whole | changes
 
 
-ROW = told()["parameters"][0]
+ROW = reported()["parameters"][0]
 OTHERWISE = {
-    "I1": {"printed_form": told()["printed_form"] | {"rank": 7}},
+    "I1": {"printed_form": reported()["printed_form"] | {"rank": 7}},
     "I2": {"spectrum": [{"prior_knows_more": True, "direction": {"gain": 1.0}}]},
     "I3": {"local": {"collinearity": None, "most_alike": []}},
     "I4": {"parameters": [ROW, ROW | {"verdict": "one-sided"}]},
     "I5": {"parameters": [ROW | {"profile": ROW["profile"] | {"upper": None}}]},
-    "I6": {"delays": told()["delays"] | {"separations": [{"pair": ["a", "b"], "smallest_difference": 0.2}]}},
+    "I6": {
+        "delays": reported()["delays"] | {"separations": [{"pair": ["a", "b"], "smallest_difference": 0.2}]}
+    },
 }
 
 
@@ -153,13 +155,13 @@ def test_another_audit_gives_another_verdict(claim):
         judged = judge(Evidence((audit,)))
         return judged[claim].kind.value
 
-    assert verdict(told()) == "supported"
-    assert verdict(told(**OTHERWISE[claim])) == "contradicted"
+    assert verdict(reported()) == "supported"
+    assert verdict(reported(**OTHERWISE[claim])) == "contradicted"
 
 
 def test_the_first_audit_that_can_answer_decides():
-    silent = told(delays={"paths": [], "separations": [], "sentence": "one path"}, study="one path")
-    judged = judge(Evidence((silent, told())))
+    silent = reported(delays={"paths": [], "separations": [], "sentence": "one path"}, study="one path")
+    judged = judge(Evidence((silent, reported())))
     assert judged["I6"].kind.value == "supported"
     assert judged["I1"].how.startswith("Audit of the study one path")
 
@@ -168,7 +170,7 @@ def test_audits_of_bundled_studies_are_read_where_they_are(tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "reports" / "paper-step"
     folder.mkdir(parents=True)
-    (folder / "audit.json").write_text(json.dumps(told(study="found")))
+    (folder / "audit.json").write_text(json.dumps(reported(study="found")))
     assert main(["claims", "--out", str(tmp_path / "page"), "--json"]) == 0
     rows = {row["id"]: row for row in json.loads(capsys.readouterr().out)["claims"]}
     assert rows["I6"]["verdict"] == "supported"

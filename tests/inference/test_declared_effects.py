@@ -47,8 +47,8 @@ def one_axis(duration: float = 16.0, camera: float = 0.2) -> Study:
 
 
 def using(base: Study, *names: str, **priors: float) -> Problem:
-    told = {key.replace("__", "."): PriorSettings(key, fixed=value) for key, value in priors.items()}
-    return problem_of(replace(base, effects=EffectsSettings(use=names), priors=dict(base.priors) | told))
+    reported = {key.replace("__", "."): PriorSettings(key, fixed=value) for key, value in priors.items()}
+    return problem_of(replace(base, effects=EffectsSettings(use=names), priors=dict(base.priors) | reported))
 
 
 def values_of(made: Problem, size: float) -> np.ndarray:
@@ -155,14 +155,14 @@ def test_gains_are_integrated_out_where_responses_are_linear_in_them(name: str, 
 
 def test_rows_have_units_priors_and_domains():
     made = using(one_axis(), "overdrive_pulse", "vibration", "sensor_lag").posterior.table
-    told = {
+    reported = {
         row.name: (row.unit, row.kind, None if row.prior is None else row.prior.dist) for row in made.rows
     }
-    assert told["overdrive_pulse.k"] == ("-", "coefficient", "norm")
-    assert told["overdrive_pulse.frame"] == ("ms", "constant", "loguniform")
-    assert told["vibration.a[r0]"] == ("rad", "coefficient", "norm")
-    assert told["vibration.frequency"] == ("1/ms", "constant", "loguniform")
-    assert told["sensor_lag.Ts"] == ("ms", "magnitude", "halfnorm")
+    assert reported["overdrive_pulse.k"] == ("-", "coefficient", "norm")
+    assert reported["overdrive_pulse.frame"] == ("ms", "constant", "loguniform")
+    assert reported["vibration.a[r0]"] == ("rad", "coefficient", "norm")
+    assert reported["vibration.frequency"] == ("1/ms", "constant", "loguniform")
+    assert reported["sensor_lag.Ts"] == ("ms", "magnitude", "halfnorm")
     lag = made.rows[made.names.index("sensor_lag.Ts")]
     assert lag.log_prior(np.array([-0.1]))[0] == -np.inf
 
@@ -177,11 +177,11 @@ def test_priors_of_effects_are_priors():
     }
     uses = EffectsSettings(use=("overdrive_pulse", "vibration"))
     table = problem_of(replace(base, effects=uses, priors=priors)).posterior.table
-    told = {row.name: row for row in table.rows}
-    assert told["overdrive_pulse.frame"].value == 1.5
-    assert told["vibration.a[r0]"].prior.parameters["scale"] == 0.25  # type: ignore[union-attr]
-    assert told["vibration.a[r1]"].value == 0.0
-    assert told["vibration.b[r0]"].default
+    reported = {row.name: row for row in table.rows}
+    assert reported["overdrive_pulse.frame"].value == 1.5
+    assert reported["vibration.a[r0]"].prior.parameters["scale"] == 0.25  # type: ignore[union-attr]
+    assert reported["vibration.a[r1]"].value == 0.0
+    assert reported["vibration.b[r0]"].default
 
 
 def test_scatter_changes_the_noise():
@@ -269,9 +269,9 @@ def test_a_plant_without_a_bounded_response_is_impossible():
     made = using(one_axis(), "cubic_stiffness")
     values = np.tile(values_of(made, 1.0), (2, 1))
     values[1, made.posterior.table.names.index("cubic_stiffness.c")] = -300.0
-    told = made.posterior.log_likelihood(values)
-    assert np.isfinite(told[0])
-    assert told[1] == -np.inf
+    reported = made.posterior.log_likelihood(values)
+    assert np.isfinite(reported[0])
+    assert reported[1] == -np.inf
 
 
 def test_the_optimum_of_a_simulated_stiffness():
@@ -320,12 +320,12 @@ def test_scales_of_a_fit_and_of_the_records_give_the_same_model():
     other = effected(plain, values[:-1], [bundled()["cubic_stiffness"]()])
     assert made.ranges is not None
     stretch = (other.ranges.response[0] / made.ranges.response[0]) ** 2
-    told = other.responses(values[:-1], values[-1:] * stretch)
+    reported = other.responses(values[:-1], values[-1:] * stretch)
     simulation = made.posterior.simulation
     assert simulation is not None
     for r, one in enumerate(simulation.responses(values[None])):
         level = made.posterior.table.offset(values[None], 0, r)[0]
-        assert_allclose(one[0, 0] + level, told[r][:, 0], rtol=0, atol=1e-9)
+        assert_allclose(one[0, 0] + level, reported[r][:, 0], rtol=0, atol=1e-9)
     assert_array_equal(made.posterior.model.effects.epochs, [-0.5, 0.5])  # type: ignore[union-attr]
 
 
@@ -380,9 +380,9 @@ def test_a_force_that_runs_away_leaves_the_other_plants_alone():
     values[1, made.posterior.table.names.index("cubic_stiffness.c")] = -300.0
     simulation = made.posterior.simulation
     assert simulation is not None
-    told = simulation(values)
-    assert told[0].bounded.tolist() == [True, False, True]
-    assert_array_equal(told[0].base[0, 1], 0.0)
+    reported = simulation(values)
+    assert reported[0].bounded.tolist() == [True, False, True]
+    assert_array_equal(reported[0].base[0, 1], 0.0)
 
 
 def test_places_in_the_campaign_go_by_name_and_numbers_by_value():

@@ -31,11 +31,11 @@ def case() -> tuple[np.ndarray, np.ndarray]:
 
 def test_marginal_is_the_dense_normal_one(case):
     columns, target = case
-    told = equations(columns, target).log_marginal() - 0.5 * 15 * LOG_2PI
+    reported = equations(columns, target).log_marginal() - 0.5 * 15 * LOG_2PI
     for b in range(4):
         covariance = columns[b].T @ columns[b] + np.eye(15)
         exact = stats.multivariate_normal(np.zeros(15), covariance).logpdf(target[b])
-        assert told[b] == pytest.approx(exact, rel=1e-11)
+        assert reported[b] == pytest.approx(exact, rel=1e-11)
 
 
 def test_records_may_be_added_one_after_another_each_with_its_own_columns(case):

@@ -47,21 +47,21 @@ def test_ar1_without_memory_is_white(sigma, gaps):
 
 def test_white_is_the_normal_density():
     residual = residual_of(30, 0.4, batch=2)
-    told = White().pointwise(residual, np.array([[0.4], [1.3]]), np.ones(30))
-    assert_allclose(told, stats.norm.logpdf(residual, scale=[[0.4], [1.3]]), rtol=1e-12)
+    reported = White().pointwise(residual, np.array([[0.4], [1.3]]), np.ones(30))
+    assert_allclose(reported, stats.norm.logpdf(residual, scale=[[0.4], [1.3]]), rtol=1e-12)
 
 
 @given(sigmas, st.floats(0.0, 0.995), gaps_lists)
 def test_ar1_is_the_normal_density_of_its_dense_covariance(sigma, rho, gaps):
     residual = residual_of(gaps.size, sigma)
-    told = AR1().pointwise(residual, np.array([[sigma, rho]]), gaps)[0]
+    reported = AR1().pointwise(residual, np.array([[sigma, rho]]), gaps)[0]
     covariance = dense(1.0, rho, gaps)
     low = np.linalg.cholesky(covariance)  # row k of its inverse is sample k given those before it
     white = np.linalg.solve(low, residual[0] / sigma)
     exact = stats.norm.logpdf(white) - np.log(sigma * np.diagonal(low))
-    assert_allclose(told, exact, rtol=1e-7, atol=1e-7)
+    assert_allclose(reported, exact, rtol=1e-7, atol=1e-7)
     whole = stats.multivariate_normal(np.zeros(gaps.size), sigma**2 * covariance, allow_singular=True)
-    assert_allclose(told.sum(), whole.logpdf(residual[0]), rtol=1e-6, atol=1e-6)
+    assert_allclose(reported.sum(), whole.logpdf(residual[0]), rtol=1e-6, atol=1e-6)
 
 
 def test_ar1_uses_the_gaps():
@@ -73,8 +73,8 @@ def test_ar1_uses_the_gaps():
 @given(sigmas, st.floats(0.3, 200.0))
 def test_student_is_scipys(sigma, nu):
     residual = residual_of(25, sigma)
-    told = Student().pointwise(residual, np.array([[sigma, nu]]), np.ones(25))
-    assert_allclose(told, stats.t.logpdf(residual, nu, scale=sigma), rtol=1e-10, atol=1e-10)
+    reported = Student().pointwise(residual, np.array([[sigma, nu]]), np.ones(25))
+    assert_allclose(reported, stats.t.logpdf(residual, nu, scale=sigma), rtol=1e-10, atol=1e-10)
 
 
 @given(gaps_lists, st.floats(0.0, 0.99), st.floats(-3, 3))
@@ -106,23 +106,23 @@ def test_white_and_correlated_noise_is_whitened_by_the_factor_of_its_dense_covar
     parameters, n = np.array(MIXTURES), gaps.size
     columns = np.random.default_rng(3).normal(size=(len(MIXTURES), 3, n))
     white, scale = WhiteAR1().whiten(columns, parameters, gaps)
-    told = WhiteAR1().pointwise(columns[:, 0], parameters, gaps)
+    reported = WhiteAR1().pointwise(columns[:, 0], parameters, gaps)
     for row, values in enumerate(MIXTURES):
         covariance = mixed(*values, gaps)
         low = np.linalg.cholesky(covariance)
         assert_allclose(white[row], np.linalg.solve(low, columns[row].T).T, rtol=1e-9, atol=1e-9)
         assert_allclose(scale[row], np.log(np.diagonal(low)).sum(), rtol=1e-9, atol=1e-9)
         whole = stats.multivariate_normal(np.zeros(n), covariance).logpdf(columns[row, 0])
-        assert_allclose(told[row].sum(), whole, rtol=1e-9)
+        assert_allclose(reported[row].sum(), whole, rtol=1e-9)
 
 
 @given(st.floats(1e-3, 1e3), st.floats(1e-3, 1e3), st.floats(0.0, 0.995), gaps_lists, st.floats(1e-6, 1e3))
 def test_each_sample_of_white_and_correlated_noise_has_its_density_given_those_before(s, c, rho, gaps, unit):
     residual = residual_of(gaps.size, max(s, c) * unit)
-    told = WhiteAR1().pointwise(residual, np.array([[s * unit, c * unit, rho]]), gaps)[0]
+    reported = WhiteAR1().pointwise(residual, np.array([[s * unit, c * unit, rho]]), gaps)[0]
     low = np.linalg.cholesky(mixed(s, c, rho, gaps))
     exact = stats.norm.logpdf(np.linalg.solve(low, residual[0] / unit)) - np.log(unit * np.diagonal(low))
-    assert_allclose(told, exact, rtol=1e-7, atol=1e-7)
+    assert_allclose(reported, exact, rtol=1e-7, atol=1e-7)
 
 
 @given(sigmas, st.floats(0.0, 0.995), gaps_lists)
@@ -160,9 +160,9 @@ def test_innovation_variances_settle_where_samples_are_equally_spaced(settling):
     """Against the factor of the dense covariance at every sample, before and after they have."""
     gaps, parameters = np.ones(150), np.array([[settling, 0.7, 0.9], [0.1, 0.5, 0.2]])
     scales = WhiteAR1().log_scales(parameters, gaps)
-    for told, own in zip(scales, parameters, strict=True):
+    for reported, own in zip(scales, parameters, strict=True):
         exact = np.log(np.diagonal(np.linalg.cholesky(mixed(*own, gaps))))
-        assert_allclose(told, exact, rtol=1e-11, atol=1e-11)
+        assert_allclose(reported, exact, rtol=1e-11, atol=1e-11)
 
 
 def test_samples_at_rounded_time_stamps_are_equally_spaced():

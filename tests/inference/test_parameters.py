@@ -100,13 +100,13 @@ def test_scales():
     assert parameter("gain", "loguniform", a=1.0, b=9.0).log_scale
     assert not parameter("gain", "loguniform", a=1.0, b=9.0, loc=-5.0).log_scale
     assert not parameter("gain", "norm").log_scale
-    for dist, told in (("uniform", {}), ("loguniform", {"a": 0.01, "b": 0.99})):
-        rho = parameter("rho", dist, **told)
+    for dist, reported in (("uniform", {}), ("loguniform", {"a": 0.01, "b": 0.99})):
+        rho = parameter("rho", dist, **reported)
         assert rho.logit_scale
         assert not rho.log_scale
 
 
-def test_problems_are_told_all_at_once():
+def test_problems_are_reported_all_at_once():
     priors = {
         "tiem_1": 3.0,
         "time_1": ("uniform", {"loc": -5.0, "scale": 4.0}),
@@ -114,16 +114,16 @@ def test_problems_are_told_all_at_once():
         "delay": -1.0,
         "sigma": 0.0,
     }
-    told = refusal(priors=priors)
-    assert len(told) == 5
-    assert "tiem_1" in told[0]
-    assert "did you mean 'time_1'?" in told[0]
+    reported = refusal(priors=priors)
+    assert len(reported) == 5
+    assert "tiem_1" in reported[0]
+    assert "did you mean 'time_1'?" in reported[0]
     assert all(
-        name in line for name, line in zip(("time_1", "order_1", "delay", "sigma"), told[1:], strict=True)
+        name in line for name, line in zip(("time_1", "order_1", "delay", "sigma"), reported[1:], strict=True)
     )
-    assert "uniform(loc=-5, scale=4) has no mass in (0, inf)" in told[1]
-    assert "must lie in (0, 2]" in told[2]
-    assert "must lie in [0, inf)" in told[3]
+    assert "uniform(loc=-5, scale=4) has no mass in (0, inf)" in reported[1]
+    assert "must lie in (0, 2]" in reported[2]
+    assert "must lie in [0, inf)" in reported[3]
 
 
 def test_a_correlation_cannot_be_fixed_at_one():
@@ -195,8 +195,8 @@ def test_orders_that_cannot_decrease_are_refused():
         "order_1": ("norm", {"loc": 0.5, "scale": 0.01}),
         "order_2": ("norm", {"loc": 1.5, "scale": 0.01}),
     }
-    (told,) = refusal(terms=2, priors=crossed)
-    assert "order_1 > order_2" in told
+    (reported,) = refusal(terms=2, priors=crossed)
+    assert "order_1 > order_2" in reported
 
 
 @given(st.permutations(range(3)), st.integers(0, 1000))

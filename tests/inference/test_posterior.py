@@ -26,8 +26,8 @@ def made(*fit: Record, **options) -> Posterior:
 
 def near_truth(posterior: Posterior, seed: int, count: int, width: float = 0.2) -> np.ndarray:
     """Coordinates around those of the truth."""
-    told = TRUTH | {"rho": 0.4, "nu": 6.0, "time_2": 0.9, "order_2": 0.3}
-    values = row_values(posterior.table, told)[None]
+    reported = TRUTH | {"rho": 0.4, "nu": 6.0, "time_2": 0.9, "order_2": 0.3}
+    values = row_values(posterior.table, reported)[None]
     shifts = width * np.random.default_rng(seed).normal(size=(count, posterior.dimension))
     return posterior.coordinates(values) + shifts
 
@@ -78,7 +78,7 @@ def test_density_is_the_dense_normal_marginal_over_gain_and_offset(noise, fit):
     assert [table.names[k] for k in posterior.linear] == ["gain", "offset"]
     coordinates = near_truth(posterior, 0, 6)
     observed = posterior.samples[0].axes[0]
-    told = posterior.log_density(coordinates)
+    reported = posterior.log_density(coordinates)
     for b, values in enumerate(posterior.values(coordinates)):
         unit = posterior.model.unit_responses(table.dynamics(values[None]))[0][0, 0, observed.index]
         columns = np.stack([unit, np.ones_like(unit)])
@@ -88,7 +88,7 @@ def test_density_is_the_dense_normal_marginal_over_gain_and_offset(noise, fit):
         covariance += dense_covariance(dict(zip(table.names, values, strict=True)), observed.gaps)
         exact = stats.multivariate_normal(mean, covariance).logpdf(observed.values)
         exact += independent_log_prior(posterior, coordinates[b : b + 1])[0]
-        assert told[b] == pytest.approx(exact, rel=3e-9)
+        assert reported[b] == pytest.approx(exact, rel=3e-9)
 
 
 def test_density_is_the_integral_over_gain_and_offset():
@@ -144,7 +144,7 @@ def test_what_is_not_linear_is_sampled_and_its_density_is_direct(noise, prior):
     assert posterior.linear == ()
     assert "gain" in [table.names[k] for k in posterior.sampled]
     coordinates = near_truth(posterior, 3, 5, 0.05)
-    told = posterior.log_density(coordinates)
+    reported = posterior.log_density(coordinates)
     observed = posterior.samples[0].axes[0]
     for b, values in enumerate(posterior.values(coordinates)):
         at = dict(zip(table.names, values, strict=True))
@@ -156,7 +156,7 @@ def test_what_is_not_linear_is_sampled_and_its_density_is_direct(noise, prior):
             covariance = dense_covariance(at, observed.gaps)
             exact = stats.multivariate_normal(np.zeros(residual.size), covariance).logpdf(residual)
         exact += independent_log_prior(posterior, coordinates[b : b + 1])[0]
-        assert told[b] == pytest.approx(exact, abs=1e-7)
+        assert reported[b] == pytest.approx(exact, abs=1e-7)
 
 
 def test_two_ways_to_say_a_normal_gain_agree():
@@ -283,9 +283,9 @@ def test_a_correlation_that_rounds_to_one_is_outside_the_prior():
     posterior = made(noise="ar1")
     coordinates = near_truth(posterior, 0, 2, 0.0)
     coordinates[0, [posterior.table.names[k] for k in posterior.sampled].index("rho")] = 40.0
-    told = posterior.log_density(coordinates)
-    assert told[0] == -np.inf
-    assert np.isfinite(told[1])
+    reported = posterior.log_density(coordinates)
+    assert reported[0] == -np.inf
+    assert np.isfinite(reported[1])
 
 
 @dataclass(frozen=True, eq=False)

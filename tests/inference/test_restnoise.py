@@ -92,12 +92,12 @@ def default_priors(*fit: Record) -> dict[str, Prior | None]:
 
 
 def test_default_priors_come_from_the_samples_at_rest_where_there_are_some():
-    told = default_priors(record(camera=0.05, command=LATE))
-    assert [prior.dist for prior in told.values()] == ["lognorm", "uniform", "uniform"]
-    assert told["sigma"].frozen.median() == pytest.approx(0.02, rel=0.25)  # 80 samples: an sd of 0.08
-    assert told["sigma"].parameters["s"] > np.log(2)
-    assert 0.01 < told["sigma_ar"].support[1] < 0.06
-    assert told["rho"].support == pytest.approx((np.exp(-1), np.exp(-20 * 0.05 / 8.0)), rel=1e-3)
+    reported = default_priors(record(camera=0.05, command=LATE))
+    assert [prior.dist for prior in reported.values()] == ["lognorm", "uniform", "uniform"]
+    assert reported["sigma"].frozen.median() == pytest.approx(0.02, rel=0.25)  # 80 samples: an sd of 0.08
+    assert reported["sigma"].parameters["s"] > np.log(2)
+    assert 0.01 < reported["sigma_ar"].support[1] < 0.06
+    assert reported["rho"].support == pytest.approx((np.exp(-1), np.exp(-20 * 0.05 / 8.0)), rel=1e-3)
     none = default_priors(record(camera=0.05))
     assert [prior.dist for prior in none.values()] == ["loguniform", "loguniform", "uniform"]
 
@@ -107,8 +107,8 @@ def test_a_short_record_keeps_a_correlation_to_infer():
 
 
 def test_priors_of_a_study_come_before_those_from_rest():
-    told = {"sigma": 0.02, "sigma_ar": ("halfnorm", {"scale": 0.5}), "rho": 0.0}
-    table = problem(record(camera=0.05, command=LATE), noise="white+ar1", priors=told).posterior.table
+    reported = {"sigma": 0.02, "sigma_ar": ("halfnorm", {"scale": 0.5}), "rho": 0.0}
+    table = problem(record(camera=0.05, command=LATE), noise="white+ar1", priors=reported).posterior.table
     rows = {row.name: row for row in table.rows}
     assert (rows["sigma"].value, rows["rho"].value) == (0.02, 0.0)
     assert rows["sigma_ar"].prior == Prior("halfnorm", {"scale": 0.5})

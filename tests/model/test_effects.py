@@ -69,14 +69,14 @@ def two_axes() -> tuple[Effected, np.ndarray, list[np.ndarray]]:
     ]
     posterior = problem(*made, terms={"direct": 2, "cross": 1}, share="paper", offset="shared").posterior
     table = posterior.table
-    told = {
+    reported = {
         "gain": lambda p: paths[p.first][p.second].gain,
         "time": lambda p: (direct, cross)[p.first][p.second][0],
         "order": lambda p: (direct, cross)[p.first][p.second][1],
         "delay": lambda p: 0.3873,
         "offset": lambda p: 0.1,
     }
-    values = np.array([told.get(row.kind, lambda p: 0.01)(row.place) for row in table.rows])
+    values = np.array([reported.get(row.kind, lambda p: 0.01)(row.place) for row in table.rows])
     plain = [read[:, 0].T + 0.1 for read in responses(table, posterior.model, values[None])]
     return effected(posterior, values), values, plain
 
@@ -131,8 +131,8 @@ def test_signature_is_the_slope(name: str):
     left = []
     for part in (0.04, 0.02, 0.01):
         psi = part * scales(made)
-        told = [y + s @ psi for y, s in zip(here, signature, strict=True)]
-        left.append(apart(made.responses(VALUES, psi), told))
+        reported = [y + s @ psi for y, s in zip(here, signature, strict=True)]
+        left.append(apart(made.responses(VALUES, psi), reported))
     size = max(float(np.abs(s @ scales(made)).max()) for s in signature)
     assert left[2] < 0.02 * 0.01 * size + 2e-3 * 0.01 + 1e-12
     assert left[2] < 0.75 * left[0] or left[0] < 1e-9
@@ -208,7 +208,7 @@ def test_jacobian_without_effects_is_exact():
         assert apart([j[..., k] for j in plain], slope) < 1e-5
 
 
-# ------------------------------------------------------------ independent roads
+# ------------------------------------------------------------ independent methods
 
 LAG = Device(((TransferPath(2.0, 0.3, (1.5,), (1.0,), 1.0),),), ONE.drive_axes, ONE.response_axes, (0.0,))
 LAG_VALUES = {"gain": 2.0, "time_1": 1.5, "order_1": 1.0, "delay": 0.3, "offset": 0.0, "sigma": 0.1}
@@ -245,7 +245,7 @@ def test_forces_against_the_differential_equation(effect, psi, law):
     """``T dy/dt = law(K u(t - tau), y)`` by a Runge-Kutta method, segment by segment."""
     made, values = lag_plant()
     scale = float(made.ranges.response[0])
-    told = made.with_effects([effect]).responses(values, np.array(psi))[0][:, 0]
+    reported = made.with_effects([effect]).responses(values, np.array(psi))[0][:, 0]
     times = made.simulator.times[0]
     levels, edges = [0.0, 1.0, -0.7, 0.4, 0.0], [-1.0, 0.65, 3.35, 6.05, 8.75, 15.0]
     exact, start = np.zeros(times.size), 0.0
@@ -257,21 +257,21 @@ def test_forces_against_the_differential_equation(effect, psi, law):
             (a, b), [start], t_eval=at, rtol=1e-9, atol=1e-11, max_step=0.02,
         )  # fmt: skip
         exact[inside], start = found.y[0][:-1], found.y[0][-1]
-    assert np.abs(told - exact).max() < 2e-3 * np.abs(exact).max()
+    assert np.abs(reported - exact).max() < 2e-3 * np.abs(exact).max()
 
 
 def test_strong_cubic_stiffness_converges_in_blocks():
     """Second order in the block width, also where whole-record sweeps do not converge."""
-    told = [
+    reported = [
         made.with_effects([CubicStiffness()]).responses(values, np.array([40.0]))[0]
         for made, values in (lag_plant(blocks) for blocks in (250, 500, 1000, 4000))
     ]
-    errors = [np.abs(one - told[-1]).max() for one in told[:-1]]
+    errors = [np.abs(one - reported[-1]).max() for one in reported[:-1]]
     assert errors[0] / errors[1] > 2.5
     assert errors[1] / errors[2] > 2.5
 
 
-def test_a_runaway_is_told_and_not_returned():
+def test_a_runaway_is_reported_and_not_returned():
     made, values = lag_plant(None)
     with pytest.raises(UnstableError, match=r"cubic_stiffness.*runs away"):
         made.with_effects([CubicStiffness()]).responses(values, np.array([-3.0]))
@@ -286,9 +286,9 @@ def test_sensor_lag_is_one_more_lag():
     for lag in (0.02, 0.1, 0.5, 3.0):
         t = np.maximum(made.simulator.times[0] - 0.65, 0.0)
         exact = 2.0 * (1 - (1.5 * np.exp(-t / 1.5) - lag * np.exp(-t / lag)) / (1.5 - lag))
-        told = made.responses(values, np.array([lag]))[0][:, 0]
-        assert np.abs(told - exact).max() < 0.012  # the kink at the onset falls within a block
-        assert np.abs(told - exact)[t > 1.0].max() < 1e-3
+        reported = made.responses(values, np.array([lag]))[0][:, 0]
+        assert np.abs(reported - exact).max() < 0.012  # the kink at the onset falls within a block
+        assert np.abs(reported - exact)[t > 1.0].max() < 1e-3
 
 
 @given(rate=st.floats(1e-3, 60.0))
@@ -359,8 +359,8 @@ def test_hysteresis_needs_a_reversal():
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.floats(-2, 2)), max_size=8))
-def test_sorted_jumps_keep_the_sum(told):
-    times, jumps = np.array([float(t) for t, _ in told]), np.array([j for _, j in told])
+def test_sorted_jumps_keep_the_sum(reported):
+    times, jumps = np.array([float(t) for t, _ in reported]), np.array([j for _, j in reported])
     drive = AxisDrive.of_jumps(times, jumps)
     assert (np.diff(drive.times) > 0).all()
     if jumps.any():
@@ -389,14 +389,14 @@ def test_two_effects_do_not_only_add():
     assert 1e-4 < apart(both.responses(VALUES, psi), summed) < 0.05
 
 
-def test_campaign_speed_is_told_by_the_grid():
+def test_campaign_speed_is_reported_by_the_grid():
     """A record pseudo-random for its whole length costs no more than its blocks: it is simulated at all."""
     rng = np.random.default_rng(2)
     made = record(3, device=LAG, command=prbs(-1.0, 1.0, hold=0.4, duration=12.0, rng=rng), noise_sd=0.0)
     posterior = problem(made).posterior
     values = np.array([LAG_VALUES[name] for name in posterior.table.names])
-    told = effected(posterior, values, [CubicStiffness()]).responses(values, np.array([5.0]))
-    assert np.isfinite(told[0]).all()
+    reported = effected(posterior, values, [CubicStiffness()]).responses(values, np.array([5.0]))
+    assert np.isfinite(reported[0]).all()
 
 
 OWN = """
@@ -424,17 +424,17 @@ def test_a_class_of_the_user(tmp_path):
     (tmp_path / "own.py").write_text(OWN)
     kind = catalogue(["own.py:Doubled"], tmp_path)["doubled"]
     made = BASE.with_effects([kind()])
-    told = made.responses(VALUES, np.ones(1))
-    assert apart(told, [2 * y - 0.1 for y in PLAIN]) < 1e-12
+    reported = made.responses(VALUES, np.ones(1))
+    assert apart(reported, [2 * y - 0.1 for y in PLAIN]) < 1e-12
 
 
-def test_bad_classes_are_told_together(tmp_path):
+def test_bad_classes_are_reported_together(tmp_path):
     (tmp_path / "own.py").write_text(OWN)
     (tmp_path / "broken.py").write_text("1 / 0")
     add = ["own.py:Unfinished", "own.py:Taken", "own.py:Dubbled", "none.py:A", "broken.py:A", "own.py"]
-    with pytest.raises(InputError) as told:
+    with pytest.raises(InputError) as reported:
         catalogue(add, tmp_path)
-    text = "\n".join(told.value.problems)
+    text = "\n".join(reported.value.problems)
     for part in (
         "must be a concrete",
         "backflow",
@@ -444,7 +444,7 @@ def test_bad_classes_are_told_together(tmp_path):
         "expected file",
     ):
         assert part in text
-    assert len(told.value.problems) == len(add)
+    assert len(reported.value.problems) == len(add)
 
 
 @pytest.mark.parametrize("name", ["trigger_jitter", "clock_skew"])

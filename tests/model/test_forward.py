@@ -125,7 +125,7 @@ def test_a_delay_off_the_grid_costs_no_accuracy():
     assert 2.8 < slope < 4.2
 
 
-# Two roads: the bench inverts Laplace transforms and shares no code with the operational algebra
+# Two methods: the bench inverts Laplace transforms and shares no code with the operational algebra
 
 
 @st.composite

@@ -1,4 +1,4 @@
-"""Director of the cell: threshold, two roads to the profile, order of convergence, tilt law."""
+"""Director of the cell: threshold, two methods to the profile, order of convergence, tilt law."""
 
 from dataclasses import replace
 from math import inf, nan, pi
@@ -146,7 +146,7 @@ def test_newton_step_solves_with_the_whole_hessian(field):
     np.testing.assert_allclose(full @ step, -state.gradient, atol=1e-10)
 
 
-# Two roads, and the order of convergence
+# Two methods, and the order of convergence
 
 
 @both
@@ -168,7 +168,7 @@ def test_solver_and_first_integral_agree(field, volts, pretilt):
     ratio=st.floats(1.1, 4.0),
     field=st.sampled_from(Field),
 )
-def test_roads_agree_for_any_material(bend, anisotropy, ratio, field):
+def test_methods_agree_for_any_material(bend, anisotropy, ratio, field):
     cell = Cell(1e-11, bend * 1e-11, 4e-11, anisotropy * 4e-11)
     volts = ratio * cell.threshold
     assert equilibrium(cell, volts, field=field).mean == pytest.approx(

@@ -55,7 +55,7 @@ def array_sum(array: LinearArray, u, phases) -> np.ndarray:
 @settings(max_examples=60, deadline=None)
 @given(array=arrays, step=st.floats(-7, 7), u=st.floats(-1, 1))
 def test_sum_and_closed_form_agree(array, step, u):
-    """Two roads, complex: the closed form carries the phase of the array centre."""
+    """Two methods, complex: the closed form carries the phase of the array centre."""
     psi = step - 2 * pi / array.period * u
     closed = array_factor(array, u, step) * np.exp(0.5j * (array.elements - 1) * psi)
     tolerance = 1e-15 * array.elements * (10 + abs(step) + 2 * pi / array.period)

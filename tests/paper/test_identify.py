@@ -146,11 +146,11 @@ def test_the_equation_holds_on_exact_data_to_second_order():
 
 def test_a_sample_with_an_exposure_stands_for_its_middle():
     exposed = truth(DEVICE, Bench(camera=0.1, exposure=0.1), step(1.0, at=1.0), duration=12.0, name="exposed")
-    told, untold = (data_of(exposed, exposure_ms=exposure) for exposure in (0.1, 0.0))
-    found, late = (least_squares(blocks_of(data), ORDERS, DELAY) for data in (told, untold))
+    reported, untold = (data_of(exposed, exposure_ms=exposure) for exposure in (0.1, 0.0))
+    found, late = (least_squares(blocks_of(data), ORDERS, DELAY) for data in (reported, untold))
     assert_allclose(found.etas, ETAS, rtol=0.01)
     assert np.abs(np.array(late.etas) / ETAS - 1).max() > 0.03
-    assert output_rmse(told.records, TRUE) < 0.2 * output_rmse(untold.records, TRUE)
+    assert output_rmse(reported.records, TRUE) < 0.2 * output_rmse(untold.records, TRUE)
 
 
 def test_both_normalisations_agree_on_exact_data_and_convert():
@@ -292,7 +292,7 @@ def test_the_scan_stays_within_its_intervals():
     assert 1.1 - 1e-9 <= found.model.delay <= 1.3 + 1e-9
 
 
-def test_a_winner_that_cannot_be_physical_is_told():
+def test_a_winner_that_cannot_be_physical_is_reported():
     times = 0.1 * np.arange(1, 81)
     runaway = table([-0.1, 0.0, *times], [0.0, 1.0, *np.ones(80)], [0.0, 0.0, *np.expm1(0.4 * times)])
     found = scan(
@@ -387,16 +387,16 @@ def test_every_path_of_the_bundled_study(identified):
 
 def test_results_are_plain_and_convert(identified):
     once, found = identified
-    told = json.loads(json.dumps(results(once, found, FEW), allow_nan=False))
-    assert [path_["path"] for path_ in told["paths"]] == ["x_x", "x_y", "y_x", "y_y"]
-    model = told["paths"][0]["models"][0]
+    reported = json.loads(json.dumps(results(once, found, FEW), allow_nan=False))
+    assert [path_["path"] for path_ in reported["paths"]] == ["x_x", "x_y", "y_x", "y_y"]
+    model = reported["paths"][0]["models"][0]
     given, last = (model["coefficients"][normalisation.value] for normalisation in Normalisation)
     assert given["stiffness"] == 5.57
     assert last["etas"][-1] == 1.0
     assert given["gain"] / last["gain"] == pytest.approx(given["stiffness"] / last["stiffness"])
     assert model["equation_rmse"] > 0
-    assert model["delay_unit"] == told["time_unit"] == "ms"
-    methods = [each["method"] for each in told["paths"][0]["models"]]
+    assert model["delay_unit"] == reported["time_unit"] == "ms"
+    methods = [each["method"] for each in reported["paths"][0]["models"]]
     assert len(set(methods)) == 5
 
 
@@ -412,9 +412,9 @@ def test_nothing_is_printed_unless_asked(capsys):
     identify(once, plan=plan)
     assert capsys.readouterr() == ("", "")
     identify(once, plan=plan, quiet=False)
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert "candidate" in told.err
+    reported = capsys.readouterr()
+    assert reported.out == ""
+    assert "candidate" in reported.err
 
 
 @pytest.mark.slow
@@ -452,10 +452,10 @@ def test_bad_scans(fields, said):
         Scan(**fields)
 
 
-def test_all_that_is_wrong_with_a_scan_is_told_together():
-    with pytest.raises(InputError) as told:
+def test_all_that_is_wrong_with_a_scan_is_reported_together():
+    with pytest.raises(InputError) as reported:
         Scan(orders=(Interval(1.8, 1.2),), delay=Interval(2, 1), order_step=-1)
-    assert len(told.value.problems) == 3
+    assert len(reported.value.problems) == 3
 
 
 @pytest.mark.parametrize(
@@ -479,9 +479,9 @@ def test_too_many_terms():
 
 def test_several_drives_at_once():
     both = record(device=TWO, camera=0.5, name="both")
-    with pytest.raises(InputError, match="'both' several drives move at once") as told:
+    with pytest.raises(InputError, match="'both' several drives move at once") as reported:
         path_data(study(both))
-    assert len(told.value.problems) == 2
+    assert len(reported.value.problems) == 2
     rng = np.random.default_rng(4)
     alone = [
         record(

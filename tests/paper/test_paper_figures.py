@@ -173,8 +173,8 @@ def test_table_1(identified):
 
 def test_posterior_intervals_stand_beside(identified, tmp_path):
     study, found = identified
-    told = {"name": "steady_state[x_x]", "value": 0.018, "lower": 0.017, "upper": None, "level": 0.9}
-    saved = {"study": "small", "step_metrics": [told | {"grade": "tentative"}]}
+    reported = {"name": "steady_state[x_x]", "value": 0.018, "lower": 0.017, "upper": None, "level": 0.9}
+    saved = {"study": "small", "step_metrics": [reported | {"grade": "tentative"}]}
     (tmp_path / "results.json").write_text(json.dumps(saved))
     rows = step_table(study, found, posterior=load_posterior(tmp_path, study))
     beside = {(row["path"], row["metric"]): row["posterior"] for row in rows}

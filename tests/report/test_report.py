@@ -43,9 +43,9 @@ QUANTILES = {"05": -1.6, "25": -0.7, "50": 0.0, "75": 0.7, "95": 1.6}
 
 
 def estimate(name: str, unit: str, value: float | None, sd: float | None, grade: str, **more: object) -> dict:
-    told = {"name": name, "value": value, "unit": unit, "mean": value, "sd": sd, "grade": grade}
+    reported = {"name": name, "value": value, "unit": unit, "mean": value, "sd": sd, "grade": grade}
     ends = {"lower": None, "upper": None} if value is None else {"lower": value - sd, "upper": value + sd}
-    return told | ends | {"level": 0.9, "interval": "equal-tailed credible", "ess": 512.0} | more
+    return reported | ends | {"level": 0.9, "interval": "equal-tailed credible", "ess": 512.0} | more
 
 
 def bands_of(record: str, held: bool, size: int) -> pd.DataFrame:
@@ -113,9 +113,14 @@ def tables_of(size: int) -> dict[str, pd.DataFrame]:
 
 
 def moved(name: str, prior: float | None, diagnosis: str) -> dict:
-    told = {"parameter": name, "prior": prior, "prior_mcse": prior and 0.0123, "likelihood": prior}
-    told |= {"likelihood_mcse": prior and 0.0123, "prior_k": None, "likelihood_k": 0.312, "threshold": 0.05}
-    return told | {"grade": "tentative", "diagnosis": diagnosis, "note": ""}
+    reported = {"parameter": name, "prior": prior, "prior_mcse": prior and 0.0123, "likelihood": prior}
+    reported |= {
+        "likelihood_mcse": prior and 0.0123,
+        "prior_k": None,
+        "likelihood_k": 0.312,
+        "threshold": 0.05,
+    }
+    return reported | {"grade": "tentative", "diagnosis": diagnosis, "note": ""}
 
 
 def results_of() -> dict:
@@ -239,9 +244,10 @@ def test_every_parameter_has_its_unit_interval_and_grade(html):
 
 
 def test_open_sides_are_said_and_not_printed_as_numbers(html):
-    told = {row[1]: row for row in rows_of(html) if len(row) == 8 and row[0] == "x"}
+    reported = {row[1]: row for row in rows_of(html) if len(row) == 8 and row[0] == "x"}
     first, second, third = (
-        told[f"settling time to {share}"] if share else told["overshoot"] for share in ("2 %", "5 %", "")
+        reported[f"settling time to {share}"] if share else reported["overshoot"]
+        for share in ("2 %", "5 %", "")
     )
     assert first[2] == first[4] == NOT_REACHED
     assert first[7] == "all draws are late"
@@ -340,7 +346,7 @@ def test_missing_file_is_named(tmp_path, missing):
     assert not (folder / "report.html").exists()
 
 
-def test_all_that_is_wrong_is_told_at_once(tmp_path):
+def test_all_that_is_wrong_is_reported_at_once(tmp_path):
     folder = run_folder(tmp_path / "run")
     (folder / "tables" / "drives.csv").unlink()
     (folder / "tables" / "priors.csv").write_text("name,unit,prior,from\n", encoding="utf-8")
@@ -348,19 +354,19 @@ def test_all_that_is_wrong_is_told_at_once(tmp_path):
     (folder / "posterior.nc").write_text("no netCDF", encoding="utf-8")
     with pytest.raises(InputError) as refused:
         load_run(folder)
-    told = "\n".join(refused.value.problems)
+    reported = "\n".join(refused.value.problems)
     assert len(refused.value.problems) == 4
     for word in ("drives.csv", "'integrated_out'", "results.json", "posterior.nc"):
-        assert word in told
+        assert word in reported
     with pytest.raises(InputError, match="no such run folder"):
         write_report(tmp_path / "nowhere")
 
 
 def test_draws_of_another_run_are_refused(tmp_path):
     folder = run_folder(tmp_path / "run")
-    told = results_of()
-    told["parameters"].append(estimate("rho", "-", 0.5, 0.1, "reliable", rhat=1.0))
-    (folder / "results.json").write_text(json.dumps(told), encoding="utf-8")
+    reported = results_of()
+    reported["parameters"].append(estimate("rho", "-", 0.5, 0.1, "reliable", rhat=1.0))
+    (folder / "results.json").write_text(json.dumps(reported), encoding="utf-8")
     with pytest.raises(InputError, match="'rho'"):
         load_run(folder)
 

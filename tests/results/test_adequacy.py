@@ -26,8 +26,8 @@ NOISE = TRUTH | {"sigma_ar": 0.003, "rho": 0.5, "nu": 200.0}
 
 def about(made: Problem, spread: float = 1e-3, **changes: float) -> Draws:
     """Draws near the truth, or what is changed of it, that count as perfectly converged."""
-    told = NOISE | changes
-    middle = np.array([told[name] if row.free else row.value for name, row in named(made)])
+    reported = NOISE | changes
+    middle = np.array([reported[name] if row.free else row.value for name, row in named(made)])
     free = np.array([row.free for _, row in named(made)])
     noise = np.random.default_rng(0).standard_normal((400, middle.size))
     return draws_of(made.posterior.table, middle * (1 + spread * free * noise))
@@ -68,7 +68,7 @@ def test_correlated_noise_under_a_model_of_it_is_not_limited():
 
 def test_correlated_noise_under_a_white_model_is_named():
     made = problem(measured(3, correlation=0.8), noise="white")
-    (one,) = [told for told in found(made, about(made)) if "not white" in told.reason]
+    (one,) = [reported for reported in found(made, about(made)) if "not white" in reported.reason]
     assert one.level == "tentative"
     assert one.reason.startswith("intervals hold only if")
     assert "corrected for 2 tests" in one.reason
@@ -95,8 +95,8 @@ def test_a_whiteness_that_one_of_many_records_lacks_by_chance_is_not_called():
 @pytest.mark.parametrize(("factor", "word"), [(4.0, "wider"), (0.4, "narrower")])
 def test_bands_that_hold_too_many_or_too_few_samples_are_named(factor, word):
     made = problem(measured(2), noise="white")
-    told = found(made, about(made, sigma=factor * TRUTH["sigma"]))
-    assert [one for one in told if f"which is {word} than the residual" in one.reason]
+    reported = found(made, about(made, sigma=factor * TRUTH["sigma"]))
+    assert [one for one in reported if f"which is {word} than the residual" in one.reason]
 
 
 def test_coverage_is_judged_by_the_independent_samples_there_are():
@@ -162,8 +162,8 @@ def test_a_residual_far_above_the_scatter_at_rest_is_named():
 def test_noise_correlated_over_much_of_the_record_is_named():
     made = problem(measured(5), noise="ar1")
     for rho, called in ((0.999, True), (0.95, True), (0.8, False)):
-        told = [one for one in found(made, about(made, 1e-5, rho=rho)) if "correlated over" in one.reason]
-        assert bool(told) == called
+        reported = [one for one in found(made, about(made, 1e-5, rho=rho)) if "correlated over" in one.reason]
+        assert bool(reported) == called
 
 
 def test_a_noise_parameter_at_the_end_of_its_prior_is_named():
@@ -171,8 +171,8 @@ def test_a_noise_parameter_at_the_end_of_its_prior_is_named():
     row = made.posterior.table.rows[made.posterior.table.names.index("sigma_ar")]
     high = row.domain[1]
     for share, called in ((0.97, True), (0.5, False)):
-        told = found(made, about(made, sigma_ar=share * high))
-        assert bool([one for one in told if "the end of its prior" in one.reason]) == called
+        reported = found(made, about(made, sigma_ar=share * high))
+        assert bool([one for one in reported if "the end of its prior" in one.reason]) == called
 
 
 def thermal(seed: int = 3) -> Record:
@@ -194,9 +194,9 @@ def test_three_lags_fitted_by_one_term_are_never_reliable(noise):
     best = find_optima(made.posterior, np.random.default_rng(0))[0].values
     draws = draws_of(made.posterior.table, np.tile(best, (400, 1)))
     assert draws.grade.level == "reliable"
-    told = found(made, draws)
-    assert told
-    limited = draws.limited(told)
+    reported = found(made, draws)
+    assert reported
+    limited = draws.limited(reported)
     assert limited.grade.level != "reliable"
     assert "reliable" not in {one.grade for one in limited.estimates()}
     assert "intervals hold only if" in limited.grade.reason
@@ -209,10 +209,10 @@ def test_three_lags_fitted_by_one_term_from_record_to_audit():
     few = {"ensembles": 2, "walkers": 32, "steps": 600, "thin": 2}
     made = fit(study(thermal(), noise="ar1", sampler=few))
     assert made.draws.grade.level != "reliable"
-    told = results(made)
-    assert "intervals hold only if" in told["verdict"]
-    assert "reliable" not in {row["grade"] for row in told["parameters"] + told["step_metrics"]}
-    assert told["limitations"]
+    reported = results(made)
+    assert "intervals hold only if" in reported["verdict"]
+    assert "reliable" not in {row["grade"] for row in reported["parameters"] + reported["step_metrics"]}
+    assert reported["limitations"]
     said = audit(made).sentence
     assert said.startswith("Given this model, ")
     assert "But intervals hold only if" in said
@@ -246,13 +246,13 @@ def test_an_undamped_resonance_faster_than_the_samples_is_no_plant(time, order, 
     made = problem(measured(7))
     assert made.scales.period == pytest.approx(0.2)
     draws = about(made, 1e-4, time_1=time, order_1=order * (1 - 1e-3))
-    told = [one for one in found(made, draws) if "not a plant" in one.reason]
-    assert bool(told) == named
+    reported = [one for one in found(made, draws) if "not a plant" in one.reason]
+    assert bool(reported) == named
     if named:
-        assert told[0].level == "unusable"
+        assert reported[0].level == "unusable"
         (one,) = unresolved(draws, made.scales.period)
         assert one.samples == pytest.approx(2 * np.pi * time / 0.2, rel=0.03)
-        assert f"{one.samples:.2g} sampling periods" in told[0].reason
+        assert f"{one.samples:.2g} sampling periods" in reported[0].reason
 
 
 def test_a_minor_mode_that_is_an_alias_keeps_numbers_from_being_reliable():

@@ -48,8 +48,11 @@ def test_predicts_the_record_it_never_saw(fitted):
 
 
 def test_scores_say_what_kind_of_band_and_from_how_many_samples_the_offset_comes(fitted):
-    (told,) = results(fitted)["held_out"]
-    assert (told["bands"], told["offset_samples"]) == ("pointwise", 10)  # one per 0.2 until 1.3 and the delay
+    (reported,) = results(fitted)["held_out"]
+    assert (reported["bands"], reported["offset_samples"]) == (
+        "pointwise",
+        10,
+    )  # one per 0.2 until 1.3 and the delay
     assert "pointwise 90 % band" in verdict(fitted)
     assert "constant error" not in verdict(fitted)
     alone = [replace(b, offset_samples=b.time.size) if b.held_out else b for b in fitted.bands]
@@ -59,7 +62,7 @@ def test_scores_say_what_kind_of_band_and_from_how_many_samples_the_offset_comes
 
 
 def test_results_have_the_keys_that_other_tools_rely_on(fitted):
-    told = results(fitted)
+    reported = results(fitted)
     assert {
         "grade",
         "grade_reason",
@@ -68,22 +71,22 @@ def test_results_have_the_keys_that_other_tools_rely_on(fitted):
         "log_evidence_sd",
         "residual_rms",
         "step_metrics",
-    } <= told.keys()
-    assert [row["name"] for row in told["parameters"]] == list(TRUTH)
-    for row in told["parameters"]:
+    } <= reported.keys()
+    assert [row["name"] for row in reported["parameters"]] == list(TRUTH)
+    for row in reported["parameters"]:
         assert {"name", "unit", "mean", "sd", "lower", "upper", "level", "ess", "rhat"} <= row.keys()
         assert row["lower"] < row["value"] < row["upper"]
         assert row["lower"] < row["mean"] < row["upper"]
-    for metric in told["step_metrics"]:
+    for metric in reported["step_metrics"]:
         assert {"value", "unit", "lower", "upper", "level", "interval", "grade"} <= metric.keys()
-    assert {metric["name"] for metric in told["step_metrics"]} >= {
+    assert {metric["name"] for metric in reported["step_metrics"]} >= {
         "rise_10_90[y]",
         "settling_2[y]",
         "delay[y]",
     }
-    assert told["grade"] in ("reliable", "tentative", "unusable")
-    assert told["sampler"]["steps"] <= told["sampler"]["most_steps"] == 600
-    assert json.loads(json.dumps(told, allow_nan=False)) == told
+    assert reported["grade"] in ("reliable", "tentative", "unusable")
+    assert reported["sampler"]["steps"] <= reported["sampler"]["most_steps"] == 600
+    assert json.loads(json.dumps(reported, allow_nan=False)) == reported
 
 
 def test_the_verdict_names_grade_residual_and_held_out_record(fitted):
@@ -140,13 +143,13 @@ def test_the_fingerprint_knows_all_that_the_draws_depend_on():
 def test_provenance_is_plain_and_complete():
     assert provenance(STUDY, "fit")["command"] == ["lcopa_bayes.fit"]
     with commanded(["lcopa-bayes", "fit", "small"]):
-        told = provenance(STUDY, "fit")
-    assert told["command"] == ["lcopa-bayes", "fit", "small"]
-    assert told["study"] == "small"
-    assert told["seed"] == 5
-    assert {"lcopa-bayes", "numpy", "scipy", "emcee"} <= told["versions"].keys()
-    assert told["settings"]["held_out"] == ["held"]
-    assert json.loads(json.dumps(told, allow_nan=False)) == told
+        reported = provenance(STUDY, "fit")
+    assert reported["command"] == ["lcopa-bayes", "fit", "small"]
+    assert reported["study"] == "small"
+    assert reported["seed"] == 5
+    assert {"lcopa-bayes", "numpy", "scipy", "emcee"} <= reported["versions"].keys()
+    assert reported["settings"]["held_out"] == ["held"]
+    assert json.loads(json.dumps(reported, allow_nan=False)) == reported
 
 
 def test_a_quick_fit_takes_a_quarter_of_the_steps():

@@ -40,8 +40,8 @@ def stiff() -> tuple[Fit, np.ndarray]:
 def test_the_interval_holds_the_truth(stiff: tuple[Fit, np.ndarray]):
     found, truth = stiff
     assert found.draws.grade.level != "unusable"
-    told = {one.name: one for one in found.draws.estimates()}
-    own = told["cubic_stiffness.c"]
+    reported = {one.name: one for one in found.draws.estimates()}
+    own = reported["cubic_stiffness.c"]
     k = found.draws.table.names.index("cubic_stiffness.c")
     sd = found.draws.flat[:, k].std()
     assert abs(own.value - truth[k]) < 4 * sd
@@ -66,12 +66,12 @@ def test_steady_state_of_a_stiff_plant(stiff: tuple[Fit, np.ndarray]):
     assert ranges is not None
     values = np.tile(np.median(found.draws.flat, axis=0), (4, 1))
     made = draws_of(table, values)
-    told = {one.name: one for one in step_metrics(made, step_curves(made, 10.0), time_unit="ms")}
+    reported = {one.name: one for one in step_metrics(made, step_curves(made, 10.0), time_unit="ms")}
     gain, c = values[0, 0], values[0, table.names.index("cubic_stiffness.c")]
     force, scale = gain * ranges.drive[0], ranges.response[0]
     level = brentq(lambda y: y + c * y**3 / scale**2 - force, 0, force)
-    assert told["steady_state[y]"].value == pytest.approx(level / ranges.drive[0], rel=1e-4)
-    assert told["value_at_end[y]"].value < told["steady_state[y]"].value
+    assert reported["steady_state[y]"].value == pytest.approx(level / ranges.drive[0], rel=1e-4)
+    assert reported["value_at_end[y]"].value < reported["steady_state[y]"].value
 
 
 def test_bands_hold_a_record_that_was_not_fitted():
@@ -124,8 +124,8 @@ def test_a_new_drive_is_predicted_with_the_effect():
     steady = 2.0 * 0.8
     bent = steady + 0.2 * steady**3 / problem.ranges.response[0] ** 2
     assert band.plant[2, -1] == pytest.approx(bent, rel=1e-3)
-    told = frequency_response(draws, span=15.0, period=0.3, time_unit="ms")
-    assert "odd_curvature" in told.outside[0]
+    reported = frequency_response(draws, span=15.0, period=0.3, time_unit="ms")
+    assert "odd_curvature" in reported.outside[0]
 
 
 def test_a_record_disturbed_alike_widens_the_band_of_a_new_drive():

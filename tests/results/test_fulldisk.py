@@ -47,42 +47,42 @@ def refused(act):
 folder = Path(sys.argv[1])
 sampler = {"ensembles": 2, "walkers": 16, "steps": 60, "thin": 1, "target_ess": 100_000}
 task = study(record(camera=0.8), sampler=sampler, priors={"delay": 0.73, "order_1": 0.8})
-told = {}
+reported = {}
 whole = fit(task)
 path = folder / "chain.h5"
 limit(int(sys.argv[2]))
-told["chain"] = refused(lambda: fit(task, folder=folder))
-told["left"] = sorted(p.name for p in folder.iterdir())
+reported["chain"] = refused(lambda: fit(task, folder=folder))
+reported["left"] = sorted(p.name for p in folder.iterdir())
 kept = path.read_bytes()
-told["again"] = refused(lambda: fit(task, folder=folder, resume=True))
-told["kept"] = path.read_bytes() == kept
+reported["again"] = refused(lambda: fit(task, folder=folder, resume=True))
+reported["kept"] = path.read_bytes() == kept
 limit(resource.RLIM_INFINITY)
 resumed = fit(task, folder=folder, resume=True)
-told["same"] = bool(np.array_equal(whole.draws.values, resumed.draws.values))
-told["sizes"] = len(kept), path.stat().st_size
+reported["same"] = bool(np.array_equal(whole.draws.values, resumed.draws.values))
+reported["sizes"] = len(kept), path.stat().st_size
 
 def save():
     write_whole(folder / "posterior.nc", lambda beside: save_tree(resumed.to_datatree(), beside))
 
 save()
 before = (folder / "posterior.nc").read_bytes()
-told["sizes"] += (len(before),)
-told["posterior"] = []
+reported["sizes"] += (len(before),)
+reported["posterior"] = []
 for size in (0, 3000, len(before) // 2, len(before) - 1):
     limit(size)
-    told["posterior"] += refused(save)
+    reported["posterior"] += refused(save)
 limit(resource.RLIM_INFINITY)
-told["intact"] = (folder / "posterior.nc").read_bytes() == before
-told["stray"] = sorted(p.name for p in folder.rglob(".*"))
+reported["intact"] = (folder / "posterior.nc").read_bytes() == before
+reported["stray"] = sorted(p.name for p in folder.rglob(".*"))
 save()
-print(json.dumps(told))
+print(json.dumps(reported))
 """
 LIMIT = 40_000
 """Room for a chain of one or two rounds, not of three [bytes]."""
 
 
 @pytest.fixture(scope="module")
-def told(tmp_path_factory) -> dict:
+def reported(tmp_path_factory) -> dict:
     folder = tmp_path_factory.mktemp("full")
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT, str(folder), str(LIMIT)],
@@ -97,26 +97,26 @@ def told(tmp_path_factory) -> dict:
     return json.loads(done.stdout) | {"folder": str(folder)}
 
 
-def test_a_chain_that_no_longer_fits_keeps_the_rounds_before(told):
-    (said,) = told["chain"]
-    assert said.startswith(f"{told['folder']}/chain.h5: cannot be written (File too large)")
+def test_a_chain_that_no_longer_fits_keeps_the_rounds_before(reported):
+    (said,) = reported["chain"]
+    assert said.startswith(f"{reported['folder']}/chain.h5: cannot be written (File too large)")
     assert "--resume" in said
-    assert told["left"] == ["chain.h5"]
-    assert len(told["again"]) == 1
-    assert told["kept"]
-    assert told["sizes"][0] <= LIMIT < told["sizes"][1]
+    assert reported["left"] == ["chain.h5"]
+    assert len(reported["again"]) == 1
+    assert reported["kept"]
+    assert reported["sizes"][0] <= LIMIT < reported["sizes"][1]
 
 
-def test_the_run_is_taken_up_to_the_same_draws(told):
-    assert told["same"]
+def test_the_run_is_taken_up_to_the_same_draws(reported):
+    assert reported["same"]
 
 
-def test_a_posterior_that_does_not_fit_leaves_the_old_one(told):
-    assert len(told["posterior"]) == 4
-    for said in told["posterior"]:
-        assert said.startswith(f"{told['folder']}/posterior.nc: cannot be written (File too large)")
-    assert told["intact"]
-    assert told["stray"] == []
+def test_a_posterior_that_does_not_fit_leaves_the_old_one(reported):
+    assert len(reported["posterior"]) == 4
+    for said in reported["posterior"]:
+        assert said.startswith(f"{reported['folder']}/posterior.nc: cannot be written (File too large)")
+    assert reported["intact"]
+    assert reported["stray"] == []
 
 
 def full(*_, **__):
@@ -189,13 +189,13 @@ def test_a_campaign_that_does_not_fit_names_its_file_and_leaves_nothing(tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_campaign_in_a_folder_that_cannot_be_made_is_told(tmp_path, monkeypatch):
+def test_a_campaign_in_a_folder_that_cannot_be_made_is_reported(tmp_path, monkeypatch):
     monkeypatch.setattr(files.Path, "mkdir", full)
     with pytest.raises(InputError, match="cannot be written to"):
         write_folder(tmp_path / "new", study(record(camera=0.8)))
 
 
-def test_figures_that_cannot_be_kept_are_told(tmp_path):
+def test_figures_that_cannot_be_kept_are_reported(tmp_path):
     from lcopa_bayes.report import write_page
 
     (tmp_path / "figures").write_text("a file in the way")

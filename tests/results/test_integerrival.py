@@ -38,11 +38,11 @@ def test_every_free_order_is_held_at_its_nearest_integer_and_at_one_at_least(fit
     assert study.fit == fitted.study.fit
 
 
-def test_the_rival_predicts_the_same_records_and_is_told(fitted, rival, tmp_path):
-    told = rival.as_json()
-    assert [row["record"] for row in told["held_out"]] == ["b"]
-    assert told["held_out"][0]["rmse"] == next(b.rmse for b in rival.fit.bands if b.held_out)
-    assert told["held_out"][0]["rmse"] != fitted.bands[-1].rmse
+def test_the_rival_predicts_the_same_records_and_is_reported(fitted, rival, tmp_path):
+    reported = rival.as_json()
+    assert [row["record"] for row in reported["held_out"]] == ["b"]
+    assert reported["held_out"][0]["rmse"] == next(b.rmse for b in rival.fit.bands if b.held_out)
+    assert reported["held_out"][0]["rmse"] != fitted.bands[-1].rmse
     assert all("order" not in quality.name for quality in rival.fit.draws.qualities)
     both = replace(fitted, rival=rival)
     saved = json.loads((both.save(tmp_path) / "results.json").read_text())

@@ -48,9 +48,9 @@ def test_the_noise_bands_are_the_quantiles_of_the_noise(noise):
     (band,) = predicted(held, noise=noise, offset="shared", count=4000)
     exact = stats.t(4.0) if noise == "student" else stats.norm
     levels = np.array([0.05, 0.25, 0.5, 0.75, 0.95])
-    told = (band.noisy - band.plant[2]) / TRUTH["sigma"]
+    reported = (band.noisy - band.plant[2]) / TRUTH["sigma"]
     error = np.sqrt(levels * (1 - levels) / 4000) / exact.pdf(exact.ppf(levels))
-    assert np.all(np.abs(told - exact.ppf(levels)[:, None]) < 4.5 * error[:, None])
+    assert np.all(np.abs(reported - exact.ppf(levels)[:, None]) < 4.5 * error[:, None])
 
 
 def test_shares_inside_the_bands_are_binomial_when_the_draws_are_the_truth():
@@ -205,9 +205,9 @@ def test_the_command_is_the_only_thing_the_plant_answers_to():
     made = problem(record(camera=0.6))
     table = made.posterior.table
     values = table.draw(5, np.random.default_rng(0))
-    told = []
+    reported = []
     for scale in (1.0, -2.5):
         command = Command(np.array([1.0, 3.0]), scale * np.array([[1.0], [0.4]]), np.zeros(1))
         _, model = made.simulated([record(command=command, name="held")])
-        told.append(responses(table, model, values)[0])
-    assert_allclose(told[1], -2.5 * told[0], rtol=1e-9, atol=1e-12)
+        reported.append(responses(table, model, values)[0])
+    assert_allclose(reported[1], -2.5 * reported[0], rtol=1e-9, atol=1e-12)

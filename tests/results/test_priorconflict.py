@@ -42,7 +42,7 @@ def normal(data: float, sd: float, prior: float = WIDTH, seed: int = 0) -> Draws
     return draws_of(table, values)
 
 
-def told(draws: Draws) -> list[Limitation]:
+def reported(draws: Draws) -> list[Limitation]:
     return [one for one in conflicts(draws) if one.parameters == ("gain",)]
 
 
@@ -55,7 +55,7 @@ def numbers(one: Limitation) -> tuple[float, float]:
 
 def test_a_normal_posterior_gives_the_closed_form():
     """Data at 0.29 +- 0.01 under a prior of sd 0.03: the posterior is at 0.261 +- 0.0095."""
-    (one,) = told(normal(0.29, 0.01))
+    (one,) = reported(normal(0.29, 0.01))
     shift, alone = numbers(one)
     assert one.level == "tentative"
     assert "widen the prior of gain" in one.remedy
@@ -64,9 +64,9 @@ def test_a_normal_posterior_gives_the_closed_form():
 
 
 def test_it_agrees_with_draws_weighted_by_the_inverse_prior():
-    """Another road to the estimate without the prior."""
+    """Another method to the estimate without the prior."""
     draws = normal(0.1, 0.01)
-    (one,) = told(draws)
+    (one,) = reported(draws)
     x = draws.column("gain")
     weights = np.exp(0.5 * (x / WIDTH) ** 2 - 0.5 * (x.max() / WIDTH) ** 2)
     alone = float(np.average(x, weights=weights))
@@ -80,7 +80,7 @@ def test_it_agrees_with_draws_weighted_by_the_inverse_prior():
     ids=["within", "not pulled", "as wide as the data", "weak data"],
 )
 def test_what_the_prior_may_well_give_or_does_not_move_is_no_conflict(data, sd):
-    assert told(normal(data, sd)) == []
+    assert reported(normal(data, sd)) == []
 
 
 def test_truths_of_the_prior_are_rarely_in_conflict():
@@ -89,7 +89,7 @@ def test_truths_of_the_prior_are_rarely_in_conflict():
     alarms = 0
     for seed in range(150):
         truth = WIDTH * rng.standard_normal()
-        alarms += bool(told(normal(truth + 0.02 * rng.standard_normal(), 0.02, seed=seed)))
+        alarms += bool(reported(normal(truth + 0.02 * rng.standard_normal(), 0.02, seed=seed)))
     assert alarms <= 150 * 2.7e-3 + 4 * np.sqrt(150 * 2.7e-3)
 
 

@@ -295,8 +295,8 @@ def test_records_and_axes_with_the_same_joint_name_are_kept_apart(tmp_path):
     with xarray.open_datatree(tmp_path / "posterior.nc", engine="h5netcdf") as read:
         groups = [read[g] for g in ("observed_data", "log_likelihood", "posterior_predictive")]
         for group in groups:
-            told = {(v.attrs["record"], v.attrs["axis"]): name for name, v in group.data_vars.items()}
-            assert told == {
+            reported = {(v.attrs["record"], v.attrs["axis"]): name for name, v in group.data_vars.items()}
+            assert reported == {
                 ("a_b", "c"): "a_b_c_1",
                 ("a_b", "b_c"): "a_b_b_c",
                 ("a", "c"): "a_c",

@@ -143,15 +143,15 @@ def test_a_prior_with_a_plateau_needs_no_smoothing(rng):
 def drawn(posterior, size=(2, 200)) -> Draws:
     """Draws near the truth: what is tested is the bookkeeping, so they need not be of the posterior."""
     rng = np.random.default_rng(3)
-    told = {"gain": 2.0, "time_1": 1.5, "order_1": 0.8, "delay": 0.73, "offset": 0.3, "sigma": 0.02}
-    centre = np.array([told[name] for name in posterior.table.names])
+    reported = {"gain": 2.0, "time_1": 1.5, "order_1": 0.8, "delay": 0.73, "offset": 0.3, "sigma": 0.02}
+    centre = np.array([reported[name] for name in posterior.table.names])
     values = centre * np.exp(0.002 * rng.normal(size=(*size, centre.size)))
     found = tuple(Quality(row.name, 900.0, 900.0, 1.0) for row in posterior.table.rows if row.free)
     return Draws(posterior.table, values, np.zeros(size), found, 400.0)
 
 
 def test_agrees_with_arviz_on_the_same_groups(caplog):
-    """Two roads: groups as `posterior.nc` has them, through `psense_summary`."""
+    """Two methods: groups as `posterior.nc` has them, through `psense_summary`."""
     posterior = problem(record(), priors={"delay": 0.73}).posterior
     draws = drawn(posterior)
     draws.values[..., posterior.table.names.index("delay")] = 0.73

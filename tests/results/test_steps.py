@@ -102,22 +102,26 @@ def test_curves_are_the_step_response_of_the_plant():
     assert np.abs(curves.normalised[0] - exact)[:, late].max() < 2e-4
     assert_allclose(curves.normalised[0][:, curves.time < TRUTH["delay"] - 0.1], 0.0, atol=1e-12)
     assert_allclose(curves.gains[:, 0, 0], TRUTH["gain"])
-    told = {metric.name: metric for metric in step_metrics(made, curves, time_unit="ms")}
-    assert told["rise_10_90[y]"].value == pytest.approx(TRUTH["time_1"] * log(9), rel=1e-3)
-    assert told["settling_2[y]"].value == pytest.approx(TRUTH["delay"] + TRUTH["time_1"] * log(50), rel=1e-3)
-    assert told["settling_5[y]"].value == pytest.approx(TRUTH["delay"] + TRUTH["time_1"] * log(20), rel=1e-3)
-    assert told["delay[y]"].value == pytest.approx(TRUTH["delay"])
-    assert told["overshoot[y]"].value == pytest.approx(0.0, abs=1e-4)
-    assert told["steady_state[y]"].value == pytest.approx(TRUTH["gain"])
-    assert told["value_at_end[y]"].value == pytest.approx(TRUTH["gain"], rel=1e-3)
-    units = {name.partition("[")[0]: metric.unit for name, metric in told.items()}
+    reported = {metric.name: metric for metric in step_metrics(made, curves, time_unit="ms")}
+    assert reported["rise_10_90[y]"].value == pytest.approx(TRUTH["time_1"] * log(9), rel=1e-3)
+    assert reported["settling_2[y]"].value == pytest.approx(
+        TRUTH["delay"] + TRUTH["time_1"] * log(50), rel=1e-3
+    )
+    assert reported["settling_5[y]"].value == pytest.approx(
+        TRUTH["delay"] + TRUTH["time_1"] * log(20), rel=1e-3
+    )
+    assert reported["delay[y]"].value == pytest.approx(TRUTH["delay"])
+    assert reported["overshoot[y]"].value == pytest.approx(0.0, abs=1e-4)
+    assert reported["steady_state[y]"].value == pytest.approx(TRUTH["gain"])
+    assert reported["value_at_end[y]"].value == pytest.approx(TRUTH["gain"], rel=1e-3)
+    units = {name.partition("[")[0]: metric.unit for name, metric in reported.items()}
     assert (units["rise_10_90"], units["overshoot"], units["steady_state"]) == ("ms", "-", "rad/V")
 
 
 def test_a_slow_tail_is_open_above_and_said():
     made, curves = curves_of(TRUTH | {"order_1": 0.4}, 20.0)
-    told = {metric.name: metric for metric in step_metrics(made, curves, time_unit="ms")}
-    settled = told["settling_2[y]"]
+    reported = {metric.name: metric for metric in step_metrics(made, curves, time_unit="ms")}
+    settled = reported["settling_2[y]"]
     assert settled.as_json()["upper"] is None
     assert "100 % of draws have not settled to 2 % of steady state by the end of the record" in settled.note
 
@@ -157,7 +161,7 @@ def test_settled_or_not_is_decided_as_the_response_after_the_record_shows():
 
 
 def settled_of(made, curves, k):
-    """`settling_2` of one draw, told as if it were all."""
+    """`settling_2` of one draw, reported as if it were all."""
     alone = draws_of(made.table, np.repeat(made.flat[k][None], 2, axis=0))
     one = replace(
         curves,
@@ -166,29 +170,29 @@ def settled_of(made, curves, k):
         delays=curves.delays[[k, k]],
         values=curves.values[[k, k]],
     )
-    told = {metric.name: metric for metric in step_metrics(alone, one, time_unit="ms")}
-    return told["settling_2[y]"].value
+    reported = {metric.name: metric for metric in step_metrics(alone, one, time_unit="ms")}
+    return reported["settling_2[y]"].value
 
 
 def test_overshoot_after_the_record_counts():
     values = ringing(0.2, (pi - np.arccos(0.2)) / sqrt(1 - 0.04) / 12.0)  # crosses 1 at the end
     posterior = problem(record(camera=0.6), terms=2, orders=(2.0, 1.0)).posterior
     made = draws_of(posterior.table, np.tile(row_values(posterior.table, values), (4, 1)))
-    told = {metric.name: metric for metric in step_metrics(made, step_curves(made, 12.0), time_unit="ms")}
-    assert told["settling_2[y]"].as_json()["value"] is None
-    assert "100 % of draws have not settled" in told["settling_2[y]"].note
-    assert told["overshoot[y]"].value == pytest.approx(exp(-pi * 0.2 / sqrt(1 - 0.04)), rel=1e-3)
+    reported = {metric.name: metric for metric in step_metrics(made, step_curves(made, 12.0), time_unit="ms")}
+    assert reported["settling_2[y]"].as_json()["value"] is None
+    assert "100 % of draws have not settled" in reported["settling_2[y]"].note
+    assert reported["overshoot[y]"].value == pytest.approx(exp(-pi * 0.2 / sqrt(1 - 0.04)), rel=1e-3)
 
 
 def test_crosstalk_is_the_ratio_of_gains():
     posterior = problem(record(device=TWO, camera=0.6)).posterior
     values = posterior.table.draw(8, np.random.default_rng(0))
     made = draws_of(posterior.table, values)
-    told = {metric.name: metric for metric in step_metrics(made, step_curves(made, 10.0), time_unit="ms")}
+    reported = {metric.name: metric for metric in step_metrics(made, step_curves(made, 10.0), time_unit="ms")}
     gains = posterior.table.gains(values)
-    assert told["crosstalk[y/x by x]"].value == pytest.approx(np.median(gains[:, 1, 0] / gains[:, 0, 0]))
-    assert told["crosstalk[x/y by y]"].value == pytest.approx(np.median(gains[:, 0, 1] / gains[:, 1, 1]))
-    assert {"rise_10_90[x_y]", "steady_state[y_x]"} < told.keys()
+    assert reported["crosstalk[y/x by x]"].value == pytest.approx(np.median(gains[:, 1, 0] / gains[:, 0, 0]))
+    assert reported["crosstalk[x/y by y]"].value == pytest.approx(np.median(gains[:, 0, 1] / gains[:, 1, 1]))
+    assert {"rise_10_90[x_y]", "steady_state[y_x]"} < reported.keys()
 
 
 @pytest.mark.parametrize(("time", "order", "fast"), [(0.01, 1.0, True), (0.01, 0.7, True), (1.5, 0.8, False)])

@@ -48,9 +48,9 @@ def test_ensembles_on_different_modes_are_unusable_however_many_draws():
     quality = one(apart)
     assert quality.rhat > 1.1
     assert quality.grade(1).level == "unusable"
-    told = overall([quality], 1)
-    assert told.level == "unusable"
-    assert "several modes" in told.reason
+    reported = overall([quality], 1)
+    assert reported.level == "unusable"
+    assert "several modes" in reported.reason
 
 
 def test_modes_that_all_ensembles_weigh_differently_are_not_reliable():
@@ -128,11 +128,11 @@ def test_the_worst_parameter_grades_the_run_and_is_named():
         Quality("bad", 9, 9, 1.3),
     )
     assert overall([good], 400).level == "reliable"
-    told = overall([good, weak, Quality("other", 350, 350, 1.0)], 400)
-    assert told.level == "tentative"
-    assert told.reason.startswith("weak")
-    assert "(also other)" in told.reason
-    assert "sample more steps" in told.reason
+    reported = overall([good, weak, Quality("other", 350, 350, 1.0)], 400)
+    assert reported.level == "tentative"
+    assert reported.reason.startswith("weak")
+    assert "(also other)" in reported.reason
+    assert "sample more steps" in reported.reason
     assert overall([good, weak, bad], 400).reason.startswith("bad")
     worst = Grade.worst([quality.grade(400) for quality in (good, bad, weak)])
     assert worst == bad.grade(400)

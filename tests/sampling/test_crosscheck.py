@@ -98,8 +98,8 @@ def test_the_distance_that_is_called_a_disagreement_is_where_the_p_value_is():
 
 
 def test_another_evidence_is_found():
-    told = {"log_evidence": 101.5, "log_evidence_sd": 0.1}
-    check = CrossCheck.of(ours(), theirs(), **told)
+    reported = {"log_evidence": 101.5, "log_evidence_sd": 0.1}
+    check = CrossCheck.of(ours(), theirs(), **reported)
     assert not check.agrees
     assert check.evidence_p == pytest.approx((1 + len(FREE)) * 2 * norm.sf(1.5 / np.hypot(0.1, 0.2)))
     assert "disagrees: log evidence 101.50 ± 0.10 against 100.00 ± 0.20" in check.sentence
@@ -109,8 +109,8 @@ def test_another_evidence_is_found():
 
 
 def test_a_run_without_evidence_is_compared_without():
-    for told in ({}, {"log_evidence": 150.0}):
-        check = CrossCheck.of(ours(), theirs(), **told)
+    for reported in ({}, {"log_evidence": 150.0}):
+        check = CrossCheck.of(ours(), theirs(), **reported)
         assert check.agrees
         assert (check.log_evidence, check.evidence_p) == (None, None)
         assert "log evidence" not in check.sentence
@@ -165,11 +165,11 @@ def test_a_simple_posterior_passes(checked):
     assert checked.cross_check.agrees
     assert not [one for one in checked.draws.limitations if "ested" in one.reason]
     assert "Nested sampling, an independent method, agrees" in verdict(checked)
-    told = results(checked)["cross_check"]
-    assert json.loads(json.dumps(told, allow_nan=False)) == told
-    assert {"agrees", "log_evidence", "log_evidence_sd", "evaluations", "parameters"} <= told.keys()
-    assert [row["name"] for row in told["parameters"]] == ["gain", "delay", "sigma"]
-    for row in told["parameters"]:
+    reported = results(checked)["cross_check"]
+    assert json.loads(json.dumps(reported, allow_nan=False)) == reported
+    assert {"agrees", "log_evidence", "log_evidence_sd", "evaluations", "parameters"} <= reported.keys()
+    assert [row["name"] for row in reported["parameters"]] == ["gain", "delay", "sigma"]
+    for row in reported["parameters"]:
         assert row["run"]["lower"] < row["nested"]["value"] < row["run"]["upper"]
 
 
@@ -188,11 +188,11 @@ def doubted(checked) -> Fit:
 def test_every_number_of_a_fit_that_is_doubted_is_lowered(checked, doubted):
     before, after = checked.draws.grade.level, doubted.draws.grade.level
     assert (before, after) in {("reliable", "tentative"), ("tentative", "unusable")}
-    told = results(doubted)
-    assert told["grade"] == after
-    assert {row["grade"] for row in told["parameters"]} == {after}
-    assert {row["grade"] for row in told["step_metrics"]} == {after}
-    assert "disagrees: the marginal of delay" in told["verdict"]
+    reported = results(doubted)
+    assert reported["grade"] == after
+    assert {row["grade"] for row in reported["parameters"]} == {after}
+    assert {row["grade"] for row in reported["step_metrics"]} == {after}
+    assert "disagrees: the marginal of delay" in reported["verdict"]
     assert verdict(doubted).count("disagrees") == 1
 
 

@@ -93,13 +93,13 @@ def test_the_evidence_of_a_linear_model_is_that_of_a_normal_density(seed):
     """From exact posterior draws."""
     posterior, mean, sd, exact = linear_gaussian()
     draws = mean + sd * np.random.default_rng(seed).standard_normal((3, 10, 40, 1))
-    told = evidence(posterior, draws, 1200.0, seed)
-    assert told is not None
-    assert told.value == pytest.approx(np.mean(told.by_ensemble))
-    assert len(told.by_ensemble) == 3
-    assert told.grade.level == "reliable"
-    assert 0.002 < told.sd < 0.05
-    assert abs(told.value - exact) < 4.5 * told.sd
+    reported = evidence(posterior, draws, 1200.0, seed)
+    assert reported is not None
+    assert reported.value == pytest.approx(np.mean(reported.by_ensemble))
+    assert len(reported.by_ensemble) == 3
+    assert reported.grade.level == "reliable"
+    assert 0.002 < reported.sd < 0.05
+    assert abs(reported.value - exact) < 4.5 * reported.sd
 
 
 def test_the_claimed_error_is_the_scatter_of_many_runs():
@@ -109,9 +109,9 @@ def test_the_claimed_error_is_the_scatter_of_many_runs():
     rng, found = np.random.default_rng(4), []
     for seed in range(SEEDS):
         draws = 0.2 + np.sqrt(0.8) * rng.standard_normal((2, 10, 15, 2))
-        told = evidence(toy, draws, 300.0, seed)
-        assert told is not None
-        found.append((told.value, told.sd))
+        reported = evidence(toy, draws, 300.0, seed)
+        assert reported is not None
+        found.append((reported.value, reported.sd))
     values, errors = np.transpose(found)
     assert (np.abs(values - exact) < 4.5 * errors).all()
     assert abs(values.mean() - exact) < 4 * values.std(ddof=1) / np.sqrt(SEEDS)
@@ -122,10 +122,10 @@ def test_the_claimed_error_is_the_scatter_of_many_runs():
 def test_a_run_gives_the_evidence_of_a_linear_model(seed):
     posterior, _, _, exact = linear_gaussian()
     run = sample(posterior, SamplePlan(2, 24, 400, 2, 200.0, seed))
-    told = evidence(posterior, run.kept()[0], gather(posterior, run).ess, seed)
-    assert told is not None
-    assert told.sd < 0.1
-    assert abs(told.value - exact) < 4.5 * told.sd
+    reported = evidence(posterior, run.kept()[0], gather(posterior, run).ess, seed)
+    assert reported is not None
+    assert reported.sd < 0.1
+    assert abs(reported.value - exact) < 4.5 * reported.sd
 
 
 def banana(z: Matrix) -> Array:
@@ -142,12 +142,12 @@ def test_two_bounded_parameters_against_quadrature():
     )
     exact = float(np.log(integral / 4 / 3.2))
     run = sample(toy, SamplePlan(2, 40, 600, 3, 300.0, 6))
-    told = evidence(toy, run.kept()[0], gather(toy, run).ess, 6)
-    assert told is not None
-    assert told.sd < 0.1
-    assert abs(told.value - exact) < 4.5 * told.sd
+    reported = evidence(toy, run.kept()[0], gather(toy, run).ess, 6)
+    assert reported is not None
+    assert reported.sd < 0.1
+    assert abs(reported.value - exact) < 4.5 * reported.sd
     again = evidence(toy, run.kept()[0], gather(toy, run).ess, 6)
-    assert again == told
+    assert again == reported
 
 
 def test_a_single_ensemble_has_no_evidence():
@@ -160,10 +160,10 @@ def test_a_single_ensemble_has_no_evidence():
 def test_exchangeable_terms_are_counted_once(alike):
     """Against the mean likelihood of prior draws; noise so loud that these find the posterior, and the
     posterior draws are prior draws kept by their likelihood."""
-    told = {"gain": GAIN, "sigma": 3.0, "offset": 0.3}
+    reported = {"gain": GAIN, "sigma": 3.0, "offset": 0.3}
     if not alike:
-        told |= {"time_1": ("gamma", {"a": 2.0, "scale": 3.0})}
-    posterior = problem(record(camera=0.6), terms=2, priors=told).posterior
+        reported |= {"time_1": ("gamma", {"a": 2.0, "scale": 3.0})}
+    posterior = problem(record(camera=0.6), terms=2, priors=reported).posterior
     assert posterior.table.exchangeable == (alike,)
     rng = np.random.default_rng(0)
     drawn = posterior.table.draw(10_000, rng)
@@ -191,9 +191,9 @@ def test_exchangeable_terms_are_counted_once(alike):
 
 @pytest.mark.parametrize(("sd", "level"), [(0.5, "reliable"), (0.51, "tentative"), (2.1, "unusable")])
 def test_the_grade_of_an_evidence_is_that_of_its_error(sd, level):
-    told = replace(Evidence(-3.0, 0.1, (-3.0,)), sd=sd)
-    assert told.grade.level == level
-    assert f"{sd:.2f} nat" in told.grade.reason
+    reported = replace(Evidence(-3.0, 0.1, (-3.0,)), sd=sd)
+    assert reported.grade.level == level
+    assert f"{sd:.2f} nat" in reported.grade.reason
 
 
 @pytest.mark.parametrize(

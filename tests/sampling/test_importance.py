@@ -286,7 +286,7 @@ def along(at) -> Optimum:
     return optimum([upper, at, delay, time, 0.0], [0.05, 0.05, 0.05, 0.05, 1.0])
 
 
-def test_the_share_of_a_long_arm_scatters_as_told():
+def test_the_share_of_a_long_arm_scatters_as_reported():
     """Started along it; the exact share is known in closed form."""
     toy, plan = armed(), replace(_PLAN, wanted=400.0)
     exact = (1 - _SHARE) * _BODY.cdf(0.6) + _SHARE * _ARM.cdf(0.6)
@@ -297,7 +297,7 @@ def test_the_share_of_a_long_arm_scatters_as_told():
         assert found.good(400, efficient=False)
         weights = np.exp(found.weighted.log_weights)
         inside = (found.weighted.sampled[:, 1] < 0.6).astype(float)
-        told = error_of(weights, inside)
-        assert told < 0.3 * exact
-        apart.append((weights @ inside - exact) / told)
+        reported = error_of(weights, inside)
+        assert reported < 0.3 * exact
+        apart.append((weights @ inside - exact) / reported)
     assert np.sqrt(np.mean(np.square(apart))) < 1.4

@@ -1,4 +1,4 @@
-"""Whole runs on posteriors whose answer is known by another road."""
+"""Whole runs on posteriors whose answer is known by another method."""
 
 from __future__ import annotations
 
@@ -67,9 +67,9 @@ def assert_share(inside: Matrix, exact: float) -> None:
     assert abs(inside.mean() - exact) < 4 * error, (inside.mean(axis=(1, 2)), error)
 
 
-def effective_of(told: Matrix) -> float:
-    """Effective draws for the mean of what is told at each (ensemble, walker, draw)."""
-    return min(float(told.size), qualities(["it"], told[..., None].astype(float))[0].ess_bulk)
+def effective_of(reported: Matrix) -> float:
+    """Effective draws for the mean of what is reported at each (ensemble, walker, draw)."""
+    return min(float(reported.size), qualities(["it"], reported[..., None].astype(float))[0].ess_bulk)
 
 
 # -- a funnel --------------------------------------------------------------------------------------

@@ -127,7 +127,7 @@ def test_shares_must_fit_the_boundaries():
 # ---------------------------------------------------------------- the grade
 
 
-def told(lower, error=0.01) -> Modes:
+def reported(lower, error=0.01) -> Modes:
     lower = np.array(lower)
     shares = np.column_stack([lower, 1 - lower])
     return Modes("order_2", "-", (1.1,), shares, np.full(shares.shape, error))
@@ -145,7 +145,7 @@ def told(lower, error=0.01) -> Modes:
     ],
 )
 def test_unequal_shares_lower_the_grade(lower, error, spread, level):
-    found = told(lower, error)
+    found = reported(lower, error)
     assert found.spread == pytest.approx(spread)
     assert shares_grade(found).level == level
     graded = overall([GOOD], 400, [found])
@@ -156,14 +156,14 @@ def test_unequal_shares_lower_the_grade(lower, error, spread, level):
         assert graded.reason.startswith(f"{wanted}{max(lower):.2f} over independent sets of draws")
 
 
-def test_the_worse_of_shares_and_quality_counts_and_both_are_told():
+def test_the_worse_of_shares_and_quality_counts_and_both_are_reported():
     weak = Quality("delay", 300.0, 300.0, 1.0)
-    graded = overall([weak], 400, [told([0.3, 0.6])])
+    graded = overall([weak], 400, [reported([0.3, 0.6])])
     assert graded.level == "unusable"
     assert "two modes" in graded.reason
     assert "delay" in graded.reason
-    assert overall([Quality("delay", 9.0, 9.0, 1.5)], 400, [told([0.3, 0.4])]).level == "unusable"
-    several = overall([GOOD], 400, [told([0.3, 0.4]), told([0.3, 0.5])])
+    assert overall([Quality("delay", 9.0, 9.0, 1.5)], 400, [reported([0.3, 0.4])]).level == "unusable"
+    several = overall([GOOD], 400, [reported([0.3, 0.4]), reported([0.3, 0.5])])
     assert "0.30 to 0.50" in several.reason
     assert "(and 1 more like this)" in several.reason
 

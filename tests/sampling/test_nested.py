@@ -64,9 +64,9 @@ def test_what_is_outside_has_no_likelihood(rng):
     orders = cube.posterior.sampled.index(cube.posterior.table.at("order", 0, 0)), -1
     outside = inside.copy()
     outside[0, orders[0]] = 2.5
-    told = cube.log_likelihood(np.concatenate([inside, outside]))
-    assert np.isfinite(told[0])
-    assert told[1] == -np.inf
+    reported = cube.log_likelihood(np.concatenate([inside, outside]))
+    assert np.isfinite(reported[0])
+    assert reported[1] == -np.inf
 
 
 # -- the homography --------------------------------------------------------------------------------
@@ -76,8 +76,8 @@ def moved(gain: str, rng: np.random.Generator) -> tuple[Element, np.ndarray, np.
     """Some points, other orders for them, and frequencies and steps that all of them can take."""
     posterior = made(2, gain=gain)
     (element,) = elements(posterior)
-    told = TRUTH | {"time_2": 0.4, "order_2": 0.5, "order_1": 1.4}
-    z = posterior.coordinates(np.array([[told[name] for name in posterior.table.names]] * 6))
+    reported = TRUTH | {"time_2": 0.4, "order_2": 0.5, "order_1": 1.4}
+    z = posterior.coordinates(np.array([[reported[name] for name in posterior.table.names]] * 6))
     z += 0.05 * rng.normal(size=z.shape)
     proposed = z.copy()
     proposed[:, element.orders] += 0.1 * rng.normal(size=(6, 2))
@@ -259,8 +259,8 @@ def by_quadrature(posterior: Posterior, ends: dict[str, tuple[float, float]], co
 
 @pytest.fixture(scope="module")
 def delay_and_sigma() -> tuple[Posterior, Nested]:
-    told = {name: TRUTH[name] for name in ("time_1", "order_1")}
-    posterior = problem(SHORT, priors=told).posterior
+    reported = {name: TRUTH[name] for name in ("time_1", "order_1")}
+    posterior = problem(SHORT, priors=reported).posterior
     return posterior, nested(posterior, PLAN)
 
 
@@ -314,8 +314,8 @@ def test_the_evidence_is_of_the_prior_with_decreasing_orders(alike):
 
 
 def test_seed_and_plan_decide_the_result_and_jobs_do_not():
-    told = {name: TRUTH[name] for name in ("time_1", "order_1", "sigma")}
-    posterior, plan = problem(SHORT, priors=told).posterior, NestedPlan(2, 40, 10, 1)
+    reported = {name: TRUTH[name] for name in ("time_1", "order_1", "sigma")}
+    posterior, plan = problem(SHORT, priors=reported).posterior, NestedPlan(2, 40, 10, 1)
     one, other = nested(posterior, plan), nested(posterior, plan, jobs=2)
     assert_array_equal(one.values, other.values)
     assert one.log_evidence == other.log_evidence

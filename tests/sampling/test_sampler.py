@@ -27,8 +27,8 @@ POSTERIOR = problem(record(camera=0.6)).posterior
 
 
 def plan(**changes: int) -> SamplePlan:
-    told = {"ensembles": 2, "walkers": 10, "steps": 4 * ROUND, "thin": 1, "target_ess": 1e9, "seed": 3}
-    return SamplePlan(**(told | changes))
+    reported = {"ensembles": 2, "walkers": 10, "steps": 4 * ROUND, "thin": 1, "target_ess": 1e9, "seed": 3}
+    return SamplePlan(**(reported | changes))
 
 
 def assert_same(a: Run, b: Run) -> None:

@@ -43,7 +43,7 @@ def test_it_is_exact_for_a_response_that_is_quadratic(stiff: tuple[Posterior, Op
     posterior, optimum = stiff
 
     def bent(values: np.ndarray) -> list:
-        told = posterior.simulation(values[:1])  # type: ignore[misc]
+        reported = posterior.simulation(values[:1])  # type: ignore[misc]
         z = posterior.coordinates(values)[:, 1]
         level = 0.3 + 0.2 * z - 0.1 * z**2
         return [
@@ -51,7 +51,7 @@ def test_it_is_exact_for_a_response_that_is_quadratic(stiff: tuple[Posterior, Op
                 base=np.broadcast_to(level[:, None], (1, z.size, one.base.shape[2])).copy(),
                 bounded=np.ones(z.size, dtype=bool),
             )
-            for one in told
+            for one in reported
         ]
 
     made = Surrogate.of(replace(posterior, surrogate=bent), optimum, np.random.default_rng(2))

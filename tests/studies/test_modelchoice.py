@@ -70,13 +70,13 @@ def test_shares_and_their_intervals():
             ("second-order", None),
         ]
     ]
-    told = choice.summary(found)
-    right = told["generating_model_preferred"]
+    reported = choice.summary(found)
+    right = reported["generating_model_preferred"]
     assert (right["count"], right["of"]) == (4, 7)
     assert binom.sf(3, 7, right["lower"]) == pytest.approx(0.05)
     assert binom.cdf(4, 7, right["upper"]) == pytest.approx(0.05)
-    assert told["integer_called_fractional"]["count"] == 1
-    assert told["kinds"][0]["others"] == {"first-order": 1}
+    assert reported["integer_called_fractional"]["count"] == 1
+    assert reported["kinds"][0]["others"] == {"first-order": 1}
 
 
 @pytest.mark.slow

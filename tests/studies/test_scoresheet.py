@@ -30,11 +30,11 @@ LEVELS = np.random.default_rng(3).uniform(-1.2, 1.2, (2, 40)) * SIZE[:, None]
 def both(name: str) -> tuple:
     """A hidden effect, the device that it is in, and the catalogue's at its sizes in the scales of a loop."""
     hidden = NAMED[name](np.random.default_rng(5))
-    told = devicetruth.SIZES[name](hidden.numbers, RATIO)
+    reported = devicetruth.SIZES[name](hidden.numbers, RATIO)
     kind = catalogue((), None)[name]
     fields = kind.__dataclass_fields__ if hasattr(kind, "__dataclass_fields__") else {}
-    effect = kind(**{key: told[key] for key in fields if key in told})
-    psi = np.array([value for key, value in told.items() if key not in fields])
+    effect = kind(**{key: reported[key] for key in fields if key in reported})
+    psi = np.array([value for key, value in reported.items() if key not in fields])
     shot = Shot(0.0, np.ones(2), SIZE, 3.0, np.eye(2), np.random.default_rng(0))
     return hidden, shot, effect, psi
 
@@ -67,7 +67,7 @@ def test_a_force_is_the_same(name: str) -> None:
 
 def test_what_depends_on_the_level_is_as_much_viscosity_of_a_slower_plant() -> None:
     e, share = 0.3, np.linspace(0.0, 1.0, 7)
-    told = devicetruth.SIZES["level_dependent_speed"]({"e": e}, RATIO)["e"]
+    reported = devicetruth.SIZES["level_dependent_speed"]({"e": e}, RATIO)["e"]
     made = SimpleNamespace(hidden=[SimpleNamespace(name="level_dependent_speed", numbers={"e": e})])
     found = SimpleNamespace(names=("level_dependent_speed",))
     path = TransferPath(1.0, 0.0, (1.0,), (1.0,), 1.0)
@@ -75,13 +75,13 @@ def test_what_depends_on_the_level_is_as_much_viscosity_of_a_slower_plant() -> N
         patch.setattr(devicetruth, "ratios", lambda *_: RATIO)
         factor = devicetruth.as_told(path, found, made).etas[0]
     np.testing.assert_allclose(
-        factor * (1 + told * (1 - 2 * share / RATIO[0])), 1 + e * (1 - 2 * share), rtol=1e-12
+        factor * (1 + reported * (1 - 2 * share / RATIO[0])), 1 + e * (1 - 2 * share), rtol=1e-12
     )
 
 
 def test_every_named_effect_has_sizes_or_a_reason() -> None:
-    told = set(devicetruth.SIZES) | set(devicetruth.UNSCORED)
-    assert told == set(NAMED)
+    reported = set(devicetruth.SIZES) | set(devicetruth.UNSCORED)
+    assert reported == set(NAMED)
     assert not set(devicetruth.SIZES) & set(devicetruth.UNSCORED)
     for name, sizes in devicetruth.SIZES.items():
         kind, numbers = catalogue((), None)[name], NAMED[name](np.random.default_rng(0)).numbers
@@ -92,9 +92,9 @@ def test_every_named_effect_has_sizes_or_a_reason() -> None:
 
 def test_the_figures_of_a_lag_are_those_of_the_closed_form() -> None:
     path = TransferPath(0.6, 2.0, (4.0,), (1.0,), 2.0)  # time constant 2
-    told = devicetruth.step_truth(path, 12.0)
-    assert told["rise_10_90"] == pytest.approx(2.0 * np.log(9), rel=1e-6)
-    assert told["value_at_end"] == pytest.approx(0.3 * -np.expm1(-5.0), rel=1e-6)
+    reported = devicetruth.step_truth(path, 12.0)
+    assert reported["rise_10_90"] == pytest.approx(2.0 * np.log(9), rel=1e-6)
+    assert reported["value_at_end"] == pytest.approx(0.3 * -np.expm1(-5.0), rel=1e-6)
     assert devicetruth.step_truth(path, 6.0)["rise_10_90"] == np.inf
 
 

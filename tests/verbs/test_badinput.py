@@ -1,4 +1,4 @@
-"""What cannot be computed or is not computed long enough is told, whatever road leads there."""
+"""What cannot be computed or is not computed long enough is reported, whatever leads there."""
 
 from __future__ import annotations
 
@@ -63,9 +63,9 @@ def test_a_likelihood_that_is_nan_stops_sampling_and_says_where(sound, jobs, cap
     posterior = broken(sound)
     with pytest.raises(FloatingPointError) as caught:
         sample(posterior, PLAN, jobs=jobs)
-    told = re.fullmatch(r"the log density is NaN at (.*)", str(caught.value))
-    assert told is not None
-    values = {name: float(value) for name, value in (pair.split(" = ") for pair in told[1].split(", "))}
+    reported = re.fullmatch(r"the log density is NaN at (.*)", str(caught.value))
+    assert reported is not None
+    values = {name: float(value) for name, value in (pair.split(" = ") for pair in reported[1].split(", "))}
     assert tuple(values) == posterior.table.names
     assert values["time_1"] > SLOW
     assert jobs > 1 or posterior.model.sound < 0
@@ -84,13 +84,13 @@ def test_the_command_line_says_where_a_likelihood_is_nan(tmp_path, capfd, monkey
     path, out = tmp_path / "step.csv", tmp_path / "run"
     save_record(record(camera=0.6), path)
     code = main(["fit", str(path), "--out", str(out), "--jobs", "1", "--quiet", "--quick"])
-    printed, told = capfd.readouterr()
+    printed, reported = capfd.readouterr()
     assert code == 2
     assert printed == ""
-    assert told.count("\n") == 1
-    assert told.startswith("error: the log density is NaN at gain = ")
-    assert "time_1 = " in told
-    assert "narrow the priors" in told
+    assert reported.count("\n") == 1
+    assert reported.startswith("error: the log density is NaN at gain = ")
+    assert "time_1 = " in reported
+    assert "narrow the priors" in reported
     assert not (out / "results.json").exists()
     assert not (out / "chain.h5").exists()
 
@@ -98,24 +98,24 @@ def test_the_command_line_says_where_a_likelihood_is_nan(tmp_path, capfd, monkey
 @pytest.fixture(scope="module")
 def hasty() -> Fit:
     """As few walkers and steps as there may be, asked for more than they can give."""
-    told = {"ensembles": 2, "walkers": 4, "steps": 1, "thin": 1, "target_ess": 5000}
-    return fit(study(record(camera=0.6), sampler=told))
+    reported = {"ensembles": 2, "walkers": 4, "steps": 1, "thin": 1, "target_ess": 5000}
+    return fit(study(record(camera=0.6), sampler=reported))
 
 
-def test_too_small_a_budget_is_told_with_a_remedy(hasty):
-    told = results(hasty)
-    assert told["grade"] in ("tentative", "unusable")
-    assert "sample more steps, about" in told["grade_reason"]
-    assert "5000 are wanted" in told["grade_reason"]
-    worst = min(told["parameters"], key=lambda one: one["ess"])
-    assert worst["grade"] == told["grade"]
-    assert worst["name"] in told["grade_reason"]
+def test_too_small_a_budget_is_reported_with_a_remedy(hasty):
+    reported = results(hasty)
+    assert reported["grade"] in ("tentative", "unusable")
+    assert "sample more steps, about" in reported["grade_reason"]
+    assert "5000 are wanted" in reported["grade_reason"]
+    worst = min(reported["parameters"], key=lambda one: one["ess"])
+    assert worst["grade"] == reported["grade"]
+    assert worst["name"] in reported["grade_reason"]
 
 
 def test_what_is_derived_from_too_few_draws_is_graded_no_better(hasty):
-    told = results(hasty)
-    graded = [*told["parameters"], *told["step_metrics"]]
-    assert len(graded) > len(told["parameters"]) > 0
+    reported = results(hasty)
+    graded = [*reported["parameters"], *reported["step_metrics"]]
+    assert len(graded) > len(reported["parameters"]) > 0
     assert {one["grade"] for one in graded} <= {"tentative", "unusable"}
 
 
@@ -128,10 +128,10 @@ def test_a_budget_of_time_ends_sampling_and_says_what_more_would_give(tmp_path, 
     short = fit(task, folder=tmp_path)
     assert short.run.stopped_after == 2e3
     assert short.run.ensembles[0].steps == 2 * 20
-    told = results(short)
-    assert told["grade"] in ("tentative", "unusable")
-    assert "the budget of 1000 s ended sampling: the smallest effective" in told["grade_reason"]
-    assert "s more by [sampler] seconds" in told["grade_reason"]
+    reported = results(short)
+    assert reported["grade"] in ("tentative", "unusable")
+    assert "the budget of 1000 s ended sampling: the smallest effective" in reported["grade_reason"]
+    assert "s more by [sampler] seconds" in reported["grade_reason"]
     unlimited = replace(task, sampler=replace(task.sampler, seconds=None))
     resumed, whole = fit(unlimited, folder=tmp_path, resume=True), fit(unlimited)
     assert resumed.run.stopped_after is None
@@ -191,8 +191,10 @@ def test_no_more_processes_than_cores(monkeypatch):
 @pytest.mark.slow
 def test_the_advice_helps():
     """The same study with the default budget is reliable."""
-    told = results(fit(study(record(camera=0.6), sampler={"ensembles": 2, "walkers": 32, "target_ess": 200})))
-    assert told["grade"] == "reliable", told["grade_reason"]
+    reported = results(
+        fit(study(record(camera=0.6), sampler={"ensembles": 2, "walkers": 32, "target_ess": 200}))
+    )
+    assert reported["grade"] == "reliable", reported["grade_reason"]
 
 
 BROKEN = """

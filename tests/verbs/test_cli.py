@@ -54,12 +54,12 @@ def run(capsys, *words: object) -> tuple[int, str, str]:
 def test_fit_prints_one_json_object_and_writes_the_run_folder(record, tmp_path, capsys):
     out = tmp_path / "run"
     code, printed, _ = run(capsys, "fit", study(record), "--out", out, "--json", "--quiet", "--jobs", 1)
-    told = json.loads(printed)
+    reported = json.loads(printed)
     assert code == 0
-    names = {p["name"] for p in told["parameters"]}
+    names = {p["name"] for p in reported["parameters"]}
     assert names == {"gain", "time_1", "order_1", "delay", "offset", "sigma"}
-    assert told["grade"] in {"reliable", "tentative", "unusable"}
-    gain = next(p for p in told["parameters"] if p["name"] == "gain")
+    assert reported["grade"] in {"reliable", "tentative", "unusable"}
+    gain = next(p for p in reported["parameters"] if p["name"] == "gain")
     assert abs(gain["mean"] - 2.0) < 5 * gain["sd"]
     for name in ("report.html", "results.json", "posterior.nc", "chain.h5", "provenance.json"):
         assert (out / name).stat().st_size > 0
@@ -92,41 +92,41 @@ def test_records_alone_are_a_study(record, tmp_path, capsys, monkeypatch):
         ("[model]\nterms = { direct = 1 }\n", ["direct"]),
     ],
 )
-def test_a_bad_study_is_told_and_nothing_is_written(record, tmp_path, capsys, more, words):
+def test_a_bad_study_is_reported_and_nothing_is_written(record, tmp_path, capsys, more, words):
     out = tmp_path / "run"
-    code, printed, told = run(capsys, "fit", study(record, more), "--out", out)
+    code, printed, reported = run(capsys, "fit", study(record, more), "--out", out)
     assert code == 2
     assert printed == ""
-    assert told.startswith("fit: loading\nerror: ")
-    assert all(word in told for word in words)
+    assert reported.startswith("fit: loading\nerror: ")
+    assert all(word in reported for word in words)
     assert not out.exists()
 
 
-def test_all_problems_of_a_broken_record_are_told_at_once(tmp_path, capsys):
+def test_all_problems_of_a_broken_record_are_reported_at_once(tmp_path, capsys):
     path = tmp_path / "broken.csv"
     path.write_text("time_ms,drive_x_V,response_y_V\n0,0,1\n1,,2\n0.5,1,two\n")
-    code, _, told = run(capsys, "fit", path, "--out", tmp_path / "run")
+    code, _, reported = run(capsys, "fit", path, "--out", tmp_path / "run")
     assert code == 2
-    assert told.count("error: ") >= 3
-    assert "line 3" in told
-    assert "line 4" in told
-    assert "'two'" in told
+    assert reported.count("error: ") >= 3
+    assert "line 3" in reported
+    assert "line 4" in reported
+    assert "'two'" in reported
     assert not (tmp_path / "run").exists()
 
 
 def test_too_few_samples(tmp_path, capsys):
     path = tmp_path / "short.csv"
     path.write_text("time_ms,drive_x_V,response_y_V\n0,0,0\n1,1,0.2\n2,1,0.4\n")
-    code, _, told = run(capsys, "fit", path, "--out", tmp_path / "run")
+    code, _, reported = run(capsys, "fit", path, "--out", tmp_path / "run")
     assert code == 2
-    assert "3 samples cannot determine 8 free parameters" in told
+    assert "3 samples cannot determine 8 free parameters" in reported
 
 
 def test_an_output_folder_that_is_a_file(record, tmp_path, capsys):
     (tmp_path / "taken").write_text("here first")
-    code, _, told = run(capsys, "fit", study(record), "--out", tmp_path / "taken")
+    code, _, reported = run(capsys, "fit", study(record), "--out", tmp_path / "taken")
     assert code == 2
-    assert "--out" in told
+    assert "--out" in reported
     assert (tmp_path / "taken").read_text() == "here first"
 
 
@@ -144,8 +144,8 @@ def test_a_killed_run_resumes_to_the_same_draws(record, tmp_path):
     assert (cut / "chain.h5").exists()
     assert not (cut / "results.json").exists(), "the run ended before it could be killed"
     assert main([*words, str(cut), "--resume"]) == 0
-    told = [json.loads((folder / "results.json").read_text()) for folder in (whole, cut)]
-    assert told[0] == told[1]
+    reported = [json.loads((folder / "results.json").read_text()) for folder in (whole, cut)]
+    assert reported[0] == reported[1]
     assert os.listdir(whole / "tables") == os.listdir(cut / "tables")
 
 
@@ -160,9 +160,9 @@ def test_simulate_writes_a_study_that_loads(tmp_path, capsys):
     assert code == 0
     assert len(json.loads(printed)["files"]) == 3
     before = (tmp_path / "demo" / "a.csv").read_bytes()
-    code, _, told = run(capsys, "simulate", campaign, "--out", tmp_path / "demo")
+    code, _, reported = run(capsys, "simulate", campaign, "--out", tmp_path / "demo")
     assert code == 2
-    assert "there already" in told
+    assert "there already" in reported
     run(capsys, "simulate", campaign, "--out", tmp_path / "demo", "--overwrite", "--quiet")
     assert (tmp_path / "demo" / "a.csv").read_bytes() == before
 
@@ -199,12 +199,12 @@ stiffness = 1.0
         (f"{BAD_PATH}gain = -0.1\netas = [-1.0]\n", ["[[path]]", "must be positive"]),
     ],
 )
-def test_a_bad_campaign_is_told(tmp_path, capsys, text, words):
+def test_a_bad_campaign_is_reported(tmp_path, capsys, text, words):
     campaign = tmp_path / "campaign.toml"
     campaign.write_text(text)
-    code, _, told = run(capsys, "simulate", campaign, "--out", tmp_path / "demo")
+    code, _, reported = run(capsys, "simulate", campaign, "--out", tmp_path / "demo")
     assert code == 2
-    assert all(word in told for word in words)
+    assert all(word in reported for word in words)
     assert not (tmp_path / "demo").exists()
 
 

@@ -143,11 +143,11 @@ def test_a_refit_keeps_what_deflections_are_counted_in(stiff: tuple[Problem, np.
 
 def test_candidates_with_and_without(stiff: tuple[Problem, np.ndarray]):
     problem, _ = stiff
-    told = candidates_of(problem.study)
-    assert [one.name for one in told] == ["study", "study-no-effects"]
-    assert [one.study.effects.use for one in told] == [("cubic_stiffness",), ()]
-    assert "cubic_stiffness" in told[0].about
-    assert "no effects" in told[1].about
+    reported = candidates_of(problem.study)
+    assert [one.name for one in reported] == ["study", "study-no-effects"]
+    assert [one.study.effects.use for one in reported] == [("cubic_stiffness",), ()]
+    assert "cubic_stiffness" in reported[0].about
+    assert "no effects" in reported[1].about
     priced = replace(problem.study, priors={})
     richer = derived(priced, known_settings("fractional-2", priced))
     assert richer.study.effects.use == ("cubic_stiffness",)

@@ -135,7 +135,7 @@ def test_a_run_folder_of_another_version_or_cut_short_is_refused(folder, capsys,
     assert sorted(folder.rglob("*")) == before
 
 
-def test_a_missing_drive_or_folder_is_told(folder, capsys):
+def test_a_missing_drive_or_folder_is_reported(folder, capsys):
     assert main(["predict", str(folder), str(folder / "none.csv")]) == 2
     assert "no such file" in capsys.readouterr().err
     assert main(["predict", str(folder / "none"), str(plan(folder, GOOD))]) == 2

@@ -89,7 +89,7 @@ def test_a_disk_that_is_full_elsewhere_is_one_sentence(folder, monkeypatch, caps
     assert said.count("\n") == 1
 
 
-def test_an_unforeseen_error_is_told_though_its_details_find_no_room(folder, monkeypatch, capsys):
+def test_an_unforeseen_error_is_reported_though_its_details_find_no_room(folder, monkeypatch, capsys):
     def broken(*_):
         raise ZeroDivisionError("by zero")
 

@@ -70,28 +70,28 @@ def test_optics_writes_its_figures(optics):
 
 def test_optics_tells_its_numbers(tmp_path, capsys):
     code, printed, _ = run(capsys, "optics", "--out", tmp_path, "--json")
-    told = json.loads(printed)
+    reported = json.loads(printed)
     assert code == 0
-    assert told["threshold_voltage"] == {
+    assert reported["threshold_voltage"] == {
         "value": pytest.approx(pi * sqrt(11.1e-12 / 1.2e-10)),
         "unit": "V",
     }
-    tilts = [row["tilt_rad"] for row in told["mean_tilt"]]
-    assert [row["voltage_V"] for row in told["mean_tilt"]] == [1, 2, 3, 4, 5]
+    tilts = [row["tilt_rad"] for row in reported["mean_tilt"]]
+    assert [row["voltage_V"] for row in reported["mean_tilt"]] == [1, 2, 3, 4, 5]
     assert tilts == sorted(tilts)
     assert tilts[0] > 0
     assert tilts[-1] < pi / 2
-    assert told["mean_tilt"][2]["printed_law_rad"] == pytest.approx(0.095215 * 3 + 1.2058)
-    assert [row["target_deg"] for row in told["steering"]] == pytest.approx([0, 5, 10, 15, 20])
-    for row in told["steering"]:
+    assert reported["mean_tilt"][2]["printed_law_rad"] == pytest.approx(0.095215 * 3 + 1.2058)
+    assert [row["target_deg"] for row in reported["steering"]] == pytest.approx([0, 5, 10, 15, 20])
+    for row in reported["steering"]:
         assert row["main_lobe_deg"] == pytest.approx(row["target_deg"], abs=1e-9)
         expected = 2 * pi * 1.2 * np.sin(np.radians(row["target_deg"]))
         assert row["phase_step_rad"] == pytest.approx(expected)
-    grating = [row for row in told["grating_lobes"] if row["order"]]
+    grating = [row for row in reported["grating_lobes"] if row["order"]]
     assert all(row["isotropic"] == pytest.approx(1.0) for row in grating)
     assert max(row["with_element"] for row in grating) == pytest.approx(0.4846, abs=1e-4)
-    assert json.loads((tmp_path / "optics.json").read_text())["chain"] == told["chain"]
-    assert told["report"] == str(tmp_path / "optics.html")
+    assert json.loads((tmp_path / "optics.json").read_text())["chain"] == reported["chain"]
+    assert reported["report"] == str(tmp_path / "optics.html")
 
 
 def test_optics_of_another_array(tmp_path, capsys):
@@ -99,15 +99,15 @@ def test_optics_of_another_array(tmp_path, capsys):
     code, printed, _ = run(
         capsys, "optics", *words, "--out", tmp_path, "--json", "--field", "self-consistent"
     )
-    told = json.loads(printed)
+    reported = json.loads(printed)
     assert code == 0
-    assert told["array"] == {"elements": 8, "pitch_m": 4e-7, "wavelength_m": 1e-6, "fill_factor": 1.0}
-    assert [row["order"] for row in told["grating_lobes"]] == [0]  # closer than half a wavelength
-    assert [row["voltage_V"] for row in told["mean_tilt"]] == [0.5, 2.5]
-    assert told["mean_tilt"][0]["tilt_rad"] == 0.0
+    assert reported["array"] == {"elements": 8, "pitch_m": 4e-7, "wavelength_m": 1e-6, "fill_factor": 1.0}
+    assert [row["order"] for row in reported["grating_lobes"]] == [0]  # closer than half a wavelength
+    assert [row["voltage_V"] for row in reported["mean_tilt"]] == [0.5, 2.5]
+    assert reported["mean_tilt"][0]["tilt_rad"] == 0.0
     # 4e-7 m steers to end-fire before the lower branch ends
-    assert told["chain"][-1]["angle_rad"] == pytest.approx(pi / 2)
-    assert told["chain"][-1]["voltage_V"] == pytest.approx(0.8 * pi / 1.257)
+    assert reported["chain"][-1]["angle_rad"] == pytest.approx(pi / 2)
+    assert reported["chain"][-1]["voltage_V"] == pytest.approx(0.8 * pi / 1.257)
 
 
 def test_optics_speaks_without_json(tmp_path, capsys):
@@ -133,10 +133,10 @@ def test_optics_speaks_without_json(tmp_path, capsys):
     ],
 )
 def test_optics_refuses(tmp_path, capsys, words, said):
-    code, printed, told = run(capsys, "optics", *words, "--out", tmp_path / "page")
+    code, printed, reported = run(capsys, "optics", *words, "--out", tmp_path / "page")
     assert code == 2
     assert printed == ""
-    assert all(word in told for word in said)
+    assert all(word in reported for word in said)
     assert not (tmp_path / "page").exists()
 
 
@@ -152,8 +152,8 @@ def identified(study, tmp_path_factory) -> Path:
 
 
 def test_identify_tells_every_model_in_both_normalisations(identified):
-    told = json.loads((identified / "identify.json").read_text())
-    (path,) = told["paths"]
+    reported = json.loads((identified / "identify.json").read_text())
+    (path,) = reported["paths"]
     methods = [model["method"] for model in path["models"]]
     assert methods[0] == "scan, k given"
     assert "scan, integer orders" in methods
@@ -167,10 +167,10 @@ def test_identify_tells_every_model_in_both_normalisations(identified):
     best = next(model for model in path["models"] if model["method"] == "output error")
     assert best["delay"] == pytest.approx(1.0, abs=0.2)
     assert best["output_rmse"] == pytest.approx(1e-3, rel=0.3)
-    (end,) = (row for row in told["step_metrics"] if row["metric"] == "at end")
+    (end,) = (row for row in reported["step_metrics"] if row["metric"] == "at end")
     truth = float(step_response(PATH, 12.0))  # what is tended to is not known from a record this short
     assert end["values"]["fractional, output error"] == pytest.approx(truth, rel=0.01)
-    assert {row["metric"] for row in told["step_metrics"]} >= {"rise", "steady", "RMSE"}
+    assert {row["metric"] for row in reported["step_metrics"]} >= {"rise", "steady", "RMSE"}
 
 
 def test_identify_draws_every_record(identified):
@@ -211,10 +211,10 @@ def test_identify_prints_a_table_and_json(study, tmp_path, capsys):
     ],
 )
 def test_identify_refuses(study, tmp_path, capsys, words, said):
-    code, printed, told = run(capsys, "identify", study, *words, "--out", tmp_path / "run", "--quiet")
+    code, printed, reported = run(capsys, "identify", study, *words, "--out", tmp_path / "run", "--quiet")
     assert code == 2
     assert printed == ""
-    assert said in told
+    assert said in reported
     assert not (tmp_path / "run").exists()
 
 
@@ -224,16 +224,16 @@ def test_identify_refuses(study, tmp_path, capsys, words, said):
 def test_claims_write_their_page_and_tell_their_rows(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     code, printed, _ = run(capsys, "claims", "--json")
-    told = json.loads(printed)
+    reported = json.loads(printed)
     assert code == 0
-    assert len(told["claims"]) == 19
-    for row in told["claims"]:
+    assert len(reported["claims"]) == 19
+    for row in reported["claims"]:
         assert row["verdict"] in {"supported", "contradicted", "undecided"}
     folder = tmp_path / "runs" / "claims"
     page = check_page(folder / "claims.html")
     assert page.count("<svg") == len(list((folder / "figures").iterdir())) == 5
-    assert all(f">{row['id']}<" in page for row in told["claims"])
-    assert json.loads((folder / "claims.json").read_text())["claims"] == told["claims"]
+    assert all(f">{row['id']}<" in page for row in reported["claims"])
+    assert json.loads((folder / "claims.json").read_text())["claims"] == reported["claims"]
     code, printed, _ = run(capsys, "claims", "--out", tmp_path / "elsewhere")
     assert code == 0
     assert re.search(r"^S4 +contradicted +7\.66", printed, re.MULTILINE)
@@ -241,17 +241,17 @@ def test_claims_write_their_page_and_tell_their_rows(tmp_path, capsys, monkeypat
 
 def test_claims_refuse_a_file_for_a_folder(tmp_path, capsys):
     (tmp_path / "taken").write_text("here first")
-    code, _, told = run(capsys, "claims", "--out", tmp_path / "taken")
+    code, _, reported = run(capsys, "claims", "--out", tmp_path / "taken")
     assert code == 2
-    assert "--out" in told
+    assert "--out" in reported
 
 
 def test_identify_refuses_a_file_for_a_folder_before_it_scans(study, tmp_path, capsys):
     (tmp_path / "taken").write_text("here first")
-    code, _, told = run(capsys, "identify", study, "--out", tmp_path / "taken")
+    code, _, reported = run(capsys, "identify", study, "--out", tmp_path / "taken")
     assert code == 2
-    assert "--out" in told
-    assert "candidate" not in told  # no progress was shown
+    assert "--out" in reported
+    assert "candidate" not in reported  # no progress was shown
 
 
 # -- read back -------------------------------------------------------------------------------------
