@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 UNFINISHED = ".part-"
 """How names of files begin that are being written."""
+_DOTS = 200
+"""Parts of the longest key of a TOML file: the time to read one grows with their square."""
 _FORMULA = re.compile(r"'*(?:[=@\t\r]|[+-](?![\d.eE+-]*\Z))")
 """How a text begins that a spreadsheet takes for a formula, or that `csv_of` made of one."""
 _TRUSTED: ContextVar[bool] = ContextVar("_TRUSTED", default=False)
@@ -160,6 +162,8 @@ def read_tables(path: Path, known: Collection[str]) -> tuple[dict[str, Any], lis
         raise InputError(f"{path}: no such file{nearest(path.name, beside)}")
     try:
         text = path.read_text(encoding="utf-8-sig")
+        if any(part.count(".") > _DOTS for part in re.split("[=,\n]", text)):
+            raise ValueError(f"a key of more than {_DOTS} parts")
         tables = tomllib.loads(text)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read as UTF-8 text ({error})") from error

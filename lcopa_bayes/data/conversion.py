@@ -102,6 +102,7 @@ class _Column:
         return bool(levels <= _LEVELS or np.median(size) > _QUANTA * size.min())
 
 
+@np.errstate(over="ignore")  # differences of numbers of 1e308 are infinite, and only compared
 def convert(tables: Sequence[CellTable], mapped: Mapped) -> tuple[list[Record], list[str]]:
     """Records of tables that share their headers, one each, and in a sentence each what was taken for what.
 

@@ -358,3 +358,10 @@ def test_cells_of_any_length_are_read_at_once(tmp_path, long):
     with pytest.raises(InputError):
         convert([read_spreadsheet(path)], Mapped(drives=("2",), responses=("y",)))
     assert time.process_time() - began < 2.0
+
+
+def test_numbers_whose_difference_no_float_holds_are_compared_all_the_same(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("time_s,drive_x_V,response_x_V\n-1e308,0,1\n1e308,1,2\n-1e308,1,1\n")
+    with pytest.raises(InputError, match="line 4, column 'time_s': the time does not come after"):
+        convert([read_spreadsheet(path)], Mapped())

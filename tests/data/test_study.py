@@ -3,6 +3,7 @@
 import hashlib
 import os
 import pickle
+import time
 from pathlib import Path
 
 import numpy as np
@@ -258,6 +259,16 @@ def test_bad_toml_is_named_by_line(tmp_path, text, line):
     (problem,) = problems_of(folder_of(tmp_path, text))
     assert "study.toml: is not valid TOML" in problem
     assert f"at line {line}" in problem
+
+
+def test_a_key_without_end_is_refused_at_once(tmp_path):
+    """The reader of TOML takes minutes over it, as a list of as many numbers does not."""
+    began = time.process_time()
+    (problem,) = problems_of(folder_of(tmp_path, "a." * 50_000 + "a = 1\n"))
+    assert "a key of more than 200 parts" in problem
+    assert time.process_time() - began < 2.0
+    (problem,) = problems_of(folder_of(tmp_path, f"[model]\nodd = [{'0.5, ' * 5_000}]\n"))
+    assert "unknown key 'odd'" in problem
 
 
 def test_study_files_that_cannot_be_read(tmp_path):
