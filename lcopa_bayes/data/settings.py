@@ -252,7 +252,8 @@ class PriorSettings(Ruled):
         """The distribution; ValueError for a fixed value or an improper prior, which have none."""
         if self.dist is None or self.improper:
             raise ValueError(f"{self.name!r} is {self.dist or f'fixed at {self.fixed}'}")
-        return _distributions()[self.dist](**self.parameters)
+        # scipy fails on integers that no machine word holds
+        return _distributions()[self.dist](**{key: float(value) for key, value in self.parameters.items()})
 
 
 @final

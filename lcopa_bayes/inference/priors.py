@@ -48,7 +48,10 @@ class Prior:
     """Its shape parameters, `loc` and `scale`, in the parameter's unit."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "parameters", MappingProxyType(dict(self.parameters)))
+        numbers = {
+            key: float(value) for key, value in self.parameters.items()
+        }  # as TOML may hold long integers
+        object.__setattr__(self, "parameters", MappingProxyType(numbers))
 
     @cached_property
     def frozen(self) -> Any:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy import stats
 
+from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.inference.priors import Prior
 
 numbers = st.floats(-1e3, 1e3)
@@ -68,3 +69,11 @@ def test_a_prior_is_a_value():
     assert str(prior) == "norm(loc=1, scale=2)"
     with pytest.raises(TypeError):
         prior.parameters["loc"] = 0.0  # type: ignore[index]
+
+
+def test_integers_of_any_length_are_numbers():
+    """A study file may hold them, and scipy takes none beyond a machine word."""
+    far = {"a": 1, "b": 10**20}
+    prior, settings = Prior("loguniform", far), PriorSettings("time_1", dist="loguniform", parameters=far)
+    assert prior.support == (1.0, 1e20) == settings.frozen().support()
+    assert prior.log_density(np.array([1e10])) == pytest.approx(settings.frozen().logpdf(1e10))
