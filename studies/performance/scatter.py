@@ -4,8 +4,8 @@
 
 For every sampled parameter, at the 5, 50 and 95 % points of the draws of all seeds together: the share of a
 seed's draws below each, whose error follows from the effective sample size that the fit states; the mean;
-and the share of every mode. The root mean square of deviations over stated errors is 1 where these are true.
-A fit that has been made is not made again.
+and the share of every mode, between the boundaries that the fit states. The root mean square of deviations
+over stated errors is 1 where these are true. A fit that has been made is not made again.
 """
 
 from __future__ import annotations
@@ -97,14 +97,17 @@ def scattered(fits: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         name: [len(fit["modes"].get(name, {}).get("shares", [0])) for fit in fits]
         for name in fits[0]["names"]
     }
-    for name, count in counts.items():
-        usual = int(np.median(count))
+    for column, (name, count) in enumerate(counts.items()):
+        usual, pooled = int(np.median(count)), np.concatenate([fit["draws"][:, column] for fit in fits])
         with_all = [fit["modes"][name] for fit, k in zip(fits, count, strict=True) if k == usual > 1]
         for mode in range(usual if len(with_all) > 2 else 0):
             shares = np.array([one["shares"][mode] for one in with_all])
             errors = np.array([one["errors"][mode] for one in with_all])
+            ends = [np.array([-np.inf, *one["boundaries"], np.inf])[mode : mode + 2] for one in with_all]
+            # a fit states the share between its own boundaries, which differ where a valley is wide
+            there = np.array([((pooled > low) & (pooled <= high)).mean() for low, high in ends])
             row = {"parameter": str(name), "quantity": f"share of mode {mode + 1}", "fits": len(with_all)}
-            rows.append(row | {"share": float(shares.mean()), "ratio": ratio(shares - shares.mean(), errors)})
+            rows.append(row | {"share": float(shares.mean()), "ratio": ratio(shares - there, errors)})
     return rows
 
 
