@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,12 +15,18 @@ from lcopa_bayes.effectsearch.outliers import NAME, Outlying
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.declared import coefficient_prior
 from lcopa_bayes.inference.noise import Noise
+from lcopa_bayes.inference.optimum import Optimum
+from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.effect import Effect, Ranges
 from lcopa_bayes.model.effects.records import Outliers
 from lcopa_bayes.results.discretisation import discretisation
-from lcopa_bayes.results.fit import plan_of, weighted_fit
+from lcopa_bayes.results.fit import plan_of, weighted_start
 from lcopa_bayes.sampling.draws import Draws
+from lcopa_bayes.sampling.weightedrun import weighted_run
+
+_DRAWS, _STREAM = 100, 13
+"""Normal draws about an optimum [-], and the mark of their randomness."""
 
 
 def explained_study(study: Study, model: ExtendedModel, outliers: Outlying | None = None) -> Study:
@@ -81,17 +87,39 @@ def declarable(study: Study, effects: Sequence[Effect]) -> bool:
     return all(known.get(effect.name) is type(effect) for effect in effects)
 
 
-def explained_draws(study: Study, *, jobs: int = 1, quick: bool = False) -> tuple[Draws, Noise] | None:
+def explained_draws(
+    study: Study, usable: Callable[[Draws, Noise], bool], *, jobs: int = 1, quick: bool = False
+) -> tuple[Draws, Noise] | None:
     """Draws of an explained study, the same that a fit of it gives and limited by the width of its blocks as
     there, and its noise; None where importance sampling does not hold, and a fit takes ensembles from the
-    prior."""
-    problem = problem_of(study)
-    problem, result = weighted_fit(problem, plan_of(problem, quick=False), jobs=jobs, quick=quick)
+    prior.
+
+    Where normal draws about its optimum are not `usable` these are returned: the posterior is around there,
+    and takes some ten thousand simulations.
+    """
+    problem, optima = weighted_start(problem_of(study), quick=quick)
+    noise = problem.posterior.noise
+    about = normal_draws(problem.posterior, optima[0], study.seed) if optima else None
+    if about is not None and not usable(about, noise):
+        return about, noise
+    plan = plan_of(problem, quick=False)
+    result = weighted_run(problem.posterior, plan, jobs=jobs, quick=quick, optima=optima)
     if result is None:
         return None
     draws = result[1]
     width = discretisation(problem, draws, jobs=jobs)
-    return draws.limited(width.limitations), problem.posterior.noise
+    return draws.limited(width.limitations), noise
+
+
+def normal_draws(posterior: Posterior, optimum: Optimum, seed: int) -> Draws | None:
+    """Normal draws about an optimum inside the prior; None where there are none."""
+    rng = np.random.default_rng([seed, _STREAM])
+    z = rng.multivariate_normal(posterior.coordinates(optimum.values[None])[0], optimum.covariance, _DRAWS)
+    z = z[posterior.log_prior(z) > -np.inf]
+    if not len(z):
+        return None
+    values = posterior.complete(z, rng)[None]
+    return Draws(posterior.table, values, np.zeros(values.shape[:2]), (), float(len(z)))
 
 
 def coordinates_of(model: ExtendedModel, draws: Draws) -> Matrix:

@@ -53,6 +53,7 @@ from lcopa_bayes.effectsearch.verdict import (
     widened,
 )
 from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.noise import Noise
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.effect import Effect
 from lcopa_bayes.sampling.convergence import Grade
@@ -272,11 +273,14 @@ def _looped(
     sampled = None
     if sample and declarable(study, state.model.effects):
         explained = explained_study(problem.study, state.model, outliers)
-        sampled = explained_draws(explained, jobs=jobs, quick=quick)
+
+        def usable(draws: Draws, noise: Noise) -> bool:
+            return not _astray(after, _drawn(problem, state, (draws, noise)))
+
+        sampled = explained_draws(explained, usable, jobs=jobs, quick=quick)
     if sampled is not None:
-        covariance = np.asarray(np.cov(coordinates_of(state.model, sampled[0]).T))
-        drawn = _side(problem, replace(state, spread=covariance, sampled=sampled))
-        if study.held_out and risen(after.unseen, drawn.unseen) > RISEN:
+        drawn = _drawn(problem, state, sampled)
+        if _astray(after, drawn):
             cautions, sampled = (*cautions, _ASTRAY), None
         else:
             after = drawn
@@ -372,6 +376,17 @@ def _alone(study: Study) -> tuple[str, ...]:
             f"{100 * SINGLE:.0f} % of its power"
         )
     return (f"{said}; fit a second record",)
+
+
+def _drawn(problem: Problem, state: State, sampled: tuple[Draws, Noise]) -> Side:
+    """The same by draws of the explained study."""
+    covariance = np.asarray(np.cov(coordinates_of(state.model, sampled[0]).T))
+    return _side(problem, replace(state, spread=covariance, sampled=sampled))
+
+
+def _astray(optimum: Side, drawn: Side) -> bool:
+    """Whether draws predict records held out worse than the optimum of the loop."""
+    return bool(optimum.unseen[0].held_out) and risen(optimum.unseen, drawn.unseen) > RISEN
 
 
 def _side(problem: Problem, state: State) -> Side:

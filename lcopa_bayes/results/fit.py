@@ -288,9 +288,13 @@ def weighted_fit(
 ) -> tuple[Problem, tuple[Run, Draws] | None]:
     """A plant with effects on blocks as narrow as its records need, and weighted draws of it with their run;
     no draws where importance sampling does not hold."""
-    optima = optima_of(problem, starts=QUICK_STARTS if quick else STARTS)
-    problem, optima = resolved_optima(problem, optima)
+    problem, optima = weighted_start(problem, quick=quick)
     return problem, weighted_run(problem.posterior, plan, jobs=jobs, quick=quick, optima=optima)
+
+
+def weighted_start(problem: Problem, *, quick: bool) -> tuple[Problem, tuple[Optimum, ...]]:
+    """The plant of `weighted_fit` and the optima that its draws begin around."""
+    return resolved_optima(problem, optima_of(problem, starts=QUICK_STARTS if quick else STARTS))
 
 
 def plan_of(problem: Problem, *, quick: bool) -> SamplePlan:

@@ -85,7 +85,7 @@ def weighted_run(
             return None
         near, weighted, share = posterior, None, 0.0
         chosen = weighty(optima)
-        if posterior.simulation is not None and len(chosen) == 1:
+        if posterior.simulation is not None and _together(posterior, chosen):
             near, weighted, share = _by_surrogate(posterior, chosen[0], rng, wanted, mapped)
         if weighted is None or not usable(weighted):
             tried = importance(posterior, optima, rng, wanted, mapped)
@@ -115,6 +115,12 @@ def usable(weighted: Weighted) -> bool:
     """Whether averages converge and enough draws count."""
     converging = weighted.pareto_k <= usable_k(weighted.count) or weighted.ess >= _EVEN * weighted.count
     return converging and weighted.ess >= _FEWEST
+
+
+def _together(posterior: Posterior, optima: Sequence[Optimum]) -> bool:
+    """Whether optima lie within a standard deviation of the best, where a descent stops on its way."""
+    z = posterior.coordinates(np.array([one.values for one in optima]))
+    return bool((np.abs(z - z[0]) <= np.sqrt(np.diag(optima[0].covariance))).all())
 
 
 def _by_surrogate(

@@ -14,7 +14,13 @@ from lcopa_bayes.cli import main
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.studyfile import load_study
 from lcopa_bayes.data.studywriter import write_study
-from lcopa_bayes.effectsearch.explained import constant_about, coordinates_of, explained_study
+from lcopa_bayes.effectsearch import explained
+from lcopa_bayes.effectsearch.explained import (
+    constant_about,
+    coordinates_of,
+    explained_draws,
+    explained_study,
+)
 from lcopa_bayes.effectsearch.loop import Loop, loop
 from lcopa_bayes.identifiability.audit import audit
 from lcopa_bayes.inference.assembly import problem_of
@@ -44,6 +50,20 @@ def test_a_fit_of_the_explained_study_gives_the_numbers_of_the_loop(bent: Loop, 
         own = bent.estimate(k)
         there = reported[own["name"]]
         assert own["alone"] == pytest.approx([there.lower, there.value, there.upper], rel=1e-9), own["name"]
+
+
+def test_draws_are_spared_where_normal_ones_about_the_optimum_are_of_no_use(bent: Loop, monkeypatch):
+    """They have the moments of the draws of a fit."""
+    assert bent.draws is not None
+    monkeypatch.setattr(explained, "weighted_run", None)  # no call of it would end
+    drawn = explained_draws(bent.study, lambda draws, noise: False, quick=True)
+    assert drawn is not None
+    rows = [k for k, row in enumerate(bent.draws.table.rows) if row.free and not row.noise]
+    normal, own = drawn[0].flat[:, rows], bent.draws.flat[:, rows]
+    assert np.isfinite(drawn[0].flat).all()
+    apart = np.abs(normal.mean(axis=0) - own.mean(axis=0)) / own.std(axis=0)
+    assert apart.max() < 4 / np.sqrt(len(normal))
+    assert np.abs(normal.std(axis=0) / own.std(axis=0) - 1).max() < 4 / np.sqrt(2 * len(normal))
 
 
 def test_it_agrees_with_the_descent_of_the_loop(bent: Loop):

@@ -513,6 +513,20 @@ def test_a_force_that_jumps_is_met_block_by_block():
     assert_allclose(again, y, atol=1e-5)
 
 
+def test_stiff_plants_together_are_each_by_itself():
+    """Where sweeps do not end for one of them none is swept."""
+    whole, values = fractional_plant(staircase([1.0, -1.0, 0.6], hold=4.0, start=0.35))
+    made = effected(whole.posterior, values, [Overflow(0.3)])
+    names = np.array(whole.posterior.table.names)
+    plants = [made.plant(values * np.where(names == "gain", s, 1)) for s in (1.0, 1.2)]
+    for psi in (np.array([0.5, 40.0]), np.array([0.1, 0.1])):
+        for plant, moved in zip(
+            plants, made.simulator.moved_together([(one, psi) for one in plants]), strict=True
+        ):
+            alone = made.simulator.moved(plant, psi)[0].deflection
+            assert_allclose(moved[0].deflection, alone, atol=1e-9 * np.abs(alone).max())
+
+
 def test_a_sampled_drive_is_a_delay_that_coefficients_move():
     """A drive that only lags, with a force: as commands, plant by plant, and as delays, all at once."""
     whole, values = fractional_plant(staircase([1.0, -1.0, 0.6], hold=4.0, start=0.35))

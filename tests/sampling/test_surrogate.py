@@ -156,6 +156,23 @@ def test_the_posterior_itself_is_asked_for_as_much_as_is_wanted(
     assert sum(asked) < 5 * plan.target_ess
 
 
+def test_optima_of_one_mode_have_one_surrogate(stiff: tuple[Posterior, Optimum]):
+    """A descent that stopped on its way is no mode of its own."""
+    posterior, best = stiff
+
+    def moved(by: float) -> Optimum:
+        z = posterior.coordinates(best.values[None])
+        z[0, 0] += by * np.sqrt(best.covariance[0, 0])
+        return replace(best, values=posterior.complete(z, None)[0])
+
+    assert weightedrun._together(posterior, [best, moved(0.5)])
+    assert not weightedrun._together(posterior, [best, moved(2.0)])
+    plan = SamplePlan.of(posterior.dimension, seed=3, target_ess=400)
+    found = weighted_run(posterior, plan, quick=True, optima=[best, moved(0.5)])
+    assert found is not None
+    assert found[0].surrogate is not None
+
+
 def test_even_weights_are_used_whatever_their_tail():
     """A surrogate that is right to 0.01 nat but at one draw was discarded by the Pareto k of its weights."""
     rng = np.random.default_rng(1)

@@ -22,8 +22,9 @@ _DEPTH = 4
 """Earlier iterates that the acceleration combines (Anderson 1965, J. ACM 12)."""
 _LEVELS = 400
 """Most steps towards the level at rest [-]."""
-_STRETCH = 64
-"""Blocks that Newton's method solves at once [-]."""
+_STRETCH = 16
+"""Blocks that Newton's method solves at once [-]: each takes as many times longer as there are others, and
+calls cost as much as that only for fewer."""
 _NEWTON = 12
 _NUDGE = 1e-6
 _JUMP = 1e-9
@@ -161,7 +162,7 @@ def _newton(
         if solved.all() or not (usable & ~solved).any():
             break
         matrix = np.eye(n) - operator * slopes[:, :1]
-        for back in (1, 2):
+        for back in (back for back in (1, 2) if slopes[:, back].any()):
             matrix[:, :, :-back] -= operator[:, :, back:] * slopes[:, back, None, back:]
         matrix[~usable], residual[~usable] = np.eye(n), 0.0
         try:

@@ -273,6 +273,7 @@ class Passage:
             chosen = spectrum if plants.size == len(places) else spectrum[plants]
             return np.asarray(fft.irfft(chosen * fft.rfft(v.reshape(y.shape), length), length)[..., :n])
 
+        sweeps = _SWEEPS
         scales, start = scale.reshape(*places.shape, 1), alone.reshape(*places.shape, n)
         if batch > 1:  # most batches are neighbours
             own = len(places) // batch
@@ -280,7 +281,9 @@ class Passage:
             if known.all():
                 share = np.divide(gains, gains[0], out=np.ones_like(gains), where=gains[0] != 0.0)
                 start = (share[..., None] * near.reshape(-1, n)).reshape(start.shape)
-        y, solved = iterated(swept, start, scales, _SWEEPS)
+            else:
+                sweeps = 0
+        y, solved = iterated(swept, start, scales, sweeps)
         failures = dict.fromkeys((places[~settled[places].all(axis=1), 0] // ranges.axes).tolist(), RUNS_AWAY)
         slow = np.flatnonzero(~solved & settled[places].all(axis=1))
         if slow.size:
