@@ -167,8 +167,10 @@ class Loop:
     @cached_property
     def _mixture(self) -> tuple[list[Matrix], Vector]:
         state = self.after.state
-        own = None if self.draws is None else coordinates_of(state.model, self.draws)
-        return mixture(state, own, self.open)
+        if self.draws is None:
+            return mixture(state, None, self.open)
+        beyond = [one for one in self.open if not one.within(self.draws.table)]
+        return mixture(state, coordinates_of(state.model, self.draws), beyond)
 
     @property
     def study(self) -> Study:

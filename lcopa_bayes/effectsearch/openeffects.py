@@ -5,12 +5,14 @@ of one that it named, gains and delays are elsewhere, and the records say little
 all of these, weighted by evidence. One more effect is one linear step away: with whitened residual r and
 tangents J at the optimum, information H and signatures S over the prior sd of their coefficients psi,
 ``psi ~ N(V S' r, V)``, ``1 / V = I + S' S - S' J G``, and coordinates move by ``-G psi``, ``G = H^-1 J' S``.
+Internal constants may have optima elsewhere, which no linear step reaches: the final model is fitted again
+from other instances of its effects.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, final
 
 import numpy as np
@@ -18,11 +20,15 @@ import numpy as np
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of, root_of
 from lcopa_bayes.core.estimate import Estimate, plain, quantile
+from lcopa_bayes.effectsearch.refits import log_bayes_factor, loosened, places, without
+from lcopa_bayes.effectsearch.regression import Optimum, Regression
 from lcopa_bayes.effectsearch.rounds import Round
 from lcopa_bayes.effectsearch.scores import State
-from lcopa_bayes.effectsearch.signature import Signature
+from lcopa_bayes.effectsearch.signature import Projection, Scale, Signature, signature_of
 from lcopa_bayes.effectsearch.trace import LEAST as CHANCE
 from lcopa_bayes.effectsearch.trace import Trace
+from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.model.effects.effect import Effect, ForceEffect, Ranges
 from lcopa_bayes.results.alternatives import parts_of_sd
 from lcopa_bayes.results.steps import curves_of, metrics_of
 
@@ -35,12 +41,20 @@ _RESPONSES = 400
 _FEWEST = 10
 """Step responses of one of them [-]."""
 _SEED = 23
+_MOST, _FORCED = 6, 2
+"""Instances of an effect that the final model is fitted again from, and beside forces [-]."""
+_STEPS, _SLIGHT = 15, 0.05
+"""Most responses of such a descent [-], and gain of its last step [nat]."""
+_FAR = 12.0
+"""Cost above that of the final model from which it is not followed to its end [nat]."""
+_DISTINCT = 0.5
+"""Descents that end closer than this in every coordinate found one optimum [sd]."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Alternative:
-    """One more effect beside those of a final model, or one in place of the last."""
+    """One more effect beside those of a final model, one in place of the last, or another instance of one."""
 
     name: str
     weight: float
@@ -49,8 +63,20 @@ class Alternative:
     """Of its coordinates, those of the plant alone where an effect is replaced, (k,)."""
     root: Matrix
     """Factor of the covariance of that, (k, m)."""
-    instead: bool
-    """Whether it stands in place of the last effect, whose coordinates it does not have."""
+    instead: str = ""
+    """Name of the effect that it stands in place of, whose coordinates it has if it is an instance of the
+    same; empty for one more effect."""
+    instance: Effect | None = None
+    """That instance."""
+
+    def within(self, table: ParameterTable) -> bool:
+        """Whether it is an instance that the free constants of a table reach."""
+        for key, value in self.instance.constants.items() if self.instance else ():
+            row = table.rows[table.names.index(f"{self.instead}.{key}")]
+            low, high = row.domain if row.free else (row.value, row.value)
+            if not low <= float(value) <= high:
+                return False
+        return self.instance is not None
 
     def draws(self, own: Matrix, middle: Vector, rng: np.random.Generator) -> Matrix:
         """Coordinates, (draws, k), from draws of the final model about its optimum `middle`."""
@@ -60,9 +86,10 @@ class Alternative:
 
 
 def alternatives(state: State, rounds: Sequence[Round]) -> tuple[Alternative, ...]:
-    """Those of a final model that its last trace, of which no effect stands out, and the refits of the round
-    that chose its last effect leave a weight."""
-    return (*_beside(state, rounds[-1].trace), *_instead(state, rounds))
+    """Those of a final model that its last trace, of which no effect stands out, the refits of the round that
+    chose its last effect, and refits of other instances of its effects leave a weight."""
+    seen = rounds[-1].trace
+    return (*_beside(state, seen), *_instead(state, rounds), *_elsewhere(state, seen.scale))
 
 
 def mixture(state: State, own: Matrix | None, found: Sequence[Alternative]) -> tuple[list[Matrix], Vector]:
@@ -72,7 +99,7 @@ def mixture(state: State, own: Matrix | None, found: Sequence[Alternative]) -> t
     x, (low, high) = state.optimum.x, state.model.bounds
 
     def within(drawn: Matrix) -> Flags:
-        k = drawn.shape[1]  # an alternative in place of the last effect has fewer coordinates
+        k = drawn.shape[1]  # another effect in place of the last has fewer coordinates
         return np.asarray(((drawn >= low[:k]) & (drawn <= high[:k])).all(axis=1))
 
     if own is None:
@@ -177,7 +204,7 @@ def _beside(state: State, seen: Trace) -> list[Alternative]:
             weight = odds(seen, seen.alone(signature)) / len(traced.signatures)
             if weight > LEAST:
                 shift, root = _step(state, signature, seen)
-                out.append(Alternative(traced.name, weight, shift, root, instead=False))
+                out.append(Alternative(traced.name, weight, shift, root))
     return out
 
 
@@ -208,5 +235,89 @@ def _instead(state: State, rounds: Sequence[Round]) -> list[Alternative]:
             continue
         shift = one.optimum.x[:size] - state.optimum.x[:size]
         root = root_of(one.optimum.covariance[:size, :size])
-        out.append(Alternative(one.added[0], weight, shift, root, instead=True))
+        out.append(Alternative(one.added[0], weight, shift, root, last.chosen.added[0]))
     return out
+
+
+def _elsewhere(state: State, scale: Scale) -> list[Alternative]:
+    """The final model with the internal constants of one of its effects at other optima."""
+    model, whitening, out = state.model, state.whitening, list[Alternative]()
+    if not any(_movable(effect, model.effected.ranges) for effect in model.effects):
+        return out
+    names = [effect.name for effect in model.effects if not effect.timed]
+    wide = loosened(model, names)
+    own = np.isin(wide.names, model.names)
+    here = Regression(wide, whitening).at(wide.coordinates(model.values(state.optimum.x)))
+    known = [here]
+    for place, effect in enumerate(model.effects):
+        for instance, start in _instances(state, place, scale):
+            moved = model.having(*(instance if k == place else one for k, one in enumerate(model.effects)))
+            tried = loosened(moved, names)
+            try:
+                quick = Regression(replace(tried, exact=False), whitening)
+                begun, _ = quick.reached(tried.coordinates(moved.values(start)), most=_STEPS, gain=_SLIGHT)
+                if quick.cost(begun) > here.cost + _FAR:
+                    continue
+                there = Regression(tried, whitening).descend(begun, most=_STEPS, gain=_SLIGHT)
+            except ArithmeticError:
+                continue
+            weight = float(np.exp(log_bayes_factor(here, there, scale.quiet)))
+            if weight > LEAST and not any(_same(there, one) for one in known):
+                known.append(there)
+                found = tried.held(there.x)[0].effects[place]
+                constants = (f"{key} {value:.3g}" for key, value in found.constants.items())
+                name, shift = f"{effect.name} with {', '.join(constants)}", there.x[own] - state.optimum.x
+                root = root_of(there.covariance[np.ix_(own, own)])
+                out.append(Alternative(name, weight, shift, root, effect.name, found))
+    return out
+
+
+def _same(one: Optimum, other: Optimum) -> bool:
+    """Whether two descents ended in one optimum."""
+    return bool((np.abs(one.x - other.x) < _DISTINCT * np.maximum(one.sd, other.sd)).all())
+
+
+def _movable(effect: Effect, ranges: Ranges) -> bool:
+    """Whether an effect of the plant has instances to choose from."""
+    return not effect.card.disturbance and len(effect.grid(ranges)) > 1
+
+
+def _instances(state: State, place: int, scale: Scale) -> list[tuple[Effect, Vector]]:
+    """Instances of one of the effects of a final model, those of most evidence in its place, and coordinates
+    of the model with each."""
+    model, optimum = state.model, state.optimum
+    effect, ranges = model.effects[place], model.effected.ranges
+    if not _movable(effect, ranges):
+        return []
+    where = places(model, effect.name)
+    bare, x = without(model, optimum.x, [effect.name])
+    others = np.delete(np.arange(optimum.x.size), where)
+    project = Projection(optimum.moving[:, others] * model.spread[others])
+    rest = project(optimum.settled + optimum.jacobian[:, where] @ optimum.x[where])
+    known = replace(scale, power=np.array([rest @ rest]))
+    units = np.array([one.coefficient.scale for one in model.effected.coefficients if one.effect == place])
+    found: list[tuple[float, Effect, Vector]] = []
+    for instance in effect.grid(ranges):
+        try:
+            signature = signature_of(bare, x, state.whitening, project, instance)
+        except ArithmeticError:
+            continue
+        start = optimum.x.copy()
+        start[where] = units * signature.amplitude(rest, known)
+        evidence = float(signature.evidence(signature.span.T @ rest[:, None], known)[0])
+        found.append((evidence, instance, np.clip(start, *model.bounds)))
+    forced = any(isinstance(one, ForceEffect) for one in model.effects)
+    return _apart([one[1:] for one in sorted(found, key=lambda one: -one[0])], _FORCED if forced else _MOST)
+
+
+def _apart(ranked: Sequence[tuple[Effect, Vector]], most: int) -> list[tuple[Effect, Vector]]:
+    """So many of the first instances at most; of a long list none beside another in every constant: they lead
+    to one optimum."""
+    rows = np.array([[float(v) for v in one.constants.values()] for one, _ in ranked])
+    step = [2 if isinstance(value, bool) else 1 for value in ranked[0][0].constants.values()]
+    place = np.stack([np.unique(column, return_inverse=True)[1] for column in rows.T], axis=1) * step
+    kept: list[int] = []
+    for k in range(len(ranked)):
+        if len(ranked) <= _MOST or not any(np.abs(place[k] - place[one]).max() <= 1 for one in kept):
+            kept.append(k)
+    return [ranked[k] for k in kept[:most]]

@@ -265,7 +265,7 @@ def freed(
     They are parameters like any other of the descent, which uses the plant's own tangents; those that a fit
     holds by default stay.
     """
-    wide = replace(_loosened(model, names), exact=False)
+    wide = replace(loosened(model, names), exact=False)
     if len(wide.columns) == len(model.columns):
         return model, x
     best = Regression(replace(model, exact=False), whitening).cost(x)
@@ -289,7 +289,7 @@ def _whole(model: ExtendedModel, x: Vector, names: Collection[str]) -> tuple[Vec
     return (np.where(own, 1.0, x),) if any(own) else ()
 
 
-def _loosened(model: ExtendedModel, names: Collection[str]) -> ExtendedModel:
+def loosened(model: ExtendedModel, names: Collection[str]) -> ExtendedModel:
     """The model with the internal constants of some of its effects as coordinates."""
     # a phase of commands moves them from sample to sample: no slope says where it should be
     held = {effect.name for effect in model.effects if effect.card.place == "drive"}
@@ -305,7 +305,7 @@ def released(state: State) -> State:
     """The state at the likeliest internal constants of its effects, with what these leave open in the
     covariance of all other coordinates; as it is where a descent does not find any as likely."""
     model, whitening = state.model, state.whitening
-    wide = _loosened(model, [effect.name for effect in model.effects if not effect.timed])
+    wide = loosened(model, [effect.name for effect in model.effects if not effect.timed])
     if len(wide.columns) == len(model.columns):
         return state
     try:

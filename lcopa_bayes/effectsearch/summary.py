@@ -139,14 +139,13 @@ def _figures(result: Loop) -> list[dict[str, Any]]:
 
 def _open(result: Loop) -> list[dict[str, Any]]:
     """Effects that are open, with the weight of all their instances beside 1 of the final model, by it."""
-    weights: dict[tuple[str, bool], float] = {}
+    weights: dict[tuple[str, str], float] = {}
     for one in result.open:
         key = one.name, one.instead
         weights[key] = weights.get(key, 0.0) + one.weight
-    last = result.names[-1] if result.names else ""
     return [
-        {"name": name, "instead": instead, "weight": weight}
-        | {"said": f"{name}{f' in place of {last}' if instead else ''} (weight {weight:.2f} beside 1)"}
+        {"name": name, "instead": bool(instead), "weight": weight}
+        | {"said": f"{name}{f' in place of {instead}' if instead else ''} (weight {weight:.2f} beside 1)"}
         for (name, instead), weight in sorted(weights.items(), key=lambda one: -one[1])
         if weight > SHOWN
     ]

@@ -123,7 +123,7 @@ def test_draws_outside_the_support_take_weight_away(faint: Loop):
     far[k] = (
         -state.optimum.x[k] if not state.model.posterior.table.rows[state.model.columns[k]].log_scale else 0
     )
-    one = Alternative("a", 1.0, far, 1e-9 * np.eye(far.size), instead=False)
+    one = Alternative("a", 1.0, far, 1e-9 * np.eye(far.size))
     parts, weights = mixture(state, None, [one])
     assert weights[1] == pytest.approx(1 / 3, abs=0.02)
     assert (parts[1] >= state.model.bounds[0]).all()
