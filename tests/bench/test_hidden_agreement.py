@@ -124,6 +124,22 @@ def test_library_and_bench_agree(name: str):
     assert size > 5 * difference or size < 0.5
 
 
+def test_a_turn_in_the_tail_of_a_step_is_one():
+    """Late after a step a response hardly moves, for long: a switch between rise and fall that is as wide as
+    that motion leaves 0.1 of the noise there, and the size of the effect 5 sd off."""
+    made, values, commands = base()
+    hidden = drawn(["rise_fall_asymmetry"], np.random.default_rng(7))
+    psi = np.array([hidden[0].numbers["e"]])
+    assert psi[0] > 0.6
+    told = made.with_effects([bundled()["rise_fall_asymmetry"]()]).responses(values, psi)
+    plain = made.responses(values, made.vanishing)
+    for r, most in ((0, 0.02), (1, 0.05)):
+        shot, times = shot_of(DEVICE, 0.0, np.random.default_rng(r)), made.simulator.times[r]
+        exact = HiddenDevice(DEVICE, hidden, shot).response(commands[r], times)
+        other = exact - DEVICE.response(commands[r], times)
+        assert np.sqrt(np.nanmean((told[r] - plain[r] - other) ** 2)) < most * NOISE
+
+
 @pytest.mark.parametrize("name", ["cubic_stiffness", "backflow", "axis_rotation", "voltage_knee"])
 def test_another_size_is_seen(name: str):
     assert gap(name, 3, wrong=1.3)[0] > 0.15

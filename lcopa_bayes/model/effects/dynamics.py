@@ -18,8 +18,9 @@ from lcopa_bayes.model.effects.effect import (
     single,
 )
 
-_SHARP = 3e-4
-"""Width of the switch between rise and fall, of ``ymax^2 / speed`` [-]: a jump would not converge."""
+_SHARP = 1e-5
+"""Width of the switch between rise and fall, of ``ymax^2 / speed`` [-]: a jump would not converge, and late
+after a step a response moves no faster than a thousandth of that for long."""
 
 
 @final
