@@ -123,6 +123,12 @@ class Weighted:
         drawn = cls.equal(posterior, coordinates, log_density, log_evidence, error)
         return replace(drawn, raw=raw, pareto_k=max(one.pareto_k for one in parts), factors=factors)
 
+    def shifted(self, by: float, sd: float) -> Weighted:
+        """The same draws of a posterior whose density is larger by a factor, of log `by` and standard error
+        `sd` [nat]."""
+        error = float(np.hypot(self.log_evidence_sd, sd))
+        return replace(self, raw=self.raw + by, log_evidence=self.log_evidence + by, log_evidence_sd=error)
+
     @property
     def batch_evidence(self) -> Vector:
         """Log evidence by the draws of each batch, (batches,) [nat]."""

@@ -127,7 +127,11 @@ def _by_surrogate(
     posterior: Posterior, optimum: Optimum, rng: np.random.Generator, plan: ImportancePlan, mapped: Mapped
 ) -> tuple[Posterior, Weighted | None, float]:
     """The posterior of a surrogate about an optimum; draws of it weighted by the posterior itself; and how
-    efficient they can be called [-]. No draws where the surrogate does not hold."""
+    efficient they can be called [-]. No draws where the surrogate does not hold.
+
+    Draws of the surrogate are those of the posterior where their weights differ so little that no mean moves
+    by more than the Monte Carlo error of as many draws as are wanted: a few of them show it.
+    """
     surrogate = Surrogate.of(posterior, optimum, rng, mapped)
     if surrogate is None:
         return posterior, None, 0.0
@@ -138,10 +142,16 @@ def _by_surrogate(
         return posterior, None, 0.0
     first = about_optimum.weighted
     tried = first.batches(_TRIED // BATCHES, rng).ravel()
-    held = _efficiency(posterior, first.coordinates[tried], first.log_density[tried], mapped)
+    ratios = spread(posterior, first.coordinates[tried], mapped) - first.log_density[tried]
+    total, share = float(logsumexp(ratios)), first.ess / first.count
+    held = effective(ratios - total) / ratios.size if np.isfinite(total) else 0.0
     if held < LEAST_EFFICIENCY:
         return posterior, None, 0.0
-    count, share = int(max(_SURPLUS * plan.wanted, _LEAST) / held), first.ess / first.count
+    least = max(_SURPLUS * plan.wanted, _LEAST)
+    apart = 1.0 / held - 1.0  # variance of the weights over their mean squared: no mean moves by more sd
+    if apart <= 1.0 / plan.wanted and usable(first) and share >= LEAST_EFFICIENCY and first.ess >= least:
+        return near, first.shifted(total - np.log(ratios.size), np.sqrt(apart / ratios.size)), share
+    count = int(least / held)
     drawn = first.batches(max(1, int(min(count, first.ess)) // BATCHES), rng).ravel()
     z, about = first.coordinates[drawn], first.log_density[drawn]
     if share < LEAST_EFFICIENCY or not usable(first):
@@ -159,13 +169,6 @@ def _by_surrogate(
         return posterior, None, 0.0
     error = float(np.hypot(weighted.log_evidence_sd, first.log_evidence_sd))
     return near, replace(weighted, log_evidence_sd=error), share
-
-
-def _efficiency(posterior: Posterior, z: Matrix, about: Vector, mapped: Mapped) -> float:
-    """Effective draws of the posterior per draw of a density that is `about` at coordinates z [-]."""
-    log_weights = spread(posterior, z, mapped) - about
-    total = logsumexp(log_weights)
-    return effective(log_weights - total) / len(z) if np.isfinite(total) else 0.0
 
 
 @final

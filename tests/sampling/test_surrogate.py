@@ -156,6 +156,32 @@ def test_the_posterior_itself_is_asked_for_as_much_as_is_wanted(
     assert sum(asked) < 5 * plan.target_ess
 
 
+@pytest.mark.parametrize("rough", [0.0, 0.3])
+def test_draws_of_a_surrogate_stand_for_the_posterior_where_their_weights_are_even(
+    stiff: tuple[Posterior, Optimum], monkeypatch, rough: float
+):
+    """A factor on the density moves the evidence alone; ripples of it ask for weights."""
+    asked, spread, higher = [], weightedrun.spread, 0.0
+
+    def rippled(posterior: Posterior, z: np.ndarray, mapped) -> np.ndarray:
+        asked.append(len(z))
+        return spread(posterior, z, mapped) + higher + rough * np.sin(1e3 * z[:, 0])
+
+    monkeypatch.setattr(weightedrun, "spread", rippled)
+    posterior, optimum = stiff
+    plan = SamplePlan.of(posterior.dimension, seed=3, target_ess=400)
+    first = weighted_run(posterior, plan, optima=[optimum])
+    once, higher = list(asked), 0.5
+    second = weighted_run(posterior, plan, optima=[optimum])
+    assert first is not None
+    assert second is not None
+    assert (once == [weightedrun._TRIED]) == (rough == 0.0)
+    runs = [run.weighted for run, _ in (first, second)]
+    assert runs[1].log_evidence - runs[0].log_evidence == pytest.approx(0.5)
+    assert_allclose(runs[1].batch_evidence - runs[0].batch_evidence, 0.5)
+    assert_allclose(runs[1].coordinates, runs[0].coordinates)
+
+
 def test_optima_of_one_mode_have_one_surrogate(stiff: tuple[Posterior, Optimum]):
     """A descent that stopped on its way is no mode of its own."""
     posterior, best = stiff
