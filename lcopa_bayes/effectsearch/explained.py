@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix
+from lcopa_bayes.core.covariance import root_of
 from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
@@ -114,7 +115,8 @@ def explained_draws(
 def normal_draws(posterior: Posterior, optimum: Optimum, seed: int) -> Draws | None:
     """Normal draws about an optimum inside the prior; None where there are none."""
     rng = np.random.default_rng([seed, _STREAM])
-    z = rng.multivariate_normal(posterior.coordinates(optimum.values[None])[0], optimum.covariance, _DRAWS)
+    centre, root = posterior.coordinates(optimum.values[None]), root_of(optimum.covariance)
+    z = centre + rng.standard_normal((_DRAWS, len(root))) @ root.T
     z = z[posterior.log_prior(z) > -np.inf]
     if not len(z):
         return None

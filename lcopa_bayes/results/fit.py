@@ -190,7 +190,8 @@ def fit(
         writable_folder(folder)
     plan, weighted_result, optima = plan_of(problem, quick=quick), None, tuple[Optimum, ...]()
     if around_optima or (problem.posterior.simulation is not None and plan.method == "auto"):
-        problem, weighted_result = weighted_fit(problem, plan, jobs=jobs, quick=quick)
+        problem, begun = weighted_start(problem, quick=quick)
+        weighted_result = weighted_run(problem.posterior, plan, jobs=jobs, quick=quick, optima=begun)
     else:
         problem, optima = resolved_optima(problem, searched[1] if searched else optima_of(problem))
     if weighted_result is not None:
@@ -283,17 +284,9 @@ def whole(fit: Predictive) -> Fit:
     return _derived(problem, run, draws, weighed, width, judged=True)
 
 
-def weighted_fit(
-    problem: Problem, plan: SamplePlan, *, jobs: int = 1, quick: bool = False
-) -> tuple[Problem, tuple[Run, Draws] | None]:
-    """A plant with effects on blocks as narrow as its records need, and weighted draws of it with their run;
-    no draws where importance sampling does not hold."""
-    problem, optima = weighted_start(problem, quick=quick)
-    return problem, weighted_run(problem.posterior, plan, jobs=jobs, quick=quick, optima=optima)
-
-
 def weighted_start(problem: Problem, *, quick: bool) -> tuple[Problem, tuple[Optimum, ...]]:
-    """The plant of `weighted_fit` and the optima that its draws begin around."""
+    """A plant with effects on blocks as narrow as its records need, and the optima that weighted draws of it
+    begin around."""
     return resolved_optima(problem, optima_of(problem, starts=QUICK_STARTS if quick else STARTS))
 
 

@@ -86,7 +86,7 @@ def weighted_run(
         near, weighted, share = posterior, None, 0.0
         chosen = weighty(optima)
         if posterior.simulation is not None and _together(posterior, chosen):
-            near, weighted, share = _by_surrogate(posterior, chosen[0], rng, wanted, mapped)
+            near, weighted, share = _by_surrogate(posterior, chosen[0], rng, size, mapped)
         if weighted is None or not usable(weighted):
             tried = importance(posterior, optima, rng, wanted, mapped)
             if tried is None:
@@ -124,7 +124,7 @@ def _together(posterior: Posterior, optima: Sequence[Optimum]) -> bool:
 
 
 def _by_surrogate(
-    posterior: Posterior, optimum: Optimum, rng: np.random.Generator, plan: ImportancePlan, mapped: Mapped
+    posterior: Posterior, optimum: Optimum, rng: np.random.Generator, wanted: float, mapped: Mapped
 ) -> tuple[Posterior, Weighted | None, float]:
     """The posterior of a surrogate about an optimum; draws of it weighted by the posterior itself; and how
     efficient they can be called [-]. No draws where the surrogate does not hold.
@@ -137,7 +137,7 @@ def _by_surrogate(
         return posterior, None, 0.0
     near = replace(posterior, surrogate=surrogate)
     # rounds of it cost little beside walkers, who show what a poor proposal misses
-    enough = replace(_PLAN, wanted=_SURPLUS * plan.wanted, efficient=False)
+    enough = replace(_PLAN, wanted=_SURPLUS * wanted, efficient=False)
     about_optimum = importance(near, [optimum], rng, enough, mapped)
     if about_optimum is None or about_optimum.weighted.ess < _FEWEST:
         return posterior, None, 0.0
@@ -148,9 +148,9 @@ def _by_surrogate(
     held = effective(ratios - total) / ratios.size if np.isfinite(total) else 0.0
     if held < LEAST_EFFICIENCY:
         return posterior, None, 0.0
-    least = max(_SURPLUS * plan.wanted, _LEAST)
+    least = max(_SURPLUS * wanted, _LEAST)
     apart = 1.0 / held - 1.0  # variance of the weights over their mean squared: no mean moves by more sd
-    if apart <= 1.0 / plan.wanted and usable(first) and share >= LEAST_EFFICIENCY and first.ess >= least:
+    if apart <= 1.0 / wanted and usable(first) and share >= LEAST_EFFICIENCY and first.ess >= least:
         return near, first.shifted(total - np.log(ratios.size), np.sqrt(apart / ratios.size)), share
     count = int(least / held)
     drawn = first.batches(max(1, int(min(count, first.ess)) // BATCHES), rng).ravel()
