@@ -28,7 +28,7 @@ from lcopa_bayes.plot.theme import (
 _KINDS = ("time", "order", "delay", "gain")
 """Kinds of parameters that are shown first; of the rest, noise and offsets come last."""
 _LAST = ("offset", "sigma", "rho", "nu")
-IN_CORNER = 10
+IN_CORNER = 8
 """Most parameters on one corner plot."""
 _LABELS = 0.47
 """Distance of an axis label from its panel [in]."""

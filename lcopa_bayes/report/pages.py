@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -38,30 +39,38 @@ Draw: TypeAlias = Callable[[Path, Mapping[str, Any]], Drawings]
 """Gives the figures of a page from the run folder and the values of a result, under `verdict` the box at its
 top where it is another than that of the values, or None."""
 Part: TypeAlias = Callable[[RunData], Drawings]
-_PARTS: tuple[Part, ...] = (
-    draws.pairs,
-    draws.parameters,
-    records.drawn,
-    responses.drawn,
-    draws.sampling,
+_HALVES: tuple[tuple[Part, ...], ...] = (
+    (draws.pairs,),
+    (draws.parameters, records.drawn, responses.drawn, draws.sampling),
 )
-"""What draws the page of a fit."""
+"""What draws the page of a fit: the corner plot takes as long as all other figures."""
 
 
-def write_report(folder: Path, fresh: Fresh | None = None) -> Path:
+def write_report(folder: Path, fresh: Fresh | None = None, halves: Sequence[Drawings] = ()) -> Path:
     """Draw the report of a run folder: `figures/*.svg` and `report.html`, whose path is returned.
 
     Reads only the folder, and values and draws that are to be there where they are `fresh`, and calculates
-    nothing; the same folder gives the same bytes. InputError when a file of the folder is missing or cannot
-    be used.
+    nothing; the same folder gives the same bytes. The figures may be there as the `drawn_half` of both
+    halves. InputError when a file of the folder is missing or cannot be used.
     """
     run = load_run(folder, fresh)
     rules = inspect.cleandoc(defaultpriors.__doc__ or "")
 
     def drawn(*_: object) -> Drawings:
-        return {key: one for part in _PARTS for key, one in part(run).items()} | {"run": run, "rules": rules}
+        figures = halves or [_figures(run, parts) for parts in _HALVES]
+        return {**dict(ChainMap(*map(dict, figures))), "run": run, "rules": rules}
 
     return _written(folder, "fit", "", run.results, drawn)
+
+
+def drawn_half(folder: Path, fresh: Fresh | None, half: int) -> Drawings:
+    """One half of the figures of a fit, 0 or 1; arguments and errors as `write_report`."""
+    with look():
+        return _figures(load_run(folder, fresh), _HALVES[half])
+
+
+def _figures(run: RunData, parts: Sequence[Part]) -> Drawings:
+    return {key: one for part in parts for key, one in part(run).items()}
 
 
 _PAGES: Mapping[str, tuple[str, Draw]] = {

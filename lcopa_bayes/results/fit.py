@@ -29,7 +29,7 @@ from lcopa_bayes.results.nearby import surrogate_about
 from lcopa_bayes.results.prediction import Band, study_bands
 from lcopa_bayes.results.predictive import Predictive
 from lcopa_bayes.results.residuals import Residual, residuals
-from lcopa_bayes.results.result import PAGE, write_page
+from lcopa_bayes.results.result import PAGE, write_fit_page
 from lcopa_bayes.results.runfolder import add_origin, fingerprint, opened, provenance
 from lcopa_bayes.results.savedfit import NAME as SAVED
 from lcopa_bayes.results.savedfit import fit_to_json
@@ -138,11 +138,9 @@ class Fit(Predictive):
                 write_text(path / SAVED, f"{text}\n")
                 add_origin(path, self.verb, origin)
                 if page:
-                    fresh = (values, self.by_name)
-                    with meanwhile(write_page, (self.verb, path, fresh), lambda _: None, jobs=jobs):
-                        pass
-            if not (page or self.is_in(path)):
-                (path / PAGE).unlink(missing_ok=True)  # of another fit
+                    write_fit_page(path, (values, self.by_name), jobs=jobs)
+            if not page and (path / PAGE).is_file() and not self.is_in(path):
+                (path / PAGE).unlink()  # of another fit
             save_json(values, path / self.file)
         return path
 

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any, ClassVar, TypeAlias
 
 import pandas as pd
 
 from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.core.estimate import plain
-from lcopa_bayes.core.parallel import meanwhile
+from lcopa_bayes.core.parallel import workers
 from lcopa_bayes.results.runfolder import locked
 
 PAGE = "report.html"
@@ -59,10 +60,11 @@ class Result(ABC):
         folder = Path(folder)
         if not self.is_in(folder):
             self.save(folder)
-        written: list[Path] = []
-        with locked(folder), meanwhile(write_page, (self.verb, folder, None), written.append, jobs=jobs):
-            pass
-        return written[0]
+        with locked(folder):
+            if self.verb == "fit":
+                return write_fit_page(folder, None, jobs=jobs)
+            with workers(None, jobs=min(jobs, 2)) as crew:
+                return next(crew.map(write_page, [(self.verb, folder)]))
 
     def is_in(self, folder: Path) -> bool:
         """Whether a run folder holds this very result."""
@@ -87,17 +89,35 @@ Fresh: TypeAlias = tuple[Mapping[str, Any], Mapping[str, Matrix]]
 """Values of a fit and its draws by parameter, (ensembles, draws), as its run folder will hold them."""
 
 
-def write_page(wanted: tuple[str, Path, Fresh | None]) -> Path:
-    """Write the page of a verb's result into its run folder, that of a fit before its values and draws are
-    there where these are given; returns its path.
+def write_page(wanted: tuple[str, Path]) -> Path:
+    """Write the page of a verb's result into its run folder; returns its path.
 
     Pages read results, and results import no page: it is looked up when wanted, and where a process of its
     own writes it this one need not load what draws figures.
     """
-    verb, folder, fresh = wanted
-    pages = import_module("lcopa_bayes.report.pages")
-    page: Path = pages.write_report(folder, fresh) if fresh else pages.write_page_of(verb, folder)
+    page: Path = _pages().write_page_of(*wanted)
     return page
+
+
+def write_fit_page(folder: Path, fresh: Fresh | None, *, jobs: int) -> Path:
+    """Write the page of a fit into its run folder, also before its values and draws are there where these are
+    given, the halves of its figures at the same time where `jobs` allow it; returns its path."""
+    with workers((folder, fresh), jobs=min(jobs, 2)) as crew:
+        halves = list(crew.each(_drawn_half, (0, 1)))
+        return next(crew.each(_composed, [halves]))
+
+
+def _drawn_half(shared: tuple[Path, Fresh | None], half: int) -> Any:
+    return _pages().drawn_half(*shared, half)
+
+
+def _composed(shared: tuple[Path, Fresh | None], halves: Sequence[Any]) -> Path:
+    page: Path = _pages().write_report(*shared, halves)
+    return page
+
+
+def _pages() -> ModuleType:
+    return import_module("lcopa_bayes.report.pages")
 
 
 def notebook_table(table: pd.DataFrame) -> str:

@@ -229,8 +229,8 @@ class Seen:
         hardly draws from shows if ever a point lay there."""
         density = np.concatenate(self.log_densities)
         ratio = density - proposal.log_density(np.concatenate(self.points))
-        total = logsumexp(log_weights)
-        return float(np.exp(2 * total - np.log(sum(self.counts)) - logsumexp(log_weights + ratio)))
+        level = 2 * logsumexp(log_weights) - np.log(sum(self.counts)) - logsumexp(log_weights + ratio)
+        return float(np.exp(min(level, 0.0)))  # above 1 where it is narrow about the point of all the weight
 
 
 def fitted(core: Mixture, y: Matrix, log_weights: Vector) -> tuple[Mixture, Mixture]:

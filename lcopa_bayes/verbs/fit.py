@@ -57,7 +57,7 @@ def fit(
             seen = structure.look if structure else first_look(wanted)
             searched = seen.problem, seen.optima
             look_result(seen).save(place)
-            drawn = meanwhile(write_page, ("look", place, None), _announced, jobs=jobs)
+            drawn = meanwhile(write_page, ("look", place), _announced, jobs=jobs)
         with drawn:
             fitted = sampled(
                 wanted,

@@ -74,7 +74,7 @@ SOURCES = (
 
 def sources() -> tuple[Source, ...]:
     """The six, and those of measured records where there are any."""
-    place = Path(os.environ.get("LCOPA_BAYES_DATA", ROOT.parent / "shared" / "records"))
+    place = Path(os.environ.get("LCOPA_BAYES_DATA", ROOT.parent / "shared")) / "records"
     there = [Source(name, place / name) for name in MEASURED if (place / name / "study.toml").is_file()]
     return SOURCES + tuple(there)
 

@@ -28,6 +28,7 @@ from lcopa_bayes.plot.theme import extremes
 from lcopa_bayes.report import records, write_page, write_report
 from lcopa_bayes.report.formatting import NOT_REACHED, figures, interval, sentence, signed, stopped, to_spread
 from lcopa_bayes.report.pages import write_page_of
+from lcopa_bayes.results.result import write_fit_page
 from lcopa_bayes.report.svg import Drawing, inlined
 from lcopa_bayes.sampling.modes import Modes
 
@@ -326,6 +327,11 @@ def test_second_rendering_gives_the_same_bytes(folder, html, tmp_path):
     assert names == sorted(path.name for path in (again / "figures").iterdir())
     assert all((folder / "figures" / n).read_bytes() == (again / "figures" / n).read_bytes() for n in names)
     assert all(re.fullmatch(r"[\w-]+\.svg", name) for name in names)
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_page_drawn_in_halves_is_the_same(folder, html, jobs):
+    assert write_fit_page(folder, None, jobs=jobs).read_text(encoding="utf-8") == html
 
 
 def test_rendering_leaves_matplotlib_as_it_was(folder, html):

@@ -307,6 +307,9 @@ def test_a_proposal_is_as_efficient_as_draws_of_it_are(rng):
     # what it does not cover shows although no draw of it lies there
     elsewhere = normal(-3.0, 0.3)
     assert seen.efficiency(elsewhere, seen.log_weights()) < 0.01
+    # one that is narrow about the only point has more effective draws than draws by that estimate
+    one = Seen().joined(wide, 1, np.zeros((1, 2)), np.zeros(1))
+    assert one.efficiency(normal(0.0, 1e-300), one.log_weights()) == 1.0
 
 
 def test_a_blend_has_the_density_of_its_draws(rng):

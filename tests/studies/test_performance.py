@@ -277,8 +277,9 @@ def test_share_of_the_likelihood_in_sampling():
 def test_measured_records_are_added_where_there_are_any(tmp_path, monkeypatch):
     monkeypatch.setenv("LCOPA_BAYES_DATA", str(tmp_path))
     assert verbs.sources() == verbs.SOURCES
-    (tmp_path / verbs.MEASURED[0]).mkdir()
-    (tmp_path / verbs.MEASURED[0] / "study.toml").touch()
+    there = tmp_path / "records" / verbs.MEASURED[0]
+    there.mkdir(parents=True)
+    (there / "study.toml").touch()
     assert [each.name for each in verbs.sources()[len(verbs.SOURCES) :]] == [verbs.MEASURED[0]]
 
 
