@@ -45,8 +45,11 @@ _STARTS = 2
 _DRAWS, _FEWER = 400, 128
 """Draws behind the measurement after sampling, and with effects, whose responses on narrow blocks cost more
 than the sampling did; the error of the measurement says what they are worth."""
-_PORTION = 32
+_PORTION = 16
 """Draws that one process takes at once [-]."""
+_FIRST, _CLEAR = 32, 0.05
+"""Draws that are looked at first, and shift with twice its error below which these are enough [posterior
+sd]."""
 
 
 @final
@@ -202,20 +205,20 @@ def discretisation(problem: Problem, draws: Draws, *, jobs: int = 1) -> Discreti
     `jobs` processes."""
     finer, used = problem.refined(FACTORS[-1]).posterior, problem.posterior
     values = draws.thinned(_DRAWS if used.simulation is None else _FEWER)
-    parts = np.array_split(values, max(1, len(values) // _PORTION))
-    with workers(None, jobs=1 if used.simulation is None else jobs) as crew:
-        there, here = (
-            np.concatenate(list(crew.map(each.joint_log_likelihood, parts))) for each in (finer, used)
-        )
-    change = there - here
-    weights = np.exp(change - change.max())
-    weights /= weights.sum()
     rows = [k for k, row in enumerate(draws.table.rows) if row.free]
-    columns = values[:, rows]
-    sd = columns.std(axis=0)
-    scaled = (columns - columns.mean(axis=0)) / np.where(sd > 0, sd, np.inf)
-    shifts = weights @ scaled * _REST
-    errors = np.sqrt(np.mean(((weights * weights.size - 1.0)[:, None] * scaled) ** 2, axis=0) / weights.size)
+    first = np.arange(len(values)) % max(1, len(values) // _FIRST) == 0
+    values, change = np.concatenate([values[first], values[~first]]), np.empty(0)
+    with workers(None, jobs=1 if used.simulation is None else jobs) as crew:
+        for end in dict.fromkeys((int(first.sum()), len(values))):
+            portion = values[len(change) : end]
+            parts = np.array_split(portion, max(1, len(portion) // _PORTION))
+            there, here = (
+                np.concatenate(list(crew.map(each.joint_log_likelihood, parts))) for each in (finer, used)
+            )
+            change = np.append(change, there - here)
+            shifts, errors = _shifts(values[:end, rows], change)
+            if (np.abs(shifts) + 2 * errors).max() < _CLEAR:
+                break
     worst = int(np.abs(shifts).argmax())
     names = [draws.table.names[k] for k in rows]
     return Discretisation(
@@ -226,6 +229,17 @@ def discretisation(problem: Problem, draws: Draws, *, jobs: int = 1) -> Discreti
         blocks=_cells(problem),
         moved=tuple(names[k] for k in np.flatnonzero(~_negligible(shifts, errors))),
     )
+
+
+def _shifts(columns: Matrix, change: Vector) -> tuple[Vector, Vector]:
+    """Shifts of means of parameters and their standard errors, by draws (draws, parameters) and what narrower
+    blocks change of their log likelihoods (draws,) [nat]; both (parameters,) [posterior sd]."""
+    weights = np.exp(change - change.max())
+    weights /= weights.sum()
+    sd = columns.std(axis=0)
+    scaled = (columns - columns.mean(axis=0)) / np.where(sd > 0, sd, np.inf)
+    errors = np.sqrt(np.mean(((weights * weights.size - 1.0)[:, None] * scaled) ** 2, axis=0) / weights.size)
+    return weights @ scaled * _REST, errors
 
 
 def _negligible(shift: Vector | float, error: Vector | float) -> Flags:

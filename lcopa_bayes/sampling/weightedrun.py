@@ -136,8 +136,8 @@ def _by_surrogate(
     if surrogate is None:
         return posterior, None, 0.0
     near = replace(posterior, surrogate=surrogate)
-    # rounds of it cost little beside walkers, who show what a poor proposal misses
-    enough = replace(_PLAN, wanted=_SURPLUS * wanted, efficient=False)
+    # rounds of it cost little beside walkers, who show what a proposal misses that is not efficient
+    enough = replace(_PLAN, wanted=_SURPLUS * wanted)
     about_optimum = importance(near, [optimum], rng, enough, mapped)
     if about_optimum is None or about_optimum.weighted.ess < _FEWEST:
         return posterior, None, 0.0

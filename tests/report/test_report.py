@@ -28,8 +28,8 @@ from lcopa_bayes.plot.theme import extremes
 from lcopa_bayes.report import records, write_page, write_report
 from lcopa_bayes.report.formatting import NOT_REACHED, figures, interval, sentence, signed, stopped, to_spread
 from lcopa_bayes.report.pages import write_page_of
-from lcopa_bayes.results.result import write_fit_page
 from lcopa_bayes.report.svg import Drawing, inlined
+from lcopa_bayes.results.result import write_fit_page
 from lcopa_bayes.sampling.modes import Modes
 
 PARAMETERS = {

@@ -12,6 +12,7 @@ from lcopa_bayes.bench.command import step
 from lcopa_bayes.bench.device import Device
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.leastsquares import LeastSquares
+from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.results.discretisation import (
     LARGEST,
     Discretisation,
@@ -117,3 +118,23 @@ def test_a_shift_caps_the_grade():
         assert "delay" in limitation.reason
         assert "blocks" in limitation.remedy
     assert replace(small, shift=0.15, error=0.05).negligible  # not more than its error beyond
+
+
+@pytest.mark.parametrize(("sigma", "looked_at"), [(0.02, 34), (1e-5, 400)])
+def test_few_draws_are_looked_at_where_the_width_hardly_matters(rng, monkeypatch, sigma, looked_at):
+    problem = exact_problem(1.8, 1.07, sigma=sigma, blocks=2)
+    x, covariance, values = optimum(problem, truth_of(problem, 1.8, 1.07))
+    least, counts = LeastSquares(problem.posterior), []
+    drawn = np.array(
+        [least.values(each, values) for each in rng.multivariate_normal(x, covariance, size=400)]
+    )
+    actual = Posterior.joint_log_likelihood
+
+    def counted(self, values):
+        counts.append(len(values))
+        return actual(self, values)
+
+    monkeypatch.setattr(Posterior, "joint_log_likelihood", counted)
+    found = discretisation(problem, draws_of(problem.posterior.table, drawn))
+    assert sum(counts) == 2 * looked_at  # on narrow blocks and on those used
+    assert (abs(found.shift) + 2 * found.error < 0.05) == (looked_at < 400)
