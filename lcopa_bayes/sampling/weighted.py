@@ -278,11 +278,11 @@ def error_of(weights: Vector, values: Vector) -> float:
     """Standard error of the mean of values, (draws,), of independent draws with normalised weights.
 
     Its square is itself an average, which few draws may dominate: n of them know it to ``sqrt(2 / n)``, and
-    by twice that it is taken larger.
+    by that it is taken larger.
     """
     terms = weights**2 * (values - weights @ values) ** 2
     total = float(terms.sum())
-    return sqrt(total * (1 + 2 * sqrt(2 * float(terms @ terms)) / total)) if total > 0 else 0.0
+    return sqrt(total * (1 + sqrt(2 * float(terms @ terms)) / total)) if total > 0 else 0.0
 
 
 def _worth(values: Vector, weights: Vector) -> float:
