@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -58,7 +57,7 @@ def write_report(folder: Path, fresh: Fresh | None = None, halves: Sequence[Draw
 
     def drawn(*_: object) -> Drawings:
         figures = halves or [_figures(run, parts) for parts in _HALVES]
-        return {**dict(ChainMap(*map(dict, figures))), "run": run, "rules": rules}
+        return {key: one for half in figures for key, one in half.items()} | {"run": run, "rules": rules}
 
     return _written(folder, "fit", "", run.results, drawn)
 
