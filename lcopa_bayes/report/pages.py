@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -52,7 +53,8 @@ def write_report(folder: Path, fresh: Fresh | None = None, halves: Sequence[Draw
     nothing; the same folder gives the same bytes. The figures may be there as the `drawn_half` of both
     halves. InputError when a file of the folder is missing or cannot be used.
     """
-    run = load_run(folder, fresh)
+    with _complete(folder / "results.json", "fit"):
+        run = load_run(folder, fresh)
     rules = inspect.cleandoc(defaultpriors.__doc__ or "")
 
     def drawn(*_: object) -> Drawings:
@@ -64,7 +66,7 @@ def write_report(folder: Path, fresh: Fresh | None = None, halves: Sequence[Draw
 
 def drawn_half(folder: Path, fresh: Fresh | None, half: int) -> Drawings:
     """One half of the figures of a fit, 0 or 1; arguments and errors as `write_report`."""
-    with look():
+    with _complete(folder / "results.json", "fit"), look():
         return _figures(load_run(folder, fresh), _HALVES[half])
 
 
@@ -114,7 +116,7 @@ def _plant(folder: Path) -> Sequence[str]:
 def _written(folder: Path, verb: str, title: str, values: Mapping[str, Any], draw: Draw) -> Path:
     """Write a page by the template of its verb, with the verdict that is drawn, else that of the values."""
     name, file = ("report.html", "results.json") if verb in _REPORTS else (f"{verb}.html", f"{verb}.json")
-    try:
+    with _complete(folder / file, verb):
         with look():
             shown = draw(folder, values)
         verdict = shown["verdict"] if "verdict" in shown else Verdict.of(values)
@@ -123,5 +125,12 @@ def _written(folder: Path, verb: str, title: str, values: Mapping[str, Any], dra
         return write_page(
             folder, f"{verb}.html", titled, values, shown, verdict=verdict, overview=overview, name=name
         )
+
+
+@contextmanager
+def _complete(file: Path, verb: str) -> Iterator[None]:
+    """Within it what a file of a verb's values lacks is an InputError that names it."""
+    try:
+        yield
     except (KeyError, UndefinedError) as error:
-        raise InputError(f"{folder / file}: lacks {error}; run `{verb}` again") from error
+        raise InputError(f"{file}: lacks {error}; run `{verb}` again") from error

@@ -17,7 +17,7 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.results.frequency import FrequencyResponse, frequency_response
 from lcopa_bayes.results.newdrive import Level, Prediction, predict
-from lcopa_bayes.results.result import Result
+from lcopa_bayes.results.result import Result, write_fit_page
 from lcopa_bayes.results.steps import path_metrics
 from lcopa_bayes.sampling.draws import Draws
 
@@ -52,6 +52,9 @@ class Predictive(Result):
                 for one in self.draws.estimates()
             ]
         )
+
+    def _write_page(self, folder: Path, jobs: int) -> Path:
+        return write_fit_page(folder, None, jobs=jobs)
 
     @abstractmethod
     def to_datatree(self) -> DataTree:

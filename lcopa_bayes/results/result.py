@@ -61,10 +61,11 @@ class Result(ABC):
         if not self.is_in(folder):
             self.save(folder)
         with locked(folder):
-            if self.verb == "fit":
-                return write_fit_page(folder, None, jobs=jobs)
-            with workers(None, jobs=min(jobs, 2)) as crew:
-                return next(crew.map(write_page, [(self.verb, folder)]))
+            return self._write_page(folder, jobs)
+
+    def _write_page(self, folder: Path, jobs: int) -> Path:
+        with workers(None, jobs=min(jobs, 2)) as crew:
+            return next(crew.map(write_page, [(self.verb, folder)]))
 
     def is_in(self, folder: Path) -> bool:
         """Whether a run folder holds this very result."""

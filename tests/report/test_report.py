@@ -4,6 +4,7 @@ import inspect
 import json
 import re
 from dataclasses import replace
+from functools import partial
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
@@ -332,6 +333,17 @@ def test_second_rendering_gives_the_same_bytes(folder, html, tmp_path):
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_page_drawn_in_halves_is_the_same(folder, html, jobs):
     assert write_fit_page(folder, None, jobs=jobs).read_text(encoding="utf-8") == html
+
+
+@pytest.mark.parametrize("lacking", ["parameters", "sampler"])
+@pytest.mark.parametrize("write", [write_report, partial(write_fit_page, fresh=None, jobs=2)])
+def test_what_the_figures_lack_of_an_older_run_is_named(tmp_path, write, lacking):
+    folder = run_folder(tmp_path / "run")
+    values = json.loads((folder / "results.json").read_text(encoding="utf-8"))
+    del values[lacking]
+    (folder / "results.json").write_text(json.dumps(values), encoding="utf-8")
+    with pytest.raises(InputError, match=rf"results\.json: lacks '{lacking}'; run `fit` again"):
+        write(folder)
 
 
 def test_rendering_leaves_matplotlib_as_it_was(folder, html):
