@@ -148,6 +148,11 @@ class Base(NamedTuple):
     """What was changed; empty when nothing was."""
 
 
+def structure_chosen(study: Study, *, as_stated: bool) -> bool:
+    """Whether the search chooses the number of terms of a study, and what its paths share."""
+    return not as_stated and study.model.terms == 1 and study.model.orders == "free"
+
+
 def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: bool, draws: int) -> Base:
     """The base fit; with one free viscous term stated and not `as_stated`, of the number the evidence asks
     for and its paths with elements and delays of their own where it asks for these.
@@ -158,7 +163,7 @@ def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: boo
     moves before its drive does and no drive before the first row explains that.
     """
     refuse_if(unmet_apart_from_rest(study))
-    alone = not as_stated and study.model.terms == 1 and study.model.orders == "free"
+    alone = structure_chosen(study, as_stated=as_stated)
     base = _based(study)
     separate = _apart(study, base) if alone else (base, study)
     # paths that share too much look like a plant that did not rest

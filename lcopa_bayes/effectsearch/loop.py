@@ -12,14 +12,14 @@ from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.errors import InputError
-from lcopa_bayes.core.estimate import HALF_WIDTH
 from lcopa_bayes.data.agreement import Disagreement, disagreements
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.basefit import BaseFit, settled, too_smooth
-from lcopa_bayes.effectsearch.basemodel import fitted_base
+from lcopa_bayes.effectsearch.basemodel import fitted_base, structure_chosen
 from lcopa_bayes.effectsearch.explained import coordinates_of, declarable, explained_draws, explained_study
 from lcopa_bayes.effectsearch.heldouteffects import missed, unseen_share
+from lcopa_bayes.effectsearch.lags import figures_with_lags, lags_of, linear_dynamics, number_with_lags
 from lcopa_bayes.effectsearch.openeffects import (
     Alternative,
     Weighed,
@@ -56,6 +56,7 @@ from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.noise import Noise
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.effect import Effect
+from lcopa_bayes.results.alternatives import Alternative as SumOfLags
 from lcopa_bayes.sampling.convergence import Grade
 from lcopa_bayes.sampling.draws import Draws
 
@@ -110,6 +111,8 @@ class Loop:
     """Records that disagree."""
     open: tuple[Alternative, ...] = ()
     """Effects that the records leave open beside, or in place of, those of the final model."""
+    lags: tuple[SumOfLags, ...] = ()
+    """Sums of lags beside the plant of the final model, where the search chose its structure."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -135,14 +138,12 @@ class Loop:
         """A coordinate of the final model over the effects that are open, with unit, 90 % interval and grade,
         its standard deviations by noise and by structure, and lower end, median and upper end under the final
         model `alone`."""
-        state, here = self.after.state, self.number(k)
-        if self.draws is not None:
-            own = next(one for one in self.draws.estimates() if one.name == here.name)
-            alone = own.lower, own.value, own.upper
-            return here.as_json(ess=own.ess, grade=own.grade, interval=own.interval) | {"alone": alone}
-        row, sd = state.model.posterior.table.rows[state.model.columns[k]], np.sqrt(state.covariance[k, k])
-        ends = row.value_at(state.optimum.x[k] + sd * HALF_WIDTH * np.array([-1.0, 0.0, 1.0]))
-        return here.as_json(ess=np.nan, grade="tentative", interval="Laplace") | {"alone": ends.tolist()}
+        here = self.number(k)
+        if self.draws is None:
+            return here.as_json(ess=np.nan, grade="tentative", interval="Laplace")
+        own = next(one for one in self.draws.estimates() if one.name == here.name)
+        alone = own.lower, own.value, own.upper
+        return here.as_json(ess=own.ess, grade=own.grade, interval=own.interval) | {"alone": alone}
 
     def number(self, k: int) -> Weighed:
         """A coordinate [`unit`] over the final model and each that is open to it and has it."""
@@ -151,13 +152,16 @@ class Loop:
         pairs = zip(*self._mixture, strict=True)
         own = [(row.value_at(part[:, k]), weight) for part, weight in pairs if k < part.shape[1]]
         shares = np.array([weight for _, weight in own])
-        return Weighed(row.name, row.unit, [values for values, _ in own], shares / shares.sum())
+        number = Weighed(row.name, row.unit, [values for values, _ in own], shares / shares.sum())
+        return number_with_lags(number, row, self.lags, state.model.plant.table.layout)
 
     @cached_property
     def figures(self) -> tuple[Weighed, ...]:
         """Figures of the plant's response to a unit step over the longest record, its effects aside, over the
         same models."""
-        return self.figures_of(self.after.state, *self._mixture)
+        own, layout = (self.figures_of(self.after.state, *self._mixture), self.problem.posterior.table.layout)
+        span, unit = self.problem.scales.span, self.problem.study.time_unit
+        return figures_with_lags(own, self.lags, layout, span=span, time_unit=unit)
 
     def figures_of(self, state: State, parts: Sequence[Matrix], weights: Vector) -> tuple[Weighed, ...]:
         """The same of any `mixture`."""
@@ -224,6 +228,7 @@ def _looped(
     study: Study, kinds: Sequence[type[Effect]], *, jobs: int, sample: bool, quick: bool, as_stated: bool
 ) -> Loop:
     draws = 1000 if quick else 2000
+    chosen = structure_chosen(study, as_stated=as_stated)
     problem, base, start, enlarged = fitted_base(study, kinds, as_stated=as_stated, draws=draws)
     outliers = outlying(study, base)
     if outliers is not None:
@@ -257,9 +262,14 @@ def _looped(
         )
     reached = _side(problem, searched.state)
     enough = ALONE if alone else EXPLAINED
-    verdict = decide(
-        _findings(study, searched, before, reached, outliers=outliers, cautions=cautions, enough=enough)
+    lags = lags_of(searched.state, problem) if chosen else ()
+    findings = _findings(
+        study, searched, before, reached, outliers=outliers, cautions=cautions, enough=enough
     )
+    findings = replace(findings, lags=linear_dynamics(searched.state, lags))
+    verdict = decide(findings)
+    if verdict.kind == "unexplained":
+        lags = lags_of(before.state, problem) if findings.lags else ()
     if outliers is not None:
         verdict = beside(verdict, outliers.sentence)
     named = verdict.kind in ("explained", "partly explained", "disturbance")
@@ -304,6 +314,7 @@ def _looped(
         outliers,
         contrary,
         alternatives(searched.state, searched.rounds) if verdict.kind != "unexplained" else (),
+        lags,
     )
 
 

@@ -135,6 +135,8 @@ class Findings:
     differ from record to record."""
     nothing: float = 1.0
     """Probability that nothing more is missing, by the last residual [-]."""
+    lags: str = ""
+    """In words, that sums of lags are all that is missing; empty where they are not."""
 
 
 def decide(given: Findings) -> Verdict:
@@ -173,6 +175,11 @@ def decide(given: Findings) -> Verdict:
 
 def _refused(given: Findings) -> str:
     """Why nothing is named though something is missing; empty where something is."""
+    if given.lags:
+        return (
+            f"Unmodelled linear dynamics are missing: {given.lags} as any effect, and leave no more than the "
+            "noise. No name is forced; figures of the step responses are over the sums of lags."
+        )
     if given.dynamics and not given.effects:
         return (
             f"Unmodelled linear dynamics are missing (worth {given.gained:.0f} nat): a further lag, a zero, "

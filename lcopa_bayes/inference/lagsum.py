@@ -257,13 +257,16 @@ def _cubic(at: Array) -> tuple[Array, ...]:
     return -a * b * c / 6, at * b * c / 2, -at * a * c / 2, at * a * b / 6
 
 
-def lag_problem(study: Study) -> Problem:
-    """The records of a study prepared for lags: one with a delay of its own for every path, offsets and noise
-    as in the study; InputError as `problem_of`."""
+def lag_problem(study: Study, fitted: Posterior | None = None) -> Problem:
+    """The records of a study prepared for lags: one with a delay of its own for every path, offsets as in the
+    study, samples and noise as in a `fitted` posterior of it, by default the study's; InputError as
+    `problem_of`."""
     model = replace(study.model, terms=1, orders=(1.0,), share="none", delay="path")
     priors = {name: prior for name, prior in study.priors.items() if name.startswith("offset")}
     problem = problem_of(replace(study, model=model, priors=priors))
-    return replace(problem, posterior=thinned(problem.posterior))
+    own = fitted or problem.posterior
+    posterior = replace(problem.posterior, samples=own.samples, noise=own.noise)
+    return replace(problem, posterior=thinned(posterior))
 
 
 def thinned(posterior: Posterior) -> Posterior:

@@ -23,7 +23,10 @@ from lcopa_bayes.core.estimate import HALF_WIDTH, LEVEL, Estimate, plain, quanti
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.lagsum import lag_problem, thinned
 from lcopa_bayes.inference.noise import GaussianNoise
-from lcopa_bayes.model.layout import PathSlot
+from lcopa_bayes.inference.observations import Samples
+from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.model.layout import Layout, PathSlot
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.steps import Metric, StepCurves, figures_of, metrics_of
 from lcopa_bayes.results.summary import listed
@@ -56,6 +59,8 @@ class Alternative:
     search: LagSearch
     advantage: float
     """Akaike's criterion of the fitted plant less that of the lags [-]."""
+    square: float
+    """Whitened residual of the fitted plant, squared [-]."""
     seed: int
     """Of the draws."""
 
@@ -134,19 +139,7 @@ class Alternatives:
     @property
     def sentence(self) -> str:
         """Which plants the records leave in question."""
-        figures = "figures of the step responses are"
-        said = {
-            "both": f"follow the records as well as the fitted plant does: {figures} over both",
-            "lags": f"follow the records better than the fitted plant: {figures} theirs",
-            "plant": "do not follow the records as well as the fitted plant does",
-        }
-        return " ".join(
-            f"Sums of {one.search.best.lags} to {one.search.lags} lags"
-            f"{f' for {listed([path.name for path in one.paths])}' if len(self.alternatives) > 1 else ''} "
-            f"{said[one.support]} (AIC {'lower' if one.advantage > 0 else 'higher'} by "
-            f"{abs(one.advantage):.1f})."
-            for one in self.alternatives
-        )
+        return sentence_of(self.alternatives)
 
     def limitations(self, names: Mapping[str, tuple[str, ...]]) -> list[Limitation]:
         """What this says of the parameters of the fitted plant, by the figure each of them is: `names` has
@@ -190,18 +183,72 @@ class Alternatives:
         )
 
 
+@final
+@dataclass(frozen=True, eq=False)
+class FittedPlant:
+    """A plant at its optimum, which sums of lags are held against."""
+
+    problem: Problem
+    """Its posterior has no effects, and Gaussian noise."""
+    values: Vector
+    """Table values, (rows,)."""
+    noise: tuple[Vector, ...]
+    """Parameters of the noise of each response axis."""
+    curves: StepCurves
+    seed: int
+    """Of draws of its rivals."""
+    more: tuple[int, ...] = ()
+    """Free parameters of each response axis beside those of the plant; by default none [-]."""
+    samples: tuple[Samples, ...] | None = None
+    """Those that its rivals follow, where they are not what the plant follows."""
+
+    @property
+    def posterior(self) -> Posterior:
+        """Of its problem."""
+        return self.problem.posterior
+
+
 def alternatives_of(fitted: Fit) -> tuple[Alternative, ...]:
-    """Sums of lags beside a fit, one for each response axis that has any; none where its noise is not normal,
-    its plant has effects, no drive moves or the records do not determine them."""
-    posterior = fitted.problem.posterior
+    """Sums of lags beside a fit; none where its noise is not normal, its plant has effects, or `lags_beside`
+    has none."""
+    posterior, draws = fitted.problem.posterior, fitted.draws
     if posterior.simulation is not None or not isinstance(posterior.noise, GaussianNoise):
         return ()
+    best = draws.flat[[int(draws.log_density.argmax())]]
+    best = posterior.complete(posterior.coordinates(best), None)
+    axes = range(len(posterior.table.layout.responses))
+    noise = tuple(posterior.noise_parameters(best, axis)[0] for axis in axes)
+    seed = fitted.run.plan.seed
+    return lags_beside(FittedPlant(fitted.problem, best[0], noise, fitted.curves, seed))
+
+
+def lags_beside(plant: FittedPlant) -> tuple[Alternative, ...]:
+    """Sums of lags beside a fitted plant, one for each response axis that has any; none where no drive moves
+    or the records do not determine them."""
     try:
-        problem = lag_problem(fitted.study)
+        own = plant.posterior
+        followed = own if plant.samples is None else replace(own, samples=plant.samples)
+        problem = lag_problem(plant.problem.study, followed)
     except InputError:
         return ()
-    open_paths = [_open(fitted, axis) for axis in range(len(posterior.table.layout.responses))]
-    return tuple(_alternative(fitted, problem, axis, paths) for axis, paths in enumerate(open_paths) if paths)
+    open_paths = [_open(plant.posterior, axis) for axis in range(len(plant.noise))]
+    return tuple(_alternative(plant, problem, axis, paths) for axis, paths in enumerate(open_paths) if paths)
+
+
+def sentence_of(found: Sequence[Alternative]) -> str:
+    """Which plants the records leave in question."""
+    figures = "figures of the step responses are"
+    said = {
+        "both": f"follow the records as well as the fitted plant does: {figures} over both",
+        "lags": f"follow the records better than the fitted plant: {figures} theirs",
+        "plant": "do not follow the records as well as the fitted plant does",
+    }
+    return " ".join(
+        f"Sums of {one.search.best.lags} to {one.search.lags} lags"
+        f"{f' for {listed([path.name for path in one.paths])}' if len(found) > 1 else ''} "
+        f"{said[one.support]} (AIC {'lower' if one.advantage > 0 else 'higher'} by {abs(one.advantage):.1f})."
+        for one in found
+    )
 
 
 def with_alternatives(fitted: Fit) -> Fit:
@@ -240,10 +287,9 @@ def parts_of_sd(values: Sequence[Vector], weights: Vector) -> tuple[float, float
     return float(np.sqrt(within)), float(np.sqrt(between))
 
 
-def _open(fitted: Fit, axis: int) -> tuple[PathSlot, ...]:
+def _open(posterior: Posterior, axis: int) -> tuple[PathSlot, ...]:
     """Paths to a response axis whose drive moves while it is sampled and whose gain is free; none where
     another gain is known and not zero."""
-    posterior = fitted.problem.posterior
     table, out = posterior.table, []
     for one in table.layout.paths:
         if one.response != axis:
@@ -260,26 +306,24 @@ def _open(fitted: Fit, axis: int) -> tuple[PathSlot, ...]:
     return tuple(out)
 
 
-def _alternative(fitted: Fit, problem: Problem, axis: int, paths: tuple[PathSlot, ...]) -> Alternative:
-    posterior, draws = thinned(fitted.problem.posterior), fitted.draws
-    best = draws.flat[[int(draws.log_density.argmax())]]
-    best = posterior.complete(posterior.coordinates(best), None)
-    noise = posterior.noise_parameters(best, axis)
-    units, square = posterior.responses(best), 0.0
+def _alternative(plant: FittedPlant, problem: Problem, axis: int, paths: tuple[PathSlot, ...]) -> Alternative:
+    posterior, noise = thinned(plant.posterior), plant.noise[axis]
+    assert isinstance(posterior.noise, GaussianNoise)
+    units, square = posterior.responses(plant.values[None]), 0.0
     for r, samples in enumerate(posterior.samples):
         observed = samples.axes[axis]
-        residual = posterior.residual(axis, r, observed, best, units[r])
-        square += float((posterior.noise.standard(residual, noise, observed.gaps) ** 2).sum())
-    ends = np.array([_ends(fitted, one) for one in paths])
-    seed = fitted.run.plan.seed * 1_000 + 10 * _STREAM + axis
-    search = LagSearch.over(problem, axis, [one.drive for one in paths], noise[0], ends)
-    advantage = square + 2 * _parameters(fitted, paths) - search.best.square - 2 * search.best.parameters
-    return Alternative(paths, search, advantage, seed)
+        residual = posterior.residual(axis, r, observed, plant.values[None], units[r])
+        square += float((posterior.noise.standard(residual, noise[None], observed.gaps) ** 2).sum())
+    ends = np.array([_ends(plant, one) for one in paths])
+    seed = plant.seed * 1_000 + 10 * _STREAM + axis
+    search = LagSearch.over(problem, axis, [one.drive for one in paths], noise, ends)
+    parameters = _parameters(posterior.table, paths) + (plant.more[axis] if plant.more else 0)
+    advantage = square + 2 * parameters - search.best.square - 2 * search.best.parameters
+    return Alternative(paths, search, advantage, square, seed)
 
 
-def _parameters(fitted: Fit, paths: Sequence[PathSlot]) -> int:
-    """Free parameters of the fitted plant that the paths use [-]."""
-    table = fitted.draws.table
+def _parameters(table: ParameterTable, paths: Sequence[PathSlot]) -> int:
+    """Free parameters of a plant that the paths use [-]."""
     used: set[int] = set()
     for one in paths:
         used.add(table.at("gain", one.response, one.drive))
@@ -288,43 +332,48 @@ def _parameters(fitted: Fit, paths: Sequence[PathSlot]) -> int:
     return sum(table.rows[k].free for k in used)
 
 
-def _ends(fitted: Fit, path: PathSlot) -> tuple[float, float]:
+def _ends(plant: FittedPlant, path: PathSlot) -> tuple[float, float]:
     """Ends of the delays that are looked at: those of the prior, not after the response has visibly begun."""
-    curves, table = fitted.curves, fitted.draws.table
+    curves, table, period = plant.curves, plant.posterior.table, plant.problem.scales.period
     row = table.rows[table.at("delay", table.layout.delay_of[path.response][path.drive])]
     if not row.free:
-        return row.value, row.value + 1e-6 * fitted.problem.scales.period
+        return row.value, row.value + 1e-6 * period
     low, high = (max(float(end), 0.0) for end in row.domain)
     curve = np.median(curves.normalised[curves.curve_of[path.response][path.drive]], axis=0)
     begun = float(curves.time[(curve >= _RISEN * curve[-1]).argmax()])
-    period = fitted.problem.scales.period
     return low, max(min(high, max(begun, low + 2 * period)), low + 1e-6 * period)
+
+
+def weights_of(layout: Layout, found: Sequence[Alternative]) -> dict[str, float]:
+    """Of the sums of lags beside a plant, by path [-]; 0 where a path has none, or the records do not support
+    them."""
+    weights = {"plant": 0.0, "both": 0.5, "lags": 1.0}
+    none = dict.fromkeys((one.name for one in layout.paths), 0.0)
+    return none | {path.name: weights[one.support] for one in found for path in one.paths}
 
 
 def _numbers(fitted: Fit, found: Sequence[Alternative]) -> list[Averaged]:
     """Every figure of the step responses that sums of lags have a part in, over both plants."""
-    weights = {"plant": 0.0, "both": 0.5, "lags": 1.0}
-    table = fitted.draws.table
-    weight_of = dict.fromkeys((one.name for one in table.layout.paths), 0.0)
-    weight_of |= {path.name: weights[one.support] for one in found for path in one.paths}
-    found = [one for one in found if weights[one.support] > 0]
+    table, unit = fitted.draws.table, fitted.study.time_unit
+    weight_of = weights_of(table.layout, found)
+    found = [one for one in found if one.support != "plant"]
     if not found:
         return []
-    own = metrics_of(table, fitted.curves, time_unit=fitted.study.time_unit)
-    other = {one.name: one for one in _figures(fitted, found)}
+    own = metrics_of(table, fitted.curves, time_unit=unit)
+    other = {one.name: one for one in lag_figures(found, fitted.curves.time, unit)}
     ess = min(fitted.draws.ess, *(one.draws.ess for one in found))
     grade = fitted.draws.grade.level if ess >= TENTATIVE_ESS else "tentative"
     out = []
     for one in own:
         if one.name not in other:
             continue
-        weight = _weight(one.name, weight_of)
+        weight = weight_in(one.name, weight_of)
         if weight > 0:
             out.append(_averaged(one, other[one.name], weight, ess, grade))
     return out
 
 
-def _weight(name: str, weight_of: Mapping[str, float]) -> float:
+def weight_in(name: str, weight_of: Mapping[str, float]) -> float:
     """Of the sums of lags in a figure: that of its path, of a crosstalk the least of the paths involved."""
     path = name.partition("[")[2].removesuffix("]")
     return weight_of[path] if path in weight_of else min(weight_of.values())
@@ -345,9 +394,10 @@ def _averaged(plant: Metric, lags: Metric, weight: float, ess: float, grade: str
     return Averaged(here, plant.values, lags.values, weight)
 
 
-def _figures(fitted: Fit, found: Sequence[Alternative]) -> list[Metric]:
-    """Figures of the step responses of sums of lags; of paths without any nothing."""
-    layout, time = found[0].search.problem.posterior.table.layout, fitted.curves.time
+def lag_figures(found: Sequence[Alternative], time: Vector, time_unit: str) -> list[Metric]:
+    """Figures of the responses of sums of lags to a unit step, at times from 0 on [`time_unit`]; of paths
+    without any nothing."""
+    layout = found[0].search.problem.posterior.table.layout
     count = min(len(one.draws.delays) for one in found)
     shape = (len(layout.responses), len(layout.drives))
     gains, delays = np.zeros((count, *shape)), np.zeros((count, len(layout.delays)))
@@ -368,7 +418,7 @@ def _figures(fitted: Fit, found: Sequence[Alternative]) -> list[Metric]:
     curve_of = tuple(tuple(i * shape[1] + j for j in range(shape[1])) for i in range(shape[0]))
     curves = StepCurves(time, normalised(time), gains, delays, curve_of, np.empty((count, 0)))
     without = [one.name for one in layout.paths if (one.response, one.drive) not in own]
-    figures = figures_of(layout, curves, normalised, time_unit=fitted.study.time_unit)
+    figures = figures_of(layout, curves, normalised, time_unit=time_unit)
     return [one for one in figures if not any(f"[{name}]" in one.name for name in without)]
 
 

@@ -73,9 +73,14 @@ def step_curves(draws: Draws, span: float) -> StepCurves:
     return curves_of(draws.table, draws.thinned(count), span)
 
 
+def step_times(span: float) -> Vector:
+    """Times of a step response over `span` [time unit], (n,)."""
+    return span * np.arange(1, _POINTS + 1) / _POINTS
+
+
 def curves_of(table: ParameterTable, values: Matrix, span: float) -> StepCurves:
     """`step_curves` at table values (draws, rows)."""
-    time = span * np.arange(1, _POINTS + 1) / _POINTS
+    time = step_times(span)
     if table.effects is not None:
         return _with_effects(table, values, time)
     units, delays = _unit_steps(table, values, time), table.dynamics(values).delays

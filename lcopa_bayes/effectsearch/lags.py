@@ -1,0 +1,149 @@
+"""Sums of lags beside the plant that a loop ends with, and their part in its numbers.
+
+A search chooses the number of terms of a family; steady values and delays depend on that family where the
+records do not show them (`results.alternatives`). What nonlinear effects add at the optimum is taken off the
+records first. What is linear and does not change with time may be part of the plant as well as an effect:
+sums of lags stand for both, and a linear effect is named only where they have no support.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.effectsearch.openeffects import Weighed
+from lcopa_bayes.effectsearch.refits import places, without
+from lcopa_bayes.effectsearch.scores import State
+from lcopa_bayes.effectsearch.verdict import REACHED
+from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.noise import WhiteAR1
+from lcopa_bayes.inference.observations import Samples
+from lcopa_bayes.inference.parameter import Parameter
+from lcopa_bayes.model.effects.effect import Effect
+from lcopa_bayes.model.layout import Layout, PathSlot
+from lcopa_bayes.results.alternatives import (
+    Alternative,
+    FittedPlant,
+    lag_figures,
+    lags_beside,
+    weight_in,
+    weights_of,
+)
+from lcopa_bayes.results.steps import curves_of, step_times
+from lcopa_bayes.results.summary import listed
+
+
+def lags_of(state: State, problem: Problem) -> tuple[Alternative, ...]:
+    """Sums of lags beside the plant of a final model and its linear effects, one for each response axis that
+    has any."""
+    model = state.model
+    linear = [effect.name for effect in model.effects if _linear(effect)]
+    others = [effect.name for effect in model.effects if not _linear(effect)]
+    plant = replace(model.plant, samples=_without(state, [*linear, *others]), noise=WhiteAR1())
+    values = model.values(state.optimum.x)[: len(plant.table.rows)]
+    more, acting = sum(len(places(model, name)) for name in linear), _acting(state, linear)
+    return lags_beside(
+        FittedPlant(
+            replace(problem, posterior=plant),
+            values,
+            state.whitening.held,
+            curves_of(plant.table, values[None], problem.scales.span),
+            problem.study.seed,
+            tuple(more * (axis in acting) for axis in range(len(state.whitening.noise))),
+            _without(state, others),
+        )
+    )
+
+
+def linear_dynamics(state: State, found: Sequence[Alternative]) -> str:
+    """In words, that sums of lags are all that the records ask for; empty where they are not.
+
+    They are where no effect of a final model is nonlinear, they have support on every response axis on which
+    a linear one acts, or without any on one at least, and leave, or the plant where that is better, no more
+    than the noise.
+    """
+    effects = state.model.effects
+    supported = [one for one in found if one.support != "plant"]
+    if not supported or not all(_linear(effect) for effect in effects):
+        return ""
+    left = max(min(one.square, one.search.best.square) / one.search.best.size for one in found)
+    acting = _acting(state, [effect.name for effect in effects])
+    if left > REACHED**2 or not acting <= {one.search.axis for one in supported}:
+        return ""
+    best, names = supported[0].search.best.lags, state.model.plant.table.layout.responses
+    return f"sums of {best} lags follow {listed([names[one.search.axis].name for one in supported])} as well"
+
+
+def _linear(effect: Effect) -> bool:
+    """Whether an effect is linear and does not change with time, or such dynamics without a name."""
+    return effect.card.linear or effect.card.dynamics
+
+
+def _acting(state: State, names: Sequence[str]) -> set[int]:
+    """Response axes on which effects act."""
+    added = _added(state, names)
+    return {part.axis for part in state.whitening.parts if added[part.rows].any()}
+
+
+def _added(state: State, names: Sequence[str]) -> Vector:
+    """What effects add at the optimum, stacked [response unit]."""
+    model, x = state.model, state.optimum.x
+    bare, own = without(model, x, names)
+    return model.predict(x) - bare.predict(own) if names else np.zeros(state.whitening.size)
+
+
+def _without(state: State, names: Sequence[str]) -> tuple[Samples, ...]:
+    """Samples less what effects add at the optimum."""
+    added, out = _added(state, names), [list(samples.axes) for samples in state.whitening.samples]
+    for part in state.whitening.parts:
+        observed = part.observed
+        out[part.record][part.axis] = replace(observed, values=observed.values - added[part.rows])
+    pairs = zip(state.whitening.samples, out, strict=True)
+    return tuple(replace(samples, axes=tuple(axes)) for samples, axes in pairs)
+
+
+def figures_with_lags(
+    figures: Sequence[Weighed], found: Sequence[Alternative], layout: Layout, *, span: float, time_unit: str
+) -> tuple[Weighed, ...]:
+    """Figures of the response to a unit step over `span` [time unit], over the sums of lags too."""
+    supported = [one for one in found if one.support != "plant"]
+    if not supported:
+        return tuple(figures)
+    weights, time = weights_of(layout, found), step_times(span)
+    lags = {one.name: one.values for one in lag_figures(supported, time, time_unit)}
+    return tuple(
+        _joined(one, [lags[one.name]], weight_in(one.name, weights)) if one.name in lags else one
+        for one in figures
+    )
+
+
+def number_with_lags(
+    number: Weighed, row: Parameter, found: Sequence[Alternative], layout: Layout
+) -> Weighed:
+    """A gain or delay of the plant over the sums of lags too, of paths with one delay over that of each;
+    other parameters are those of the plant alone."""
+    own = [one for one in layout.paths if _uses(row, one, layout)]
+    shares = weights_of(layout, found)
+    values = [
+        (one.draws.gains if row.kind == "gain" else one.draws.delays)[:, p]
+        for one in found
+        if one.support != "plant"
+        for p, path in enumerate(one.paths)
+        if path in own
+    ]
+    return _joined(number, values, float(np.mean([shares[one.name] for one in own]))) if values else number
+
+
+def _uses(row: Parameter, path: PathSlot, layout: Layout) -> bool:
+    """Whether a parameter is the gain or the delay of a path."""
+    if row.kind == "delay":
+        return layout.delay_of[path.response][path.drive] == row.place.first
+    return row.kind == "gain" and (path.response, path.drive) == row.place
+
+
+def _joined(number: Weighed, others: Sequence[Vector], weight: float) -> Weighed:
+    shares = [*((1 - weight) * number.weights), *np.full(len(others), weight / len(others))]
+    return replace(number, parts=[*number.parts, *others], weights=np.array(shares))
