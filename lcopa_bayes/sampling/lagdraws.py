@@ -45,6 +45,8 @@ components, over the range of a coordinate [-]."""
 _WALKERS, _STEPS, _THIN = 96, 500, 10
 _ROUNDS = 8
 """Most times that many steps are made; the first two are left out."""
+_MOVED = 3
+"""Coordinates of a walker that a proposal moves [-]."""
 _WANTED = 200.0
 """Effective draws that end them."""
 _KEPT = 1_000
@@ -203,8 +205,7 @@ def _walked(table: LagTable, begun: Mixture, rng: np.random.Generator) -> tuple[
     position = begun.draw(max(_WALKERS, 4 * low.size), rng)
     inside = (position > low) & (position < high)
     position = np.where(inside, position, rng.uniform(low, high, position.shape))
-    moves = [(emcee.moves.DEMove(), 0.8), (emcee.moves.StretchMove(), 0.2)]
-    sampler = emcee.EnsembleSampler(*position.shape, table.log_density, vectorize=True, moves=moves)
+    sampler = emcee.EnsembleSampler(*position.shape, table.log_density, vectorize=True, moves=_FewMove())
     state = emcee.State(position, random_state=np.random.RandomState(rng.integers(2**32)).get_state())
     state = sampler.run_mcmc(state, 2 * _STEPS, skip_initial_state_check=True)
     sampler.reset()
@@ -216,6 +217,17 @@ def _walked(table: LagTable, begun: Mixture, rng: np.random.Generator) -> tuple[
             break
     kept = chain.reshape(-1, low.size)
     return kept[rng.choice(len(kept), min(_KEPT, len(kept)), replace=False)], ess
+
+
+class _FewMove(emcee.moves.DEMove):  # type: ignore[misc]
+    """Differential evolution in a few coordinates of each walker: in all of ten lags and delays at once one
+    proposal in a hundred is accepted, and walkers stay where they began."""
+
+    def get_proposal(self, here: Matrix, others: Any, random: Any) -> tuple[Matrix, Vector]:
+        """See emcee.moves.DEMove; symmetric as that."""
+        proposed, factor = super().get_proposal(here, others, random)
+        chosen = random.rand(*here.shape).argsort(axis=1) < _MOVED
+        return np.where(chosen, proposed, here), factor
 
 
 def _ess(table: LagTable, chain: Array) -> float:
