@@ -19,7 +19,7 @@ from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.basefit import STARTS, BaseFit, base_fit, too_smooth
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
-from lcopa_bayes.effectsearch.refits import log_bayes_factor
+from lcopa_bayes.effectsearch.refits import Refit, log_bayes_factor
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.rounds import leading
 from lcopa_bayes.effectsearch.scores import State
@@ -201,8 +201,10 @@ def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: boo
         else:
             rng = np.random.default_rng([study.seed, 12, terms])
             named = _named(base, library, rng, draws)
-            if named >= gain and not gain + _named(wider, library, rng, draws) > named + _GAIN:
-                break
+            if named is not None and named.log_bayes_factor >= gain:
+                richer = _named(wider, library, rng, draws)
+                if not _gain(base, wider, named, richer) > _GAIN:
+                    break
             said = (
                 f"The base model has {terms} viscous terms instead of {terms - 1}: the last one is worth "
                 f"{gain:.0f} nat, and explains more, alone or beside an effect, than an effect in its place."
@@ -292,19 +294,26 @@ def _shift(fit: BaseFit, problem: Problem) -> float:
     return largest_shift(fit.optimum.covariance, white(tangents.T).T, changes)
 
 
-def _gain(base: Base, wider: Base) -> float:
-    """Log evidence of the wider model over the other under the wider one's noise [nat]."""
+def _gain(base: Base, wider: Base, named: Refit | None = None, richer: Refit | None = None) -> float:
+    """Log evidence of the wider model over the other under the wider one's noise [nat]; of either with its
+    best effect, where that is given.
+
+    A base fit without an effect that is there takes some of it for noise, each as much as it leaves: what an
+    effect brings to one of them says nothing of what it brings to the other.
+    """
     quiet = float(sum(wider.fit.noise_samples))
-    same = Regression(base.fit.model, wider.fit.regression.whitening).descend(base.fit.optimum.x)
+    smaller = named.state if named else base.start
+    larger = richer.state if richer else wider.start
+    same = Regression(smaller.model, larger.whitening).descend(smaller.optimum.x)
     ordering = wider.fit.model.plant.table.log_support - base.fit.model.plant.table.log_support
-    return log_bayes_factor(same, wider.fit.optimum, quiet) + ordering
+    paid = (richer.paid if richer else 0.0) - (named.paid if named else 0.0)
+    return log_bayes_factor(same, larger.optimum, quiet) + ordering + paid
 
 
-def _named(base: Base, library: Sequence[type[Effect]], rng: np.random.Generator, draws: int) -> float:
-    """Log evidence that the best named effect adds to a base fit [nat]; 0 without one."""
+def _named(base: Base, library: Sequence[type[Effect]], rng: np.random.Generator, draws: int) -> Refit | None:
+    """The best named effect beside a base fit."""
     seen = trace(base.start, library, rng, noise_samples=base.fit.noise_samples, draws=draws)
-    best = leading(base.start, seen) if seen.alarmed else None
-    return best.log_bayes_factor if best is not None else 0.0
+    return leading(base.start, seen) if seen.alarmed else None
 
 
 def _explained(base: Base, library: Sequence[type[Effect]], rng: np.random.Generator, draws: int) -> float:

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.stats import f as f_distribution
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.effectsearch.openeffects import Weighed
@@ -34,6 +35,9 @@ from lcopa_bayes.results.alternatives import (
 )
 from lcopa_bayes.results.steps import curves_of, step_times
 from lcopa_bayes.results.summary import listed
+
+_CHANCE = 0.99
+"""Probability up to which chance explains a residual above the noise [-]."""
 
 
 def lags_of(state: State, problem: Problem) -> tuple[Alternative, ...]:
@@ -58,23 +62,30 @@ def lags_of(state: State, problem: Problem) -> tuple[Alternative, ...]:
     )
 
 
-def linear_dynamics(state: State, found: Sequence[Alternative]) -> str:
+def linear_dynamics(state: State, found: Sequence[Alternative], quiet: Sequence[int]) -> str:
     """In words, that sums of lags are all that the records ask for; empty where they are not.
 
     They are where no effect of a final model is nonlinear, they have support on every response axis on which
     a linear one acts, or without any on one at least, and leave, or the plant where that is better, no more
-    than the noise.
+    than the noise, which is known from so many `quiet` samples of each axis.
     """
     effects = state.model.effects
     supported = [one for one in found if one.support != "plant"]
     if not supported or not all(_linear(effect) for effect in effects):
         return ""
-    left = max(min(one.square, one.search.best.square) / one.search.best.size for one in found)
     acting = _acting(state, [effect.name for effect in effects])
-    if left > REACHED**2 or not acting <= {one.search.axis for one in supported}:
+    left = all(_at_noise(one, quiet[one.search.axis]) for one in found)
+    if not left or not acting <= {one.search.axis for one in supported}:
         return ""
     best, names = supported[0].search.best.lags, state.model.plant.table.layout.responses
     return f"sums of {best} lags follow {listed([names[one.search.axis].name for one in supported])} as well"
+
+
+def _at_noise(one: Alternative, quiet: int) -> bool:
+    """Whether sums of lags, or the plant, leave no more than noise known from so many samples."""
+    best = one.search.best
+    chance = f_distribution.ppf(_CHANCE, best.size, quiet) if quiet else np.inf
+    return bool(min(one.square, best.square) / best.size <= max(REACHED**2, chance))
 
 
 def _linear(effect: Effect) -> bool:

@@ -266,7 +266,11 @@ def _looped(
     findings = _findings(
         study, searched, before, reached, outliers=outliers, cautions=cautions, enough=enough
     )
-    findings = replace(findings, lags=linear_dynamics(searched.state, lags))
+    findings = replace(
+        findings,
+        lags=linear_dynamics(searched.state, lags, base.noise_samples),
+        preferred=any(one.support == "lags" for one in lags),
+    )
     verdict = decide(findings)
     if verdict.kind == "unexplained":
         lags = lags_of(before.state, problem) if findings.lags else ()

@@ -14,6 +14,7 @@ from lcopa_bayes.effectsearch.rounds import Round
 from lcopa_bayes.effectsearch.scores import Score, in_turn, pooled_coverage, pooled_rmse
 from lcopa_bayes.effectsearch.trace import SEEN
 from lcopa_bayes.model.effects.effect import Card
+from lcopa_bayes.results.alternatives import sentence_of
 
 FAR = 2.0
 """Shifts beyond so many standard deviations are listed [-]."""
@@ -49,6 +50,10 @@ def results(result: Loop) -> dict[str, Any]:
         ],
         "effects": _effects(result, chances),
         "open": _open(result),
+        "alternatives": {
+            "sums_of_lags": [one.as_json() for one in result.lags],
+            "sentence": sentence_of(result.lags),
+        },
         "outliers": result.outliers
         and attributes(result.outliers, "count", "share", "width", "log_bayes_factor", "sentence"),
         "before": side(result.before, result),

@@ -137,6 +137,8 @@ class Findings:
     """Probability that nothing more is missing, by the last residual [-]."""
     lags: str = ""
     """In words, that sums of lags are all that is missing; empty where they are not."""
+    preferred: bool = False
+    """Whether the records prefer sums of lags to the plant on a response axis."""
 
 
 def decide(given: Findings) -> Verdict:
@@ -233,6 +235,12 @@ def _quiet(given: Findings, confidence: Confidence) -> Verdict:
             f"Something is missing: {given.missed.said}. The fitted records do not show what: the largest "
             f"log Bayes factor of any effect is {given.largest:.1f} nat, and chance alone reaches "
             f"{given.threshold:.1f}. So no name is given.",
+        )
+    if given.preferred:
+        confidence = "tentative"
+        nothing += (
+            " But sums of lags follow them better than the plant does: it has another form, and figures of "
+            "the step responses are over the lags."
         )
     if given.missed is not None and given.missed.far:
         confidence, nothing = "tentative", f"{nothing} But {given.missed.said}."
