@@ -22,7 +22,7 @@ from lcopa_bayes.results.summary import joined
 
 def fractional(usable: Sequence[Row]) -> dict[str, Any]:
     """Whether the best fractional candidate is warranted against the best integer one, and against sums of
-    lags (`results.alternatives`), which are integer models too.
+    lags (`results.sumsoflags`), which are integer models too.
 
     The best is the simplest that none of its kind beats beyond chance.
     """

@@ -12,11 +12,13 @@ from dataclasses import replace
 import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.refits import Refit, refit, under_one_noise
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.signature import Signature
 from lcopa_bayes.effectsearch.trace import SEEN, Trace, Traced
+from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.effect import Effect, ForceEffect
 
 _CANDIDATES = 4
@@ -37,6 +39,16 @@ _OTHER = 0.9
 _STEPS = 12
 _SIZES = (1.0, -1.0)
 """Coefficients from which a single one is also started, with fitted and with integer orders [prior sd]."""
+_TEMPERATURES = ("K", "degC", "mK", "degF")
+
+
+def offered(study: Study) -> list[type[Effect]]:
+    """Effects of the catalogue that can occur where a study measures: temperatures are responses of a thermal
+    plant, anything else may be of any."""
+    known = catalogue(study.effects.add, study.folder).values()
+    if not all(axis.unit in _TEMPERATURES for axis in study.response_axes):
+        return list(known)
+    return [kind for kind in known if not kind.card.fields or "thermal" in kind.card.fields]
 
 
 def refitted(state: State, seen: Trace) -> tuple[list[Refit], list[str]]:

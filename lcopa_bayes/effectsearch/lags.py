@@ -1,7 +1,7 @@
 """Sums of lags beside the plant that a loop ends with, and their part in its numbers.
 
 A search chooses the number of terms of a family; steady values and delays depend on that family where the
-records do not show them (`results.alternatives`). What nonlinear effects add at the optimum is taken off the
+records do not show them (`results.sumsoflags`). What nonlinear effects add at the optimum is taken off the
 records first. What is linear and does not change with time may be part of the plant as well as an effect:
 sums of lags stand for both, and a linear effect is named only where they have no support.
 """
@@ -25,7 +25,9 @@ from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.model.effects.effect import Effect
 from lcopa_bayes.model.layout import Layout, PathSlot
-from lcopa_bayes.results.alternatives import (
+from lcopa_bayes.results.steps import curves_of, step_times
+from lcopa_bayes.results.summary import listed
+from lcopa_bayes.results.sumsoflags import (
     Alternative,
     FittedPlant,
     lag_figures,
@@ -33,8 +35,6 @@ from lcopa_bayes.results.alternatives import (
     weight_in,
     weights_of,
 )
-from lcopa_bayes.results.steps import curves_of, step_times
-from lcopa_bayes.results.summary import listed
 
 _CHANCE = 0.99
 """Probability up to which chance explains a residual above the noise [-]."""

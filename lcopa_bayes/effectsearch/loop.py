@@ -17,6 +17,7 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.bandwidening import Widening
 from lcopa_bayes.effectsearch.basefit import BaseFit, settled, too_smooth
 from lcopa_bayes.effectsearch.basemodel import fitted_base, structure_chosen
+from lcopa_bayes.effectsearch.candidates import offered
 from lcopa_bayes.effectsearch.explained import coordinates_of, declarable, explained_draws, explained_study
 from lcopa_bayes.effectsearch.heldouteffects import missed, unseen_share
 from lcopa_bayes.effectsearch.lags import figures_with_lags, lags_of, linear_dynamics, number_with_lags
@@ -54,13 +55,11 @@ from lcopa_bayes.effectsearch.verdict import (
 )
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.noise import Noise
-from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.effect import Effect
-from lcopa_bayes.results.alternatives import Alternative as SumOfLags
+from lcopa_bayes.results.sumsoflags import Alternative as SumOfLags
 from lcopa_bayes.sampling.convergence import Grade
 from lcopa_bayes.sampling.draws import Draws
 
-_TEMPERATURES = ("K", "degC", "mK", "degF")
 _ASTRAY = (
     "the draws of the study predict the records held out worse than its optimum does and are not used: "
     "intervals and bands are those of a Laplace approximation there"
@@ -213,15 +212,6 @@ def loop(
     kinds = offered(study) if library is None else list(library)
     with threadpool_limits(1):  # many small products: more threads only wait for each other
         return _looped(study, kinds, jobs=jobs, sample=sample, quick=quick, as_stated=as_stated)
-
-
-def offered(study: Study) -> list[type[Effect]]:
-    """Effects of the catalogue that can occur where a study measures: temperatures are responses of a thermal
-    plant, anything else may be of any."""
-    known = catalogue(study.effects.add, study.folder).values()
-    if not all(axis.unit in _TEMPERATURES for axis in study.response_axes):
-        return list(known)
-    return [kind for kind in known if not kind.card.fields or "thermal" in kind.card.fields]
 
 
 def _looped(

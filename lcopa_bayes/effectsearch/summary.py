@@ -14,7 +14,7 @@ from lcopa_bayes.effectsearch.rounds import Round
 from lcopa_bayes.effectsearch.scores import Score, in_turn, pooled_coverage, pooled_rmse
 from lcopa_bayes.effectsearch.trace import SEEN
 from lcopa_bayes.model.effects.effect import Card
-from lcopa_bayes.results.alternatives import sentence_of
+from lcopa_bayes.results.sumsoflags import sentence_of
 
 FAR = 2.0
 """Shifts beyond so many standard deviations are listed [-]."""

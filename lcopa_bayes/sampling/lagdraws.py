@@ -219,6 +219,7 @@ def _walked(table: LagTable, begun: Mixture, rng: np.random.Generator) -> tuple[
     return kept[rng.choice(len(kept), min(_KEPT, len(kept)), replace=False)], ess
 
 
+@final
 class _FewMove(emcee.moves.DEMove):  # type: ignore[misc]
     """Differential evolution in a few coordinates of each walker: in all of ten lags and delays at once one
     proposal in a hundred is accepted, and walkers stay where they began."""

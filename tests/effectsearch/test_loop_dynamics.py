@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from lcopa_bayes.data.study import Study
-from lcopa_bayes.effectsearch.loop import loop, offered
+from lcopa_bayes.effectsearch.candidates import offered
+from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.effects import effected
 from lcopa_bayes.model.effects.catalogue import bundled

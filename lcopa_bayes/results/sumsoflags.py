@@ -1,0 +1,234 @@
+"""Sums of lags beside a fitted plant: what its paths may be if they are no Kelvin elements.
+
+Each response axis has its own, held against the fitted plant by Akaike's criterion: other families follow the
+records as well, and have other steady values and delays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal, final
+
+import numpy as np
+
+from lcopa_bayes.core.arrays import Array, Vector
+from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.inference.assembly import Problem
+from lcopa_bayes.inference.lagsum import lag_problem, thinned
+from lcopa_bayes.inference.noise import GaussianNoise
+from lcopa_bayes.inference.observations import Samples
+from lcopa_bayes.inference.parameters import ParameterTable
+from lcopa_bayes.inference.posterior import Posterior
+from lcopa_bayes.model.layout import Layout, PathSlot
+from lcopa_bayes.results.steps import Metric, StepCurves, figures_of
+from lcopa_bayes.results.summary import listed
+from lcopa_bayes.sampling.lagdraws import LagDraws, LagSearch, lag_draws
+
+_SUPPORT = 10.0
+"""Difference of Akaike's criterion beyond which the worse plant has no support [-]."""
+_RISEN = 0.3
+"""Share of its value at the end of the record that a response has reached before which its delay ends [-]."""
+_STREAM = 17
+"""Marks the randomness of these draws."""
+
+Support = Literal["plant", "both", "lags"]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Alternative:
+    """Sums of lags in place of the paths to one response axis."""
+
+    paths: tuple[PathSlot, ...]
+    """Those whose drive moves and whose gain is not known."""
+    search: LagSearch
+    advantage: float
+    """Akaike's criterion of the fitted plant less that of the lags [-]."""
+    square: float
+    """Whitened residual of the fitted plant, squared [-]."""
+    seed: int
+    """Of the draws."""
+
+    @property
+    def support(self) -> Support:
+        """Which of both the records leave in question."""
+        if abs(self.advantage) <= _SUPPORT:
+            return "both"
+        return "lags" if self.advantage > 0 else "plant"
+
+    @cached_property
+    def draws(self) -> LagDraws:
+        """Drawn where they are asked for."""
+        return lag_draws(self.search, self.seed)
+
+    @property
+    def ess(self) -> float | None:
+        """Effective sample size of the draws [-]; None where the records give the lags no support."""
+        return None if self.support == "plant" else self.draws.ess
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values of the search."""
+        best = self.search.best
+        times = np.exp(best.coordinates[: -len(self.paths)]).reshape(len(self.paths), -1)
+        return {
+            "paths": [one.name for one in self.paths],
+            "lags": best.lags,
+            "times": [sorted(row) for row in times.tolist()],
+            "aic_advantage": self.advantage,
+            "support": self.support,
+        }
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class FittedPlant:
+    """A plant at its optimum, which sums of lags are held against."""
+
+    problem: Problem
+    """Its posterior has no effects, and Gaussian noise."""
+    values: Vector
+    """Table values, (rows,)."""
+    noise: tuple[Vector, ...]
+    """Parameters of the noise of each response axis."""
+    curves: StepCurves
+    seed: int
+    """Of draws of its rivals."""
+    more: tuple[int, ...] = ()
+    """Free parameters of each response axis beside those of the plant; by default none [-]."""
+    samples: tuple[Samples, ...] | None = None
+    """Those that its rivals follow, where they are not what the plant follows."""
+
+    @property
+    def posterior(self) -> Posterior:
+        """Of its problem."""
+        return self.problem.posterior
+
+
+def lags_beside(plant: FittedPlant) -> tuple[Alternative, ...]:
+    """Sums of lags beside a fitted plant, one for each response axis that has any; none where no drive moves
+    or the records do not determine them."""
+    try:
+        own = plant.posterior
+        followed = own if plant.samples is None else replace(own, samples=plant.samples)
+        problem = lag_problem(plant.problem.study, followed)
+    except InputError:
+        return ()
+    open_paths = [_open(plant.posterior, axis) for axis in range(len(plant.noise))]
+    return tuple(_alternative(plant, problem, axis, paths) for axis, paths in enumerate(open_paths) if paths)
+
+
+def sentence_of(found: Sequence[Alternative]) -> str:
+    """Which plants the records leave in question."""
+    figures = "figures of the step responses are"
+    said = {
+        "both": f"follow the records as well as the fitted plant does: {figures} over both",
+        "lags": f"follow the records better than the fitted plant: {figures} theirs",
+        "plant": "do not follow the records as well as the fitted plant does",
+    }
+    return " ".join(
+        f"Sums of {one.search.best.lags} to {one.search.lags} lags"
+        f"{f' for {listed([path.name for path in one.paths])}' if len(found) > 1 else ''} "
+        f"{said[one.support]} (AIC {'lower' if one.advantage > 0 else 'higher'} by {abs(one.advantage):.1f})."
+        for one in found
+    )
+
+
+def weights_of(layout: Layout, found: Sequence[Alternative]) -> dict[str, float]:
+    """Of the sums of lags beside a plant, by path [-]; 0 where a path has none, or the records do not support
+    them."""
+    weights = {"plant": 0.0, "both": 0.5, "lags": 1.0}
+    none = dict.fromkeys((one.name for one in layout.paths), 0.0)
+    return none | {path.name: weights[one.support] for one in found for path in one.paths}
+
+
+def weight_in(name: str, weight_of: Mapping[str, float]) -> float:
+    """Of the sums of lags in a figure: that of its path, of a crosstalk the least of the paths involved."""
+    path = name.partition("[")[2].removesuffix("]")
+    return weight_of[path] if path in weight_of else min(weight_of.values())
+
+
+def lag_figures(found: Sequence[Alternative], time: Vector, time_unit: str) -> list[Metric]:
+    """Figures of the responses of sums of lags to a unit step, at times from 0 on [`time_unit`]; of paths
+    without any nothing."""
+    layout = found[0].search.problem.posterior.table.layout
+    count = min(len(one.draws.delays) for one in found)
+    shape = (len(layout.responses), len(layout.drives))
+    gains, delays = np.zeros((count, *shape)), np.zeros((count, len(layout.delays)))
+    own = {}
+    for one in found:
+        for p, path in enumerate(one.paths):
+            own[path.response, path.drive] = (one.draws, p)
+            gains[:, path.response, path.drive] = one.draws.gains[:count, p]
+            delays[:, layout.delay_of[path.response][path.drive]] = one.draws.delays[:count, p]
+
+    def normalised(at: Vector) -> Array:
+        out = np.zeros((shape[0] * shape[1], count, at.size))
+        for (i, j), (lags, p) in own.items():
+            steady = gains[:, i, j, None]
+            out[i * shape[1] + j] = lags.response(p, at)[:count] / np.where(steady == 0.0, 1.0, steady)
+        return out
+
+    curve_of = tuple(tuple(i * shape[1] + j for j in range(shape[1])) for i in range(shape[0]))
+    curves = StepCurves(time, normalised(time), gains, delays, curve_of, np.empty((count, 0)))
+    without = [one.name for one in layout.paths if (one.response, one.drive) not in own]
+    figures = figures_of(layout, curves, normalised, time_unit=time_unit)
+    return [one for one in figures if not any(f"[{name}]" in one.name for name in without)]
+
+
+def _open(posterior: Posterior, axis: int) -> tuple[PathSlot, ...]:
+    """Paths to a response axis whose drive moves while it is sampled and whose gain is free; none where
+    another gain is known and not zero."""
+    table, out = posterior.table, []
+    for one in table.layout.paths:
+        if one.response != axis:
+            continue
+        row = table.rows[table.at("gain", axis, one.drive)]
+        if not row.free and row.value != 0.0:
+            return ()
+        moves = any(
+            experiment.drives[one.drive].moves and samples.axes[axis].values.size
+            for experiment, samples in zip(posterior.model.experiments, posterior.samples, strict=True)
+        )
+        if row.free and moves:
+            out.append(one)
+    return tuple(out)
+
+
+def _alternative(plant: FittedPlant, problem: Problem, axis: int, paths: tuple[PathSlot, ...]) -> Alternative:
+    posterior, noise = thinned(plant.posterior), plant.noise[axis]
+    assert isinstance(posterior.noise, GaussianNoise)
+    units, square = posterior.responses(plant.values[None]), 0.0
+    for r, samples in enumerate(posterior.samples):
+        observed = samples.axes[axis]
+        residual = posterior.residual(axis, r, observed, plant.values[None], units[r])
+        square += float((posterior.noise.standard(residual, noise[None], observed.gaps) ** 2).sum())
+    ends = np.array([_ends(plant, one) for one in paths])
+    seed = plant.seed * 1_000 + 10 * _STREAM + axis
+    search = LagSearch.over(problem, axis, [one.drive for one in paths], noise, ends)
+    parameters = _parameters(posterior.table, paths) + (plant.more[axis] if plant.more else 0)
+    advantage = square + 2 * parameters - search.best.square - 2 * search.best.parameters
+    return Alternative(paths, search, advantage, square, seed)
+
+
+def _parameters(table: ParameterTable, paths: Sequence[PathSlot]) -> int:
+    """Free parameters of a plant that the paths use [-]."""
+    used: set[int] = set()
+    for one in paths:
+        used.add(table.at("gain", one.response, one.drive))
+        used.add(table.at("delay", table.layout.delay_of[one.response][one.drive]))
+        used.update(table.terms[table.layout.element_of[one.response][one.drive]].every)
+    return sum(table.rows[k].free for k in used)
+
+
+def _ends(plant: FittedPlant, path: PathSlot) -> tuple[float, float]:
+    """Ends of the delays that are looked at: those of the prior, not after the response has visibly begun."""
+    curves, table, period = plant.curves, plant.posterior.table, plant.problem.scales.period
+    row = table.rows[table.at("delay", table.layout.delay_of[path.response][path.drive])]
+    if not row.free:
+        return row.value, row.value + 1e-6 * period
+    low, high = (max(float(end), 0.0) for end in row.domain)
+    curve = np.median(curves.normalised[curves.curve_of[path.response][path.drive]], axis=0)
+    begun = float(curves.time[(curve >= _RISEN * curve[-1]).argmax()])
+    return low, max(min(high, max(begun, low + 2 * period)), low + 1e-6 * period)
