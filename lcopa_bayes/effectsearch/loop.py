@@ -251,19 +251,13 @@ def _looped(
             contrary=contrary,
         )
     reached = _side(problem, searched.state)
-    enough = ALONE if alone else EXPLAINED
     lags = lags_of(searched.state, problem) if chosen else ()
-    findings = _findings(
-        study, searched, before, reached, outliers=outliers, cautions=cautions, enough=enough
-    )
-    findings = replace(
-        findings,
-        lags=linear_dynamics(searched.state, lags, base.noise_samples),
-        preferred=any(one.support == "lags" for one in lags),
-    )
-    verdict = decide(findings)
+    dynamics = linear_dynamics(searched.state, lags, base.noise_samples)
+    findings = _findings(study, searched, before, reached, outliers=outliers, cautions=cautions, alone=alone)
+    preferred = any(one.support == "lags" for one in lags)
+    verdict = decide(replace(findings, lags=dynamics, preferred=preferred))
     if verdict.kind == "unexplained":
-        lags = lags_of(before.state, problem) if findings.lags else ()
+        lags = lags_of(before.state, problem) if dynamics else ()
     if outliers is not None:
         verdict = beside(verdict, outliers.sentence)
     named = verdict.kind in ("explained", "partly explained", "disturbance")
@@ -334,7 +328,7 @@ def _findings(
     *,
     outliers: Outlying | None,
     cautions: tuple[str, ...],
-    enough: float,
+    alone: bool,
 ) -> Findings:
     """What a search found, `before` without its effects and `after` with them."""
     first, last = searched.rounds[0].trace, searched.rounds[-1].trace
@@ -362,7 +356,7 @@ def _findings(
         remaining_name=last.leader.name if last.leader else "",
         share=searched.share,
         excess=before.state.whitening.excess(before.state.optimum.residual),
-        enough=enough,
+        enough=ALONE if alone else EXPLAINED,
         scatter=first.scatter,
         missed=None if by_record else missed(study, after.fit, now, searched.state),
         unseen=unseen_share(study, was, now, searched.state) if study.held_out else np.nan,
