@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import foreign
 import numpy as np
 from devicetruth import place, side_figures, size_deviations, step_deviations
 from threadpoolctl import threadpool_limits
@@ -18,6 +19,7 @@ from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.loop import Loop, Side, loop
 from lcopa_bayes.effectsearch.scores import pooled_coverage
+from lcopa_bayes.results.structure import with_least_terms
 
 _ATTEMPTS = 20
 FREEDOM = 4.0
@@ -40,7 +42,7 @@ class Task:
     """What one campaign hides."""
 
     kind: str
-    """clean, coloured, heavy, named, plain, outside, pair or control."""
+    """clean, coloured, heavy, named, plain, outside, pair, control or foreign."""
     effects: tuple[str, ...]
     drives: str
     correlation: float
@@ -49,6 +51,8 @@ class Task:
     """Whether the final posterior is drawn too."""
     quiet: int = 0
     """Samples at rest of each axis, over all fit records, and no repeat; 0: as recorded."""
+    plant: str = ""
+    """Kind of a foreign plant, whose study states nothing of its model; empty: the steerer of the bench."""
 
     @property
     def name(self) -> str:
@@ -66,11 +70,16 @@ def play(folder: Path, task: Task) -> dict[str, Any]:
     if path.exists():
         return json.loads(path.read_text(encoding="utf-8"))
     with threadpool_limits(1):
-        made = measured(task)
+        if task.plant:
+            made = foreign.campaign(task.plant, task.effects, task.seed)
+            study = with_least_terms(made.study(task.seed))  # as the verb does
+        else:
+            made = measured(task)
+            study = study_of(made, task.seed)
         begun, cpu = time.perf_counter(), time.process_time()
         try:
-            found = loop(study_of(made, task.seed), sample=task.sampled, as_stated=True)
-            row = asdict(task) | judged(found, made)
+            found = loop(study, sample=task.sampled, as_stated=not task.plant)
+            row = asdict(task) | judged(found, made) | (foreign.scored if task.plant else scored)(found, made)
         except Exception as error:  # a crash is a result too, and must not end the others
             row = asdict(task) | {"crashed": f"{type(error).__name__}: {error}"}
     row |= {"seconds": time.perf_counter() - begun, "cpu_seconds": time.process_time() - cpu}
@@ -107,7 +116,7 @@ def shortened(made: Campaign, quiet: int) -> Campaign:
     return replace(made, fit=tuple(out))
 
 
-def judged(found: Loop, made: Campaign) -> dict[str, Any]:
+def judged(found: Loop, made: Campaign | foreign.Foreign) -> dict[str, Any]:
     """What the loop said, beside the truth that only the judge sees."""
     trace = found.trace
     truth = [one.name for one in made.hidden]
@@ -136,12 +145,6 @@ def judged(found: Loop, made: Campaign) -> dict[str, Any]:
         "base_failed": found.base.failed,
         "before": errors(found.before, made),
         "after": errors(found.after, made),
-        "plant_before": deviations(found.before, made)
-        | step_deviations(side_figures(found, found.before), found, made),
-        "plant_alone": deviations(found.after, made)
-        | step_deviations(found.figures, found, made, alone=True),
-        "plant_after": deviations(found.after, made, found) | step_deviations(found.figures, found, made),
-        "sizes_after": size_deviations(found, made),
         "coverage_before": pooled_coverage(found.before.unseen),
         "coverage_after": pooled_coverage(found.after.unseen),
         "share_with_band": float(np.mean([score.banded for score in found.after.unseen])),
@@ -149,21 +152,34 @@ def judged(found: Loop, made: Campaign) -> dict[str, Any]:
     }
 
 
-def errors(side: Side, made: Campaign) -> dict[str, float]:
-    """Root mean square errors, on held-out records against the response without noise or disturbances
-    [rad]."""
-    fit = np.concatenate([score.observed - score.predicted for score in side.fit])
+def scored(found: Loop, made: Campaign) -> dict[str, Any]:
+    """Places of gains, delays and figures of the device, and of the sizes of its effects [normal sd]."""
+    return {
+        "plant_before": deviations(found.before, made)
+        | step_deviations(side_figures(found, found.before), found, made),
+        "plant_alone": deviations(found.after, made)
+        | step_deviations(found.figures, found, made, alone=True),
+        "plant_after": deviations(found.after, made, found) | step_deviations(found.figures, found, made),
+        "sizes_after": size_deviations(found, made),
+    }
+
+
+def errors(side: Side, made: Campaign | foreign.Foreign) -> dict[str, float]:
+    """Root mean square errors over the noise [-], on held-out records against the response without noise or
+    disturbances."""
+    axes = [one.name for one in made.fit[0].response_axes]
+    noise = dict(zip(axes, np.broadcast_to(getattr(made, "noise", NOISE), len(axes)), strict=True))
+    fit = np.concatenate([(score.observed - score.predicted) / noise[score.axis] for score in side.fit])
     apart = []
     for score in side.unseen:
         record = next(one for one in made.held_out if one.name == score.record)
-        axis = [one.name for one in record.response_axes].index(score.axis)
-        exact = made.truth[score.record][np.searchsorted(record.time, score.time), axis]
-        apart.append(score.predicted - exact)
+        rows = np.searchsorted(record.time, score.time)
+        exact = made.truth[score.record][rows, axes.index(score.axis)]
+        apart.append((score.predicted - exact) / noise[score.axis])
     both = np.concatenate(apart)
     return {
-        "fit_rmse": float(np.sqrt(np.mean(fit**2))),
-        "fit_over_noise": float(np.sqrt(np.mean(fit**2)) / NOISE),
-        "held_out_truth_rmse": float(np.sqrt(np.mean(both**2))),
+        "fit_over_noise": float(np.sqrt(np.mean(fit**2))),
+        "held_out_truth_over_noise": float(np.sqrt(np.mean(both**2))),
     }
 
 

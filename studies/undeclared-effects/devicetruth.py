@@ -3,6 +3,7 @@ of its effects in the scales that the loop measures them in."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.optimize import brentq
@@ -16,7 +17,8 @@ from lcopa_bayes.effectsearch.loop import Loop, Side
 from lcopa_bayes.effectsearch.openeffects import Weighed, mixture
 from lcopa_bayes.model.path import TransferPath
 
-FIGURES = ("value_at_end", "rise_10_90")
+_FINE = 4001
+"""Points at which a step response is looked at for where it crosses a level first."""
 UNSCORED = {
     "trigger_jitter": "a number for every record, drawn by chance",
     "pointing_offset": "a number for every record, drawn by chance",
@@ -83,8 +85,9 @@ SIZES: dict[str, Sizes] = {
 
 
 def place(values: Vector, truth: float) -> float:
-    """Where a truth lies among equally probable values, negative above their median [normal sd]."""
-    below = np.sum(values < truth) + 0.5 * np.sum(values == truth)
+    """Where a truth lies among equally probable values, negative above their median [normal sd]; of several
+    equal to it, at the one nearest to the median, so that an interval that ends there holds it."""
+    below = np.clip(0.5 * values.size, np.sum(values < truth), np.sum(values <= truth))
     return -float(norm.ppf((below + 0.5) / (values.size + 1)))
 
 
@@ -107,33 +110,51 @@ def size_deviations(found: Loop, made: Campaign) -> dict[str, float]:
     return {name: place(values, truth[name]) for name, values in found_there.items()}
 
 
-def step_truth(path: TransferPath, span: float) -> dict[str, float]:
-    """Figures of a path's response to a unit step; the rise is infinite where it is not within `span`."""
+def step_truth(
+    rises: Callable[[Vector], Vector], steady: float, delay: float, span: float
+) -> dict[str, float]:
+    """Figures of a response ``steady rises(time - delay)`` to a unit step; the rise is infinite where it is
+    not within `span`."""
+    time = (span - delay) * np.linspace(0.0, 1.0, _FINE)
+    curve = rises(time)
 
-    def risen(time: float) -> float:
-        return float(unit_step(path, np.array([time]))[0]) * path.gain / path.steady
+    def first(level: float) -> float:
+        k = int(np.argmax(curve >= level))  # of a response that rings, the first crossing
+        if not k:
+            return np.inf
+        return float(brentq(lambda t: rises(np.array([t]))[0] - level, time[k - 1], time[k]))
 
-    late = span - path.delay
-    end = risen(late)
-    rise = np.inf
-    if end > 0.9:
-        tenth, most = (brentq(lambda t, at=at: risen(t) - at, 1e-9, late) for at in (0.1, 0.9))
-        rise = most - tenth
-    return {"value_at_end": path.steady * end, "rise_10_90": rise}
+    most = first(0.9)
+    rise = most - first(0.1) if np.isfinite(most) else np.inf
+    return {"value_at_end": steady * float(curve[-1]), "rise_10_90": rise}
 
 
 def step_deviations(
     figures: tuple[Weighed, ...], found: Loop, made: Campaign, *, alone: bool = False
 ) -> dict[str, float]:
-    """Places of the figures of the device without its effects [normal sd]; `alone`, among the values of the
-    final model."""
+    """Places of the figures of the device without its effects."""
     axes = made.device.response_axes, made.device.drive_axes
+    span = found.problem.scales.span
+    told = [[as_told(path, found, made) for path in row] for row in made.device.paths]
     truth = {
         f"{key}[{response.name}_{drive.name}]": value
-        for response, row in zip(axes[0], made.device.paths, strict=True)
+        for response, row in zip(axes[0], told, strict=True)
         for drive, path in zip(axes[1], row, strict=True)
-        for key, value in step_truth(as_told(path, found, made), found.problem.scales.span).items()
+        for key, value in step_truth(partial(risen, path), path.steady, path.delay, span).items()
     }
+    return places(figures, truth, alone=alone)
+
+
+def risen(path: TransferPath, time: Vector) -> Vector:
+    """Response to a unit step, without the delay and over the steady one."""
+    return np.asarray(path.stiffness * unit_step(path, time))
+
+
+def places(
+    figures: tuple[Weighed, ...], truth: Mapping[str, float], *, alone: bool = False
+) -> dict[str, float]:
+    """Where true figures lie among those of a loop [normal sd]; `alone`, among the values of the final
+    model."""
     return {
         one.name: place(one.parts[0] if alone else one.values, truth[one.name])
         for one in figures

@@ -1,7 +1,9 @@
-"""Score sheet of the loop: hidden effects on the virtual bench, judged by thresholds frozen beforehand.
+"""Score sheet of the loop: hidden effects on the virtual bench and plants outside the family, judged by
+thresholds frozen beforehand.
 
     python studies/undeclared-effects/score.py [--seed 1000] [--each 4] [--controls 60] [--outsiders 10]
-        [--pairs 30] [--sampled 6] [--cells 12] [--jobs N] [--out reports/undeclared-effects] [--limit N]
+        [--pairs 30] [--sampled 6] [--cells 12] [--foreign 64] [--jobs N]
+        [--out reports/undeclared-effects] [--limit N]
 
 Every campaign is a task of its own, kept in OUT/rows: a killed run goes on where it stopped. Seeds below 1000
 were used in development and are refused unless --trial is given.
@@ -17,7 +19,8 @@ from typing import Any
 
 import numpy as np
 from campaigns import Task, play
-from scoresheet import bounds, matrix, sheet
+from foreign import EFFECTS, KINDS
+from scoresheet import bounds, matrix, plants, sheet
 from tqdm import tqdm
 
 from lcopa_bayes.bench.undeclared import NAMED, OUTSIDE
@@ -40,7 +43,7 @@ def tasks(options: argparse.Namespace) -> list[Task]:
     made += [("clean", (), "rich", 0.0)] * options.controls
     made += [("coloured", (), "rich", COLOURED)] * options.controls
     made += [("named", (name,), "rich", 0.0) for name in NAMED for _ in range(options.each)]
-    made += [("plain", (name,), "plain", 0.0) for name in NAMED for _ in range(max(1, options.each // 4))]
+    made += [("plain", (name,), "plain", 0.0) for name in NAMED for _ in range(-(-options.each // 4))]
     made += [("outside", (name,), "rich", 0.0) for name in OUTSIDE for _ in range(options.outsiders)]
     made += [
         ("heavy", (), "rich", rho) for k in range(options.controls) for rho in (0.0, COLOURED)[k % 2 :][:1]
@@ -57,10 +60,16 @@ def tasks(options: argparse.Namespace) -> list[Task]:
         for k, (kind, names, drives, rho) in enumerate(made)
     ]
     further = [cell for cell in CELLS for _ in range(options.cells)]
-    return listed + [
+    listed += [
         Task("control", (), "rich", rho, first + len(made) + k, quiet=quiet)
         for k, (rho, quiet) in enumerate(further)
     ]
+    first += len(listed)
+    for k in range(options.foreign):
+        turn, hides = divmod(k + k // len(KINDS), 4)  # one of four, and of each kind in turn
+        names = EFFECTS[turn % len(EFFECTS) :][:1] if hides == 3 else ()
+        listed.append(Task("foreign", names, "foreign", 0.0, first + k, plant=KINDS[k % len(KINDS)]))
+    return listed
 
 
 def frozen() -> dict[str, Any]:
@@ -104,6 +113,7 @@ def main() -> None:
         "cpu_seconds_each": float(np.median([row["cpu_seconds"] for row in rows])),
         "sheet": lines,
         "matrix": matrix(rows),
+        "plants": plants(rows),
         "crashes": [
             [row[key] for key in ("kind", "effects", "seed", "crashed")] for row in rows if row["crashed"]
         ],
@@ -149,6 +159,7 @@ def _options() -> argparse.Namespace:
         "pairs": 30,
         "sampled": 6,
         "cells": 12,
+        "foreign": 64,
     }
     for name, default in (numbers | {"jobs": 1, "limit": None, "every": 1}).items():
         parser.add_argument(f"--{name}", type=int, default=default)

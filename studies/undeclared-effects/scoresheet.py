@@ -22,6 +22,10 @@ FIGURES = {
 }
 """Numbers of the device that are scored, by how their names begin."""
 SIZES = {"": "sizes and constants of effects"}
+PATHS = {"steady_state": "steady states"} | {
+    key: FIGURES[key] for key in ("delay", "value_at_end", "rise_10_90")
+}
+"""The same of the paths of foreign plants."""
 
 
 def bounds(hits: int, trials: int, level: float = 0.95) -> tuple[float, float]:
@@ -84,7 +88,7 @@ def number(
 
 def sheet(rows: Sequence[Row], targets: Mapping[str, Any], seen: float) -> list[dict[str, Any]]:
     """Every measure of "What to hold ourselves to"."""
-    usable = [row for row in rows if not row["crashed"]]
+    usable = [row for row in rows if not row["crashed"] and row["kind"] != "foreign"]
     by = {
         kind: [row for row in usable if row["kind"] == kind]
         for kind in ("clean", "coloured", "heavy", "named")
@@ -105,7 +109,7 @@ def sheet(rows: Sequence[Row], targets: Mapping[str, Any], seen: float) -> list[
     corrected = [row for row in by["named"] if row["verdict"] in NAMING]
     widened = [row for row in [*by["named"], *by["outside"]] if row["verdict"] == "unexplained"]
     plants = [row for row in corrected if not row["disturbance"]]
-    ratio = [row["after"]["held_out_truth_rmse"] / row["before"]["held_out_truth_rmse"] for row in plants]
+    ratio = [_ratio(row) for row in plants]
     over = [row["after"]["fit_over_noise"] for row in [*by["clean"], *plants]]
     inside = targets["coverage"]
     return [
@@ -216,8 +220,61 @@ def sheet(rows: Sequence[Row], targets: Mapping[str, Any], seen: float) -> list[
             targets["two_effects"],
             "least",
         ),
+        *_foreign([row for row in rows if row["kind"] == "foreign" and not row["crashed"]], targets, seen),
         share("crashed", list(rows), lambda r: bool(r["crashed"]), 0.0, "most"),
     ]
+
+
+def _foreign(rows: Sequence[Row], targets: Mapping[str, Any], seen: float) -> list[dict[str, Any]]:
+    """Lines of plants outside the family."""
+    name = "foreign plants"
+    bare = [row for row in rows if not row["effects"]]
+    visible = [row for row in rows if row["effects"] and (_survival(row) is None or _survival(row) > seen)]
+    ratio = [_ratio(row) for row in rows if row["verdict"] in NAMING and not row["disturbance"]]
+    most = targets["held_out_ratio_largest"]
+    return [
+        share(f"an effect named, {name}", bare, lambda r: bool(r["named"]), targets["false_alarms"], "most"),
+        share(f"clean, {name}", bare, lambda r: r["verdict"] == "clean", 0.0, "least"),
+        share(
+            f"right effect first, where it survives, {name}",
+            visible,
+            lambda r: first_of(r) in r["truth"],
+            targets["right_first"],
+            "least",
+        ),
+        number(f"held-out error after / before, {name}, largest", ratio, np.max, most, "most"),
+        *intervals(name, _concluded(rows), "plant_after", targets, PATHS),
+    ]
+
+
+def plants(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Foreign plants by kind: campaigns, those with nothing hidden, of these the clean and the named, and the
+    90 % intervals of each figure that hold the truth, of how many."""
+    out = []
+    for kind in dict.fromkeys(row["plant"] for row in rows if row["kind"] == "foreign"):
+        own = [row for row in rows if row["plant"] == kind]
+        done = [row for row in own if not row["crashed"]]
+        bare = [row for row in done if not row["effects"]]
+        line = {"plant": kind, "campaigns": len(own), "bare": len(bare)}
+        line["clean"] = sum(row["verdict"] == "clean" for row in bare)
+        line["named"] = sum(bool(row["named"]) for row in bare)
+        lines = intervals(kind, _concluded(done), "plant_after", None, PATHS)[len(PATHS) :]
+        line["held"] = {
+            key: [round(one["trials"] * (one["value"] or 0.0)), one["trials"]]
+            for key, one in zip(PATHS, lines, strict=True)
+        }
+        out.append(line)
+    return out
+
+
+def _concluded(rows: Sequence[Row]) -> list[Row]:
+    """Those whose numbers the loop stands by."""
+    return [row for row in rows if row["verdict"] != "unexplained"]
+
+
+def _ratio(row: Row) -> float:
+    """Held-out error after over before, against the response without noise [-]."""
+    return row["after"]["held_out_truth_over_noise"] / row["before"]["held_out_truth_over_noise"]
 
 
 def intervals(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -92,10 +93,11 @@ def test_every_named_effect_has_sizes_or_a_reason() -> None:
 
 def test_the_figures_of_a_lag_are_those_of_the_closed_form() -> None:
     path = TransferPath(0.6, 2.0, (4.0,), (1.0,), 2.0)  # time constant 2
-    reported = devicetruth.step_truth(path, 12.0)
+    of = partial(devicetruth.risen, path), path.steady, path.delay
+    reported = devicetruth.step_truth(*of, 12.0)
     assert reported["rise_10_90"] == pytest.approx(2.0 * np.log(9), rel=1e-6)
     assert reported["value_at_end"] == pytest.approx(0.3 * -np.expm1(-5.0), rel=1e-6)
-    assert devicetruth.step_truth(path, 6.0)["rise_10_90"] == np.inf
+    assert devicetruth.step_truth(*of, 6.0)["rise_10_90"] == np.inf
 
 
 def test_the_place_of_a_truth_is_positive_where_values_lie_above_it() -> None:
