@@ -14,6 +14,7 @@ from lcopa_bayes.core.covariance import covariance_of
 from lcopa_bayes.core.parallel import Workers
 from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.leastsquares import LeastSquares
+from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.poles import regressed
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.effects.effect import UnstableError
@@ -88,16 +89,48 @@ def find_optima(
         return _kept(posterior, _descended(posterior, _near(posterior, effect_starts(posterior, alone, rng))))
     drawn = table.draw(_FEWER if len(near) else _SCREENED, rng)
     drawn = nearly_white(posterior, np.vstack([regressed(posterior, drawn), drawn, *near]))
-    likelihood = posterior.log_likelihood(drawn)
+    each = posterior.log_likelihoods(drawn)
+    likelihood = each.sum(axis=0)
     if np.isnan(likelihood).any():
         posterior.log_density(posterior.coordinates(drawn[np.isnan(likelihood)]))  # raises and says where
     own = len(drawn) - len(near)
-    begun = _distinct(posterior, drawn[np.argsort(-likelihood[:own], kind="stable")], starts)
+    begun = _distinct(posterior, _ranked(table, drawn[:own], each[:, :own]), starts)
     if len(near):
         begun.append(drawn[own + int(likelihood[own:].argmax())])
-    found = _kept(posterior, _descended(posterior, begun, crew=crew))
+    found = _recombined(posterior, _kept(posterior, _descended(posterior, begun, crew=crew)))
     further = _with_spare_terms(posterior, found) if found else []
-    return _kept(posterior, [*found, *_descended(posterior, further, crew=crew)]) if further else found
+    if not further:
+        return found
+    return _recombined(posterior, _kept(posterior, [*found, *_descended(posterior, further, crew=crew)]))
+
+
+def _ranked(table: ParameterTable, values: Matrix, likelihoods: Matrix) -> Matrix:
+    """Table values, (batch, rows), likeliest first, from log likelihoods of each response, (axes, batch).
+
+    Responses that share no free parameter are ranked apart, and the k-th of each stand together: no draw of
+    the paths of all of them is as likely as that.
+    """
+    out, groups = values.copy(), list[set[int]]()
+    acting = [set(table.acting_on(k)) for k in range(len(table.rows))]
+    for own, row in zip(acting, table.rows, strict=True):
+        if row.free and own:
+            groups = [own.union(*(g for g in groups if g & own)), *(g for g in groups if not g & own)]
+    for group in groups:
+        order = np.argsort(-likelihoods[sorted(group)].sum(axis=0), kind="stable")
+        rows = [k for k, own in enumerate(acting) if own & group]
+        out[:, rows] = values[order][:, rows]
+    return out
+
+
+def _recombined(posterior: Posterior, found: tuple[Optimum, ...]) -> tuple[Optimum, ...]:
+    """Optima with the one that has the best of them in every response, where the best of all has not."""
+    if len(found) < 2:
+        return found
+    values = np.stack([one.values for one in found])
+    best = _ranked(posterior.table, values, posterior.log_likelihoods(values))[0]
+    if min(_apart(posterior, best, one) for one in values) < _SAME:
+        return found
+    return _kept(posterior, [*found, *_descended(posterior, [best])])
 
 
 def again(

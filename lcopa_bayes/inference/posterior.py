@@ -136,12 +136,16 @@ class Posterior:
 
     def log_likelihood(self, values: Matrix) -> Vector:
         """Log likelihood of canonical values, linear parameters integrated out, (batch,)."""
+        return np.asarray(self.log_likelihoods(values).sum(axis=0))
+
+    def log_likelihoods(self, values: Matrix) -> Matrix:
+        """The same of each response axis, (axes, batch)."""
         if values.shape[0] > _PORTION:
             portions = (values[k : k + _PORTION] for k in range(0, values.shape[0], _PORTION))
-            return np.concatenate([self.log_likelihood(portion) for portion in portions])
+            return np.concatenate([self.log_likelihoods(portion) for portion in portions], axis=1)
         units = self.responses(values)
-        total = np.zeros(values.shape[0])
-        for axis in range(len(self.table.layout.responses)):
+        out = np.zeros((len(self.table.layout.responses), values.shape[0]))
+        for axis, total in enumerate(out):
             if isinstance(self.noise, GaussianNoise):
                 equations, log_scale, count = self.equations(axis, values, units)
                 total += equations.log_marginal() - log_scale - 0.5 * count * LOG_2PI
@@ -151,8 +155,8 @@ class Posterior:
                     noise = self.noise_parameters(values, axis)
                     total += self.noise.pointwise(residual, noise, samples.axes[axis].gaps).sum(axis=1)
         if self.simulation is not None:  # without a bounded response nothing is likely
-            total[~bounded(units)] = -np.inf
-        return total
+            out[:, ~bounded(units)] = -np.inf
+        return out
 
     def noise_parameters(self, values: Matrix, axis: int) -> Matrix:
         """Noise parameters of a response axis, (batch, names)."""

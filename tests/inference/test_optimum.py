@@ -7,10 +7,10 @@ import pytest
 from numpy.testing import assert_allclose
 from small import TRUTH, TWO, path, problem, record
 
-from lcopa_bayes.bench.command import prbs
+from lcopa_bayes.bench.command import joint, prbs
 from lcopa_bayes.bench.device import Device
 from lcopa_bayes.core.parallel import workers
-from lcopa_bayes.data.record import Record
+from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.inference.leastsquares import LeastSquares
 from lcopa_bayes.inference.optimum import along_orders, find_optima
 from lcopa_bayes.inference.posterior import Posterior
@@ -262,3 +262,34 @@ def test_a_term_that_is_a_constant_and_one_that_is_not_are_both_found_from_a_sin
     assert constant
     assert other
     assert constant[0][gain] > 1.5 * other[0][gain]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_every_response_of_paths_that_share_nothing_is_found(seed):
+    rng = np.random.default_rng(seed)
+    axes = [tuple(Axis(f"{letter}{k}", "V") for k in range(count)) for letter, count in (("u", 2), ("y", 3))]
+    paths = tuple(
+        tuple(
+            path(rng.uniform(0.5, 2), rng.uniform(0.1, 3), (rng.uniform(0.5, 3),), (0.95,)) for _ in range(2)
+        )
+        for _ in range(3)
+    )
+    device = Device(paths, *axes, (0.1, 0.2, 0.3))
+    command = joint(*(prbs(-1.0, 1.0, hold=hold, duration=30.0, rng=rng) for hold in (2.3, 3.1)))
+    posterior = made(record(seed, device=device, command=command, duration=30.0), noise="white")
+    best = find_optima(posterior, rng)[0].values
+    sds = [best[posterior.table.at("sigma", axis)] for axis in range(3)]
+    assert_allclose(sds, TRUTH["sigma"], rtol=0.2)  # 150 samples of each
+
+
+def test_likelihoods_of_responses_add_up():
+    posterior = CASES["coupled, all apart"]
+    values = posterior.table.draw(300, np.random.default_rng(0))
+    both, whole = posterior.log_likelihoods(values), posterior.log_likelihood(values)
+    assert_allclose(both.sum(axis=0), whole, rtol=1e-12)
+    other = values.copy()
+    own = [k for k in range(len(posterior.table.rows)) if posterior.table.acting_on(k) == (1,)]
+    other[:, own] = values[::-1][:, own]
+    changed = posterior.log_likelihoods(other)
+    assert_allclose(changed[0], both[0], rtol=1e-12)
+    assert_allclose(changed[1], both[1][::-1], rtol=1e-12)
