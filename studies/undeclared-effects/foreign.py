@@ -14,6 +14,7 @@ from lcopa_bayes.bench.hiddeneffects import Hidden, Shot
 from lcopa_bayes.bench.inversion import unit_step
 from lcopa_bayes.bench.readingeffects import static
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
+from lcopa_bayes.core.estimate import quantile
 from lcopa_bayes.data.record import Axis, Record
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.loop import Loop
@@ -345,7 +346,7 @@ def truths(made: Foreign, span: float, named: Iterable[str]) -> dict[str, float]
 
 
 def scored(found: Loop, made: Foreign) -> dict[str, Any]:
-    """Places of the figures of every path [normal sd]."""
+    """Places of the figures of every path [normal sd]; and true value, ends and median of each."""
     span = found.problem.scales.span
     bare, truth = truths(made, span, ()), truths(made, span, found.names)
     return {
@@ -353,4 +354,9 @@ def scored(found: Loop, made: Foreign) -> dict[str, Any]:
         "plant_alone": places(found.figures, truth, alone=True),
         "plant_after": places(found.figures, truth),
         "sizes_after": {},
+        "figures": {
+            one.name: [truth[one.name], *(float(quantile(one.values, at)) for at in (0.05, 0.5, 0.95))]
+            for one in found.figures
+            if one.name in truth
+        },
     }
