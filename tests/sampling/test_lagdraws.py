@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from inference.test_lagsum import DELAY, GAINS, SD, lags, made
+from small import U, Y
 
 from lcopa_bayes.core.arrays import Matrix
+from lcopa_bayes.data.record import Record
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.lagsum import lag_problem
 from lcopa_bayes.sampling.lagdraws import LagDraws, LagSearch, _begun, _walked, _weighted, lag_draws
 
@@ -89,3 +93,29 @@ def test_the_response_is_the_sum_of_its_lags() -> None:
     )
     assert one.response(0, time)[:5] == pytest.approx(expected, abs=1e-12)
     assert one.response(0, time)[:, -1] == pytest.approx(one.gains[:, 0], rel=1e-9, abs=1e-9)
+
+
+def chains(seed: int) -> Study:
+    """Two drives of one response, each with three lags one behind the other: short ones look like a delay."""
+    rng = np.random.default_rng(seed)
+    times = np.array([0.3, 0.1, 0.05])
+    shares = np.array([np.prod([one / (one - other) for other in times if other != one]) for one in times])
+    time, records = np.linspace(0.0, 3.0, 300), []
+    for k in range(2):
+        drive = np.zeros((time.size, 2))
+        drive[time >= 0.5, k] = 20.0
+        start = time[time >= 0.5][0]
+        response = (0.8, -0.3)[k] * 20.0 * lags(time, tuple(shares), tuple(times), start + 0.01)
+        read = response + 0.05 * rng.standard_normal(time.size)
+        records.append(Record(f"r{k}", time, drive, read[:, None], (U, replace(U, name="v")), (Y,), "s"))
+    return Study("chains", None, "s", 0, tuple(records), (), noise={"kind": "white"})
+
+
+def test_walkers_of_several_paths_leave_where_they_began() -> None:
+    """Moves of all ten coordinates at once leave hardly more than one effective draw a walker, which is the
+    one that it began with."""
+    search = LagSearch.over(lag_problem(chains(0)), 0, [0, 1], np.array([0.05]), np.array([[0.0, 0.2]] * 2))
+    rng = np.random.default_rng(1)
+    draws, ess = _walked(search.table, _begun(search, rng), rng)
+    assert draws.shape[1] >= 8
+    assert ess >= 200
