@@ -103,9 +103,8 @@ def mixture(state: State, own: Matrix | None, found: Sequence[Alternative]) -> t
         return np.asarray(((drawn >= low[:k]) & (drawn <= high[:k])).all(axis=1))
 
     if own is None:
-        drawn = x + rng.standard_normal((_DRAWS, x.size)) @ root_of(state.covariance).T
-        inside = within(drawn)
-        own = drawn[inside] if inside.any() else x[None]
+        own = _about(state, rng)
+        own = own[within(own)]
     parts, weights = [own], [1.0]
     for one in found:
         drawn = one.draws(own[rng.integers(len(own), size=_DRAWS)], x, rng)
@@ -114,6 +113,17 @@ def mixture(state: State, own: Matrix | None, found: Sequence[Alternative]) -> t
             parts.append(drawn[inside])
             weights.append(one.weight * float(inside.mean()))
     return parts, np.array(weights) / sum(weights)
+
+
+def _about(state: State, rng: np.random.Generator) -> Matrix:
+    """Normal draws about an optimum; coordinates at an end of their support stay there, since of draws of
+    several of them at once none may be inside."""
+    stuck, own = state.optimum.stuck, np.tile(state.optimum.x, (_DRAWS, 1))
+    whole = state.covariance
+    cross = whole[np.ix_(~stuck, stuck)]
+    given = whole[np.ix_(~stuck, ~stuck)] - cross @ np.linalg.pinv(whole[np.ix_(stuck, stuck)]) @ cross.T
+    own[1:, ~stuck] += rng.standard_normal((_DRAWS - 1, len(given))) @ root_of(given).T
+    return own
 
 
 def pooled(values: Sequence[Vector], weights: Vector) -> Vector:

@@ -134,3 +134,22 @@ def test_odds_are_those_of_the_evidence_even_where_a_float_does_not_hold_them():
     assert odds(of_four, log(20.0)) == pytest.approx(5.0)
     assert odds(SimpleNamespace(threshold=2 * CHANCE, traced=(None,)), 2 * log(20.0)) == pytest.approx(20.0)
     assert odds(of_four, 1e4) == np.inf
+
+
+def test_coordinates_at_an_end_of_their_support_leave_the_others_their_width(faint: Loop):
+    """Second method: regression of the others on those that are held, over normal draws of all."""
+    state = faint.after.state
+    k = state.model.names.index("gain")
+    x, stuck = state.optimum.x.copy(), np.zeros(state.optimum.x.size, dtype=bool)
+    for name in ("order_1", "time_1"):
+        stuck[state.model.names.index(name)] = True
+    low, high = state.model.bounds
+    held = replace(state, optimum=replace(state.optimum, stuck=stuck))
+    (draws,), _ = mixture(held, None, [])
+    assert (draws[:, stuck] == x[stuck]).all()
+    assert ((draws >= low) & (draws <= high)).all()
+    drawn = np.random.default_rng(0).multivariate_normal(x, state.covariance, 20_000)
+    slopes = np.linalg.lstsq(drawn[:, stuck] - x[stuck], drawn[:, k] - x[k], rcond=None)[0]
+    left = drawn[:, k] - x[k] - (drawn[:, stuck] - x[stuck]) @ slopes
+    assert draws[:, k].std() == pytest.approx(left.std(), rel=0.05)
+    assert draws[:, k].std() < 0.95 * drawn[:, k].std()
