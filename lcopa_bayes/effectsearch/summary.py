@@ -294,6 +294,8 @@ def next_measurement(result: Loop) -> str:
             wanted = _wanted([cards[name] for name in group if name in cards])
             return f"To separate {', '.join(group)}, record {wanted}."
     if result.verdict.kind == "unexplained":
+        if result.lags:
+            return "Record until the responses settle, and sample their onset: sums of lags leave both open."
         alone = [one.remedy for one in result.contrary if len(one.records) == 1]
         if alone:
             return f"{alone[0][0].upper()}{alone[0][1:]}."

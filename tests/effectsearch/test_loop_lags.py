@@ -60,7 +60,9 @@ def test_a_chain_of_lags_takes_no_name(chain: Loop):
     assert chain.names == ()
     assert "linear dynamics" in chain.verdict.sentence
     assert [one.support for one in chain.lags] == ["lags"]
-    assert "Sums of 3 to 4 lags follow the records better" in results(chain)["alternatives"]["sentence"]
+    shown = results(chain)
+    assert "Sums of 3 to 4 lags follow the records better" in shown["alternatives"]["sentence"]
+    assert "sample their onset" in shown["next_measurement"]
 
 
 def test_figures_hold_the_truth_where_the_plant_of_the_loop_does_not(chain: Loop):
