@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from typing import Any, final
 
 import numpy as np
+from scipy.stats import truncnorm
 
 from lcopa_bayes.core.arrays import Array, Flags, Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of, root_of
@@ -116,14 +117,22 @@ def mixture(state: State, own: Matrix | None, found: Sequence[Alternative]) -> t
 
 
 def _about(state: State, rng: np.random.Generator) -> Matrix:
-    """Normal draws about an optimum; coordinates at an end of their support stay there, since of draws of
-    several of them at once none may be inside."""
-    stuck, own = state.optimum.stuck, np.tile(state.optimum.x, (_DRAWS, 1))
-    whole = state.covariance
-    cross = whole[np.ix_(~stuck, stuck)]
-    given = whole[np.ix_(~stuck, ~stuck)] - cross @ np.linalg.pinv(whole[np.ix_(stuck, stuck)]) @ cross.T
-    own[1:, ~stuck] += rng.standard_normal((_DRAWS - 1, len(given))) @ root_of(given).T
-    return own
+    """Normal draws about an optimum.
+
+    Coordinates that an end of their support holds are drawn on its inner side, each by itself, with the slope
+    of the likelihood there: of normal draws of several of them at once none may be inside.
+    """
+    optimum, whole = state.optimum, state.covariance
+    stuck, shift = optimum.stuck, np.zeros((_DRAWS, optimum.x.size))
+    slope, sd = (optimum.jacobian.T @ optimum.white)[stuck], np.sqrt(np.diag(whole))[stuck]
+    steep = np.abs(slope) * sd
+    inward = truncnorm(steep, np.inf, -steep * sd, sd).rvs((_DRAWS, steep.size), random_state=rng)
+    shift[:, stuck] = -np.sign(slope) * inward
+    onto = whole[np.ix_(~stuck, stuck)] @ np.linalg.pinv(whole[np.ix_(stuck, stuck)])
+    given = whole[np.ix_(~stuck, ~stuck)] - onto @ whole[np.ix_(stuck, ~stuck)]
+    scatter = rng.standard_normal((_DRAWS, len(given))) @ root_of(given).T
+    shift[:, ~stuck] = scatter + shift[:, stuck] @ onto.T
+    return np.concatenate([optimum.x[None], optimum.x + shift])
 
 
 def pooled(values: Sequence[Vector], weights: Vector) -> Vector:

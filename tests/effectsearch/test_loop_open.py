@@ -136,20 +136,26 @@ def test_odds_are_those_of_the_evidence_even_where_a_float_does_not_hold_them():
     assert odds(of_four, 1e4) == np.inf
 
 
-def test_coordinates_at_an_end_of_their_support_leave_the_others_their_width(faint: Loop):
-    """Second method: regression of the others on those that are held, over normal draws of all."""
+def test_coordinates_at_an_end_of_their_support_are_drawn_inside_of_it(faint: Loop):
+    """Second methods: the density of a normal cut off at its end, by quadrature; regression of the others on
+    those that are held, over normal draws of all."""
     state = faint.after.state
-    k = state.model.names.index("gain")
-    x, stuck = state.optimum.x.copy(), np.zeros(state.optimum.x.size, dtype=bool)
-    for name in ("order_1", "time_1"):
-        stuck[state.model.names.index(name)] = True
-    low, high = state.model.bounds
-    held = replace(state, optimum=replace(state.optimum, stuck=stuck))
+    optimum, names = state.optimum, state.model.names
+    stuck = np.isin(names, ("order_1", "time_1"))
+    white = optimum.white + optimum.jacobian[:, stuck] @ (np.array([1.0, -1.5]) * optimum.sd[stuck])
+    held = replace(state, optimum=replace(optimum, stuck=stuck, white=white))
     (draws,), _ = mixture(held, None, [])
-    assert (draws[:, stuck] == x[stuck]).all()
-    assert ((draws >= low) & (draws <= high)).all()
-    drawn = np.random.default_rng(0).multivariate_normal(x, state.covariance, 20_000)
-    slopes = np.linalg.lstsq(drawn[:, stuck] - x[stuck], drawn[:, k] - x[k], rcond=None)[0]
-    left = drawn[:, k] - x[k] - (drawn[:, stuck] - x[stuck]) @ slopes
-    assert draws[:, k].std() == pytest.approx(left.std(), rel=0.05)
-    assert draws[:, k].std() < 0.95 * drawn[:, k].std()
+    slope = optimum.jacobian.T @ white
+    for k in np.flatnonzero(stuck):
+        inward = np.sign(slope[k]) * (optimum.x[k] - draws[:, k])
+        assert inward.min() >= 0.0
+        far = np.linspace(0.0, 8.0 * optimum.sd[k], 20_000)
+        density = np.exp(-np.abs(slope[k]) * far - 0.5 * far**2 / optimum.sd[k] ** 2)
+        mean = float(density @ far / density.sum())
+        assert inward.mean() == pytest.approx(mean, rel=0.06)
+    k = names.index("gain")
+    drawn = np.random.default_rng(0).multivariate_normal(np.zeros(len(names)), state.covariance, 20_000)
+    slopes = np.linalg.lstsq(drawn[:, stuck], drawn[:, k], rcond=None)[0]
+    left = draws[:, k] - optimum.x[k] - (draws[:, stuck] - optimum.x[stuck]) @ slopes
+    assert left.mean() == pytest.approx(0.0, abs=0.1 * left.std())
+    assert left.std() == pytest.approx((drawn[:, k] - drawn[:, stuck] @ slopes).std(), rel=0.05)
