@@ -23,6 +23,7 @@ import numpy as np
 from scipy.linalg import eigh, orth
 from scipy.optimize import least_squares
 from scipy.sparse import csr_array
+from scipy.stats.qmc import Halton
 
 from lcopa_bayes.core.arrays import Array, Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of
@@ -50,6 +51,9 @@ _APART = 0.7
 """Least distance of the time constants a search starts from [-, natural logarithm]."""
 _STARTS = 3
 """Places where a further lag is tried."""
+_TRIED, _AGAIN, _LOWER = 1_000, 3, 0.5
+"""Places that a path is begun again from, most times that this is done, and least fall of the square
+for which it is done once more [-]."""
 _STEP = 1e-7
 """Step of a difference quotient, over the range of its coordinate [-]."""
 
@@ -192,12 +196,33 @@ class LagFit:
 
 def lag_fits(table: LagTable) -> tuple[LagFit, ...]:
     """The best of a few searches for each number of lags, 1 to `MOST`: a further lag begins where it alone
-    explains most of what the others leave."""
+    explains most of what the others leave, and the best begins again with lags and delays of each path from
+    everywhere."""
     fits: list[LagFit] = []
     for lags in range(1, MOST + 1):
         tried = [_descended(table, lags, start) for start in _starts(table, fits[-1] if fits else None)]
-        fits.append(min(tried, key=lambda one: one.square))
+        best = min(tried, key=lambda one: one.square)
+        for _ in range(_AGAIN):
+            again = _descended(table, lags, _exchanged(table, best.coordinates))
+            if again.square > best.square - _LOWER:
+                break
+            best = again
+        fits.append(best)
     return tuple(fits)
+
+
+def _exchanged(table: LagTable, coordinates: Vector) -> Vector:
+    """Coordinates with lags and delay of one path after the other exchanged for those, of many, that explain
+    most beside the others: a few starts for all paths alike miss what each of them needs."""
+    low, high = table.ends((coordinates.size - table.paths) // table.paths)
+    places = np.arange(coordinates.size - table.paths).reshape(table.paths, -1)
+    anywhere = Halton(places.shape[1] + 1, scramble=False).random(_TRIED + 1)[1:]
+    for path in range(table.paths):
+        own = np.append(places[path], places.size + path)
+        tried = np.tile(coordinates, (_TRIED, 1))
+        tried[:, own] = low[own] + (high[own] - low[own]) * anywhere
+        coordinates = tried[int(table.conditional(tried).log_marginal.argmax())]
+    return coordinates
 
 
 def best_of(fits: Sequence[LagFit]) -> LagFit:

@@ -149,3 +149,39 @@ def test_of_many_samples_some_are_used_and_the_answer_stays() -> None:
     times = [np.sort(np.exp(lag_fits(tabulated(one))[1].coordinates[:-1])) for one in (few, many)]
     assert times[0] == pytest.approx(TIMES, rel=0.1)
     assert times[1] == pytest.approx(TIMES, rel=0.1)
+
+
+def two_drives(seed: int, paths: tuple[tuple[tuple[float, float], float], ...]) -> Study:
+    """Products of two lags behind a delay, on two drives that move in every record."""
+    rng, time, records = np.random.default_rng(seed), np.linspace(0.0, 60.0, 300), []
+    for name in "ab":
+        drive, read = np.zeros((time.size, 2)), 2 * SD * rng.standard_normal(time.size)
+        for k, (times, delay) in enumerate(paths):
+            at = time[np.sort(rng.choice(np.arange(20, 250), 3, replace=False))]
+            drive[:, k] = np.append(0.0, rng.uniform(-1, 1, 3))[np.searchsorted(at, time, side="right")]
+            shares = np.array(times) / (np.array(times) - np.array(times[::-1]))
+            for start, jump in zip(
+                at, np.diff(drive[np.searchsorted(time, at), k], prepend=0.0), strict=True
+            ):
+                read += (1.0, -0.5)[k] * jump * lags(time, tuple(shares), times, start + delay)
+        records.append(Record(name, time, drive, read[:, None], (U, replace(U, name="v")), (Y,), "s"))
+    return Study("both", None, "s", 0, tuple(records), (), noise={"kind": "white"})
+
+
+@pytest.mark.parametrize(
+    ("seed", "paths"),
+    [
+        (1, (((3.2, 0.92), 2.85), ((10.5, 4.1), 1.27))),
+        (9, (((8.4, 4.7), 2.33), ((1.74, 1.1), 2.75))),
+        (14, (((7.6, 4.7), 2.58), ((2.13, 1.24), 1.65))),
+    ],
+)
+def test_least_squares_of_two_paths_leave_no_more_than_what_made_the_records(
+    seed: int, paths: tuple[tuple[tuple[float, float], float], ...]
+) -> None:
+    delays = np.linspace([0.0, 0.0], [6.0, 6.0], 33).T
+    table = lag_table(lag_problem(two_drives(seed, paths)), 0, [0, 1], np.array([2 * SD]), delays)
+    (first, early), (second, late) = paths
+    truth = np.array([*np.log(first), *np.log(second), early, late])
+    square = float((table.residuals(truth[None]) ** 2).sum()) + table.remainder
+    assert lag_fits(table)[1].square <= square + 0.1
