@@ -148,6 +148,11 @@ def number_with_lags(
     return _joined(number, values, float(np.mean([shares[one.name] for one in own]))) if values else number
 
 
+def ess_with_lags(ess: float, found: Sequence[Alternative]) -> float:
+    """Effective draws of a number over sums of lags too: the fewest of any part."""
+    return min([ess, *(one.draws.ess for one in found if one.support != "plant")])
+
+
 def _uses(row: Parameter, path: PathSlot, layout: Layout) -> bool:
     """Whether a parameter is the gain or the delay of a path."""
     if row.kind == "delay":

@@ -20,7 +20,13 @@ from lcopa_bayes.effectsearch.basemodel import fitted_base, structure_chosen
 from lcopa_bayes.effectsearch.candidates import offered
 from lcopa_bayes.effectsearch.explained import coordinates_of, declarable, explained_draws, explained_study
 from lcopa_bayes.effectsearch.heldouteffects import missed, unseen_share
-from lcopa_bayes.effectsearch.lags import figures_with_lags, lags_of, linear_dynamics, number_with_lags
+from lcopa_bayes.effectsearch.lags import (
+    ess_with_lags,
+    figures_with_lags,
+    lags_of,
+    linear_dynamics,
+    number_with_lags,
+)
 from lcopa_bayes.effectsearch.openeffects import (
     Alternative,
     Weighed,
@@ -32,7 +38,7 @@ from lcopa_bayes.effectsearch.openeffects import (
 from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
 from lcopa_bayes.effectsearch.outliers import Outlying, outlying, without_outliers
 from lcopa_bayes.effectsearch.refits import released
-from lcopa_bayes.effectsearch.rounds import CLEAR, SINGLE, Round, Search, search
+from lcopa_bayes.effectsearch.rounds import Round, Search, search, single_record
 from lcopa_bayes.effectsearch.scores import (
     Score,
     State,
@@ -142,7 +148,8 @@ class Loop:
             return here.as_json(ess=np.nan, grade="tentative", interval="Laplace")
         own = next(one for one in self.draws.estimates() if one.name == here.name)
         alone = own.lower, own.value, own.upper
-        return here.as_json(ess=own.ess, grade=own.grade, interval=own.interval) | {"alone": alone}
+        ess = ess_with_lags(own.ess, self.lags)
+        return here.as_json(ess=ess, grade=own.grade, interval=own.interval) | {"alone": alone}
 
     def number(self, k: int) -> Weighed:
         """A coordinate [`unit`] over the final model and each that is open to it and has it."""
@@ -226,7 +233,7 @@ def _looped(
         problem, base, start, enlarged = fitted_base(study, kinds, as_stated=as_stated, draws=draws)
     before = _side(problem, start)
     contrary = disagreements((*study.fit, *study.held_out))
-    cautions = (*map(str, contrary), *base.caution, *_alone(study))
+    cautions = (*map(str, contrary), *base.caution, *single_record(study))
     alone = len(study.fit) == 1 and not study.held_out
     searched, wrong = None, next((str(one) for one in contrary if one.gross), base.failed)
     if not wrong or (base.smooth and wrong == base.failed):
@@ -364,19 +371,6 @@ def _findings(
         reached=np.nan if by_record else over_noise(after.fit, now, clear=not last.alarmed),
         nothing=1 / (1 + sum(odds(last, one.log_bayes_factor) for one in last.traced if not one.scatters)),
     )
-
-
-def _alone(study: Study) -> tuple[str, ...]:
-    """What a single record leaves open."""
-    if len(study.fit) > 1:
-        return ()
-    said = "an effect of the device and a peculiarity of a single record are confounded"
-    if not study.held_out:
-        said += (
-            f": an effect is named only where the residual is {CLEAR:g} times the noise and it takes "
-            f"{100 * SINGLE:.0f} % of its power"
-        )
-    return (f"{said}; fit a second record",)
 
 
 def _drawn(problem: Problem, state: State, sampled: tuple[Draws, Noise]) -> Side:

@@ -9,6 +9,7 @@ from typing import final
 
 import numpy as np
 
+from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.candidates import refitted
 from lcopa_bayes.effectsearch.refits import (
     SIGNIFICANT,
@@ -311,3 +312,16 @@ def group(state: State, chosen: Refit, refits: Sequence[Refit], seen: Trace) -> 
         if margin < MARGIN:
             out.append(one.name)
     return tuple(out)
+
+
+def single_record(study: Study) -> tuple[str, ...]:
+    """What a single record leaves open."""
+    if len(study.fit) > 1:
+        return ()
+    said = "an effect of the device and a peculiarity of a single record are confounded"
+    if not study.held_out:
+        said += (
+            f": an effect is named only where the residual is {CLEAR:g} times the noise and it takes "
+            f"{100 * SINGLE:.0f} % of its power"
+        )
+    return (f"{said}; fit a second record",)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from lcopa_bayes.core.estimate import EQUAL_TAILED, attributes, plain
+from lcopa_bayes.effectsearch.lags import ess_with_lags
 from lcopa_bayes.effectsearch.loop import Loop, Side
 from lcopa_bayes.effectsearch.residuals import View, views
 from lcopa_bayes.effectsearch.rounds import Round
@@ -136,7 +137,9 @@ def _effects(result: Loop, chances: dict[str, float]) -> list[dict[str, Any]]:
 def _figures(result: Loop) -> list[dict[str, Any]]:
     """Figures of the step responses; delays and steady values are among the parameters."""
     draws = result.draws
-    ess, interval = (draws.ess, EQUAL_TAILED) if draws is not None else (np.nan, "Laplace")
+    ess, interval = np.nan, "Laplace"
+    if draws is not None:
+        ess, interval = ess_with_lags(draws.ess, result.lags), EQUAL_TAILED
     grade = result.grade.level
     kept = (one for one in result.figures if not one.name.startswith(("delay[", "steady_state[")))
     return [one.as_json(ess=ess, grade=grade, interval=interval) for one in kept]
