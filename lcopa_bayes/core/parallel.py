@@ -126,8 +126,7 @@ def meanwhile(
 @contextmanager
 def _pool(jobs: int, shared: object) -> Iterator[ProcessPoolExecutor]:
     """Processes of one thread each that share a value; InputError when one is lost."""
-    package = __name__.partition(".")[0]
-    imported_ahead(*(name for name in sys.modules if name.startswith(f"{package}.")))
+    imported_ahead()
     pool = ProcessPoolExecutor(jobs, mp_context=_CONTEXT, initializer=_take_up, initargs=(shared,))
     try:
         yield pool
@@ -303,12 +302,15 @@ else:
 
 
 def imported_ahead(*modules: str) -> None:
-    """Let another process import these modules from now on, for workers that are started later to begin with.
+    """Let another process import these modules from now on, for workers that are started later to begin with,
+    by default those of the package that are imported here.
 
     Where workers are processes of their own, as on other systems than Linux, this does nothing.
     """
     if sys.platform == "linux":
-        forkserver.set_forkserver_preload(list(modules))
+        package = __name__.partition(".")[0]
+        loaded = [name for name in sys.modules if name.startswith(f"{package}.")]
+        forkserver.set_forkserver_preload(list(modules) or loaded)
         # an interrupt ends it without a word, even while it imports
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:

@@ -19,6 +19,7 @@ from typing import TypeAlias, final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.crew import ALONE, Crew
 from lcopa_bayes.data.description import FOLLOWED, Described, LaggedSum
 from lcopa_bayes.data.drive import moved_with_drive
 from lcopa_bayes.data.record import Record
@@ -84,7 +85,7 @@ class Disagreement:
         return f"{self.reason[0].upper()}{self.reason[1:]}: {self.remedy}."
 
 
-def disagreements(records: Sequence[Record]) -> tuple[Disagreement, ...]:
+def disagreements(records: Sequence[Record], crew: Crew = ALONE) -> tuple[Disagreement, ...]:
     """What the records, all of equal axes, contradict: each record by itself, then in pairs.
 
     A record that several others contradict is named once. Ratios are accurate to a tenth where a description
@@ -95,7 +96,7 @@ def disagreements(records: Sequence[Record]) -> tuple[Disagreement, ...]:
     period = min(float(np.median(np.diff(record.time))) for record in records)
     span = max(float(np.ptp(record.time)) for record in records)
     lags = np.geomspace(period, span, _LAGS)
-    described = [one for one in (Described(record, lags) for record in records) if one.moving and one.best]
+    described = [one for one in crew.sharing(lags).each(_described, records) if one is not None]
     leads = [
         max((-seen[0] for seen in _judged(one) if _runs_ahead(*seen, period)), default=0.0)
         for one in described
@@ -124,6 +125,12 @@ def disagreements(records: Sequence[Record]) -> tuple[Disagreement, ...]:
             joint.append(seen)
     # what one record contradicts in all others together, these contradict in it
     return (*ahead, *_once(sorted(pairs, key=_severity)), *sorted(joint, key=_severity)[:1])
+
+
+def _described(lags: Vector, record: Record) -> Described | None:
+    """A record's description; None where nothing moves or is described."""
+    one = Described(record, lags)
+    return one if one.moving and one.best else None
 
 
 def _severity(one: Disagreement) -> tuple[bool, bool, float]:

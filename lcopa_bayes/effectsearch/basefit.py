@@ -9,6 +9,7 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.crew import ALONE, Crew
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.noise import (
     AxisNoise,
@@ -71,7 +72,12 @@ class BaseFit:
 
 
 def base_fit(
-    model: ExtendedModel, rng: np.random.Generator, *, starts: int = STARTS, near: Sequence[Vector] = ()
+    model: ExtendedModel,
+    rng: np.random.Generator,
+    *,
+    starts: int = STARTS,
+    near: Sequence[Vector] = (),
+    crew: Crew = ALONE,
 ) -> BaseFit:
     """The optimum of a fit's own search from so many starts, then noise, and the optimum under it; `near` are
     further coordinates to start from.
@@ -80,12 +86,13 @@ def base_fit(
     """
     posterior = model.plant
     seeds = [model.values(x) for x in near]
-    optima = find_optima(replace(posterior, noise=White()), rng, starts=starts, near=seeds)
+    white = replace(posterior, noise=White())
+    optima = find_optima(white, rng, starts=starts, near=seeds, crew=crew.sharing(white))
     # where no search ends inside the priors a draw of them is as good a start as any
     first = optima[0].values if optima else posterior.table.draw(1, rng)[0]
     x = model.coordinates(first)
     others = [model.delayed(x, share) for share in _DELAYS] if model.delays else []
-    optimum = Regression(model, Whitening(posterior.samples, _guessed(posterior))).best([x, *others])
+    optimum = Regression(model, Whitening(posterior.samples, _guessed(posterior))).best([x, *others], crew)
     noise: tuple[AxisNoise, ...] = ()
     for _ in range(_ROUNDS):
         delay = model.dead_time(optimum.x)

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.crew import ALONE, Crew
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.data.record import Record
 from lcopa_bayes.data.requirements import not_at_rest, unmet_apart_from_rest
@@ -153,7 +154,9 @@ def structure_chosen(study: Study, *, as_stated: bool) -> bool:
     return not as_stated and study.model.terms == 1 and study.model.orders == "free"
 
 
-def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: bool, draws: int) -> Base:
+def fitted_base(
+    study: Study, library: Sequence[type[Effect]], *, as_stated: bool, draws: int, crew: Crew = ALONE
+) -> Base:
     """The base fit; with one free viscous term stated and not `as_stated`, of the number the evidence asks
     for and its paths with elements and delays of their own where it asks for these.
 
@@ -164,29 +167,29 @@ def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: boo
     """
     refuse_if(unmet_apart_from_rest(study))
     alone = structure_chosen(study, as_stated=as_stated)
-    base = _based(study)
-    separate = _apart(study, base) if alone else (base, study)
+    base = _based(study, crew=crew)
+    separate = _apart(study, base, crew) if alone else (base, study)
     # paths that share too much look like a plant that did not rest
     mended = started(separate[1], separate[0].fit)
     rival = np.inf  # a sensor that drifts looks like a plant that did not rest, or has a slow term
     if mended is not None or separate[0].fit.smooth:
-        rival = _explained(separate[0], library, np.random.default_rng([study.seed, 14]), draws)
+        rival = _explained(separate[0], library, np.random.default_rng([study.seed, 14]), draws, crew)
         mended = mended if mended is None or mended.power < rival else None
     if mended is None:
         refuse_if(not_at_rest(study.fit, study.held_out))
     else:
         study = replace(mended.study, model=study.model)
-        base = _based(study)._replace(sentence=mended.sentence)
+        base = _based(study, crew=crew)._replace(sentence=mended.sentence)
     later = _later(study, base.fit)
     if later is not None:
         study = later.study
-        base = _based(study)._replace(sentence=f"{base.sentence} {later.sentence}".strip())
+        base = _based(study, crew=crew)._replace(sentence=f"{base.sentence} {later.sentence}".strip())
     if not alone:
         return base
-    base, study = separate if mended is None and later is None else _apart(study, base)
+    base, study = separate if mended is None and later is None else _apart(study, base, crew)
     for terms in range(2, _MOST + 1):
         try:
-            wider = _wider(replace(study, model=replace(study.model, terms=terms)), base, terms)
+            wider = _wider(replace(study, model=replace(study.model, terms=terms)), base, terms, crew)
         except (ArithmeticError, InputError):  # not simulated, or more parameters than samples
             break
         gain = _gain(base, wider)
@@ -200,9 +203,9 @@ def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: boo
             said = f"The base model has {terms} viscous terms, because with fewer {base.fit.failed}."
         else:
             rng = np.random.default_rng([study.seed, 12, terms])
-            named = _named(base, library, rng, draws)
+            named = _named(base, library, rng, draws, crew)
             if named is not None and named.log_bayes_factor >= gain:
-                richer = _named(wider, library, rng, draws)
+                richer = _named(wider, library, rng, draws, crew)
                 if not _gain(base, wider, named, richer) > _GAIN:
                     break
             said = (
@@ -213,14 +216,14 @@ def fitted_base(study: Study, library: Sequence[type[Effect]], *, as_stated: boo
     return base
 
 
-def _apart(study: Study, base: Base) -> tuple[Base, Study]:
+def _apart(study: Study, base: Base, crew: Crew) -> tuple[Base, Study]:
     """Base fit and study with an element and a delay of each path, where that is worth 10 nat."""
     layout = base.problem.posterior.table.layout
     if len(layout.paths) == len(layout.elements) == len(layout.delays):
         return base, study
     apart = replace(study, model=replace(study.model, share="none", delay="path"))
     try:
-        wider = _wider(apart, base, 0)
+        wider = _wider(apart, base, 0, crew)
     except (ArithmeticError, InputError):
         return base, study
     gain = _gain(base, wider)
@@ -230,18 +233,18 @@ def _apart(study: Study, base: Base) -> tuple[Base, Study]:
     return wider._replace(sentence=f"{base.sentence} {said}".strip()), apart
 
 
-def _wider(study: Study, base: Base, terms: int) -> Base:
+def _wider(study: Study, base: Base, terms: int, crew: Crew = ALONE) -> Base:
     """The base fit of a study that contains that of another, also from the optimum of the latter.
 
     Where it stays less likely than that, it has failed. `terms` separates its random numbers from others'.
     """
-    wider = _based(study, terms, contained=base)
+    wider = _based(study, terms, contained=base, crew=crew)
     regression = wider.fit.regression
     inner = Regression(base.fit.model, regression.whitening).descend(base.fit.optimum.x)
     if wider.fit.optimum.cost <= inner.cost + _BELOW:
         return wider
     starts = _lifted(wider.fit.model, base, np.random.default_rng([study.seed, 13, terms]))
-    optimum = regression.best([wider.fit.optimum.x, *starts])
+    optimum = regression.best([wider.fit.optimum.x, *starts], crew)
     short = optimum.cost - inner.cost
     failed = wider.fit.failed
     if short > _BELOW:
@@ -260,24 +263,24 @@ def _lifted(model: ExtendedModel, base: Base, rng: np.random.Generator) -> list[
     return [] if starts is None else [model.coordinates(each) for each in starts]
 
 
-def _based(study: Study, *key: int, contained: Base | None = None) -> Base:
+def _based(study: Study, *key: int, contained: Base | None = None, crew: Crew = ALONE) -> Base:
     """A study's base fit as stated; `key` separates its random numbers from others'. It starts from the
     optimum of a `contained` model too."""
     problem = problem_of(study)
-    fit = _fit(problem, key, contained)
+    fit = _fit(problem, key, contained, crew)
     narrow = narrowed(problem, partial(_shift, fit))
     if narrow is not problem:
         problem = narrow
-        fit = _fit(problem, key, contained)
+        fit = _fit(problem, key, contained, crew)
     return Base(problem, fit, _state(study, fit), "")
 
 
-def _fit(problem: Problem, key: Sequence[int], contained: Base | None) -> BaseFit:
+def _fit(problem: Problem, key: Sequence[int], contained: Base | None, crew: Crew) -> BaseFit:
     model, seed = ExtendedModel(problem.posterior), [problem.study.seed, 10, *key]
     if contained is None:
-        return base_fit(model, np.random.default_rng(seed))
+        return base_fit(model, np.random.default_rng(seed), crew=crew)
     near = _lifted(model, contained, np.random.default_rng([*seed, 1]))
-    return base_fit(model, np.random.default_rng(seed), starts=_MORE_STARTS, near=near)
+    return base_fit(model, np.random.default_rng(seed), starts=_MORE_STARTS, near=near, crew=crew)
 
 
 def _state(study: Study, fit: BaseFit) -> State:
@@ -310,17 +313,23 @@ def _gain(base: Base, wider: Base, named: Refit | None = None, richer: Refit | N
     return log_bayes_factor(same, larger.optimum, quiet) + ordering + paid
 
 
-def _named(base: Base, library: Sequence[type[Effect]], rng: np.random.Generator, draws: int) -> Refit | None:
+def _named(
+    base: Base, library: Sequence[type[Effect]], rng: np.random.Generator, draws: int, crew: Crew
+) -> Refit | None:
     """The best named effect beside a base fit."""
-    seen = trace(base.start, library, rng, noise_samples=base.fit.noise_samples, draws=draws)
-    return leading(base.start, seen) if seen.alarmed else None
+    quiet = base.fit.noise_samples
+    seen = trace(base.start, library, rng, noise_samples=quiet, draws=draws, crew=crew)
+    return leading(base.start, seen, crew) if seen.alarmed else None
 
 
-def _explained(base: Base, library: Sequence[type[Effect]], rng: np.random.Generator, draws: int) -> float:
+def _explained(
+    base: Base, library: Sequence[type[Effect]], rng: np.random.Generator, draws: int, crew: Crew
+) -> float:
     """Squared residual that the best named effect leaves of a base fit [response unit^2]; infinite without
     one that leaves noise."""
-    seen = trace(base.start, library, rng, noise_samples=base.fit.noise_samples, draws=draws)
-    best = leading(base.start, seen)
+    quiet = base.fit.noise_samples
+    seen = trace(base.start, library, rng, noise_samples=quiet, draws=draws, crew=crew)
+    best = leading(base.start, seen, crew)
     return np.inf if best is None or too_smooth(best.optimum) else best.optimum.power
 
 

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.crew import ALONE, Crew
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.refits import Refit, refit, under_one_noise
 from lcopa_bayes.effectsearch.regression import Regression
@@ -51,7 +52,7 @@ def offered(study: Study) -> list[type[Effect]]:
     return [kind for kind in known if not kind.card.fields or "thermal" in kind.card.fields]
 
 
-def refitted(state: State, seen: Trace) -> tuple[list[Refit], list[str]]:
+def refitted(state: State, seen: Trace, crew: Crew = ALONE) -> tuple[list[Refit], list[str]]:
     """Refits of what may be named, by falling evidence; what could not be refitted and why.
 
     Candidates come near the best of all. Effects that the base model imitates to first order are tried too,
@@ -76,26 +77,40 @@ def refitted(state: State, seen: Trace) -> tuple[list[Refit], list[str]]:
         if one.card.dynamics and one.signatures and one.log_bayes_factor >= worthy:
             worth[one.name] = one.signature
             sizes[one.name] = worth[one.name].amplitude(seen.residual, seen.scale)
-    done: list[Refit] = []
-    failures: list[str] = []
-    for name, amplitude in sizes.items():
-        effect, reached_at = worth[name].effect, None
-        try:
-            traced = seen.of(name)
-            if (far or traced.card.dynamics) and movable(traced):
-                effect, reached_at = descended(state, seen, traced)
-                amplitude = reached_at[-amplitude.size :] / state.model.having(effect).scale
-            starts = [(effect, amplitude)]
-            settled = reached_at is not None or traced.card.dynamics or not seen.alarmed
-            other = None if settled else other_instance(seen, traced, least)
-            if other is not None:
-                starts.append((other.effect, other.amplitude(seen.residual, seen.scale)))
-            known = (state.model, state.optimum, state.whitening)
-            ends = [refit(*known, [start], seen.scale.quiet, near=reached_at) for start in starts]
-            done.append(min(ends, key=lambda end: end.optimum.cost))
-        except ArithmeticError as error:
-            failures.append(f"{name}: {error}")
+    known = crew.sharing((state, least if seen.alarmed else np.inf, far))
+    # of the trace a task needs one effect
+    tasks = [(replace(seen, traced=(seen.of(name),)), amplitude) for name, amplitude in sizes.items()]
+    ends = dict(zip(sizes, known.each(_refitted, tasks), strict=True))
+    done = [_beside(state, end) for end in ends.values() if isinstance(end, Refit)]
+    failures = [f"{name}: {end}" for name, end in ends.items() if not isinstance(end, Refit)]
     return under_one_noise(done), failures
+
+
+def _refitted(known: tuple[State, float, bool], task: tuple[Trace, Vector]) -> Refit | str:
+    """The refit of the only effect of a trace, or why there is none."""
+    (state, least, far), (seen, amplitude) = known, task
+    (traced,) = seen.traced
+    effect, reached_at = traced.signature.effect, None
+    try:
+        if (far or traced.card.dynamics) and movable(traced):
+            effect, reached_at = descended(state, seen, traced)
+            amplitude = reached_at[-amplitude.size :] / state.model.having(effect).scale
+        starts = [(effect, amplitude)]
+        settled = reached_at is not None or traced.card.dynamics
+        other = None if settled else other_instance(seen, traced, least)
+        if other is not None:
+            starts.append((other.effect, other.amplitude(seen.residual, seen.scale)))
+        base = (state.model, state.optimum, state.whitening)
+        ends = [refit(*base, [start], seen.scale.quiet, near=reached_at) for start in starts]
+    except ArithmeticError as error:
+        return str(error)
+    return min(ends, key=lambda end: end.optimum.cost)
+
+
+def _beside(state: State, end: Refit) -> Refit:
+    """A refit, perhaps of another process, on the very plant and noise that it was started from."""
+    model = replace(end.model, plant=state.model.plant, scaled=state.model.having(*end.model.effects).scaled)
+    return replace(end, model=model, before=state.optimum, whitening=state.whitening)
 
 
 def other_instance(seen: Trace, traced: Traced, least: float) -> Signature | None:

@@ -11,6 +11,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.crew import Crew
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.data.agreement import Disagreement, disagreements
 from lcopa_bayes.data.study import Study
@@ -66,6 +67,8 @@ from lcopa_bayes.results.sumsoflags import Alternative as SumOfLags
 from lcopa_bayes.sampling.convergence import Grade
 from lcopa_bayes.sampling.draws import Draws
 
+_WORTHWHILE = 2.0
+"""Time that a search takes from which processes share it [s]."""
 _ASTRAY = (
     "the draws of the study predict the records held out worse than its optimum does and are not used: "
     "intervals and bands are those of a Laplace approximation there"
@@ -217,34 +220,41 @@ def loop(
             "so leave `use` out of [effects]"
         )
     kinds = offered(study) if library is None else list(library)
-    with threadpool_limits(1):  # many small products: more threads only wait for each other
-        return _looped(study, kinds, jobs=jobs, sample=sample, quick=quick, as_stated=as_stated)
+    # many small products: more threads only wait for each other
+    with threadpool_limits(1), Crew(jobs, after=_WORTHWHILE) as crew:
+        return _looped(study, kinds, crew, sample=sample, quick=quick, as_stated=as_stated)
 
 
 def _looped(
-    study: Study, kinds: Sequence[type[Effect]], *, jobs: int, sample: bool, quick: bool, as_stated: bool
+    study: Study, kinds: Sequence[type[Effect]], crew: Crew, *, sample: bool, quick: bool, as_stated: bool
 ) -> Loop:
     draws = 1000 if quick else 2000
     chosen = structure_chosen(study, as_stated=as_stated)
-    problem, base, start, enlarged = fitted_base(study, kinds, as_stated=as_stated, draws=draws)
+    problem, base, start, enlarged = fitted_base(study, kinds, as_stated=as_stated, draws=draws, crew=crew)
     outliers = outlying(study, base)
     if outliers is not None:
         study, kinds = outliers.study, [kind for kind in kinds if kind.card.name != OUTLIERS]
-        problem, base, start, enlarged = fitted_base(study, kinds, as_stated=as_stated, draws=draws)
+        problem, base, start, enlarged = fitted_base(
+            study, kinds, as_stated=as_stated, draws=draws, crew=crew
+        )
     before = _side(problem, start)
-    contrary = disagreements((*study.fit, *study.held_out))
+    contrary = disagreements((*study.fit, *study.held_out), crew)
     cautions = (*map(str, contrary), *base.caution, *single_record(study))
     alone = len(study.fit) == 1 and not study.held_out
     searched, wrong = None, next((str(one) for one in contrary if one.gross), base.failed)
     if not wrong or (base.smooth and wrong == base.failed):
         rng = np.random.default_rng([study.seed, 11])
-        searched = search(start, kinds, rng, noise_samples=base.noise_samples, draws=draws, alone=alone)
+        searched = search(
+            start, kinds, rng, noise_samples=base.noise_samples, draws=draws, alone=alone, crew=crew
+        )
         if base.noise_known and not searched.rounds[-1].trace.alarmed:
             searched = _settled(searched)
             if not all(one.firm for one in base.noise) and not searched.state.model.effects:
                 # too few samples at rest leave noise plausible in which every effect drowns
                 unknown = (0,) * len(base.noise)
-                searched = search(searched.state, kinds, rng, noise_samples=unknown, draws=draws, alone=alone)
+                searched = search(
+                    searched.state, kinds, rng, noise_samples=unknown, draws=draws, alone=alone, crew=crew
+                )
                 searched = _settled(searched)
         searched = replace(searched, state=released(searched.state))
     # of a residual too smooth to be judged an effect is only named where it leaves noise
@@ -284,7 +294,8 @@ def _looped(
         def usable(draws: Draws, noise: Noise) -> bool:
             return not _astray(after, _drawn(problem, state, (draws, noise)))
 
-        sampled = explained_draws(explained, usable, jobs=jobs, quick=quick)
+        crew.close()
+        sampled = explained_draws(explained, usable, jobs=crew.jobs, quick=quick)
     if sampled is not None:
         drawn = _drawn(problem, state, sampled)
         if _astray(after, drawn):
@@ -293,23 +304,11 @@ def _looped(
             after = drawn
     if sampled is None and state is not after.state:
         after = _side(problem, state)
+    found = alternatives(searched.state, searched.rounds) if verdict.kind != "unexplained" else ()
     return Loop(
-        problem,
-        base,
-        enlarged,
-        searched.rounds,
-        state.model.effects,
-        searched.groups if named else (),
-        verdict,
-        before,
-        after,
-        not study.held_out,
-        cautions,
-        sampled[0] if sampled is not None else None,
-        outliers,
-        contrary,
-        alternatives(searched.state, searched.rounds) if verdict.kind != "unexplained" else (),
-        lags,
+        *(problem, base, enlarged, searched.rounds, state.model.effects, searched.groups if named else ()),
+        *(verdict, before, after, not study.held_out, cautions, sampled[0] if sampled is not None else None),
+        *(outliers, contrary, found, lags),
     )
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import final
 
 import numpy as np
 
 from lcopa_bayes.core.arrays import Flags, Matrix, Vector
 from lcopa_bayes.core.covariance import covariance_of
+from lcopa_bayes.core.crew import ALONE, Crew
 from lcopa_bayes.effectsearch.extendedmodel import ExtendedModel
 from lcopa_bayes.effectsearch.whitening import Whitening
 
@@ -177,29 +178,41 @@ class Regression:
             stuck,
         )
 
-    def lowest(self, starts: Sequence[Vector], *, gain: float = GAIN) -> tuple[Vector, bool]:
+    def lowest(
+        self, starts: Sequence[Vector], *, gain: float = GAIN, crew: Crew = ALONE
+    ) -> tuple[Vector, bool]:
         """`reached` from the best of several starts: a few evaluations from each, the best two taken to the
         end.
 
         ArithmeticError when no start has a finite response.
         """
-        looked: list[tuple[float, Vector]] = []
-        for start in starts:
-            try:
-                x, _ = self.reached(start, most=_GLANCE if len(starts) > 1 else _EVALUATIONS, gain=gain)
-            except ArithmeticError:
-                continue
-            looked.append((self.cost(x), x))
+        several, most = crew.sharing(self), _GLANCE if len(starts) > 1 else _EVALUATIONS
+        glances = several.each(partial(_glance, most, gain), starts)
+        looked = [one for one in glances if one is not None]
         if not looked:
             raise FloatingPointError("the simulated response is not finite at any start")
         looked.sort(key=lambda one: one[0])
-        ends = [self.reached(x, gain=gain) for _, x in looked[:2]]
+        ends = list(several.each(partial(_end, gain), [x for _, x in looked[:2]]))
         return min(ends, key=lambda one: self.cost(one[0])) if len(ends) > 1 else ends[0]
 
-    def best(self, starts: Sequence[Vector]) -> Optimum:
+    def best(self, starts: Sequence[Vector], crew: Crew = ALONE) -> Optimum:
         """The optimum of `lowest`, described."""
-        x, converged = self.lowest(starts)
+        x, converged = self.lowest(starts, crew=crew)
         return self.at(x, converged=converged)
+
+
+def _glance(most: int, gain: float, regression: Regression, start: Vector) -> tuple[float, Vector] | None:
+    """Cost [nat] and coordinates after a few evaluations; None where the response at the start is not
+    finite."""
+    try:
+        x, _ = regression.reached(start, most=most, gain=gain)
+    except ArithmeticError:
+        return None
+    return regression.cost(x), x
+
+
+def _end(gain: float, regression: Regression, start: Vector) -> tuple[Vector, bool]:
+    return regression.reached(start, gain=gain)
 
 
 def _solved(matrix: Matrix, right: Vector, free: Flags) -> Vector:

@@ -9,6 +9,7 @@ from typing import final
 
 import numpy as np
 
+from lcopa_bayes.core.crew import ALONE, Crew
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.effectsearch.candidates import refitted
 from lcopa_bayes.effectsearch.refits import (
@@ -91,6 +92,7 @@ def search(
     noise_samples: Sequence[int],
     draws: int,
     alone: bool = False,
+    crew: Crew = ALONE,
 ) -> Search:
     """Add effects one at a time, up to three, while evidence, records left out and significance all speak
     for it, from a record that is `alone` only large ones; then try pairs where something remains, and
@@ -98,11 +100,11 @@ def search(
     state, rounds = start, []
     groups: dict[str, tuple[str, ...]] = {}
     for number in range(MOST + 1):
-        seen = trace(state, library, rng, noise_samples=noise_samples, draws=draws)
+        seen = trace(state, library, rng, noise_samples=noise_samples, draws=draws, crew=crew)
         if not (seen.alarmed or state.whitening.dependence) or number == MOST:
             rounds.append(Round(seen, (), (), None))
             break
-        refits, failures = refitted(state, seen)
+        refits, failures = refitted(state, seen, crew)
         # what one refit leaves is not noise alone: a further effect must stand out from it
         bar = seen.threshold + (MARGIN if number else 0.0)
         likely = [one for one in accepted(refits, seen, bar) if not alone or _large(one)]
@@ -120,7 +122,7 @@ def search(
         paired = _paired(start, state, rounds[0].trace)
         if paired is not None:
             state = paired.state
-            seen = trace(state, library, rng, noise_samples=noise_samples, draws=draws)
+            seen = trace(state, library, rng, noise_samples=noise_samples, draws=draws, crew=crew)
             rounds += [Round(rounds[0].trace, (paired,), (), paired), Round(seen, (), (), None)]
     names = [effect.name for effect in state.model.effects]
     confounded = tuple(groups.get(name, (name,)) for name in names)
@@ -157,9 +159,9 @@ def _gained(start: State, state: State, quiet: float) -> tuple[float, float]:
     return gained, plain.cost - state.optimum.cost
 
 
-def leading(start: State, seen: Trace) -> Refit | None:
+def leading(start: State, seen: Trace, crew: Crew = ALONE) -> Refit | None:
     """The single named effect of most evidence that would be accepted; None without any."""
-    likely = accepted(refitted(start, seen)[0], seen, seen.threshold)
+    likely = accepted(refitted(start, seen, crew)[0], seen, seen.threshold)
     return next((one for one in likely if not one.dynamics), None)
 
 

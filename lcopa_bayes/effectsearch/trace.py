@@ -12,6 +12,7 @@ from scipy.special import logsumexp
 from scipy.stats import binom
 
 from lcopa_bayes.core.arrays import Matrix, Vector
+from lcopa_bayes.core.crew import ALONE, Crew
 from lcopa_bayes.effectsearch.noise import scatter_evidence
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.effectsearch.signature import Projection, Scale, Signature, signature_of
@@ -139,6 +140,7 @@ def trace(
     *,
     noise_samples: Sequence[int] = (),
     draws: int = _DRAWS,
+    crew: Crew = ALONE,
 ) -> Trace:
     """Evidence of every effect of `library` in the residual of a model, and the threshold of chance.
 
@@ -151,25 +153,18 @@ def trace(
     quiet, freedom = float(sum(noise_samples)), whitening.effective - optimum.x.size
     scale = Scale(quiet, freedom, np.array([residual @ residual]))
     present = {effect.name for effect in model.effects}
-    effects: list[Traced] = []
-    for kind in library:
-        if kind.card.name in present or not kind.applies(model.plant.table.layout):
-            continue
-        if issubclass(kind, ScatterEffect):
-            joint = "the noise is known from the residual alone" if whitening.dependence else ""
-            scattered = -np.inf if joint else scatter_evidence(optimum.white)
-            effects.append(Traced(kind.card, (), scattered, 0, joint))
-            continue
-        commands = max(commands_of(one.record.drive) for one in whitening.samples)
-        if kind.per_command and commands > MOST_COMMANDS:
-            why = f"it follows every command by itself, and a record has {commands} (at most {MOST_COMMANDS})"
-            effects.append(Traced(kind.card, (), -np.inf, 0, why))
-            continue
-        effects.append(_traced(state, project, residual, scale, kind))
+    layout = model.plant.table.layout
+    kinds = [one for one in library if one.card.name not in present and one.applies(layout)]
+    longest = sorted(
+        kinds, key=lambda kind: -len(kind.grid(model.effected.ranges))
+    )  # first: none waits for it
+    known = crew.sharing((state, project, residual, scale))
+    done = dict(zip(longest, known.each(_traced, longest), strict=True))
+    effects = [done[kind] for kind in kinds]
     effects.sort(key=lambda one: -one.log_bayes_factor)
     return against_chance(
         Trace(tuple(effects), LEAST, (LEAST, LEAST), np.nan, 0, residual, scale),
-        lambda count: _chance(project, whitening, effects, rng, count, scale),
+        lambda count: _chance(project, whitening, effects, rng, count, scale, crew),
         draws,
     )
 
@@ -215,11 +210,20 @@ def commands_of(drive: Matrix) -> int:
     return int((np.diff(drive, axis=0) != 0).any(axis=1).sum())
 
 
-def _traced(state: State, project: Projection, residual: Vector, scale: Scale, kind: type[Effect]) -> Traced:
+def _traced(known: tuple[State, Projection, Vector, Scale], kind: type[Effect]) -> Traced:
+    state, project, residual, scale = known
+    whitening = state.whitening
+    if issubclass(kind, ScatterEffect):
+        joint = "the noise is known from the residual alone" if whitening.dependence else ""
+        return Traced(kind.card, (), -np.inf if joint else scatter_evidence(state.optimum.white), 0, joint)
+    commands = max(commands_of(one.record.drive) for one in whitening.samples) if kind.per_command else 0
+    if commands > MOST_COMMANDS:
+        why = f"it follows every command by itself, and a record has {commands} (at most {MOST_COMMANDS})"
+        return Traced(kind.card, (), -np.inf, 0, why)
     signatures, evidence, failed = [], [], ""
     for instance in kind.grid(state.model.effected.ranges):
         try:
-            signatures.append(signature_of(state.model, state.optimum.x, state.whitening, project, instance))
+            signatures.append(signature_of(state.model, state.optimum.x, whitening, project, instance))
         except ArithmeticError as error:
             failed = str(error)
             continue
@@ -238,6 +242,7 @@ def _chance(
     rng: np.random.Generator,
     draws: int,
     scale: Scale,
+    crew: Crew = ALONE,
 ) -> Vector:
     """Largest log Bayes factor of each of `draws` residuals of the base model alone, (draws,) [nat]."""
     listed = [one for traced in effects for one in traced.signatures]
@@ -247,6 +252,8 @@ def _chance(
     edges = np.cumsum([0, *(span.shape[1] for span in spans)])
     every = np.concatenate(spans, axis=1).T
     z = whitening.chance(draws, rng)
+    scattered = any(one.scatters for one in effects)
+    scatter = crew.map(_scatter_evidence, [z.T] if scattered else [])  # meanwhile
     left = project(z)
     inner = (every @ left.astype(np.float32)).astype(float)
     known = Scale(scale.quiet, scale.freedom, np.einsum("nd,nd->d", left, left))
@@ -259,6 +266,10 @@ def _chance(
         if count:
             by_effect.append(logsumexp(evidence[start : start + count], axis=0) - np.log(count))
         start += count
-    if any(one.scatters for one in effects):
-        by_effect.append(np.array([scatter_evidence(column) for column in z.T]))
+    by_effect += scatter
     return np.asarray(np.max(by_effect, axis=0))
+
+
+def _scatter_evidence(white: Matrix) -> Vector:
+    """That of each residual (draws, n), (draws,) [nat]."""
+    return np.array([scatter_evidence(one) for one in white])

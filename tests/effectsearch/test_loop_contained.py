@@ -36,7 +36,7 @@ def base():
 def astray(heeds_near):
     """A base fit that ends far from the records' plant with two terms, unless it `heeds_near` starts."""
 
-    def fit(model, rng, *, starts=4, near=()):
+    def fit(model, rng, *, starts=4, near=(), crew=None):
         found = basefit.base_fit(model, rng)
         if len(model.posterior.table.of_kind("order")) < 2:
             return found
@@ -65,7 +65,7 @@ def test_more_terms_are_at_least_as_likely_as_fewer(base, monkeypatch, heeds_nea
 def test_more_terms_that_stay_less_likely_are_no_base(base, monkeypatch):
     """Where no start reaches what the smaller model does, the wider one is not used."""
     monkeypatch.setattr(basemodel, "base_fit", astray(False))
-    monkeypatch.setattr(Regression, "best", lambda self, starts: self.at(starts[0]))
+    monkeypatch.setattr(Regression, "best", lambda self, starts, crew: self.at(starts[0]))
     wider = basemodel._wider(TWO, base, 2)
     assert "less likely than that of fewer" in wider.fit.failed
 

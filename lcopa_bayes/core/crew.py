@@ -1,0 +1,95 @@
+"""Processes for a search of many stages: one pool for all of them, started once the search has taken long."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from functools import cached_property, lru_cache, partial
+from time import monotonic
+from types import SimpleNamespace, TracebackType
+from typing import Any, TypeVar, final
+
+from lcopa_bayes.core.parallel import Workers, imported_ahead, workers
+
+S = TypeVar("S")
+T = TypeVar("T")
+R = TypeVar("R")
+_SCRIPT = b"__main__"
+"""Where the main script keeps what it defines, which no worker imports."""
+
+
+@final
+class Crew:
+    """`jobs` processes from `after` seconds on, this one alone before, and where `jobs` is 1; results do not
+    depend on that. A context that ends the processes."""
+
+    def __init__(self, jobs: int = 1, *, after: float = 0.0) -> None:
+        """No process takes part yet; what they need is imported meanwhile."""
+        self.jobs, self._due, self._stack = jobs, monotonic() + after, ExitStack()
+        self._ended = False
+        if jobs > 1:
+            imported_ahead()
+
+    def __enter__(self) -> Crew:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)
+
+    def sharing(self, shared: S) -> Workers[S]:
+        """Workers of a stage whose tasks share a value. It is pickled once, with what it has cached.
+
+        A task whose value or input another process cannot import, such as an effect of a study's own file,
+        is done in this one.
+        """
+        packed = lru_cache(1)(lambda: _packed(shared))
+
+        def submit(task: Callable[[S, T], R], one: T) -> SimpleNamespace:
+            if not self._ended and self.jobs > 1 and monotonic() >= self._due:
+                sent = packed(), _packed(one)
+                if None not in sent:
+                    return SimpleNamespace(
+                        result=partial(next, self._pool.each(partial(_done, task), [sent]))
+                    )
+            return SimpleNamespace(result=partial(task, shared, one))
+
+        return Workers(submit, iter)
+
+    def map(self, function: Callable[[T], R], inputs: Sequence[T]) -> Iterator[R]:
+        """Results of a function that needs nothing shared, in the order of the inputs."""
+        return self.sharing(None).map(function, inputs)
+
+    @cached_property
+    def _pool(self) -> Workers[None]:
+        return self._stack.enter_context(workers(None, jobs=self.jobs))
+
+    def close(self) -> None:
+        """End the processes; from now on this one works alone."""
+        self._ended = True
+        self._stack.close()
+
+
+def _packed(value: object) -> bytes | None:
+    """A pickle; None where another process could not read it."""
+    try:
+        packed = pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
+    except (pickle.PicklingError, AttributeError, TypeError):
+        return None
+    return None if _SCRIPT in packed else packed
+
+
+@lru_cache(1)
+def _unpacked(packed: bytes) -> Any:
+    return pickle.loads(packed)
+
+
+def _done(task: Callable[[Any, Any], R], nothing: None, sent: tuple[bytes, bytes]) -> R:
+    """A task in a worker, which keeps what tasks share for the next one."""
+    return task(_unpacked(sent[0]), pickle.loads(sent[1]))
+
+
+ALONE = Crew()
+"""This process."""
