@@ -126,27 +126,37 @@ def test_a_truth_that_is_not_reached_lies_in_an_interval_that_is_open() -> None:
 
 
 def rows() -> list[dict]:
-    """Three foreign campaigns: a clean one, one in which a name is wrong, and one that is not explained."""
+    """Four foreign campaigns: a clean one, one in which a name is wrong, one that is not explained, and one in
+    which sums of lags are all that is missing."""
     common = {"kind": "foreign", "drives": "foreign", "seed": 0, "crashed": "", "effects": [], "truth": []}
     common |= {"disturbance": False, "survival": {}, "refits": [], "coverage_after": 0.9, "plant": "wall"}
     common |= {key: {"held_out_truth_over_noise": 0.5} for key in ("before", "after")}
     figures = {"steady_state[y1]": 1.0, "delay[y1]": -2.0, "value_at_end[y1]": 0.1, "rise_10_90[y1]": 1.6}
-    said = [("clean", []), ("explained", ["cross_fade"]), ("unexplained", [])]
-    return [common | {"verdict": one, "named": names, "plant_after": figures} for one, names in said]
+    lags = f"{scoresheet.LINEAR} 3 lags follow y1 as well as any effect."
+    said = [
+        ("clean", [], ""),
+        ("explained", ["cross_fade"], ""),
+        ("unexplained", [], ""),
+        ("unexplained", [], lags),
+    ]
+    return [
+        common | {"verdict": one, "named": names, "sentence": words, "plant_after": figures}
+        for one, names, words in said
+    ]
 
 
 def test_lines_of_foreign_plants_are_counted() -> None:
     (line,) = scoresheet.plants(rows())
-    assert (line["bare"], line["clean"], line["named"]) == (3, 1, 1)
+    assert (line["bare"], line["clean"], line["named"]) == (4, 1, 1)
     assert line["held"] == {
-        "steady_state": [2, 2],
-        "delay": [0, 2],
-        "value_at_end": [2, 2],
-        "rise_10_90": [2, 2],
+        "steady_state": [3, 3],
+        "delay": [0, 3],
+        "value_at_end": [3, 3],
+        "rise_10_90": [3, 3],
     }
     targets = score.frozen()["targets"]
     lines = {one["measure"]: one for one in scoresheet.sheet(rows(), targets, 0.1)}
-    assert lines["an effect named, foreign plants"]["value"] == pytest.approx(1 / 3)
+    assert lines["an effect named, foreign plants"]["value"] == pytest.approx(1 / 4)
     assert lines["90 % intervals of the delays, foreign plants"]["value"] == 0.0
     assert lines["50 % intervals of the values at record end, foreign plants"]["value"] == 1.0
     assert lines["90 % intervals of the delays, clean"]["trials"] == 0
