@@ -126,7 +126,7 @@ def test_a_truth_that_is_not_reached_lies_in_an_interval_that_is_open() -> None:
 
 
 def rows() -> list[dict]:
-    """Four foreign campaigns: a clean one, one in which a name is wrong, one that is not explained, and one in
+    """Four foreign campaigns: a clean one, one in which a name is wrong, one that is not explained, one in
     which sums of lags are all that is missing."""
     common = {"kind": "foreign", "drives": "foreign", "seed": 0, "crashed": "", "effects": [], "truth": []}
     common |= {"disturbance": False, "survival": {}, "refits": [], "coverage_after": 0.9, "plant": "wall"}
