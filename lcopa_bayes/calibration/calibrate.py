@@ -17,7 +17,8 @@ from lcopa_bayes.calibration.replica import ENGINES, Engine, Failure, Outcome, R
 from lcopa_bayes.calibration.truths import Stated, Truths, truths_around, truths_stated
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.files import writable_folder, write_text
-from lcopa_bayes.core.parallel import Progress, workers
+from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.core.rules import whole, word_of
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of

@@ -24,7 +24,8 @@ from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import writable_folder
-from lcopa_bayes.core.parallel import Progress, workers
+from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from functools import cached_property, lru_cache, partial
@@ -10,13 +9,11 @@ from time import monotonic
 from types import SimpleNamespace, TracebackType
 from typing import Any, TypeVar, final
 
-from lcopa_bayes.core.parallel import Workers, imported_ahead, workers
+from lcopa_bayes.core.parallel import Workers, imported_ahead, packed, unpacked, workers
 
 S = TypeVar("S")
 T = TypeVar("T")
 R = TypeVar("R")
-_SCRIPT = b"__main__"
-"""Where the main script keeps what it defines, which no worker imports."""
 
 
 @final
@@ -45,11 +42,11 @@ class Crew:
         A task whose value or input another process cannot import, such as an effect of a study's own file,
         is done in this one.
         """
-        packed = lru_cache(1)(lambda: _packed(shared))
+        common = lru_cache(1)(lambda: packed(shared))
 
         def submit(task: Callable[[S, T], R], one: T) -> SimpleNamespace:
             if not self._ended and self.jobs > 1 and monotonic() >= self._due:
-                sent = packed(), _packed(one)
+                sent = common(), packed(one)
                 if None not in sent:
                     return SimpleNamespace(
                         result=partial(next, self._pool.each(partial(_done, task), [sent]))
@@ -72,23 +69,14 @@ class Crew:
         self._stack.close()
 
 
-def _packed(value: object) -> bytes | None:
-    """A pickle; None where another process could not read it."""
-    try:
-        packed = pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
-    except (pickle.PicklingError, AttributeError, TypeError):
-        return None
-    return None if _SCRIPT in packed else packed
-
-
 @lru_cache(1)
-def _unpacked(packed: bytes) -> Any:
-    return pickle.loads(packed)
+def _unpacked(sent: bytes) -> Any:
+    return unpacked(sent)
 
 
 def _done(task: Callable[[Any, Any], R], nothing: None, sent: tuple[bytes, bytes]) -> R:
     """A task in a worker, which keeps what tasks share for the next one."""
-    return task(_unpacked(sent[0]), pickle.loads(sent[1]))
+    return task(_unpacked(sent[0]), unpacked(sent[1]))
 
 
 ALONE = Crew()

@@ -1,30 +1,27 @@
-"""Workers: independent tasks done in this process, in several of one thread each, or on a Dask cluster.
-
-Progress of long work: a bar on a terminal, plain lines now and then where there is none.
-"""
+"""Workers: independent tasks done in this process, in several of one thread each, or on a Dask cluster."""
 
 from __future__ import annotations
 
 import ctypes
 import os
+import pickle
 import platform
 import signal
 import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
 from importlib.metadata import version
+from itertools import chain
 from multiprocessing import forkserver, parent_process
 from multiprocessing.context import BaseContext, SpawnContext, SpawnProcess
 from threading import Thread
 from typing import Any, Generic, TypeVar, final
 
 from threadpoolctl import threadpool_limits
-from tqdm import tqdm
 
 from lcopa_bayes.core.errors import InputError
 
@@ -36,6 +33,8 @@ _MMAP_THRESHOLD, _TRIM_THRESHOLD = (-3, 32 << 20), (-1, 256 << 20)
 come from the heap, and up to 256 MB at its end are kept when they are freed [byte]."""
 CONNECT = 5.0
 """Time a Dask scheduler has to answer [s]."""
+_SCRIPT = b"__main__"
+"""Where the main script keeps what it defines, which no worker imports."""
 _ALIKE = "install the same versions on every worker"
 _ADVICE = "what was finished is stored; go on with --resume"
 
@@ -89,7 +88,8 @@ class _Later:
 @contextmanager
 def workers(shared: S, *, jobs: int = 1, dask: str | None = None) -> Iterator[Workers[S]]:
     """Workers that share a value: `jobs` processes of one thread each, this one alone where `jobs` is 1, or
-    those of the Dask cluster at the address `dask`.
+    those of the Dask cluster at the address `dask`. What no other process can read, such as an effect of a
+    study's own file, is done by this one.
 
     Processes end with this one, however it ends, and do not run the main script again, so that a script needs
     no main guard. InputError when there is no such cluster, and when a worker or the cluster is lost.
@@ -102,21 +102,28 @@ def workers(shared: S, *, jobs: int = 1, dask: str | None = None) -> Iterator[Wo
         with threadpool_limits(1):
             yield Workers(lambda task, one: _Later(task, shared, one), iter)
     else:
-        with _pool(jobs, shared) as pool, threadpool_limits(1):  # threads here would take the workers' cores
-            yield Workers(lambda task, one: pool.submit(_perform, task, one), as_completed)
+        sent = packed(shared)
+        with _pool(jobs, sent) as pool, threadpool_limits(1):  # threads here would take the workers' cores
+
+            def submit(task: Callable[[S, T], R], one: T) -> Any:
+                work = None if sent is None else packed((task, one))
+                return _Later(task, shared, one) if work is None else pool.submit(_perform, work)
+
+            yield Workers(submit, _as_finished)
 
 
 @contextmanager
 def meanwhile(
     task: Callable[[T], R], one: T, finished: Callable[[R], None], *, jobs: int = 1
 ) -> Iterator[None]:
-    """Do a task in a process of its own while what is within runs, or before it where `jobs` is 1; `finished`
-    takes its result at once. An error of the task is raised at the end."""
-    if jobs <= 1:
+    """Do a task in a process of its own while what is within runs, or before it where `jobs` is 1 or no other
+    process can read the task; `finished` takes its result at once. An error of the task is raised at the
+    end."""
+    if jobs <= 1 or packed((task, one)) is None:
         finished(task(one))
         yield
         return
-    with _pool(1, None) as pool:
+    with _pool(1, packed(None)) as pool:
         future = pool.submit(task, one)
         future.add_done_callback(lambda done: None if done.exception() else finished(done.result()))
         yield
@@ -124,8 +131,8 @@ def meanwhile(
 
 
 @contextmanager
-def _pool(jobs: int, shared: object) -> Iterator[ProcessPoolExecutor]:
-    """Processes of one thread each that share a value; InputError when one is lost."""
+def _pool(jobs: int, shared: bytes | None) -> Iterator[ProcessPoolExecutor]:
+    """Processes of one thread each that share a pickled value; InputError when one is lost."""
     imported_ahead()
     pool = ProcessPoolExecutor(jobs, mp_context=_CONTEXT, initializer=_take_up, initargs=(shared,))
     try:
@@ -137,6 +144,26 @@ def _pool(jobs: int, shared: object) -> Iterator[ProcessPoolExecutor]:
         ) from None
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def packed(value: object) -> bytes | None:
+    """A pickle; None where another process could not read it."""
+    try:
+        out = pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
+    except (pickle.PicklingError, AttributeError, TypeError):
+        return None
+    return None if _SCRIPT in out else out
+
+
+def unpacked(sent: bytes) -> Any:
+    """What `packed` was given, in a process of its own; nothing else is read so."""
+    return pickle.loads(sent)
+
+
+def _as_finished(futures: Iterable[Any]) -> Iterator[Any]:
+    """Tasks of this process while workers do theirs, then these as they finish."""
+    own = [one for one in futures if isinstance(one, _Later)]
+    return chain(own, as_completed(one for one in futures if not isinstance(one, _Later)))
 
 
 def keep_freed_memory() -> None:
@@ -323,7 +350,7 @@ _shared: Any = None
 """What the tasks of this worker process share; set once when it starts."""
 
 
-def _take_up(shared: object) -> None:
+def _take_up(shared: bytes | None) -> None:
     global _shared
     import numpy  # noqa: F401 - its threads can only be limited once they are there
     import scipy.linalg  # noqa: F401
@@ -333,7 +360,7 @@ def _take_up(shared: object) -> None:
     if sys.platform == "linux":
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     threadpool_limits(1)
-    _shared = shared
+    _shared = None if shared is None else unpacked(shared)
     Thread(target=_end_with_parent, daemon=True).start()
 
 
@@ -345,54 +372,6 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _perform(task: Callable[[Any, T], R], one: T) -> R:
+def _perform(work: bytes) -> Any:
+    task, one = unpacked(work)
     return task(_shared, one)
-
-
-_LINES = 10.0
-"""Least time between two lines of one task in a log [s]."""
-_LINE = "{desc}: {n_fmt}/{total_fmt} {unit}s, {elapsed} so far, {remaining} left{postfix}"
-_COUNT = "{desc}: {n_fmt} {unit}s, {elapsed} so far{postfix}"
-
-
-@final
-class Progress(tqdm):  # type: ignore[type-arg]
-    """`tqdm` that writes lines a log can hold where standard error is no terminal.
-
-    Takes what `tqdm` takes; `quiet` shows nothing. A new description, and the end, are shown at once.
-    """
-
-    def __init__(self, *args: Any, quiet: bool = False, **options: Any) -> None:
-        self._plain = not sys.stderr.isatty()
-        self._last, self._due = "", 0.0
-        if self._plain:
-            line = _LINE if options.get("total") else _COUNT
-            options = {"mininterval": _LINES, "bar_format": line} | options
-        super().__init__(*args, disable=quiet, **options)  # type: ignore[call-overload]
-
-    def display(self, msg: str | None = None, pos: int | None = None) -> None:
-        """Show the bar, or a line where there is no terminal and the last one is old enough."""
-        if not self._plain:
-            super().display(msg, pos)
-        elif time.monotonic() >= self._due:
-            self._write(str(self) if msg is None else msg)
-
-    def set_description(self, desc: str | None = None, refresh: bool | None = True) -> None:
-        """Name what is being done."""
-        if not self._plain:
-            super().set_description(desc, refresh)
-        elif not self.disable and desc != self.desc:  # the line has a colon of its own
-            self._due = 0.0
-            self.set_description_str(desc, refresh)
-
-    def close(self) -> None:
-        """End with a last line."""
-        if self._plain and not self.disable:
-            self._write(str(self))
-            self._due, self.leave = float("inf"), False
-        super().close()
-
-    def _write(self, text: str) -> None:
-        if text != self._last:
-            print(text, file=sys.stderr, flush=True)
-            self._last, self._due = text, time.monotonic() + _LINES

@@ -14,7 +14,8 @@ from threadpoolctl import threadpool_limits
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.errors import InputError, gathered, refuse_if
 from lcopa_bayes.core.estimate import attributes, plain
-from lcopa_bayes.core.parallel import Progress, workers
+from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.data.settings import ModelSettings, NoiseSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import problem_of

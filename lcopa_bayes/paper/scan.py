@@ -16,7 +16,7 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
-from lcopa_bayes.core.parallel import Progress
+from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.model.blockpulses import Circle, Spectrum, integration_weights, lower_toeplitz
 from lcopa_bayes.model.path import Normalisation, TransferPath
 from lcopa_bayes.paper.intervals import Candidates, Scan

@@ -18,7 +18,7 @@ from typing import Any, final
 
 from lcopa_bayes.core.errors import InputError
 from lcopa_bayes.core.estimate import attributes, plain
-from lcopa_bayes.core.parallel import Progress
+from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.data.settings import ModelSettings
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, table_of

@@ -28,7 +28,8 @@ import numpy as np
 from scipy.special import logsumexp
 
 from lcopa_bayes.core.arrays import Matrix, Vector
-from lcopa_bayes.core.parallel import Progress, Workers
+from lcopa_bayes.core.parallel import Workers
+from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.aroundoptima import around_optima

@@ -18,7 +18,8 @@ from dynesty.internal_samplers import InternalSampler, SamplerArgument, SamplerR
 from scipy.special import logsumexp
 
 from lcopa_bayes.core.arrays import Index, Matrix, Vector
-from lcopa_bayes.core.parallel import Progress, workers
+from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.constrainedwalk import Walk

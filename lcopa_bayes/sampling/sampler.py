@@ -13,7 +13,8 @@ from typing import final
 import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix
-from lcopa_bayes.core.parallel import Progress, workers
+from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.data.settings import Method
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.inference.posterior import Posterior
@@ -41,8 +42,7 @@ _LEAST = 5
 _FEWEST = 2
 """Rounds before a budget may end sampling."""
 _AS_LONG = 0.4
-"""Sampling takes at least this share of the moves that tempering took: a posterior that was hard to reach
-has modes that fill slowly [-]."""
+"""Least share of the moves of tempering that sampling takes: modes that are hard to reach fill slowly [-]."""
 _TREND = 2.0
 """Standard errors below which a drift of the kept draws is taken for chance where the run as a whole drifts
 [-]: there chance is the less likely reason, and to go on costs little."""

@@ -21,7 +21,8 @@ from lcopa_bayes.core.arrays import Matrix
 from lcopa_bayes.core.errors import InputError, refuse_if
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.files import csv_of, read_json, save_json, writable_folder, write_text, write_whole
-from lcopa_bayes.core.parallel import Progress, workers
+from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.core.rules import word_of
 from lcopa_bayes.data.study import Study
 from lcopa_bayes.data.tables import population_priors

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Thread, Timer
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -271,3 +272,19 @@ def test_workers_of_other_versions_are_refused(monkeypatch):
         refused = r"cannot take part \(No module named 'lcopa_bayes'\); install the same versions"
         with pytest.raises(InputError, match=refused), workers(1, dask=made.scheduler_address):
             pass
+
+
+@pytest.mark.parametrize("where", ["shared", "input"])
+def test_what_no_other_process_can_read_is_done_in_this_one(where):
+    """Such as an effect of a study's own file, whose module only its path leads to."""
+    module = ModuleType("elsewhere")
+    exec("class Own(int):\n    pass", module.__dict__)
+    three = module.Own(3)
+    shared, inputs = (three, [1, 2]) if where == "shared" else (3, [module.Own(1), 2])
+    with workers(shared, jobs=2) as crew:
+        assert list(crew.each(added, inputs)) == [4, 5]
+        assert sorted(crew.finished(added, inputs)) == [4, 5]
+
+
+def added(shared: int, one: int) -> int:
+    return int(shared) + int(one)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from lcopa_bayes.core import parallel
-from lcopa_bayes.core.parallel import Progress
+from lcopa_bayes.core import progress
+from lcopa_bayes.core.progress import Progress
 
 
 @pytest.fixture
 def at_once(monkeypatch):
-    monkeypatch.setattr(parallel, "_LINES", 0.0)
+    monkeypatch.setattr(progress, "_LINES", 0.0)
 
 
 def lines(capsys) -> list[str]:

@@ -11,7 +11,8 @@ from scipy import stats
 from scipy.special import logsumexp
 from small import TRUTH, Toy, problem, record
 
-from lcopa_bayes.core.parallel import Progress, workers
+from lcopa_bayes.core.parallel import workers
+from lcopa_bayes.core.progress import Progress
 from lcopa_bayes.inference.conditional import Conditional, Expanded
 from lcopa_bayes.inference.optimum import Optimum
 from lcopa_bayes.sampling import marginal, outer
