@@ -46,11 +46,10 @@ class Crew:
 
         def submit(task: Callable[[S, T], R], one: T) -> SimpleNamespace:
             if not self._ended and self.jobs > 1 and monotonic() >= self._due:
-                sent = common(), packed(one)
-                if None not in sent:
-                    return SimpleNamespace(
-                        result=partial(next, self._pool.each(partial(_done, task), [sent]))
-                    )
+                sent = common()
+                if sent is not None:
+                    work = partial(_done, task, sent)
+                    return SimpleNamespace(result=partial(next, self._pool.map(work, [one])))
             return SimpleNamespace(result=partial(task, shared, one))
 
         return Workers(submit, iter)
@@ -74,9 +73,9 @@ def _unpacked(sent: bytes) -> Any:
     return unpacked(sent)
 
 
-def _done(task: Callable[[Any, Any], R], nothing: None, sent: tuple[bytes, bytes]) -> R:
+def _done(task: Callable[[Any, T], R], sent: bytes, one: T) -> R:
     """A task in a worker, which keeps what tasks share for the next one."""
-    return task(_unpacked(sent[0]), unpacked(sent[1]))
+    return task(_unpacked(sent), one)
 
 
 ALONE = Crew()

@@ -119,12 +119,13 @@ def meanwhile(
     """Do a task in a process of its own while what is within runs, or before it where `jobs` is 1 or no other
     process can read the task; `finished` takes its result at once. An error of the task is raised at the
     end."""
-    if jobs <= 1 or packed((task, one)) is None:
+    work = None if jobs <= 1 else packed((partial(_alone, task), one))
+    if work is None:
         finished(task(one))
         yield
         return
-    with _pool(1, packed(None)) as pool:
-        future = pool.submit(task, one)
+    with _pool(1, None) as pool:
+        future = pool.submit(_perform, work)
         future.add_done_callback(lambda done: None if done.exception() else finished(done.result()))
         yield
         future.result()

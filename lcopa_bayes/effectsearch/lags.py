@@ -101,9 +101,8 @@ def _acting(state: State, names: Sequence[str]) -> set[int]:
 
 def _added(state: State, names: Sequence[str]) -> Vector:
     """What effects add at the optimum, stacked [response unit]."""
-    model, x = state.model, state.optimum.x
-    bare, own = without(model, x, names)
-    return model.predict(x) - bare.predict(own) if names else np.zeros(state.whitening.size)
+    bare, own = without(state.model, state.optimum.x, names)
+    return state.fitted - bare.predict(own) if names else np.zeros(state.whitening.size)
 
 
 def _without(state: State, names: Sequence[str]) -> tuple[Samples, ...]:

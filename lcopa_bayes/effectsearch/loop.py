@@ -273,8 +273,10 @@ def _looped(
     findings = _findings(study, searched, before, reached, outliers=outliers, cautions=cautions, alone=alone)
     preferred = any(one.support == "lags" for one in lags)
     verdict = decide(replace(findings, lags=dynamics, preferred=preferred))
-    if verdict.kind == "unexplained":
-        lags = lags_of(before.state, problem) if dynamics else ()
+    if verdict.kind == "unexplained" and not dynamics:
+        lags = ()
+    elif verdict.kind == "unexplained" and searched.state.model.effects:
+        lags = lags_of(before.state, problem)  # beside the plant without them
     if outliers is not None:
         verdict = beside(verdict, outliers.sentence)
     named = verdict.kind in ("explained", "partly explained", "disturbance")
