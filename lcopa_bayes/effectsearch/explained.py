@@ -84,8 +84,13 @@ def constant_about(effect: Effect, key: str, value: float, ranges: Ranges) -> Pr
 
 def declarable(study: Study, effects: Sequence[Effect]) -> bool:
     """Whether a study can name the effects: those of the catalogue and of its own files."""
-    known = catalogue(study.effects.add, study.folder)
-    return all(known.get(effect.name) is type(effect) for effect in effects)
+    known = {name: _place(kind) for name, kind in catalogue(study.effects.add, study.folder).items()}
+    return all(known.get(effect.name) == _place(type(effect)) for effect in effects)
+
+
+def _place(kind: type[Effect]) -> tuple[str, str]:
+    """Where a class is defined: one of a study's own file is another object each time the file is read."""
+    return kind.__module__, kind.__qualname__
 
 
 def explained_draws(

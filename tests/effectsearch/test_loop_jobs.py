@@ -10,6 +10,7 @@ from test_loop import LIBRARY, study
 
 from lcopa_bayes.core import crew
 from lcopa_bayes.data.settings import EffectsSettings
+from lcopa_bayes.effectsearch.explained import declarable
 from lcopa_bayes.effectsearch.loop import loop
 from lcopa_bayes.model.effects.catalogue import catalogue
 
@@ -100,3 +101,16 @@ def test_a_short_search_starts_no_process(monkeypatch):
     monkeypatch.setattr(crew, "workers", None)  # no call of it would end
     found = loop(study(2), library=LIBRARY[:1], jobs=2, sample=False, quick=True, as_stated=True)
     assert found.verdict.kind == "clean"
+
+
+def test_a_study_with_an_effect_of_the_user_is_sampled(tmp_path):
+    """The file is read again for it; a class of the same name from elsewhere is not what the study names."""
+    (tmp_path / "own.py").write_text(OWN)
+    made = replace(study(2, 0.06), folder=tmp_path, effects=EffectsSettings(add=("own.py:Cubed",)))
+    kind = catalogue(["own.py:Cubed"], tmp_path)["cubed"]
+    assert declarable(made, [kind()])
+    assert not declarable(made, [type("Cubed", (kind,), {"__module__": "elsewhere"})()])
+    found = loop(made, library=[kind], quick=True, as_stated=True)
+    assert found.names == ("cubed",)
+    assert found.draws is not None
+    assert "cubed.c" in found.draws.table.names
