@@ -11,6 +11,7 @@ import tempfile
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
+from errno import ENAMETOOLONG
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -85,6 +86,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"interrupted{resume}", file=sys.stderr)
         return INTERRUPTED
     except Exception as error:
+        if isinstance(error, OSError) and error.errno == ENAMETOOLONG:
+            return refused([str(refusal_of(error))], as_json=options.json)
         said = refusal_of(error) or f"unforeseen {type(error).__name__}: {error}"
         refused([f"{said}; {_details([PROGRAM, *given])}"], as_json=options.json)
         return FAILED

@@ -17,8 +17,11 @@ REMEDIES = {
     errno.EACCES: f"allow writing there {ELSEWHERE}",
     errno.EPERM: f"allow writing there {ELSEWHERE}",
     errno.EROFS: f"allow writing there {ELSEWHERE}",
+    errno.ENAMETOOLONG: "give a shorter name",
 }
 """What to do about what the system refuses, by its error number."""
+_LONGEST = 100
+"""Letters of a file's name that a message shows."""
 
 
 class InputError(ValueError):
@@ -41,8 +44,13 @@ def refusal_of(error: BaseException) -> str | None:
     """What the system refused, where and why, with a remedy if one is known; None for another error."""
     if not (isinstance(error, OSError) and error.errno in REMEDIES):
         return None
-    where = f"{error.filename}: " if error.filename else ""
+    where = f"{shortened(str(error.filename))}: " if error.filename else ""
     return f"{where}{os.strerror(error.errno)}; {REMEDIES[error.errno]}"
+
+
+def shortened(name: str) -> str:
+    """A name as messages show it: one that no system can hold by its beginning."""
+    return name if len(name) <= _LONGEST else f"{name[:_LONGEST]}..."
 
 
 def refuse_if(problems: Sequence[str]) -> None:

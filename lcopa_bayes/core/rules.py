@@ -72,8 +72,13 @@ def texts(words: str, mark: str = "") -> Rule:
 
 POSITIVE = Rule("a number above 0", lambda value: is_number(value) and value > 0)
 FOLDER = Rule(
-    "text fit for a folder",
-    lambda value: isinstance(value, str) and value.strip(" .") != "" and not set(value) & set("/\\\0\n"),
+    "text fit for a folder, of at most 100 letters",  # figures and unfinished files add to it
+    lambda value: (
+        isinstance(value, str)
+        and value.strip(" .") != ""
+        and not set(value) & set("/\\\0\n")
+        and len(value) <= 100
+    ),
 )
 FLAG = Rule("true or false", lambda value: isinstance(value, bool))
 

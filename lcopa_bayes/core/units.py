@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from types import MappingProxyType
 
@@ -13,6 +14,7 @@ TIME_UNITS: Mapping[str, int] = MappingProxyType(
     {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000, "min": 60_000_000_000, "h": 3_600_000_000_000}
 )
 """Nanoseconds in each unit of time by its word."""
+_COMPOUND = re.compile(r"[/*· ]")
 
 
 def in_time_unit(time: Array | float, given: str, wanted: str) -> Array:
@@ -26,6 +28,9 @@ def per(unit: str, other: str) -> str:
     """Unit of a ratio, ``-`` where it has none."""
     if other == "-":
         return unit
+    other = (
+        f"({other})" if _COMPOUND.search(other) else other
+    )  # °C/L/min would be a degree per litre and minute
     return f"1/{other}" if unit == "-" else f"{unit}/{other}"
 
 

@@ -349,9 +349,10 @@ def _unreadable(table: CellTable, name: str, values: Vector, called: str, *, emp
     """Add cells that are neither numbers nor, unless `empty` is refused, empty to the problems of a table."""
     column = table.names.index(name)
     cells = table.columns[column]
+    remedy = "write a number in every row" if empty else "write a number as in the other rows, or nothing"
     gone = ("", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--")
     bad = [
-        f"{table.place(column, row)}: {cells[row]!r} is not a number of {called}"
+        f"{table.place(column, row)}: {cells[row]!r} is not a number of {called}; {remedy}"
         for row in np.flatnonzero(~np.isfinite(values)).tolist()
         if empty or cells[row].lower() not in gone
     ]

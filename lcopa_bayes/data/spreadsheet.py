@@ -49,6 +49,8 @@ def read_spreadsheet(path: Path, *, sheet: str | None = None) -> CellTable:
     there is no such file or sheet, it cannot be read, or it holds no table.
     """
     path = Path(path)
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; name the tables in it, such as {path}/step.csv")
     if not path.is_file():
         beside = (one.name for one in path.parent.glob("*") if one.suffix.lower() in (*WORKBOOKS, *TEXTS))
         raise InputError(f"{path}: no such file{nearest(path.name, beside)}")

@@ -107,7 +107,8 @@ def _decided(
     if symmetry is not None:
         return "structurally unidentifiable", f"before any noise, {symmetry.sentence}"
     level, low, high = f"{100 * LEVEL:g} %", *profile.intervals[LEVEL]
-    moving = f" while {', '.join(profile.moving[:3])} compensate" if profile.moving else ""
+    several = "" if len(profile.moving) > 1 else "s"
+    moving = f" while {', '.join(profile.moving[:3])} compensate{several}" if profile.moving else ""
     if low is None and high is None:
         a, b = profile.said_end(0), profile.said_end(1)
         most = float(profile.fall.max())

@@ -36,6 +36,8 @@ BANDS = (
     (f"plant_{POINTWISE}", "25", "75", BAND, 0.55, "50 % plant"),
 )
 """Pointwise bands of a response: columns, ends, colour, opacity and label."""
+_BESIDE = 14
+"""Letters that fit beside the panel of a drive; longer names stand above it."""
 _ORDINATE_BAND = (-log(0.975), -log(0.025))
 """2.5 and 97.5 % quantiles of the unit exponential law of a periodogram ordinate over its mean [-]."""
 
@@ -67,7 +69,7 @@ def above_drives(
     `ratio` that of the panel of the response over another's.
     """
     units = list(dict.fromkeys(drives["unit"]))
-    figure = blank(height + 0.85 * len(units))
+    figure = blank(height + 0.95 * len(units))
     top, *below = figure.subplots(
         1 + len(units), 1, sharex=True, squeeze=False, height_ratios=[ratio] + [1.0] * len(units)
     ).ravel()
@@ -93,7 +95,8 @@ def draw_drives(panel: Axes, drives: pd.DataFrame, unit: str, *, until: float) -
         if until > time[-1]:
             time, drive = np.append(time, until), np.append(drive, drive[-1])
         draw_line(panel, time, drive, drawstyle="steps-post", color=colour, label=plain(name))
-    panel.set_ylabel(label(names[0] if len(names) == 1 else "drive", unit))
+    text = label(names[0] if len(names) == 1 else "drive", unit)
+    panel.set_ylabel(text) if len(text) <= _BESIDE else panel.set_title(text, fontsize=8.5)
     panel.margins(y=0.12)
     if len(names) > 1:
         panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
@@ -161,7 +164,7 @@ def record_figure(rows: pd.DataFrame, time_unit: str, *, held_out: bool) -> Figu
     responses = rows[rows["role"] == "response"]
     units = list(dict.fromkeys(responses["unit"]))
     drives = rows[rows["role"] == "drive"].rename(columns={"value": "drive"})
-    figure = blank(1.4 * len(units) + 1.0 * drives["unit"].nunique() + 0.6)
+    figure = blank(1.4 * len(units) + 1.1 * drives["unit"].nunique() + 0.6)
     heights = [1.8] * len(units) + [1.0] * drives["unit"].nunique()
     panels = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights).ravel()
     for panel, own in zip(panels, units, strict=False):

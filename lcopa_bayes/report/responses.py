@@ -70,6 +70,6 @@ def _metric(row: Mapping[str, Any]) -> dict[str, Any]:
         "path": path.rstrip("]"),
         "metric": _WORDS.get(kind, kind.replace("_", " ")),
         "median": never if row["value"] is None else to_spread(row["value"], row["sd"]),
-        "ends": ends if (lower is None) == (upper is None) else ends.replace(OPEN, never),
+        "ends": ends,
         "note": row.get("note", ""),
     }

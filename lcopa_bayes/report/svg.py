@@ -75,8 +75,8 @@ def drawing(
     data: str = "",
     series: Mapping[str, Any] | None = None,
 ) -> Drawing:
-    """A figure as a drawing."""
-    return Drawing(stem, svg_of(figure), caption, mark, data, series)
+    """A figure as a drawing; names of axes are as long as people like, those of files are not."""
+    return Drawing(stem[:120], svg_of(figure), caption, mark, data, series)
 
 
 def paged(

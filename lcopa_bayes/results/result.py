@@ -19,6 +19,8 @@ from lcopa_bayes.results.runfolder import locked
 
 PAGE = "report.html"
 """Page of a fit in its run folder."""
+_SENTENCE = 30
+"""Letters from which a cell is a sentence."""
 
 
 class Result(ABC):
@@ -76,8 +78,7 @@ class Result(ABC):
         return bool(stored == plain(self.to_json()))
 
     def __str__(self) -> str:
-        table = self.summary().to_string(index=False, float_format=shown, na_rep="")
-        return f"{table}\n\n{self.verdict}"
+        return f"{_text_table(self.summary())}\n\n{self.verdict}"
 
     def _repr_html_(self) -> str:
         from html import escape
@@ -121,6 +122,19 @@ def _pages() -> ModuleType:
     return import_module("lcopa_bayes.report.pages")
 
 
+def _text_table(table: pd.DataFrame) -> str:
+    """A table as text: numbers and names on the right, sentences on the left."""
+    table = table.copy()
+    for name in table.select_dtypes(exclude="number"):
+        cells = [shown(one) for one in table[name]]
+        width = max(map(len, [str(name), *cells]))
+        if width > _SENTENCE:
+            table[name] = [one.ljust(width) for one in cells]
+            table = table.rename(columns={name: str(name).ljust(width)})
+    text: str = table.to_string(index=False, float_format=shown, na_rep="")
+    return "\n".join(line.rstrip() for line in text.splitlines())
+
+
 def notebook_table(table: pd.DataFrame) -> str:
     """A table as HTML for a notebook: numbers short and on the right, words on the left."""
     words = table.select_dtypes(exclude="number").columns
@@ -130,9 +144,11 @@ def notebook_table(table: pd.DataFrame) -> str:
 
 
 def shown(value: object) -> str:
-    """A cell: four significant digits or two decimals, nothing for what is open or undefined."""
+    """A cell: four significant digits or two decimals, none from 1000 on; nothing for what is open or
+    undefined."""
     if value is None or value != value:
         return ""
     if isinstance(value, float):
-        return f"{value + 0.0:.4g}" if abs(value) < 10 else f"{value:.2f}"  # no negative zero
+        places = ".4g" if abs(value) < 10 or not abs(value) < 1e6 else ".2f" if abs(value) < 1000 else ".0f"
+        return format(value + 0.0, places)  # no negative zero
     return str(value)

@@ -32,6 +32,8 @@ _WORTHWHILE = 2.0
 """Time that the first structure takes from which processes share the search of others [s]."""
 _MOST = 4
 """Most terms that are looked at."""
+_SHOWN = 3
+"""Most structures that a sentence names beside the one chosen."""
 
 
 @final
@@ -96,7 +98,8 @@ class Structure:
     @property
     def sentence(self) -> str:
         """What was chosen of what."""
-        others = "; ".join(one.name for one in self.looked if one is not self.chosen)
+        names = [one.name for one in self.looked if one is not self.chosen]
+        others = "; ".join(names) if len(names) <= _SHOWN else f"{len(names)} others"
         return (
             f"The records chose a structure by BIC: {self.chosen.name}; looked at beside it: {others}. "
             "`compare` shows what the others leave open."

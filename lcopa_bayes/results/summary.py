@@ -5,7 +5,9 @@ What a reader asks a fit first: the plant, how well it follows the records, what
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -55,7 +57,8 @@ def overview(fit: Fit) -> dict[str, Any]:
 def plant(table: ParameterTable, values: Vector) -> list[str]:
     """Transfer functions of all paths at table values (rows,), and the elements that they share."""
     layout = table.layout
-    alone = len(layout.elements) == 1
+    shared = {e for e, count in Counter(chain(*layout.element_of)).items() if count > 1}
+    named = shared if len(layout.elements) > 1 else set()
     lines = []
     elements = {}
     for e, slot in enumerate(layout.elements):
@@ -70,10 +73,9 @@ def plant(table: ParameterTable, values: Vector) -> list[str]:
             gain = values[table.at("gain", i, j)]
             delay = values[table.at("delay", layout.delay_of[i][j])]
             size = measured(f"{gain:.4g}", per(response.unit, drive.unit))
-            below = f"({elements[e]})" if alone else layout.elements[e].name
+            below = layout.elements[e].name if e in named else f"({elements[e]})"
             lines.append(f"{response.name} / {drive.name} = {size} exp(-{delay:.4g} s) / {below}")
-    if not alone:
-        lines += [f"{slot.name} = {elements[e]}" for e, slot in enumerate(layout.elements)]
+    lines += [f"{slot.name} = {elements[e]}" for e, slot in enumerate(layout.elements) if e in named]
     if table.effects is not None:
         lines += [
             f"with {row.name} = {value:.4g} {row.unit}"
@@ -166,7 +168,6 @@ def verdict(fit: Fit) -> str:
     if fit.cross_check is not None and fit.cross_check.agrees:  # a disagreement is part of the grade
         said = fit.cross_check.sentence
         parts.append(f"{said[0].upper()}{said[1:]}.")
-    parts.append(f"{fit.discretisation.sentence}.")
     worst = min((r for r in fit.residuals if not r.held_out), key=lambda r: r.p_white, default=None)
     flags = [one.held_out for one in fit.residuals] + [one.held_out for one in fit.bands]
     tried = flags.count(False)  # as many tests as `adequacy` corrects for
@@ -180,7 +181,7 @@ def verdict(fit: Fit) -> str:
             f"({100 * slow:.0f} % of draws are more than 2 % away): algebraic tails are slow."
         )
     parts += [one.sentence for one in (fit.structure, fit.alternatives, fit.rival) if one is not None]
-    return " ".join(parts)
+    return " ".join([*parts, f"{fit.discretisation.sentence}."])
 
 
 def _held_out_sentence(fit: Fit) -> list[str]:

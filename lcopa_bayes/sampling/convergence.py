@@ -19,6 +19,8 @@ Level = Literal["reliable", "tentative", "unusable"]
 
 RELIABLE_RHAT = 1.02
 """Nested R-hat of independent ensembles [-] (Margossian et al. 2024, Bayesian Analysis 19)."""
+_ALSO = 3
+"""Parameters that a reason names beside the worst."""
 TENTATIVE_RHAT = 1.1
 """Above it the estimates of the ensembles differ."""
 RELIABLE_MEMORY = 0.5
@@ -310,6 +312,12 @@ def overall(qualities: Sequence[Quality], target_ess: float, modes: Sequence[Mod
     return Grade(Grade.worst([by_quality, uneven[0]]).level, reason)
 
 
+def also_said(others: Sequence[str]) -> str:
+    """The next few of parameters that share a fault, and how many more do; nothing without any."""
+    more = f" and {len(others) - _ALSO} more" if len(others) > _ALSO else ""
+    return f" (also {', '.join(others[:_ALSO])}{more})" if others else ""
+
+
 def _by_quality(qualities: Sequence[Quality], target_ess: float) -> Grade:
     """The worst parameter's grade, and why."""
     worst = max(qualities, key=lambda quality: (_RANK[quality.grade(target_ess).level], -quality.ess))
@@ -321,5 +329,5 @@ def _by_quality(qualities: Sequence[Quality], target_ess: float) -> Grade:
             f"independent sets of draws agree (largest R-hat {max(q.rhat for q in qualities):.3f}) and the "
             f"smallest effective sample size is {min(q.ess for q in qualities):.0f} ({worst.name})",
         )
-    others = f" (also {', '.join(n for n in weak if n != worst.name)})" if len(weak) > 1 else ""
+    others = also_said([name for name in weak if name != worst.name])
     return Grade(grade.level, f"{worst.name}{others}: {worst.remedy(target_ess)}")

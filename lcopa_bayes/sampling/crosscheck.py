@@ -12,7 +12,7 @@ from scipy.stats import kstwobign, norm
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.estimate import EQUAL_TAILED, LEVEL, attributes, plain
-from lcopa_bayes.sampling.convergence import Grade, Level, Limitation
+from lcopa_bayes.sampling.convergence import Grade, Level, Limitation, also_said
 from lcopa_bayes.sampling.draws import Draws
 from lcopa_bayes.sampling.nested import Nested
 
@@ -166,8 +166,7 @@ class CrossCheck:
         said = []
         if self._apart:
             worst = self._apart[0]
-            others = [parameter.name for parameter in self._apart[1:]]
-            also = f" (also {', '.join(others)})" if others else ""
+            also = also_said([parameter.name for parameter in self._apart[1:]])
             said.append(
                 f"the marginal of {worst.name} differs by {worst.distance:.2f} in cumulative probability, "
                 f"p = {worst.p:.1g}{also}"

@@ -25,6 +25,7 @@ from lcopa_bayes.data.study import Study
 from lcopa_bayes.inference.assembly import Problem, problem_of
 from lcopa_bayes.inference.observations import Samples
 from lcopa_bayes.inference.parameter import Parameter
+from lcopa_bayes.inference.priors import Prior
 from lcopa_bayes.results.runfolder import provenance
 from lcopa_bayes.results.stored import StoredResult
 from lcopa_bayes.results.structure import with_least_terms
@@ -39,6 +40,8 @@ _AWAY = 5.0
 _IN_TURN = 3
 """... in so many samples in turn."""
 _ENDS = (0.05, 0.95)
+_LEVEL = {"uniform": "", "loguniform": ", every decade alike"}
+"""Densities that are level between two ends, and on which scale."""
 _MANY = 50_000
 """Samples of the fit records from which means of them are advised [-]: a fit then takes many minutes."""
 
@@ -105,8 +108,8 @@ def _of_model(problem: Problem) -> list[str]:
     free = [row for row in table.rows if row.free]
     several = " or ".join(map(str, terms))
     return [
-        f"Every path is gain exp(-delay s) / (1 + sum of (time_i s)^order_i), with {several} "
-        f"term{'s' * (terms != [1])}; all paths together have {_counted(elements, 'element')} and "
+        "Every path is gain exp(-delay s) / (1 + sum of (time_i s)^order_i), s the Laplace variable, with "
+        f"{several} term{'s' * (terms != [1])}; all paths together have {_counted(elements, 'element')} and "
         f"{_counted(delays, 'delay')}.",
         f"{_counted(len(free), 'free parameter')}, {len(table.rows) - len(free)} fixed; "
         f"{problem.posterior.dimension} are sampled, the others are integrated out.",
@@ -214,7 +217,7 @@ def _sentences(one: dict[str, Any], unit: str) -> list[str]:
             scatter = measured(f"{axis['scatter']:.2g}", axis["unit"])
             said += f"; {axis['at_rest']} at rest, which scatter by {scatter}"
         if axis["onset"] is not None:
-            said += f"; it moves clearly {axis['onset']:.4g} {unit} after the first change of a drive"
+            said += f"; it moves clearly {axis['onset']:.3g} {unit} after the first change of a drive"
         out.append(f"{said}.")
     return out
 
@@ -234,8 +237,16 @@ def _prior(row: Parameter) -> dict[str, Any]:
         "upper": ends[1],
         "prior": str(row.prior),
         "from": "default" if row.default else "study",
-        "words": f"between {ends[0]:.4g} and {ends[1]:.4g} with 90 % probability",
+        "words": _words(row.prior, ends),
     }
+
+
+def _words(prior: Prior, ends: Sequence[float]) -> str:
+    """What a prior says, in words: a density that is level has hard ends, and no other places to name."""
+    if prior.dist in _LEVEL:
+        low, high = prior.support
+        return f"anywhere between {low:.4g} and {high:.4g}{_LEVEL[prior.dist]}"
+    return f"between {ends[0]:.3g} and {ends[1]:.3g} with 90 % probability"
 
 
 @final

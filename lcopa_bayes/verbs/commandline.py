@@ -51,6 +51,9 @@ class CommandParser(argparse.ArgumentParser):
         elif unknown and verb in self.verbs:
             options = re.findall(r"--[\w-]+", self.verbs[verb].format_help())
             message = f"{unknown[1]} is not an option of {verb}{nearest(unknown[1], options)}"
+        elif not verb and self.verbs and self.given:
+            options = re.findall(r"--[\w-]+", self.format_help())
+            message = f"{self.given[0]} is not an option{nearest(self.given[0], options)}"
         elif "--json" not in self.given:
             self.print_usage(sys.stderr)
         raise SystemExit(refused([message], as_json="--json" in self.given))

@@ -51,7 +51,14 @@ def test_a_record_in_minutes_is_the_one_in_seconds(tmp_path):
 
 @pytest.mark.parametrize(
     ("unit", "other", "ratio"),
-    [("rad", "V", "rad/V"), ("rad", "-", "rad"), ("-", "V", "1/V"), ("-", "-", "-")],
+    [
+        ("rad", "V", "rad/V"),
+        ("rad", "-", "rad"),
+        ("-", "V", "1/V"),
+        ("-", "-", "-"),
+        ("°C", "L/min", "°C/(L/min)"),
+        ("-", "m3/h", "1/(m3/h)"),
+    ],
 )
 def test_the_unit_of_a_ratio(unit, other, ratio):
     assert per(unit, other) == ratio

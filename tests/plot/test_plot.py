@@ -2,9 +2,11 @@
 
 import subprocess
 import sys
+from itertools import combinations
 
 import matplotlib
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.colors import to_hex
 from small import record, study
@@ -12,7 +14,8 @@ from small import record, study
 import lcopa_bayes as lb
 from lcopa_bayes.bench.command import on_off
 from lcopa_bayes.paper.staticoptics import OpticsPlan
-from lcopa_bayes.plot.theme import BAND, StyledFigure
+from lcopa_bayes.plot.records import record_figure
+from lcopa_bayes.plot.theme import BAND, StyledFigure, look
 from lcopa_bayes.report.svg import svg_of
 from lcopa_bayes.verbs.papers import optics
 
@@ -187,3 +190,23 @@ def test_a_drive_of_many_changes_is_drawn_with_its_beginning():
     whole, beginning = lb.plot.drive(many).axes
     assert whole.get_xlim()[1] >= 300
     assert beginning.get_xlim() == pytest.approx((0, 21))
+
+
+def test_names_of_drives_do_not_run_into_each_other():
+    """Long names stand above their panels, short ones at their side."""
+    names = {"Heater power of the shell": "W", "Coolant flow": "L/min", "u": "V"}
+    rows = pd.DataFrame(
+        [
+            {"role": role, "axis": axis, "unit": unit, "time": time, "value": float(time > 1)}
+            for axis, unit, role in [*((*one, "drive") for one in names.items()), ("T", "K", "response")]
+            for time in (0.0, 1.0, 2.0)
+        ]
+    )
+    with look():
+        figure = record_figure(rows, "h", held_out=False)
+        figure.draw_without_rendering()
+    texts = [one for panel in figure.axes for one in (panel.yaxis.label, panel._left_title) if one.get_text()]
+    boxes = [one.get_window_extent() for one in texts]
+    assert len(boxes) == 4
+    assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
+    assert all(figure.bbox.contains(*corner) for box in boxes for corner in (box.min, box.max))

@@ -7,11 +7,14 @@ from __future__ import annotations
 from copy import deepcopy
 from typing import Any
 
+import numpy as np
 import pytest
+from small import TWO, problem, record
 
 from lcopa_bayes.report import write_page
 from lcopa_bayes.report.answers import _ANSWERS, Answer, answers
 from lcopa_bayes.report.pages import _PAGES
+from lcopa_bayes.results.summary import plant
 
 
 def row(name: str, grade: str = "reliable", **more: Any) -> dict[str, Any]:
@@ -259,3 +262,13 @@ def test_an_answer_links_to_a_section_of_its_page(tmp_path):
     shown["answers"] = [Answer("How far?", "There.", "Near field")]
     with pytest.raises(ValueError, match="near-field"):
         write_page(tmp_path, template, "t", values, {}, overview=shown)
+
+
+@pytest.mark.parametrize(("share", "named"), [("none", 0), ("paper", 2), ("all", 0)])
+def test_the_plant_names_only_elements_that_paths_share(share, named):
+    """An element of one path stands in its line, where a reader looks for it."""
+    table = problem(record(device=TWO, camera=0.5), share=share).posterior.table
+    lines = plant(table, np.arange(1.0, 1.0 + len(table.rows)))
+    paths = [line for line in lines if " / " in line and "exp(" in line]
+    assert len(lines) == len(paths) + named
+    assert sum(line.endswith(")") for line in paths) == (len(paths) if named == 0 else 0)

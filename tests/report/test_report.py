@@ -253,7 +253,7 @@ def test_open_sides_are_said_and_not_printed_as_numbers(html):
     )
     assert first[2] == first[4] == NOT_REACHED
     assert first[7] == "all draws are late"
-    assert second[4] == f"7.50 to {NOT_REACHED}"
+    assert second[4] == "7.50 to open"  # the caption says why
     assert third[4] == "0.0380 to 0.0420"
     assert not re.search(r"\b(nan|inf|None)\b", re.sub(r"<svg.*?</svg>", "", html, flags=re.DOTALL))
 
@@ -278,6 +278,7 @@ def test_a_grade_and_its_reason_are_said_once(tmp_path):
     box = text[text.index('<div class="verdict') : text.index("<nav ")]
     assert box.count("too few draws of time_1") == box.count("entative") - 2 == 1
     assert "<p>More was learned.</p>" in box
+    assert box.index("Why this grade") < box.index("<details>") < box.index("More was learned")
 
 
 def test_default_priors_are_explained_in_the_words_of_their_module(html):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from small import draws_of, problem
@@ -10,6 +12,7 @@ from lcopa_bayes.sampling.convergence import (
     Grade,
     Limitation,
     Quality,
+    also_said,
     between,
     drift,
     limited,
@@ -262,3 +265,13 @@ def test_the_worth_of_a_drift_in_closed_form():
     rng = np.random.default_rng(0)
     values = rng.standard_normal((4, 64, 60)) + 0.3 * np.linspace(-0.5, 0.5, 60)
     assert drift(values) == pytest.approx(1 / 0.2**2, rel=0.3)
+
+
+def test_a_reason_names_a_few_of_many_parameters():
+    """A page that begins with thirty names is not read."""
+    draws = np.stack([normal(k) + np.array([0.0, 0.0, 0.0, 6.0])[:, None, None] for k in range(9)], axis=-1)
+    reason = overall(qualities([f"p{k}" for k in range(9)], draws), 1).reason
+    assert len(re.findall(r"\bp\d\b", reason)) == 4
+    assert " and 5 more)" in reason
+    assert also_said(["a", "b", "c"]) == " (also a, b, c)"
+    assert also_said([]) == ""

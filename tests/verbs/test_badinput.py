@@ -299,3 +299,31 @@ def test_a_reader_who_has_seen_enough_ends_it_without_a_trace(tmp_path):
         end.stdout.close()
         assert end.stderr.read() == b""
     assert end.returncode == 1
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        (["fit", "LONG.csv"], "`name` must be text fit for a folder, of at most 100 letters"),
+        (["new", "x", "LONG.csv"], "`record name` must be text fit for a folder, of at most 100 letters"),
+        (["new", "x" * 300, "step.csv"], "at most 100 letters"),
+        (["new", f"{'x' * 300}/oven", "step.csv"], "File name too long; give a shorter name"),
+        (["fit", f"{'n' * 5000}.csv"], "nnn...: File name too long; give a shorter name"),
+        (["new", "x", "."], ".: is a folder; name the tables in it"),
+        (["--versoin"], "--versoin is not an option; did you mean '--version'?"),
+    ],
+)
+def test_names_that_no_system_holds_and_folders_for_tables_are_refused(
+    command, said, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    save_record(record(1), tmp_path / "step.csv")
+    long = f"{'l' * 200}.csv"
+    (tmp_path / long).write_bytes((tmp_path / "step.csv").read_bytes())
+    try:
+        code = main([one.replace("LONG.csv", long) for one in command])
+    except SystemExit as end:
+        code = end.code
+    assert code == 2
+    assert said in capsys.readouterr().err
+    assert sorted(one.name for one in tmp_path.iterdir()) == [long, "step.csv"]

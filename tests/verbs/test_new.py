@@ -15,6 +15,7 @@ from small import record
 import lcopa_bayes as lb
 from lcopa_bayes.cli import main
 from lcopa_bayes.data.record import Record, save_record
+from lcopa_bayes.results.result import _text_table
 
 
 @pytest.fixture
@@ -202,3 +203,23 @@ def test_obstacles_to_a_fit_are_part_of_a_check(capsys, tmp_path):
     assert "constant throughout" in result.verdict
     with pytest.raises(lb.InputError, match="constant throughout"):
         lb.fit(lb.Study("small", fit=[flat], terms=1))
+
+
+def test_a_level_prior_is_said_by_its_ends():
+    """Nine tenths of a uniform prior begin above delays that it allows."""
+    result = lb.check(lb.Study("small", fit=[record(1, name="on")], terms=1))
+    said = {one["name"]: one for one in result.to_json()["parameters"]}
+    assert said["delay"]["words"].startswith("anywhere between 0 and ")
+    assert float(said["delay"]["words"].split()[-1]) == pytest.approx(said["delay"]["upper"] / 0.95, rel=1e-3)
+    assert said["time_1"]["words"].endswith(", every decade alike")
+    assert said["gain"]["words"].endswith(" with 90 % probability")
+
+
+def test_sentences_of_a_printed_table_begin_in_one_column():
+    table = pd.DataFrame(
+        {"name": ["a", "long"], "size": [1234.567, 0.5], "reason": ["short", "many words " * 4]}
+    )
+    printed = _text_table(table).splitlines()
+    at = printed[0].index("reason")
+    assert [line[at:] for line in printed] == ["reason", "short", ("many words " * 4).rstrip()]
+    assert [line[:at].split() for line in printed[1:]] == [["a", "1235"], ["long", "0.5"]]
