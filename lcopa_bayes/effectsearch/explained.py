@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from lcopa_bayes.core.arrays import Matrix
+from lcopa_bayes.core.arrays import Matrix, Vector
 from lcopa_bayes.core.covariance import root_of
 from lcopa_bayes.data.settings import PriorSettings
 from lcopa_bayes.data.study import Study
@@ -16,12 +16,12 @@ from lcopa_bayes.effectsearch.outliers import NAME, Outlying
 from lcopa_bayes.inference.assembly import problem_of
 from lcopa_bayes.inference.declared import coefficient_prior
 from lcopa_bayes.inference.noise import Noise
-from lcopa_bayes.inference.optimum import Optimum
+from lcopa_bayes.inference.optimum import Optimum, nearly_white, optima_near
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.effects.catalogue import catalogue
 from lcopa_bayes.model.effects.effect import Effect, Ranges
 from lcopa_bayes.model.effects.records import Outliers
-from lcopa_bayes.results.discretisation import discretisation
+from lcopa_bayes.results.discretisation import discretisation, resolved_optima
 from lcopa_bayes.results.fit import plan_of, weighted_start
 from lcopa_bayes.sampling.draws import Draws
 from lcopa_bayes.sampling.weightedrun import weighted_run
@@ -94,16 +94,23 @@ def _place(kind: type[Effect]) -> tuple[str, str]:
 
 
 def explained_draws(
-    study: Study, usable: Callable[[Draws, Noise], bool], *, jobs: int = 1, quick: bool = False
+    study: Study,
+    usable: Callable[[Draws, Noise], bool],
+    *,
+    near: Mapping[str, float] | None = None,
+    jobs: int = 1,
+    quick: bool = False,
 ) -> tuple[Draws, Noise] | None:
-    """Draws of an explained study, the same that a fit of it gives and limited by the width of its blocks as
-    there, and its noise; None where importance sampling does not hold, and a fit takes ensembles from the
-    prior.
+    """Draws of an explained study, of the posterior that a fit of it samples and limited by the width of its
+    blocks as there, and its noise; None where importance sampling does not hold, and a fit takes ensembles
+    from the prior. Parameters by name `near` an optimum spare the search for it.
 
     Where normal draws about its optimum are not `usable` these are returned: the posterior is around there,
     and takes some ten thousand simulations.
     """
-    problem, optima = weighted_start(problem_of(study), quick=quick)
+    problem = problem_of(study)
+    begun = optima_near(problem.posterior, [_values(problem.posterior, near)] if near else [])
+    problem, optima = resolved_optima(problem, begun) if begun else weighted_start(problem, quick=quick)
     noise = problem.posterior.noise
     about = normal_draws(problem.posterior, optima[0], study.seed) if optima else None
     if about is not None and not usable(about, noise):
@@ -115,6 +122,12 @@ def explained_draws(
     draws = result[1]
     width = discretisation(problem, draws, jobs=jobs)
     return draws.limited(width.limitations), noise
+
+
+def _values(posterior: Posterior, known: Mapping[str, float]) -> Vector:
+    """Table values, (rows,), with parameters by name; noise that is free is nearly white."""
+    values = np.array([known.get(row.name, row.value) for row in posterior.table.rows])
+    return np.asarray(nearly_white(posterior, values[None])[0])
 
 
 def normal_draws(posterior: Posterior, optimum: Optimum, seed: int) -> Draws | None:

@@ -297,7 +297,9 @@ def _looped(
             return not _astray(after, _drawn(problem, state, (draws, noise)))
 
         crew.close()
-        sampled = explained_draws(explained, usable, jobs=crew.jobs, quick=quick)
+        values = state.model.values(state.optimum.x).tolist()
+        known = dict(zip(state.model.posterior.table.names, values, strict=True))
+        sampled = explained_draws(explained, usable, near=known, jobs=crew.jobs, quick=quick)
     if sampled is not None:
         drawn = _drawn(problem, state, sampled)
         if _astray(after, drawn):

@@ -86,7 +86,7 @@ def find_optima(
     table = posterior.table
     if posterior.simulation is not None:
         alone = find_optima(posterior.without_effects, rng, starts=starts)
-        return _kept(posterior, _descended(posterior, _near(posterior, effect_starts(posterior, alone, rng))))
+        return optima_near(posterior, effect_starts(posterior, alone, rng))
     drawn = table.draw(_FEWER if len(near) else _SCREENED, rng)
     drawn = nearly_white(posterior, np.vstack([regressed(posterior, drawn), drawn, *near]))
     each = posterior.log_likelihoods(drawn)
@@ -215,6 +215,12 @@ def _with_spare_terms(posterior: Posterior, found: Sequence[Optimum]) -> list[Ve
         ]
         out += [one for one, possible in zip(starts, inside, strict=True) if possible]
     return out
+
+
+def optima_near(posterior: Posterior, starts: Sequence[Vector]) -> tuple[Optimum, ...]:
+    """Optima of a posterior with effects that table values `starts`, (rows,) each, lead to, best first,
+    duplicates removed."""
+    return _kept(posterior, _descended(posterior, _near(posterior, starts)))
 
 
 def _near(posterior: Posterior, starts: Sequence[Vector]) -> list[Vector]:

@@ -32,6 +32,10 @@ from lcopa_bayes.model.effects.passage import Moved, Plant, forced
 from lcopa_bayes.model.effects.simulator import Simulator
 from lcopa_bayes.model.forward import Dynamics, ForwardModel, deflections
 
+_ACCURACY = 1e-9
+"""Accuracy of responses under forces over their scale [-]: slopes are not taken from them (`effects`), and
+noise is some thousand times as large."""
+
 
 @final
 class Simulated(NamedTuple):
@@ -218,7 +222,7 @@ class Simulation:
                 forces.append((kind(*(c if np.ptp(c) else float(c[0, 0]) for c in own)), psi))
         simulator, plant = self.simulator(self.effects(values[0])), self.plant(values[0])
         scenes = [simulator.scene(r, plant) for r in range(len(out))]
-        records = forced(self.model.plain, scenes, gains, dynamics, forces)
+        records = forced(self.model.plain, scenes, gains, dynamics, forces, _ACCURACY)
         for record, (deflection, failures) in zip(out, records, strict=True):
             bounded[list(failures)] = False
             record.base[...] = deflection

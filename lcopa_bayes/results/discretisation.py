@@ -163,9 +163,7 @@ def narrowed(problem: Problem, shift: Callable[[Problem], float]) -> Problem:
 
     Not beyond `FINEST` or `_MOST_CELLS`, where the measurement after sampling gives the remaining shift.
     """
-    while shift(problem) > LARGEST:
-        if problem.refinement >= FINEST or 2 * _cells(problem) > _MOST_CELLS:
-            break
+    while problem.refinement < FINEST and 2 * _cells(problem) <= _MOST_CELLS and shift(problem) > LARGEST:
         problem = problem.refined(2)
     return problem
 

@@ -23,7 +23,9 @@ from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.sampling.moves import Terrain
 
 _PORTION = 256
-"""Draws whose density one process computes at once."""
+"""Draws whose density one process computes at once [-]."""
+_DEAR = 16
+"""The same of responses with effects, a few hundred of which all processes share [-]."""
 Mapped = Callable[..., Iterable[Any]]
 """A map of a function over tasks, here or in other processes."""
 
@@ -139,5 +141,6 @@ def charted_density(posterior: Posterior, chart: Chart, y: Matrix, mapped: Mappe
 
 def spread(posterior: Posterior, z: Matrix, mapped: Mapped) -> Vector:
     """Log density of sampled coordinates portion by portion, (batch,)."""
-    portions = np.array_split(z, max(1, len(z) // _PORTION))
+    size = _PORTION if posterior.simulation is None or posterior.surrogate is not None else _DEAR
+    portions = np.array_split(z, max(1, len(z) // size))
     return np.concatenate(list(mapped(posterior.log_density, portions)))

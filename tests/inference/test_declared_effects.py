@@ -92,7 +92,7 @@ def test_responses_are_those_of_the_simulator(name: str):
     for r, (split, y) in enumerate(zip(simulation.responses(values[None]), direct, strict=True)):
         for axis in range(y.shape[1]):
             level = posterior.table.offset(values[None], axis, r)[0]
-            assert_allclose(split[axis, 0] + level, y[:, axis], rtol=0, atol=1e-10)
+            assert_allclose(split[axis, 0] + level, y[:, axis], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ACTING)
@@ -368,7 +368,7 @@ def test_iterating_the_whole_and_dividing_it_give_one_response(name: str, monkey
     simulation = made.posterior.simulation
     assert simulation is not None
     swept = simulation.responses(values)
-    monkeypatch.setattr(passage, "_SWEEPS", 0)
+    monkeypatch.setattr(passage, "_FEWER", 0)
     for one, other in zip(swept, simulation.responses(values), strict=True):
         assert np.isfinite(one).all()
         assert_allclose(one, other, rtol=0, atol=1e-9)
@@ -391,3 +391,33 @@ def test_places_in_the_campaign_go_by_name_and_numbers_by_value():
     places = campaign_places(made)
     found = [places[name] for name in ("run1", "run2", "run3", "run10")]
     assert found == pytest.approx([-0.5, -1 / 6, 1 / 6, 0.5])
+
+
+def test_neighbours_whose_difference_is_taken_are_solved_alike(monkeypatch: pytest.MonkeyPatch):
+    """Where a force all but jumps two ways of solving end apart by far more than a slope's step moves a
+    response: if one neighbour has to be solved block by block, all are; in a density each is by itself."""
+    made = using(TWO_AXES, "rise_fall_asymmetry")
+    values, simulation, plain, marched = values_of(made, 0.7), made.posterior.simulation, [], []
+    assert simulation is not None
+    iterated, blockwise = passage.iterated, passage.marched
+
+    def failing(swept, start, scale, most, **more):
+        y, solved = iterated(swept, start, scale, most, **more)
+        if len(start) > 2:
+            solved[-1] = False
+            plain.append(len(start))
+        return y, solved
+
+    def counted(kernel, force, scale, plants, **more):
+        marched.append(plants)
+        return blockwise(kernel, force, scale, plants, **more)
+
+    monkeypatch.setattr(passage, "iterated", failing)
+    monkeypatch.setattr(passage, "marched", counted)
+    simulation.responses(np.tile(values, (3, 1)))
+    assert marched == [1] * len(plain)
+    plain.clear(), marched.clear()
+    least = LeastSquares(made.posterior)
+    least.residual(least.coordinates(values), values)
+    assert max(plain) > 2
+    assert marched == plain

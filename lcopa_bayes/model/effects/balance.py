@@ -52,13 +52,18 @@ def resting(force: Callable[[Matrix], Matrix], start: Matrix, scale: Matrix) -> 
 
 
 def iterated(
-    swept: Callable[[Index, Array], Array], start: Array, scale: Array, most: int
+    swept: Callable[[Index, Array], Array],
+    start: Array,
+    scale: Array,
+    most: int,
+    *,
+    tolerance: float = TOLERANCE,
 ) -> tuple[Array, Flags]:
     """Fixed points of `swept` for many plants, (plants, axes, n), by at most so many accelerated sweeps, and
     which plants have reached theirs; the others are as far as the iteration got.
 
     Parameters: swept, from plants by number and their y, as `start`, to their next y; scale (plants, axes,
-    1), typical size of y. Accuracy: 1e-12 of the scale.
+    1), typical size of y. Accuracy: `tolerance` of the scale.
     """
     y, out = start, start.copy()
     plants, solved = np.arange(len(start)), np.zeros(len(start), dtype=bool)
@@ -71,7 +76,7 @@ def iterated(
             target = swept(plants, y)
             change = (target - y) / scale[plants]
             size = np.abs(change).max(axis=(1, 2))
-        done = size < TOLERANCE
+        done = size < tolerance
         out[plants[done]], solved[plants[done]] = target[done], True
         kept = ~done & (size < RUNAWAY)  # NaN is not kept
         steps.append(change.reshape(plants.size, -1))
@@ -95,13 +100,22 @@ def _mixed(steps: Sequence[Matrix], points: Sequence[Matrix]) -> Matrix:
     return np.asarray(points[-1] - (weights.swapaxes(1, 2) @ apart)[:, 0])
 
 
-def marched(kernel: Matrix, force: Force, scale: Matrix, plants: int) -> tuple[Array, Flags]:
+def marched(
+    kernel: Matrix,
+    force: Force,
+    scale: Matrix,
+    plants: int,
+    *,
+    near: Matrix | None = None,
+    tolerance: float = TOLERANCE,
+) -> tuple[Array, Flags]:
     """``y = kernel * force(y)``, causal convolution, stretch by stretch where `iterated` fails on the whole:
     (plants, axes, n), and which plants have no bounded solution, (plants,).
 
     Parameters: kernel (rows, n), the impulse response in block means, of every axis of every plant; scale
-    (rows, 1), typical size of y. A stretch is solved by Newton's method, for rows where that fails block by
-    block, each one equation. Accuracy: 1e-12 of the scale.
+    (rows, 1), typical size of y; `near` (rows, n), where Newton's method starts, by default from what the
+    past leaves. A stretch is solved by Newton's method, for rows where that fails block by
+    block, each one equation. Accuracy: `tolerance` of the scale, block by block 1e-12.
     """
     rows, n = kernel.shape
     window = min(n, _STRETCH)
@@ -113,7 +127,8 @@ def marched(kernel: Matrix, force: Force, scale: Matrix, plants: int) -> tuple[A
         own = slice(first, min(first + window, n))
         size = own.stop - first
         before, past = y[:, first : first + 2], history[:, own]
-        now, v, solved = _newton(operator[:, :size, :size], past, before, force, own, scale)
+        begin = past if near is None else near[:, own]
+        now, v, solved = _newton(operator[:, :size, :size], past, before, force, own, begin, scale, tolerance)
         if not (solved | lost).all():
             known = solved | lost
             slow, pushed = _blockwise(operator[:, :size, :size], past, before, force, own, scale, known)
@@ -137,7 +152,14 @@ def marched(kernel: Matrix, force: Force, scale: Matrix, plants: int) -> tuple[A
 
 
 def _newton(
-    operator: Array, past: Matrix, before: Matrix, force: Force, own: slice, scale: Matrix
+    operator: Array,
+    past: Matrix,
+    before: Matrix,
+    force: Force,
+    own: slice,
+    start: Matrix,
+    scale: Matrix,
+    tolerance: float,
 ) -> tuple[Matrix, Matrix, Flags]:
     """``y = past + operator @ force(y)`` on a stretch, the force, both (rows, blocks), and what is solved,
     (rows,). Slopes of the force, in y and in its two earlier values, are differences over 1e-6 of the scale.
@@ -145,7 +167,7 @@ def _newton(
     rows, n = past.shape
     nudge = _NUDGE * scale[..., None] * np.eye(4)[1:].T  # (rows, 4 variants, 3 arguments)
     every = np.tile(np.arange(own.start, own.stop), 4)
-    y, solved = past, np.zeros(rows, dtype=bool)
+    y, solved = start, np.zeros(rows, dtype=bool)
     out, pushed = past.copy(), np.zeros(past.shape)
     for _ in range(_NEWTON):
         with np.errstate(over="ignore", invalid="ignore"):
@@ -154,7 +176,7 @@ def _newton(
             forces = force(every, *varied).reshape(rows, 4, n)
             slopes = (forces[:, 1:] - forces[:, :1]) / (_NUDGE * scale[..., None])
             residual = past - y + (operator @ forces[:, 0, :, None])[..., 0]
-            done = np.abs(residual / scale).max(axis=1) < TOLERANCE
+            done = np.abs(residual / scale).max(axis=1) < tolerance
         new = done & ~solved
         out[new], pushed[new] = (y + residual)[new], forces[new, 0]
         solved |= done

@@ -12,7 +12,7 @@ from scipy import fft
 
 from lcopa_bayes.core.arrays import Array, Index, Matrix, Vector
 from lcopa_bayes.model.blockpulses import Circle
-from lcopa_bayes.model.effects.balance import earlier, iterated, marched, resting
+from lcopa_bayes.model.effects.balance import TOLERANCE, earlier, iterated, marched, resting
 from lcopa_bayes.model.effects.effect import (
     Effect,
     ElementEffect,
@@ -34,8 +34,9 @@ Forces: TypeAlias = Sequence[tuple[ForceEffect, Array]]
 constants that differ likewise."""
 Kernels: TypeAlias = dict[tuple[int, float, float], Matrix]
 """Responses to an impulse by element, width of the blocks, and the factor on time constants."""
-_SWEEPS = 50
-"""Most sweeps of the iteration [-]: what they do not bring to rest is solved block by block."""
+_SWEEPS, _FEWER = 50, 18
+"""Most sweeps of the iteration, and where responses need not be so accurate [-]: what they do not bring to
+rest is solved block by block."""
 RUNS_AWAY = "the response runs away"
 
 
@@ -84,7 +85,12 @@ def linear(
 
 
 def forced(
-    model: ForwardModel, scenes: Sequence[Scene], gains: Array, dynamics: Dynamics, forces: Forces
+    model: ForwardModel,
+    scenes: Sequence[Scene],
+    gains: Array,
+    dynamics: Dynamics,
+    forces: Forces,
+    tolerance: float = TOLERANCE,
 ) -> Iterator[tuple[Array, dict[int, str]]]:
     """Of every record, deflections of many plants under forces, (axes, batch, samples) [response unit], and
     why some of the plants, by number, have no bounded response.
@@ -104,7 +110,9 @@ def forced(
     for experiment, scene, units in zip(
         model.experiments, scenes, model.unit_responses(dynamics), strict=True
     ):
-        passage = Passage(model.layout, experiment, scene, gains, dynamics, forces, kernels)
+        passage = Passage(
+            model.layout, experiment, scene, gains, dynamics, forces, kernels, tolerance=tolerance
+        )
         change, failures = passage.change()
         yield deflections(model.layout, scene.rest, gains, units) + change, failures
 
@@ -171,6 +179,8 @@ class Passage:
     """Factor on all time constants [-]."""
     filters: Sequence[tuple[SensorEffect, Vector]] = ()
     """Of the sensor, with their coefficients."""
+    tolerance: float = TOLERANCE
+    """Accuracy of the balance of forces over the scale of the response [-]."""
 
     def change(self) -> tuple[Array, dict[int, str]]:
         """What effects add to the deflections at the samples, (axes, batch, samples) [response unit], and why
@@ -273,23 +283,35 @@ class Passage:
             chosen = spectrum if plants.size == len(places) else spectrum[plants]
             return np.asarray(fft.irfft(chosen * fft.rfft(v.reshape(y.shape), length), length)[..., :n])
 
-        sweeps = _SWEEPS
+        rough = self.tolerance > TOLERANCE
+        sweeps = _FEWER if rough else _SWEEPS
         scales, start = scale.reshape(*places.shape, 1), alone.reshape(*places.shape, n)
         if batch > 1:  # most batches are neighbours
             own = len(places) // batch
-            near, known = iterated(swept, start[:own], scales[:own], _SWEEPS)
-            if known.all():
+            near, known = iterated(swept, start[:own], scales[:own], sweeps, tolerance=self.tolerance)
+            if rough or known.all():
                 share = np.divide(gains, gains[0], out=np.ones_like(gains), where=gains[0] != 0.0)
                 start = (share[..., None] * near.reshape(-1, n)).reshape(start.shape)
             else:
                 sweeps = 0
-        y, solved = iterated(swept, start, scales, sweeps)
+        y, solved = iterated(swept, start, scales, sweeps, tolerance=self.tolerance)
+        if not rough and batch > 1 and not solved.all():
+            solved[:] = False  # neighbours whose difference is taken meet a force that all but jumps alike
         failures = dict.fromkeys((places[~settled[places].all(axis=1), 0] // ranges.axes).tolist(), RUNS_AWAY)
         slow = np.flatnonzero(~solved & settled[places].all(axis=1))
         if slow.size:
             rows = places[slow].ravel()
             force = partial(problem.deviation, level, rows)
-            y[slow], lost = marched(kernel.reshape(-1, n)[rows], force, scale[rows], len(slow))
+            # differences of neighbours have to meet a force that all but jumps alike: from the same start
+            reached = y[slow].reshape(-1, n) if rough else None
+            y[slow], lost = marched(
+                kernel.reshape(-1, n)[rows],
+                force,
+                scale[rows],
+                len(slow),
+                near=reached,
+                tolerance=self.tolerance,
+            )
             failures |= dict.fromkeys((places[slow[lost], 0] // ranges.axes).tolist(), RUNS_AWAY)
         bent = _shifted(y.reshape(-1, n) - alone, place.ravel(), grid.n)
         return (
