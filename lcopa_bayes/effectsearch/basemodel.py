@@ -147,6 +147,8 @@ class Base(NamedTuple):
     start: State
     sentence: str
     """What was changed; empty when nothing was."""
+    richer: tuple[State, ...] = ()
+    """Plants that contain it and were not chosen."""
 
 
 def structure_chosen(study: Study, *, as_stated: bool) -> bool:
@@ -198,6 +200,7 @@ def fitted_base(
         if wider.fit.failed or not gain > _GAIN:
             if base.fit.failed:
                 continue
+            base = _beside(base, wider)
             break
         if base.fit.failed:
             said = f"The base model has {terms} viscous terms, because with fewer {base.fit.failed}."
@@ -207,6 +210,7 @@ def fitted_base(
             if named is not None and named.log_bayes_factor >= gain:
                 richer = _named(wider, library, rng, draws, crew)
                 if not _gain(base, wider, named, richer) > _GAIN:
+                    base = _beside(base, wider)
                     break
             said = (
                 f"The base model has {terms} viscous terms instead of {terms - 1}: the last one is worth "
@@ -228,9 +232,14 @@ def _apart(study: Study, base: Base, crew: Crew) -> tuple[Base, Study]:
         return base, study
     gain = _gain(base, wider)
     if wider.fit.failed or not (gain > _GAIN or base.fit.failed):
-        return base, study
+        return _beside(base, wider), study
     said = f"Every path has an element and a delay of its own, which is worth {gain:.0f} nat."
     return wider._replace(sentence=f"{base.sentence} {said}".strip()), apart
+
+
+def _beside(base: Base, wider: Base) -> Base:
+    """A base fit with a wider one that it is preferred to, unless that has failed."""
+    return base if wider.fit.failed else base._replace(richer=(*base.richer, wider.start))
 
 
 def _wider(study: Study, base: Base, terms: int, crew: Crew = ALONE) -> Base:

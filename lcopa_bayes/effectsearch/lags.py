@@ -125,7 +125,7 @@ def figures_with_lags(
     weights, time = weights_of(layout, found), step_times(span)
     lags = {one.name: one.values for one in lag_figures(supported, time, time_unit)}
     return tuple(
-        _joined(one, [lags[one.name]], weight_in(one.name, weights)) if one.name in lags else one
+        one.beside([lags[one.name]], weight_in(one.name, weights)) if one.name in lags else one
         for one in figures
     )
 
@@ -144,7 +144,7 @@ def number_with_lags(
         for p, path in enumerate(one.paths)
         if path in own
     ]
-    return _joined(number, values, float(np.mean([shares[one.name] for one in own]))) if values else number
+    return number.beside(values, float(np.mean([shares[one.name] for one in own]))) if values else number
 
 
 def ess_with_lags(ess: float, found: Sequence[Alternative]) -> float:
@@ -157,8 +157,3 @@ def _uses(row: Parameter, path: PathSlot, layout: Layout) -> bool:
     if row.kind == "delay":
         return layout.delay_of[path.response][path.drive] == row.place.first
     return row.kind == "gain" and (path.response, path.drive) == row.place
-
-
-def _joined(number: Weighed, others: Sequence[Vector], weight: float) -> Weighed:
-    shares = [*((1 - weight) * number.weights), *np.full(len(others), weight / len(others))]
-    return replace(number, parts=[*number.parts, *others], weights=np.array(shares))

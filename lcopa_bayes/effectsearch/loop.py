@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from typing import Any, final
 
 import numpy as np
@@ -39,6 +39,7 @@ from lcopa_bayes.effectsearch.openeffects import (
 from lcopa_bayes.effectsearch.outliers import NAME as OUTLIERS
 from lcopa_bayes.effectsearch.outliers import Outlying, outlying, without_outliers
 from lcopa_bayes.effectsearch.refits import released
+from lcopa_bayes.effectsearch.richerplants import RicherPlants
 from lcopa_bayes.effectsearch.rounds import Round, Search, search, single_record
 from lcopa_bayes.effectsearch.scores import (
     Score,
@@ -121,6 +122,8 @@ class Loop:
     """Effects that the records leave open beside, or in place of, those of the final model."""
     lags: tuple[SumOfLags, ...] = ()
     """Sums of lags beside the plant of the final model, where the search chose its structure."""
+    richer: RicherPlants = field(default_factory=RicherPlants)
+    """Plants that contain that of the final model, where the search chose its structure."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -162,6 +165,7 @@ class Loop:
         own = [(row.value_at(part[:, k]), weight) for part, weight in pairs if k < part.shape[1]]
         shares = np.array([weight for _, weight in own])
         number = Weighed(row.name, row.unit, [values for values, _ in own], shares / shares.sum())
+        number = self.richer.number(number, row)
         return number_with_lags(number, row, self.lags, state.model.plant.table.layout)
 
     @cached_property
@@ -170,6 +174,7 @@ class Loop:
         same models."""
         own, layout = (self.figures_of(self.after.state, *self._mixture), self.problem.posterior.table.layout)
         span, unit = self.problem.scales.span, self.problem.study.time_unit
+        own = self.richer.figures(own, span=span, time_unit=unit)
         return figures_with_lags(own, self.lags, layout, span=span, time_unit=unit)
 
     def figures_of(self, state: State, parts: Sequence[Matrix], weights: Vector) -> tuple[Weighed, ...]:
@@ -230,13 +235,12 @@ def _looped(
 ) -> Loop:
     draws = 1000 if quick else 2000
     chosen = structure_chosen(study, as_stated=as_stated)
-    problem, base, start, enlarged = fitted_base(study, kinds, as_stated=as_stated, draws=draws, crew=crew)
+    based = partial(fitted_base, as_stated=as_stated, draws=draws, crew=crew)
+    problem, base, start, enlarged, wider = based(study, kinds)
     outliers = outlying(study, base)
     if outliers is not None:
         study, kinds = outliers.study, [kind for kind in kinds if kind.card.name != OUTLIERS]
-        problem, base, start, enlarged = fitted_base(
-            study, kinds, as_stated=as_stated, draws=draws, crew=crew
-        )
+        problem, base, start, enlarged, wider = based(study, kinds)
     before = _side(problem, start)
     contrary = disagreements((*study.fit, *study.held_out), crew)
     cautions = (*map(str, contrary), *base.caution, *single_record(study))
@@ -283,9 +287,10 @@ def _looped(
     if not searched.state.model.effects:
         before = reached
     after = reached if named else before
-    state, wider = after.state, after.state.model.wider
+    state = after.state
     if named:
-        verdict = widened(verdict, {name: wider[name] for name in _names(state) if name in wider})
+        factors = state.model.wider
+        verdict = widened(verdict, {name: factors[name] for name in _names(state) if name in factors})
     if verdict.kind in ("unexplained", "partly explained") or searched.rounds[-1].trace.alarmed:
         white = state.whitening  # something significant remains, which bands have to hold
         state = replace(state, widening=Widening.of(white.samples, state.optimum.residual, white.noise))
@@ -312,7 +317,7 @@ def _looped(
     return Loop(
         *(problem, base, enlarged, searched.rounds, state.model.effects, searched.groups if named else ()),
         *(verdict, before, after, not study.held_out, cautions, sampled[0] if sampled is not None else None),
-        *(outliers, contrary, found, lags),
+        *(outliers, contrary, found, lags, RicherPlants.beside(state, wider)),
     )
 
 

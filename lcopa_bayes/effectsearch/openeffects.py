@@ -166,6 +166,13 @@ class Weighed:
         """Equally probable values over all [`unit`]."""
         return pooled(self.parts, self.weights)
 
+    def beside(self, others: Sequence[Vector], weight: float) -> Weighed:
+        """Over further parts too, which have this weight together."""
+        if not others:
+            return self
+        shares = [*((1 - weight) * self.weights), *np.full(len(others), weight / len(others))]
+        return replace(self, parts=[*self.parts, *others], weights=np.array(shares))
+
     def as_json(self, *, ess: float, grade: str, interval: str) -> dict[str, Any]:
         """Median and 90 % interval, the standard deviations by noise and by structure, and lower end, median
         and upper end under the final model `alone`."""

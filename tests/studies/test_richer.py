@@ -1,0 +1,83 @@
+"""Plants that a loop does not choose have a part in its numbers: a truth outside the chosen one is held."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "studies" / "undeclared-effects"))
+
+from foreign import campaign, truths
+
+from lcopa_bayes.core.estimate import quantile
+from lcopa_bayes.data.study import Study
+from lcopa_bayes.effectsearch import richerplants
+from lcopa_bayes.effectsearch.loop import Loop, loop
+from lcopa_bayes.effectsearch.richerplants import RicherPlants
+from lcopa_bayes.results.structure import with_least_terms
+
+SEED = 982200005
+"""Of a campaign of three terms, of which the third is worth half a nat."""
+KIND = "three terms"
+
+
+def study() -> Study:
+    return with_least_terms(campaign(KIND, (), SEED).study(SEED))
+
+
+@pytest.fixture(scope="module")
+def found() -> Loop:
+    return loop(study(), sample=False)
+
+
+def ends(found: Loop, name: str) -> tuple[float, float]:
+    (one,) = (one for one in found.figures if one.name == name)
+    return float(quantile(one.values, 0.05)), float(quantile(one.values, 0.95))
+
+
+def test_a_steady_value_beyond_the_record_is_held(found: Loop) -> None:
+    """By the interval over the plant that was not chosen too, and not by that of the others."""
+    true = truths(campaign(KIND, (), SEED), found.problem.scales.span, ())["steady_state[y1]"]
+    low, high = ends(found, "steady_state[y1]")
+    assert low <= true <= high
+    low, high = ends(replace(found, richer=RicherPlants()), "steady_state[y1]")
+    assert high < true
+
+
+def test_a_richer_plant_contains_the_chosen_one(found: Loop) -> None:
+    (one,) = found.richer.plants
+    assert found.verdict.kind == "clean"
+    assert one.state.model.plant.table.layout.elements[0].terms == 3
+    assert found.problem.posterior.table.layout.elements[0].terms == 2
+    assert 0.0 <= one.gained < 3.0
+    squares = []
+    for state in (found.after.state, one.state):
+        white = found.after.state.whitening
+        left = white(white.observed - state.model.predict(state.optimum.x))
+        squares.append(float(left @ left))
+    assert one.gained == pytest.approx((squares[0] - squares[1]) / 2, abs=1e-6)
+
+
+def test_its_part_is_the_stated_weight(found: Loop) -> None:
+    """Of the plant's draws, before sums of lags take theirs; of gains, and not of times."""
+    alone = replace(found, lags=())
+    names = found.after.state.model.names
+    for name, parts in (("gain", 2), ("time_1", 1)):
+        number = alone.number(names.index(name))
+        assert len(number.parts) == parts + len(found.open)
+        assert number.weights.sum() == pytest.approx(1.0)
+        assert parts == 1 or number.weights[-1] == pytest.approx(richerplants.WEIGHT)
+    steady = next(one for one in alone.figures if one.name == "steady_state[y1]")
+    own = steady.parts[-1]
+    gain = alone.number(names.index("gain")).parts[-1]
+    assert np.median(own) == pytest.approx(np.median(gain), rel=0.05)
+
+
+def test_a_stated_structure_has_none() -> None:
+    made = study()
+    made = replace(made, model=replace(made.model, terms=2))
+    assert not loop(made, sample=False, as_stated=True).richer.plants
