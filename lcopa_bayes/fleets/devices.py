@@ -95,7 +95,8 @@ def row_of(verb: str, values: Mapping[str, Any], fit: Predictive | None) -> dict
     tests, scores = numbers["residual_tests"], [*numbers["fit_scores"], *numbers["held_out"]]
     row["p_white"] = min((one["p_white"] for one in tests), default=None)
     row["coverage_90"] = min(one["coverage_90"] for one in scores)
-    row["rmse"] = max(one["rmse"] for one in scores)
+    worst = max(scores, key=lambda one: one["rmse"])
+    row["rmse"], row["rmse_unit"] = worst["rmse"], worst["unit"]
     for one in numbers["parameters"]:
         row |= {one["name"]: one["value"], f"{one['name']}_lower": one["lower"]}
         row[f"{one['name']}_upper"] = one["upper"]

@@ -104,9 +104,14 @@ def _compare(v: Values) -> _Answers:
     yield "What next?", said, ""
 
 
+_UNNAMED = {"clean": "Nothing that these records could show", "unexplained": "Something without a name"}
+"""What a model lacks by a verdict without effects."""
+
+
 def _loop(v: Values) -> _Answers:
     names = [one["name"] for one in v["effects"]]
-    said = f"{listed(names) or v['verdict']} ({v['confidence']})."
+    unnamed = _UNNAMED.get(v["verdict"], v["verdict"].capitalize())
+    said = f"{listed(names) or unnamed} ({v['confidence']})."
     yield "What does the model lack?", said, "What was missing"
     scores = zip(v["before"]["scores"], v["after"]["scores"], strict=True)
     held = [(before, after) for before, after in scores if after["held_out"]]

@@ -20,6 +20,7 @@ _FITTED = (
     ("outlier, p:number", "p_odd", lambda p: figures(p, 2)),
     ("residual white, p:number", "p_white", lambda p: figures(p, 2)),
     ("RMSE:number", "rmse", figures),
+    ("unit", "rmse_unit", str),
     ("in 90 % band:number", "coverage_90", percent),
 )
 _COLUMNS: Mapping[str, tuple[Any, ...]] = {

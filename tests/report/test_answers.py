@@ -170,7 +170,10 @@ SAID = [
     ("compare", ("flags",), [{"model": "a", "sentence": "odd"}], "What is missing?", "a: odd."),
     ("compare", ("flags",), [{"model": "a", "sentence": "odd"}], "What next?", "`loop` looks for what a leaves out."),
     ("loop", (), None, "What does the model lack?", "creep (firm)."),
-    ("loop", ("effects",), [], "What does the model lack?", "explained (firm)."),
+    ("loop", (), {"effects": [], "verdict": "clean"}, "What does the model lack?",
+     "Nothing that these records could show (firm)."),
+    ("loop", (), {"effects": [], "verdict": "unexplained"}, "What does the model lack?",
+     "Something without a name (firm)."),
     ("loop", (), None, "How good", "The worst held-out response, r/x, goes from 3.00×10⁻⁴ to 2.00×10⁻⁴ rad "
      "rms, 1.02 times the noise."),
     ("loop", (), None, "What was wrong", "Biased without it: gain by 15 sd."),
@@ -241,6 +244,8 @@ def test_an_answer_follows_the_result(verb, place, value, question, said):
         for key in path:
             at = at[key]
         at[last] = value
+    elif value is not None:
+        values |= value
     found = [one.answer for one in answers(verb, values) if one.question.startswith(question)]
     assert found == ([] if said is None else [said])
 
