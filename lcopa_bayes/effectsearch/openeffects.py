@@ -35,6 +35,8 @@ from lcopa_bayes.results.steps import curves_of, metrics_of
 
 LEAST = 3e-3
 """Weight beside that of the final model below which an alternative is left out [-]."""
+_CERTAIN = 300.0
+"""Evidence beyond which odds do not grow [nat]."""
 _DRAWS = 4000
 """Draws of all models together [-]."""
 _RESPONSES = 400
@@ -216,10 +218,10 @@ def odds(seen: Trace, log_bayes_factor: float) -> float:
     """Of one more effect against none [-]: as probable beforehand as any other, and all together as none.
 
     Its evidence counts in what chance gives: where that is more than under noise that is known, by as much
-    less. Infinite where a float does not hold it.
+    less. Of more than `_CERTAIN` nat as of these, so that weights can be added up.
     """
-    with np.errstate(over="ignore"):
-        return float(np.exp(log_bayes_factor * CHANCE / seen.threshold)) / len(seen.traced)
+    exponent = min(log_bayes_factor * CHANCE / seen.threshold, _CERTAIN)
+    return float(np.exp(exponent)) / len(seen.traced)
 
 
 def _beside(state: State, seen: Trace) -> list[Alternative]:
