@@ -17,7 +17,7 @@ from lcopa_bayes.comparison.averaging import (
     simplest,
 )
 from lcopa_bayes.comparison.priorwidth import FACTORS
-from lcopa_bayes.results.summary import joined
+from lcopa_bayes.core.wording import joined
 
 
 def fractional(usable: Sequence[Row]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.stats import f as f_distribution
 
 from lcopa_bayes.core.arrays import Vector
+from lcopa_bayes.core.wording import listed
 from lcopa_bayes.effectsearch.openeffects import Weighed
 from lcopa_bayes.effectsearch.refits import places, without
 from lcopa_bayes.effectsearch.scores import State
@@ -26,7 +27,6 @@ from lcopa_bayes.inference.parameter import Parameter
 from lcopa_bayes.model.effects.effect import Effect
 from lcopa_bayes.model.layout import Layout, PathSlot
 from lcopa_bayes.results.steps import curves_of, step_times
-from lcopa_bayes.results.summary import listed
 from lcopa_bayes.results.sumsoflags import (
     Alternative,
     FittedPlant,

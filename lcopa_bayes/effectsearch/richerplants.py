@@ -20,7 +20,6 @@ from lcopa_bayes.effectsearch.openeffects import Weighed, mixture, step_figures
 from lcopa_bayes.effectsearch.regression import Regression
 from lcopa_bayes.effectsearch.scores import State
 from lcopa_bayes.inference.parameter import Parameter
-from lcopa_bayes.results.summary import listed
 
 WEIGHT = 0.2
 """Of all richer plants beside the chosen one [-]. Of 58 paths of plants outside the family 90 % intervals
@@ -109,9 +108,11 @@ class RicherPlants:
         """What they are and what part they have; empty without any."""
         if not self.plants:
             return ""
-        said = listed([one.said for one in self.plants])
-        each = "each has the same part" if len(self.plants) > 1 else "it has a part"
+        several = len(self.plants) > 1
+        said = " or ".join(one.said for one in self.plants)
+        little = "which have" if several else "which has"
+        part = "they have equal parts" if several else "it has a part"
         return (
-            f"The records do not reject {said}, which has too little evidence to be chosen: {each} in gains, "
+            f"The records do not reject {said}, {little} too little evidence to be chosen: {part} in gains, "
             f"delays and figures of the step responses, {100 * WEIGHT:.0f} % of the plant's draws."
         )

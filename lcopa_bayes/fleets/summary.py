@@ -12,6 +12,7 @@ from scipy.stats import beta
 
 from lcopa_bayes.core.arrays import Array, Matrix
 from lcopa_bayes.core.estimate import LEVEL, plain
+from lcopa_bayes.core.wording import listed
 from lcopa_bayes.fleets.population import LEVELS, Population, has_likelihood, population_of
 from lcopa_bayes.sampling.importanceweights import LARGEST_K
 
@@ -219,7 +220,7 @@ def _verdict(values: Mapping[str, Any]) -> str:
     odd = [f"{row['device']} ({row['differs_in']})" for row in rows if row["differs_in"]]
     if odd:
         verb = "do not belong" if len(odd) > 1 else "does not belong"
-        parts.append(f"{len(odd)} {verb} to the population: {_listed(odd)}.")
+        parts.append(f"{len(odd)} {verb} to the population: {listed(odd, _NAMED)}.")
     elif any(one["parameters"] for one in groups):
         parts.append("No device stands out from the population.")
     if len(groups) > 1:
@@ -233,10 +234,5 @@ def _verdict(values: Mapping[str, Any]) -> str:
         parts.append(f"{one['name']}: {one['devices']} devices, {100 * one['share']:.0f} % ({ends}).")
     failed = [row["device"] for row in rows if row["grade"] == "failed"]
     if failed:
-        parts.append(f"Failed: {_listed(failed)}.")
+        parts.append(f"Failed: {listed(failed, _NAMED)}.")
     return " ".join(parts)
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return ", ".join(names[:_NAMED]) + more

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import log10
 from typing import Any, NamedTuple, TypeAlias, final
 
+from lcopa_bayes.core.wording import joined, listed
 from lcopa_bayes.report.formatting import (
     ends,
     figures,
@@ -17,7 +18,7 @@ from lcopa_bayes.report.formatting import (
     to_spread,
     with_error,
 )
-from lcopa_bayes.results.summary import grouped, joined, listed
+from lcopa_bayes.results.summary import grouped
 
 Values: TypeAlias = Mapping[str, Any]
 

@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar, final
+from zlib import crc32
 
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
@@ -27,6 +28,8 @@ COLOURS = {
     "#7a6a00": ("olive", "#c9b53a"),
 }
 """Colours of figures that a page replaces by a variable: its name and what it is on a dark ground."""
+_LONGEST = 110
+"""Letters of a file name from which the rest becomes a checksum."""
 _NO_METADATA = dict.fromkeys(("Date", "Creator", "Format", "Type"))
 
 
@@ -75,8 +78,11 @@ def drawing(
     data: str = "",
     series: Mapping[str, Any] | None = None,
 ) -> Drawing:
-    """A figure as a drawing; names of axes are as long as people like, those of files are not."""
-    return Drawing(stem[:120], svg_of(figure), caption, mark, data, series)
+    """A figure as a drawing; names of axes are as long as people like, those of files are not, and two that
+    begin alike stay two files."""
+    if len(stem) > _LONGEST:
+        stem = f"{stem[:_LONGEST]}_{crc32(stem.encode()):08x}"
+    return Drawing(stem, svg_of(figure), caption, mark, data, series)
 
 
 def paged(

@@ -18,10 +18,10 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.estimate import HALF_WIDTH, LEVEL, Estimate, plain, quantile
+from lcopa_bayes.core.wording import listed
 from lcopa_bayes.inference.noise import GaussianNoise
 from lcopa_bayes.results.fit import Fit
 from lcopa_bayes.results.steps import Metric, metrics_of
-from lcopa_bayes.results.summary import listed
 from lcopa_bayes.results.sumsoflags import (
     Alternative,
     FittedPlant,

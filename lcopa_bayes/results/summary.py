@@ -6,7 +6,7 @@ What a reader asks a fit first: the plant, how well it follows the records, what
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,7 @@ import numpy as np
 from lcopa_bayes.core.arrays import Vector
 from lcopa_bayes.core.estimate import plain
 from lcopa_bayes.core.units import measured, per
+from lcopa_bayes.core.wording import joined, listed
 from lcopa_bayes.inference.kinds import COEFFICIENTS, CONSTANTS
 from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.results.residuals import WHITE_P
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from lcopa_bayes.results.firstlook import FirstLook
     from lcopa_bayes.results.fit import Fit
 
-_NAMED = 8
 """Most parameters named in a sentence."""
 _AT_REST = 8
 """Samples at rest without which their scatter is not shown [-]."""
@@ -127,12 +127,6 @@ def grouped(graded: Iterable[tuple[str, str]]) -> str:
     return joined([f"{grade}: {listed(names)}" for grade, names in shown.items()])
 
 
-def listed(names: Sequence[str], most: int = _NAMED) -> str:
-    """The first few of some names, and how many more there are."""
-    more = len(names) - most
-    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
-
-
 def _missing(fit: Fit) -> str:
     reasons = [one.reason for one in fit.draws.limitations if one.level != "reliable"]
     if fit.draws.modes:
@@ -149,12 +143,6 @@ def _next(fit: Fit) -> str:
         remedies.append("hold out a record (--held-out) to test the prediction")
     remedies.append("`audit` says what the records determine, `loop` what the model lacks")
     return joined(remedies)
-
-
-def joined(clauses: Iterable[str]) -> str:
-    """Clauses as one sentence, each once; empty without any."""
-    text = "; ".join(dict.fromkeys(clauses))
-    return f"{text[0].upper()}{text[1:]}." if text else ""
 
 
 IMPORTANCE = "importance draws"

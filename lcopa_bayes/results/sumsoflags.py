@@ -15,6 +15,7 @@ import numpy as np
 
 from lcopa_bayes.core.arrays import Array, Vector
 from lcopa_bayes.core.errors import InputError
+from lcopa_bayes.core.wording import listed
 from lcopa_bayes.inference.assembly import Problem
 from lcopa_bayes.inference.lagsum import lag_problem, thinned
 from lcopa_bayes.inference.noise import GaussianNoise
@@ -23,7 +24,6 @@ from lcopa_bayes.inference.parameters import ParameterTable
 from lcopa_bayes.inference.posterior import Posterior
 from lcopa_bayes.model.layout import Layout, PathSlot
 from lcopa_bayes.results.steps import Metric, StepCurves, figures_of
-from lcopa_bayes.results.summary import listed
 from lcopa_bayes.sampling.lagdraws import LagDraws, LagSearch, lag_draws
 
 _SUPPORT = 10.0

@@ -13,6 +13,7 @@ from scipy.stats import chi2, norm, rankdata, spearmanr
 
 from lcopa_bayes.core.arrays import Array, Vector
 from lcopa_bayes.core.estimate import attributes
+from lcopa_bayes.core.wording import listed
 from lcopa_bayes.sampling.modes import Modes
 
 Level = Literal["reliable", "tentative", "unusable"]
@@ -314,8 +315,7 @@ def overall(qualities: Sequence[Quality], target_ess: float, modes: Sequence[Mod
 
 def also_said(others: Sequence[str]) -> str:
     """The next few of parameters that share a fault, and how many more do; nothing without any."""
-    more = f" and {len(others) - _ALSO} more" if len(others) > _ALSO else ""
-    return f" (also {', '.join(others[:_ALSO])}{more})" if others else ""
+    return f" (also {listed(others, _ALSO)})" if others else ""
 
 
 def _by_quality(qualities: Sequence[Quality], target_ess: float) -> Grade:

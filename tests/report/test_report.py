@@ -29,7 +29,7 @@ from lcopa_bayes.plot.theme import extremes
 from lcopa_bayes.report import records, write_page, write_report
 from lcopa_bayes.report.formatting import NOT_REACHED, figures, interval, sentence, signed, stopped, to_spread
 from lcopa_bayes.report.pages import write_page_of
-from lcopa_bayes.report.svg import Drawing, inlined
+from lcopa_bayes.report.svg import Drawing, drawing, inlined
 from lcopa_bayes.results.result import write_fit_page
 from lcopa_bayes.sampling.modes import Modes
 
@@ -617,3 +617,11 @@ def test_a_check_begins_with_its_remarks_and_the_record_that_they_name(tmp_path)
         ]
         assert ("Remarks" in titles) == (odd in these)
         assert titles.index("Plant") == (2 if odd in these else 1)
+
+
+def test_files_of_drawings_whose_long_names_begin_alike_are_two():
+    figure = matplotlib.figure.Figure(figsize=(1, 1))
+    first, second = (drawing(f"{'a' * 200}{k}", figure, "") for k in range(2))
+    assert first.stem != second.stem
+    assert max(len(first.stem), len(second.stem)) < 125
+    assert drawing("a" * 110, figure, "").stem == "a" * 110

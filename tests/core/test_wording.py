@@ -1,0 +1,15 @@
+"""Lists of names and clauses of a sentence."""
+
+from lcopa_bayes.core.wording import joined, listed
+
+
+def test_a_list_ends_with_how_many_more_there_are():
+    assert listed(["a", "b"], 2) == "a, b"
+    assert listed(["a", "b", "c", "d"], 2) == "a, b and 2 more"
+    assert listed([]) == ""
+    assert listed([str(k) for k in range(9)]).endswith("7 and 1 more")
+
+
+def test_clauses_become_one_sentence():
+    assert joined(["one thing", "another", "one thing"]) == "One thing; another."
+    assert joined(iter(())) == ""
